@@ -30,6 +30,7 @@ render/setup
 render/room
 datasets/errors
 datasets/parallel datasets/progress datasets/input_files datasets/version
+datasets/camera_pictures
 datasets/rooms
 datasets/recipe
 datasets/plan

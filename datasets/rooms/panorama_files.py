@@ -1,4 +1,4 @@
-"""Pictures with linear light: photographs (JPEG, PNG), OpenEXR and Radiance HDR, and equirectangular panoramas of them.
+"""Pictures with linear light: photographs, OpenEXR and Radiance HDR, and equirectangular panoramas of them.
 
 Photographs of 8 bits count as sRGB and are turned upright as their EXIF data say. EXR and HDR files hold linear values.
 All give an array of bands R, G, B in any unit, upper row first.
@@ -14,8 +14,8 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import ImageOps
 
+from phibench.datasets.camera_pictures import IN_WORDS, read_camera_picture
 from phibench.datasets.input_files import PICTURE_PIXELS, InputFile, quiet_terminal
 from phibench.datasets.rooms.room_files import RoomError
 from phibench.render.sensor.srgb import srgb_decoded
@@ -27,7 +27,7 @@ Light = NDArray[np.float32]
 ASPECT = 2.0
 _ASPECT_TOLERANCE = 0.01
 _LEAST_ROWS = 16
-_REMEDY = "give a JPEG, PNG, OpenEXR or Radiance HDR file"
+_REMEDY = f"give a picture as {IN_WORDS}, OpenEXR or Radiance HDR"
 _HDR_MAGIC = (b"#?RADIANCE", b"#?RGBE")
 _OVERSHOOT = 0.01  # of the light, below 0
 _EXR_MAGIC = b"\x76\x2f\x31\x01"
@@ -78,13 +78,18 @@ def read_light(path: Path) -> Light:
     return np.asarray(lit, dtype=np.float32)
 
 
+def is_linear(path: Path) -> bool:
+    """Tell whether a file begins like OpenEXR or Radiance HDR, whose values are linear."""
+    data = InputFile(path, _REMEDY, RoomError).read()
+    return data[:4] == _EXR_MAGIC or data.startswith(_HDR_MAGIC)
+
+
 def _photograph(file: InputFile, data: bytes) -> Light:
-    picture = file.picture(("PNG", "JPEG"), data)
-    if picture.mode.startswith(("I", "F")):
-        raise file.fault(f"has more than 8 bits a colour (mode {picture.mode}), whose curve is not known")
-    codes = np.asarray(ImageOps.exif_transpose(picture).convert("RGB"))
+    picture = read_camera_picture(file, data)
+    if picture.kind not in ("jpeg", "rgb"):
+        raise file.fault("is no photograph of 8 bits: of DN of a mosaic and of YUYV the colours are not known here")
     linear = srgb_decoded(np.arange(256) / 255.0).astype(np.float32)
-    return linear[codes]
+    return linear[picture.pixels]
 
 
 def _exr(file: InputFile) -> Light:

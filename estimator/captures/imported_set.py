@@ -22,6 +22,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
+from phibench.datasets.camera_pictures import read_camera_picture
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.frames.frame_files import png_bytes
 from phibench.datasets.frames.sensor_card import SensorCard
@@ -34,7 +35,7 @@ from phibench.datasets.store.provenance import provenance
 from phibench.datasets.store.schema import CHECKSUMS, Document
 from phibench.estimator.captures.measure import Setting, read_setting
 from phibench.estimator.captures.pair_list import ListedPair, photos_of, read_pair_list
-from phibench.estimator.captures.picture_files import Photo, sensor_choice
+from phibench.estimator.captures.picture_files import Photo, require_colour, sensor_choice
 from phibench.estimator.captures.rig_file import require_camera_size
 from phibench.estimator.interface import Image, Pair
 from phibench.estimator.pair_set import PairTruth, SpotTruth
@@ -128,6 +129,7 @@ def _import(folder: Path, listed: Sequence[ListedPair], setting: Setting, work: 
         photos = photos_of(folder, row, setting)
         first = first or photos.down.on[0]
         for photo in photos.all:
+            require_colour(photo)
             require_camera_size(setting.known.rig, photo.size_px, str(photo.path))
             sensor_choice(photo, setting.sensor)
             _require_like(first, photo)
@@ -258,13 +260,11 @@ class ImportedSet:
         data = file.read()
         if self.hashes.get(name) != hashlib.sha256(data).hexdigest():
             raise file.fault("was changed, its SHA-256 is not the listed one")
-        image = np.array(file.picture(data=data))
+        image = read_camera_picture(file, data).pixels
         if image.ndim != (2 if self.card.output == "raw" else 3):
             raise file.fault("is a picture of another kind than the set's")
         if image.shape[:2] != (self.rig.camera.height_px, self.rig.camera.width_px):
             raise file.fault("has another size than the set's camera")
-        image = image.astype(np.uint16) if image.ndim == 2 else image
-        image.flags.writeable = False
         return image
 
 

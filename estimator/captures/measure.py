@@ -34,7 +34,7 @@ from phibench.estimator.captures.pair_photos import (
     nothing_found,
     pair_of_photos,
 )
-from phibench.estimator.captures.picture_files import SensorChoice, sensor_choice
+from phibench.estimator.captures.picture_files import SensorChoice, require_colour, sensor_choice
 from phibench.estimator.captures.rig_file import MeasuredRig, read_rig_file, require_camera_size
 from phibench.estimator.captures.spot_shape import (
     OUTLINE_SIGMA_PX,
@@ -189,6 +189,7 @@ def measure(photos: PairPhotos, stroke_m: float, setting: Setting) -> Measuremen
     if not LEAST_STROKE_M <= stroke_m <= MOST_STROKE_M:
         raise DatasetError(f"a stroke of {stroke_m:g} m: allowed is {LEAST_STROKE_M:g} to {MOST_STROKE_M:g} m, metres")
     for photo in photos.all:
+        require_colour(photo)
         require_camera_size(setting.known.rig, photo.size_px, str(photo.path))
     chosen = sensor_choice(photos.down.on[0], setting.sensor)
     for photo in photos.all:

@@ -1,40 +1,32 @@
-"""Picture files of a real camera: JPEG, PNG, PGM and headerless raw, with what each tells about its camera.
+"""Picture files of a real camera, with what each tells about it, and the sensor behind them.
 
-A JPEG keeps its quantisation tables and the subsampling of its chroma. A PGM or a PNG of 16 bits holds DN of the
-mosaic. Headerless raw (`.raw`) holds nothing but DN, row by row: 8 bits, or 16 bits with the low byte first, whose size
-comes from the rig file and whose bits from the sensor file. Pixels stay as they are: no colour is managed, nothing is
-turned.
+Formats are those of `camera_pictures`, and headerless raw (`.raw`). That holds nothing but DN, row by row: 8 bits, or
+16 bits with the low byte first, whose size comes from the rig file and whose bits from the sensor file. No colour is
+managed.
 """
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image as Picture
-from PIL import JpegImagePlugin
 
+from phibench.datasets.camera_pictures import IN_WORDS, Kind, Subsampling, read_camera_picture
 from phibench.datasets.frames.sensor_card import SensorCard, card_of, sensor_card
 from phibench.datasets.frames.sensor_file import SensorFile
-from phibench.datasets.input_files import PICTURE_PIXELS, InputFile
+from phibench.datasets.input_files import InputFile
+from phibench.datasets.rooms.panorama_files import is_linear, read_light
 from phibench.estimator.interface import Image
-from phibench.estimator.spots.image_planes import ImageError
+from phibench.estimator.spots.image_planes import ImageError, linear_planes
 from phibench.estimator.spots.jpeg_coefficients import quantisation
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import Rig
-from phibench.scenes.validation import printable_line
 
-_ORIENTATION, _MAKE, _MODEL = 0x0112, 0x010F, 0x0110  # EXIF tags
-Subsampling = Literal["4:4:4", "4:2:2", "4:2:0"]
-_SAMPLING: dict[int, Subsampling] = {0: "4:4:4", 1: "4:2:2", 2: "4:2:0"}
-_REMEDY = "give the camera's own file"
-_PGM = re.compile(rb"P5(?:\s+|\s*#[^\n]*\n\s*)+(\d+)(?:\s+|\s*#[^\n]*\n\s*)+(\d+)(?:\s+|\s*#[^\n]*\n\s*)+(\d+)\s")
-Kind = Literal["jpeg", "rgb", "raw"]
+_REMEDY = f"give the camera's own picture as {IN_WORDS}"
 
 
 @dataclass(frozen=True)
@@ -45,14 +37,18 @@ class Photo:
     ----------
     path : Path
     pixels : array, read-only
-        By `kind`: "jpeg" and "rgb" (H, W, 3) uint8; "raw" (H, W) uint16, DN.
-    kind : "jpeg", "rgb" or "raw"
+        By `kind`: "jpeg" and "rgb" (H, W, 3) uint8; "yuyv" (H, W, 2) uint8; "raw" (H, W) uint16, DN.
+    kind : "jpeg", "rgb", "yuyv" or "raw"
     camera : str
         Maker and model of EXIF; "" where there is none.
     tables : arrays of shape (8, 8)
         Quantisation tables of a JPEG; none otherwise.
     subsampling : str
         Chroma of a JPEG, such as "4:2:2".
+    orientation : int
+        Of EXIF, by which the stored rows were turned upright; 1 for none.
+    grey : bool
+        The file has one channel of 8 bits.
     """
 
     path: Path
@@ -61,6 +57,8 @@ class Photo:
     camera: str = ""
     tables: tuple[Array, ...] = field(default=(), repr=False)
     subsampling: Subsampling | None = None
+    orientation: int = 1
+    grey: bool = False
 
     @property
     def size_px(self) -> tuple[int, int]:
@@ -71,8 +69,22 @@ class Photo:
 # -- reading ---------------------------------------------------------------------------------------------------------
 
 
+def read_picture(path: Path) -> Photo:
+    """Picture of a file with a head, without what a rig or a sensor file says.
+
+    Raises
+    ------
+    ImageError
+        If the file is no picture of the formats that are read (`camera_pictures`); in one sentence.
+    """
+    found = read_camera_picture(InputFile(path, _REMEDY, ImageError))
+    return Photo(
+        path, found.pixels, found.kind, found.camera, found.tables, found.subsampling, found.orientation, found.grey
+    )
+
+
 def read_photo(path: Path, rig: Rig, given: SensorFile | None = None) -> Photo:
-    """Picture of a file.
+    """Picture of a file, headerless ones included.
 
     Parameters
     ----------
@@ -85,64 +97,47 @@ def read_photo(path: Path, rig: Rig, given: SensorFile | None = None) -> Photo:
     Raises
     ------
     ImageError
-        If the file is no picture of a camera, is turned by EXIF, or has other pixels than any camera that is known
-        here; in one sentence.
+        If the file is no picture of a camera, or has other pixels than any camera that is known here; in one sentence.
     """
+    if path.suffix.lower() != ".raw":
+        return read_picture(path)
     file = InputFile(path, _REMEDY, ImageError)
-    data = file.read()
-    if path.suffix.lower() == ".raw":
-        return Photo(path, _sealed(_headerless(file, data, rig, given)), "raw")
-    if data[:2] == b"P5":
-        return Photo(path, _sealed(_pgm(file, data)), "raw")
-    picture = file.picture(data=data)
-    exif = picture.getexif()
-    turned = exif.get(_ORIENTATION, 1)
-    if turned != 1:
-        raise file.fault(
-            f"is turned by EXIF (orientation {printable_line(str(turned), 10)}): its pixels are not in the order of "
-            "the sensor that rig and calibration speak of"
+    return Photo(path, _sealed(_headerless(file, file.read(), rig, given)), "raw")
+
+
+def read_linear(path: Path, given: SensorFile | None = None) -> NDArray[np.float32]:
+    """Linear light of a picture, shape (H, W, 3), in any unit; of OpenEXR and Radiance HDR files, too.
+
+    Raises
+    ------
+    DatasetError
+        As `read_picture` and `panorama_files.read_light`.
+    """
+    if is_linear(path):
+        return read_light(path)
+    photo = read_picture(path)
+    planes = linear_planes(photo.pixels, sensor_choice(photo, given).card)
+    return np.asarray(np.maximum(np.moveaxis(planes, 0, -1), 0.0), np.float32)
+
+
+def require_colour(photo: Photo) -> None:
+    """Refuse a grey picture of 8 bits: a spot in it is told by no colour, and its camera's chain is not known here.
+
+    Raises
+    ------
+    ImageError
+        In one sentence.
+    """
+    if photo.grey:
+        raise ImageError(
+            f"{photo.path} is a grey picture of 8 bits, in which no spot is fitted; give the camera's colour picture, "
+            'or the DN of a monochrome sensor as PGM or PNG of 16 bits with --sensor and preset = "mono-raw"'
         )
-    camera = printable_line(" ".join(str(exif[tag]) for tag in (_MAKE, _MODEL) if tag in exif), 80)
-    if picture.mode in ("I;16", "I;16B", "I"):
-        return Photo(path, _sealed(_sixteen_bits(file, picture)), "raw", camera)
-    if picture.mode not in ("RGB", "RGBA"):
-        raise file.fault(
-            f"is a {picture.format} file of mode {picture.mode}: colour of 8 bits, or one channel of 16 bits is read"
-        )
-    pixels = np.array(picture.convert("RGB"))
-    if picture.format != "JPEG":
-        return Photo(path, _sealed(pixels), "rgb", camera)
-    tables = tuple(np.array(table, float).reshape(8, 8) for _, table in sorted(picture.quantization.items()))  # type: ignore[attr-defined]
-    sampling = _SAMPLING.get(JpegImagePlugin.get_sampling(picture))
-    if sampling is None or not tables:
-        raise file.fault("is a JPEG with another chroma than 4:4:4, 4:2:2 or 4:2:0")
-    return Photo(path, _sealed(pixels), "jpeg", camera, tables, sampling)
 
 
 def _sealed(image: NDArray[Any]) -> Image:
     image.flags.writeable = False
     return image
-
-
-def _sixteen_bits(file: InputFile, picture: Picture.Image) -> NDArray[np.uint16]:
-    values = np.array(picture)
-    if values.min(initial=0) < 0 or values.max(initial=0) > 65535:
-        raise file.fault("has pixels beyond 16 bits")
-    return values.astype(np.uint16)
-
-
-def _pgm(file: InputFile, data: bytes) -> NDArray[np.uint16]:
-    """DN of a binary PGM; Pillow would stretch them to 16 bits."""
-    head = _PGM.match(data[:1000])
-    if head is None or any(len(text) > 6 for text in head.groups()):
-        raise file.fault("is not a picture of the format PGM")
-    width, height, top = (int(text) for text in head.groups())
-    if not (0 < width * height <= PICTURE_PIXELS and 0 < top < 65536):
-        raise file.fault(f"is a PGM of {width} x {height} pixels up to {top}: no picture of a camera")
-    kind = np.dtype(np.uint8) if top < 256 else np.dtype(">u2")
-    if len(data) - head.end() != width * height * kind.itemsize:
-        raise file.fault(f"is a PGM of another size than the {width} x {height} pixels that it tells")
-    return np.frombuffer(data, kind, offset=head.end()).reshape(height, width).astype(np.uint16)
 
 
 def _headerless(file: InputFile, data: bytes, rig: Rig, given: SensorFile | None) -> NDArray[np.uint16]:
@@ -177,6 +172,7 @@ def require_one_camera(photos: Sequence[Photo]) -> None:
     for other in photos[1:]:
         for what, one, two in (
             ("size", f"{first.size_px[0]} x {first.size_px[1]}", f"{other.size_px[0]} x {other.size_px[1]}"),
+            ("EXIF orientation", str(first.orientation), str(other.orientation)),
             ("kind", first.kind, other.kind),
             ("camera", first.camera, other.camera),
             ("chroma", first.subsampling or "", other.subsampling or ""),
@@ -218,8 +214,8 @@ class SensorChoice:
     note: str
 
 
-_PRESET = {"jpeg": "mjpeg", "rgb": "srgb8", "raw": "bayer-raw"}
-_ALSO = {"rgb": ("yuyv",), "raw": ("mono-raw",)}
+_PRESET = {"jpeg": "mjpeg", "rgb": "srgb8", "yuyv": "yuyv", "raw": "bayer-raw"}
+_ALSO = {"raw": ("mono-raw",)}
 
 
 def sensor_choice(photo: Photo, given: SensorFile | None = None) -> SensorChoice:

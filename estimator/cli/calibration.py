@@ -113,6 +113,7 @@ def align(
     principal_point_sigma_px: float = 5.0,
     mirror_tilt_sigma_deg: float = 0.5,
     outline_sigma_factor: float = 1.0,
+    sensor: Path | None = None,
 ) -> int:
     """Print by how far and in which direction the mirror must move to be centred.
 
@@ -122,7 +123,7 @@ def align(
     Parameters
     ----------
     image
-        PNG or JPEG frame of the camera.
+        Frame of the camera: JPEG, PNG, TIFF, PPM or PGM; turned upright as its EXIF data say.
     out
         PNG to write: the outline and an arrow, 20 times as long as the move; by default `<image>-align.png` in
         the current folder.
@@ -149,8 +150,11 @@ def align(
         How well the axis of a mirror that is no sphere is known to be upright.
     outline_sigma_factor
         As in `phibench calibrate`.
+    sensor
+        TOML file of the sensor; by default the preset of the kind of file is assumed.
     """
     from phibench.datasets.errors import DatasetError
+    from phibench.datasets.frames.sensor_file import read_sensor_file
     from phibench.estimator.calibration.align import (
         Numbers,
         alignment,
@@ -162,8 +166,8 @@ def align(
         write_alignment_picture,
         write_circle_picture,
     )
+    from phibench.estimator.captures.picture_files import read_picture, sensor_choice
     from phibench.estimator.captures.rig_file import read_rig_file, require_camera_size
-    from phibench.estimator.spots.image_planes import read_picture
 
     numbers = Numbers(radius_mm, distance_mm, focal_px, cx_px, cy_px, focus_mm)
     numbers.require_sound()
@@ -171,7 +175,8 @@ def align(
     if rig is not None and given:
         raise DatasetError(f"{next(iter(given))}: {rig} says what the rig is; write it there, and leave the option out")
     known = None if rig is None else read_rig_file(rig).rig
-    pixels, card = read_picture(image)
+    photo = read_picture(image)
+    pixels, card = photo.pixels, sensor_choice(photo, None if sensor is None else read_sensor_file(sensor)).card
     out = Path(f"{image.stem}-align.png") if out is None else out
     if known is None:
         known = rig_of_numbers(pixels, card, numbers)

@@ -492,7 +492,7 @@ def sensitivities(directory: Path, *, out: Path | None = None) -> int:
 
 def _picture(sample: Sample, position: str, preset: str, file: Path | None) -> NDArray[Any]:
     """Picture to unroll: a file's, or a frame of the sample."""
+    from phibench.estimator.captures.picture_files import read_picture
     from phibench.estimator.geometry.panorama import frame
-    from phibench.estimator.spots.image_planes import read_picture
 
-    return frame(sample, position, preset) if file is None else read_picture(file)[0]
+    return frame(sample, position, preset) if file is None else read_picture(file).pixels

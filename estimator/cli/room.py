@@ -27,6 +27,7 @@ def from_mirror_ball(
     width: Whole | None = None,
     point_m: Annotated[tuple[float, float, float] | None, Parameter(negative="")] = None,
     box_m: Annotated[tuple[float, float, float, float, float] | None, Parameter(negative="")] = None,
+    sensor: Path | None = None,
 ) -> int:
     """Unwrap a photograph of a mirror ball into a panorama of its surroundings.
 
@@ -37,7 +38,7 @@ def from_mirror_ball(
     Parameters
     ----------
     photo
-        JPEG, PNG, OpenEXR or Radiance HDR file.
+        JPEG, PNG, TIFF, PPM, PGM, OpenEXR or Radiance HDR file; turned upright as its EXIF data say.
     out
         Panorama to write: .exr (linear light, and what is seen) or .png.
     radius_m
@@ -60,9 +61,12 @@ def from_mirror_ball(
         Place of the ball's centre in the room: from the robot, x its front, z up from the floor; for the table.
     box_m
         Walls around the robot: x_low, x_high, y_low, y_high, height; for the table.
+    sensor
+        TOML file of the sensor, of a photograph that holds DN; by default the preset bayer-raw is assumed.
     """
-    from phibench.datasets.rooms.panorama_files import read_light
+    from phibench.datasets.frames.sensor_file import read_sensor_file
     from phibench.datasets.store.files import require_writable
+    from phibench.estimator.captures.picture_files import read_linear
     from phibench.estimator.outline.mirror_ball import (
         BallPhoto,
         find_ball,
@@ -77,7 +81,7 @@ def from_mirror_ball(
     require_suffix(out)
     require_writable(out)
     table = panorama_table(out, point_m, box_m, surroundings_m)
-    light = read_light(photo)
+    light = read_linear(photo, None if sensor is None else read_sensor_file(sensor))
     ball = find_ball(light, stated)
     u, v, radius = ball.circle_px
     found = (

@@ -17,7 +17,6 @@ from __future__ import annotations
 import io
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,20 +24,17 @@ from numpy.typing import NDArray
 from PIL import Image as Picture
 
 from phibench.datasets.errors import DatasetError
-from phibench.datasets.frames.sensor_card import SensorCard, sensor_card
-from phibench.datasets.input_files import InputFile
+from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.estimator.interface import Box, Image
 from phibench.estimator.spots.camera_codes import light_of, rgb_codes, rgb_picture, tone_slope
 from phibench.estimator.spots.jpeg_coefficients import qtables_of
 from phibench.estimator.spots.raw_pixels import bayer_filters, raw_electrons
 from phibench.scenes.frames import Array, BoolArray
-from phibench.scenes.validation import printable_line
 
 KINDS = ("bayer-raw", "mono-raw", "srgb8", "yuyv", "mjpeg")
 RAW = KINDS[:2]
 PROCESSED = KINDS[2:]
 
-_ORIENTATION = 0x0112  # EXIF tag
 _TOP_CODE = 254  # of 8 bits: from here on a pixel may be cut
 _DEMOSAIC_VARIANCE_PX2 = 0.5  # of bilinear interpolation's kernel (1/2, 1, 1/2), per axis
 
@@ -47,37 +43,12 @@ class ImageError(DatasetError):
     """An image that cannot be used; the message is one sentence for the person at the terminal."""
 
 
-# -- kinds and files -------------------------------------------------------------------------------------------------
+# -- kinds -------------------------------------------------------------------------------------------------
 
 
 def kind_of(card: SensorCard) -> str:
     """One of `KINDS`, or the card's output if it is none of them."""
     return f"{card.mosaic}-raw" if card.output == "raw" else card.output
-
-
-def read_picture(path: Path) -> tuple[NDArray[np.uint8], SensorCard]:
-    """Image of a PNG or JPEG file, with the card of its kind: (H, W, 3), or (H, W, 2) of a "yuyv" PNG.
-
-    Raises
-    ------
-    ImageError
-        If the file is no colour picture of 8 bits, or is turned by EXIF.
-    """
-    file = InputFile(path, "give a PNG or JPEG file of the camera", ImageError)
-    picture = file.picture()
-    kind, mode = picture.format, picture.mode
-    turned = picture.getexif().get(_ORIENTATION, 1)
-    if turned != 1:
-        raise file.fault(
-            f"is turned by EXIF (orientation {printable_line(str(turned), 10)}): its pixels are not in the order of "
-            "the sensor, nor is the picture as you see it"
-        )
-    if (kind, mode) == ("PNG", "LA"):
-        return np.asarray(picture), sensor_card("yuyv")
-    pixels = np.asarray(picture.convert("RGB"))
-    if mode not in ("RGB", "RGBA") or kind not in ("PNG", "JPEG"):
-        raise ImageError(f"{path} is a {kind} file of mode {mode}: give the camera's colour frame as PNG or JPEG")
-    return pixels, sensor_card("mjpeg" if kind == "JPEG" else "srgb8")
 
 
 def through_jpeg(image: NDArray[np.uint8], card: SensorCard) -> NDArray[np.uint8]:

@@ -27,13 +27,13 @@ from phibench.datasets.store.documents import from_json, read_rigs, to_json
 from phibench.datasets.store.layers import read_exr, write_exr
 from phibench.estimator.calibration.bundle import Bundle
 from phibench.estimator.calibration.file import read_calibration, write_calibration
+from phibench.estimator.captures.picture_files import read_picture
 from phibench.estimator.cli.main import main
 from phibench.estimator.geometry.rig_parameters import PARAMETERS
 from phibench.estimator.interface import Outcome
 from phibench.estimator.sandbox.resolve import MethodError, Reference, resolve
 from phibench.estimator.sealed.sealed_set import read_seal
 from phibench.estimator.sealed.submission import SealedPairs, outcomes_of, read_submission, submission
-from phibench.estimator.spots.image_planes import read_picture
 from phibench.scenes.rig import Rig
 from phibench.scenes.validation import nearest
 

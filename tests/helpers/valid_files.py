@@ -38,6 +38,7 @@ from phibench.estimator.benchmark.document import MethodCard, read_records, read
 from phibench.estimator.benchmark.score import score_outcomes
 from phibench.estimator.calibration.bundle import Bundle
 from phibench.estimator.calibration.file import read_calibration, write_calibration
+from phibench.estimator.captures.picture_files import read_picture
 from phibench.estimator.geometry.rig_parameters import PARAMETERS
 from phibench.estimator.sandbox.resolve import Reference
 from phibench.estimator.sealed.sealed_set import (
@@ -49,7 +50,6 @@ from phibench.estimator.sealed.sealed_set import (
 )
 from phibench.estimator.sealed.submission import SealedPairs, outcomes_of, read_submission, submission
 from phibench.estimator.sealed.truth_file import read_truth_file, truth_text
-from phibench.estimator.spots.image_planes import read_picture
 from phibench.estimator.studies.framework import read_settings
 from phibench.estimator.studies.run import find_study, read_study
 from phibench.render.room.light_map import LightMap, encoded

@@ -215,13 +215,17 @@ def test_pictures_of_two_cameras_are_told(case: Case, tmp_path: Path, capsys) ->
     assert "kind" in refused(capsys, case.arguments({**case.jpg, "up": case.raw["up"]}, names=names))
 
 
-def test_a_picture_turned_by_exif_and_no_picture_are_told(case: Case, tmp_path: Path, capsys) -> None:
+def test_pictures_turned_differently_by_exif_and_no_picture_are_told(case: Case, tmp_path: Path, capsys) -> None:
     exif, turned, none = Image.Exif(), tmp_path / "turned.jpg", tmp_path / "none.jpg"
-    exif[0x0112] = 6
+    exif[0x0112] = 3
     with Image.open(case.jpg["up"][0]) as picture:
-        picture.save(turned, exif=exif, quality=85, subsampling="4:2:2")
+        picture.save(turned, exif=exif, qtables=picture.quantization, subsampling="4:2:2")
     none.write_text("no picture at all")
-    for path, word in ((turned, "turned by EXIF"), (none, "is not a picture"), (tmp_path / "gone.jpg", "is missing")):
+    for path, word in (
+        (turned, "EXIF orientation 1 and 3"),
+        (none, "is not a picture"),
+        (tmp_path / "a.jpg", "missing"),
+    ):
         assert word in refused(capsys, case.arguments({**case.jpg, "up": [path]}, names=("down", "up")))
 
 
@@ -268,5 +272,7 @@ def test_a_faulty_sensor_file_is_told(case: Case, tmp_path: Path, capsys) -> Non
 
 def test_a_grey_jpeg_is_told(case: Case, tmp_path: Path, capsys) -> None:
     with Image.open(io.BytesIO(case.jpg["up"][0].read_bytes())) as picture:
-        picture.convert("L").save(tmp_path / "grey.jpg")
-    assert "mode L" in refused(capsys, case.arguments({**case.jpg, "up": [tmp_path / "grey.jpg"]}))
+        for name in ("down", "up"):
+            picture.convert("L").rotate(180 * (name == "up")).save(tmp_path / f"{name}.jpg")
+    grey = {name: [tmp_path / f"{name}.jpg"] for name in ("down", "up")}
+    assert "grey picture of 8 bits" in refused(capsys, case.arguments(grey, names=("down", "up")))

@@ -12,6 +12,7 @@ from helpers.chain_scenes import COLLECTED, FITS, MIDDLE, ROOM, SQUARE, UNITS, s
 from PIL import Image
 
 from phibench.datasets.frames.sensor_card import card_of
+from phibench.estimator.captures.picture_files import read_picture, sensor_choice
 from phibench.estimator.geometry.status import Status
 from phibench.estimator.limits.processed_bound import chain_limit
 from phibench.estimator.processed.chain_model import chain_model, codes
@@ -28,7 +29,7 @@ from phibench.estimator.spots.camera_codes import (
     yuyv_image,
 )
 from phibench.estimator.spots.gaussian_spot import SpotBlur
-from phibench.estimator.spots.image_planes import colour_planes, linear_planes, read_picture, through_jpeg
+from phibench.estimator.spots.image_planes import colour_planes, linear_planes, through_jpeg
 from phibench.estimator.spots.jpeg_coefficients import coefficients, quantised
 from phibench.estimator.spots.jpeg_recovery import recovered
 from phibench.render.sensor import processing
@@ -221,9 +222,9 @@ def test_jpeg_tables_of_a_card_are_those_of_the_file() -> None:
 def test_a_png_of_two_planes_is_read_as_yuyv(tmp_path) -> None:
     image = RANDOM.integers(0, 256, (8, 12, 2), dtype=np.uint8)
     Image.fromarray(image).save(tmp_path / "frame.png")
-    found, card = read_picture(tmp_path / "frame.png")
-    np.testing.assert_array_equal(found, image)
-    assert card.output == "yuyv"
+    found = read_picture(tmp_path / "frame.png")
+    np.testing.assert_array_equal(found.pixels, image)
+    assert sensor_choice(found).card.output == "yuyv"
 
 
 def test_messages() -> None:

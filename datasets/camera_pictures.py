@@ -1,0 +1,222 @@
+"""Pictures of cameras: one reader with one list of formats, for every command that takes one.
+
+* JPEG: colour or grey, with its quantisation tables and the subsampling of its chroma.
+* PNG and TIFF of 8 bits: colour, grey or a palette; a grey picture has three equal colours.
+* PNG and TIFF of 16 bits: one channel is the mosaic's DN; of colours the upper 8 bits are taken, as viewers do.
+* PPM of 8 bits, and PGM, whose values are the mosaic's DN as they stand.
+* PNG of grey with a second plane of 8 bits: YUYV, as `phibench dataset frames` writes it.
+
+Pictures are turned upright as their EXIF orientation says. Other formats are refused by name, with what converts them.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, JpegImagePlugin
+
+from phibench.datasets.input_files import PICTURE_PIXELS, InputFile
+from phibench.scenes.validation import printable_line
+
+FORMATS = ("JPEG", "PNG", "TIFF", "PPM")
+IN_WORDS = "JPEG, PNG, TIFF, PPM or PGM"
+Kind = Literal["jpeg", "rgb", "yuyv", "raw"]
+Subsampling = Literal["4:4:4", "4:2:2", "4:2:0"]
+
+_ORIENTATION, _MAKE, _MODEL, _DNG = 0x0112, 0x010F, 0x0110, 0xC612  # EXIF and TIFF tags
+_SAMPLING: dict[int, Subsampling] = {-1: "4:4:4", 0: "4:4:4", 1: "4:2:2", 2: "4:2:0"}  # -1: of grey
+_SIXTEEN = ("I;16", "I;16B", "I;16L", "I")
+_PGM = re.compile(rb"P5(?:\s+|\s*#[^\n]*\n\s*)+(\d+)(?:\s+|\s*#[^\n]*\n\s*)+(\d+)(?:\s+|\s*#[^\n]*\n\s*)+(\d+)\s")
+
+
+@dataclass(frozen=True)
+class CameraPicture:
+    """Picture of a file, upright.
+
+    Attributes
+    ----------
+    pixels : array, read-only
+        By `kind`: "jpeg" and "rgb" (H, W, 3) uint8; "raw" (H, W) uint16, DN; "yuyv" (H, W, 2) uint8.
+    kind : "jpeg", "rgb", "yuyv" or "raw"
+    grey : bool
+        The file has one channel of 8 bits, which stands three times in the pixels.
+    camera : str
+        Maker and model of EXIF; "" where there is none.
+    orientation : int
+        Of EXIF, 1 to 8: how the stored rows were turned to make these.
+    tables : arrays of shape (8, 8)
+        Quantisation tables of a JPEG; none otherwise.
+    subsampling : str or None
+        Chroma of a JPEG, such as "4:2:2".
+    """
+
+    pixels: NDArray[Any] = field(repr=False)
+    kind: Kind
+    grey: bool = False
+    camera: str = ""
+    orientation: int = 1
+    tables: tuple[NDArray[Any], ...] = field(default=(), repr=False)
+    subsampling: Subsampling | None = None
+
+
+def read_camera_picture(file: InputFile, data: bytes | None = None) -> CameraPicture:
+    """Picture of a file, or of bytes that are already read from it.
+
+    Raises
+    ------
+    DatasetError
+        Of the file's own kind, if it is no picture of `FORMATS`, damaged or too large; in one sentence.
+    """
+    data = file.read() if data is None else data
+    if other := _other_format(data, file.path.suffix.lower()):
+        raise file.fault(other)
+    if data[:2] == b"P5":
+        return CameraPicture(_sealed(_pgm(file, data)), "raw")
+    picture = file.picture(FORMATS, data)
+    if getattr(picture, "n_frames", 1) > 1 and picture.format != "JPEG":  # a JPEG's others are its previews
+        raise file.fault(f"holds {picture.n_frames} pictures: one is read")  # type: ignore[attr-defined]
+    exif = picture.getexif()
+    camera = printable_line(" ".join(str(exif[tag]) for tag in (_MAKE, _MODEL) if tag in exif), 80)
+    kind, pixels = _pixels(file, picture)
+    orientation = _orientation(file, exif.get(_ORIENTATION, 1), kind)
+    found = CameraPicture(
+        _sealed(upright(pixels, orientation)), kind, picture.mode in ("L", "LA", "1"), camera, orientation
+    )
+    return _with_tables(file, picture, found) if kind == "jpeg" else found
+
+
+def _with_tables(file: InputFile, picture: Image.Image, found: CameraPicture) -> CameraPicture:
+    """JPEG with its tables; one that was turned off the grid of its blocks is R, G, B like any other."""
+    tables = tuple(np.array(table, float).reshape(8, 8) for _, table in sorted(picture.quantization.items()))  # type: ignore[attr-defined]
+    sampling = _SAMPLING.get(JpegImagePlugin.get_sampling(picture))
+    if sampling is None or not tables:
+        raise file.fault("is a JPEG with another chroma than 4:4:4, 4:2:2 or 4:2:0")
+    if found.orientation > 1:
+        down, across = {"4:4:4": (8, 8), "4:2:2": (8, 16), "4:2:0": (16, 16)}[sampling]
+        aside = found.orientation > 4
+        if picture.height % down or picture.width % across or (aside and sampling == "4:2:2"):
+            return replace(found, kind="rgb")
+        tables = tuple(table.T for table in tables) if aside else tables
+    return replace(found, tables=tables, subsampling=sampling)
+
+
+def upright(pixels: NDArray[Any], orientation: int) -> NDArray[Any]:
+    """Stored rows turned as the orientation 1 to 8 of EXIF says, a copy."""
+    if orientation > 4:  # rows are stored as columns
+        pixels = np.swapaxes(pixels, 0, 1)
+    rows, columns = {2: (1, -1), 3: (-1, -1), 4: (-1, 1), 6: (1, -1), 7: (-1, -1), 8: (-1, 1)}.get(orientation, (1, 1))
+    return np.ascontiguousarray(pixels[::rows, ::columns])
+
+
+def _orientation(file: InputFile, told: object, kind: Kind) -> int:
+    if not (isinstance(told, int) and 1 <= told <= 8):
+        return 1  # no orientation: viewers show such a picture as it is stored
+    if told != 1 and kind in ("raw", "yuyv"):
+        raise file.fault(f"is turned by EXIF (orientation {told}): DN and YUYV are read in the sensor's own rows alone")
+    return told
+
+
+def _sealed(image: NDArray[Any]) -> NDArray[Any]:
+    image.flags.writeable = False
+    return image
+
+
+def _pixels(file: InputFile, picture: Image.Image) -> tuple[Kind, NDArray[Any]]:
+    if picture.mode in _SIXTEEN:
+        values = np.array(picture)
+        if values.min(initial=0) < 0 or values.max(initial=0) > 65535:
+            raise file.fault("has pixels beyond 16 bits")
+        return "raw", values.astype(np.uint16)
+    if (picture.format, picture.mode) == ("PNG", "LA") and np.asarray(picture)[..., 1].min(initial=255) < 255:
+        return "yuyv", np.array(picture)  # a plane that is full everywhere is no chroma, but says: opaque
+    if picture.mode not in ("RGB", "RGBA", "RGBX", "L", "LA", "P", "PA", "1"):
+        raise file.fault(f"is a {picture.format} file of mode {picture.mode}: grey or R, G, B of 8 or 16 bits is read")
+    return ("jpeg" if picture.format == "JPEG" else "rgb"), np.array(picture.convert("RGB"))
+
+
+def _pgm(file: InputFile, data: bytes) -> NDArray[np.uint16]:
+    """DN of a binary PGM; Pillow would stretch them to 16 bits."""
+    head = _PGM.match(data[:1000])
+    if head is None or any(len(text) > 6 for text in head.groups()):
+        raise file.fault("is not a picture of the format PGM")
+    width, height, top = (int(text) for text in head.groups())
+    if not (0 < width * height <= PICTURE_PIXELS and 0 < top < 65536):
+        raise file.fault(f"is a PGM of {width} x {height} pixels up to {top}: no picture of a camera")
+    kind = np.dtype(np.uint8) if top < 256 else np.dtype(">u2")
+    if len(data) - head.end() != width * height * kind.itemsize:
+        raise file.fault(f"is a PGM of another size than the {width} x {height} pixels that it tells")
+    return np.frombuffer(data, kind, offset=head.end()).reshape(height, width).astype(np.uint16)
+
+
+# -- formats that are not read ---------------------------------------------------------------------------------------
+
+_DEVELOP = "`dcraw -D -4 FILE` writes the DN of its mosaic as PGM"
+_RAW_SUFFIXES = {
+    ".dng": "DNG", ".cr2": "Canon CR2", ".cr3": "Canon CR3", ".nef": "Nikon NEF", ".arw": "Sony ARW",
+    ".orf": "Olympus ORF", ".rw2": "Panasonic RW2", ".raf": "Fujifilm RAF", ".pef": "Pentax PEF",
+}  # fmt: skip
+_RAW_MAGIC = {
+    b"FUJIFILMCCD-RAW": "Fujifilm RAF",
+    b"IIRO": "Olympus ORF",
+    b"IIRS": "Olympus ORF",
+    b"IIU\0": "Panasonic RW2",
+}
+_BRANDS = {
+    "HEIC": ((b"heic", b"heix", b"hevc", b"hevx", b"heim", b"heis", b"mif1", b"msf1"), "`heif-convert FILE out.png`"),
+    "AVIF": ((b"avif", b"avis"), "`avifdec FILE out.png`"),
+    "Canon CR3": ((b"crx ",), "LibRaw's `4channels` or `unprocessed_raw FILE`"),
+}
+_MAGIC = {
+    b"GIF8": "GIF",
+    b"BM": "BMP",
+    b"\0\0\0\x0cjP": "JPEG 2000",
+    b"\xff\x4f\xff\x51": "JPEG 2000",
+    b"\xff\x0a": "JPEG XL",
+    b"\0\0\0\x0cJXL": "JPEG XL",
+    b"8BPS": "Photoshop",
+    b"%PDF": "PDF",
+}
+
+
+def _other_format(data: bytes, suffix: str) -> str:
+    """Fault of a format that is known and not read; "" for all others."""
+    if data[4:8] == b"ftyp":
+        brand = data[8:12]
+        named = next((name for name, (brands, _) in _BRANDS.items() if brand in brands), None)
+        if named == "HEIC" and any(one in data[16:64] for one in _BRANDS["AVIF"][0]):
+            named = "AVIF"
+        if named is None:
+            return "is a video; `ffmpeg -i FILE %04d.png` takes single frames out of it"
+        return _converted(named, f"{_BRANDS[named][1]} converts it")
+    if data[:4] == b"RIFF" and data[8:12] == b"WEBP":
+        return _converted("WebP", "`dwebp FILE -o out.png` converts it")
+    if raw := _raw_format(data, suffix):
+        return _converted(raw, _DEVELOP)
+    named = next((name for magic, name in _MAGIC.items() if data.startswith(magic)), None)
+    return _converted(named, "`magick FILE out.png` converts it") if named else ""
+
+
+def _converted(name: str, how: str) -> str:
+    return f"is a {name} file, which is not read here; {how}"
+
+
+def _raw_format(data: bytes, suffix: str) -> str:
+    """Name of a camera's own raw format: by its first bytes, or a TIFF with DNG's tag or a known suffix."""
+    if named := next((name for magic, name in _RAW_MAGIC.items() if data.startswith(magic)), None):
+        return named
+    if data[:4] not in (b"II*\0", b"MM\0*"):
+        return ""
+    if data[8:10] == b"CR":
+        return "Canon CR2"
+    try:
+        directory = Image.Exif()
+        directory.load(b"Exif\0\0" + data)
+        if _DNG in directory:
+            return "DNG"
+    except Exception:  # what is damaged is told by the decoder
+        return ""
+    return _RAW_SUFFIXES.get(suffix, "")

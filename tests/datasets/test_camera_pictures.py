@@ -1,0 +1,139 @@
+"""One reader of pictures: each format gives the pixels that were stored, or is refused by its name."""
+
+from __future__ import annotations
+
+import io
+import struct
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from phibench.datasets.camera_pictures import read_camera_picture, upright
+from phibench.datasets.errors import DatasetError
+from phibench.datasets.input_files import InputFile
+
+RANDOM = np.random.default_rng(3)
+COLOUR = RANDOM.integers(0, 256, (16, 32, 3), dtype=np.uint8)
+GREY = RANDOM.integers(0, 256, (16, 32), dtype=np.uint8)
+DEEP = RANDOM.integers(0, 65536, (16, 32), dtype=np.uint16)
+
+
+def read(path: Path):
+    return read_camera_picture(InputFile(path, "give another"))
+
+
+def test_lossless_formats_give_the_pixels_and_their_kind(tmp_path: Path) -> None:
+    for suffix in ("png", "tif", "ppm"):
+        Image.fromarray(COLOUR).save(tmp_path / f"colour.{suffix}")
+        found = read(tmp_path / f"colour.{suffix}")
+        assert (found.kind, found.grey) == ("rgb", False)
+        np.testing.assert_array_equal(found.pixels, COLOUR)
+    for suffix in ("png", "tif"):
+        Image.fromarray(GREY).save(tmp_path / f"grey.{suffix}")
+        found = read(tmp_path / f"grey.{suffix}")
+        assert (found.kind, found.grey) == ("rgb", True)
+        np.testing.assert_array_equal(found.pixels, np.repeat(GREY[..., None], 3, axis=2))
+        assert cv2.imwrite(str(tmp_path / f"deep.{suffix}"), DEEP)
+        found = read(tmp_path / f"deep.{suffix}")
+        assert (found.kind, found.pixels.dtype) == ("raw", np.uint16)
+        np.testing.assert_array_equal(found.pixels, DEEP)
+        # of 16 bits a colour: the upper eight, as viewers show them
+        assert cv2.imwrite(str(tmp_path / f"deep-colour.{suffix}"), np.stack([DEEP, DEEP, DEEP], axis=-1))
+        found = read(tmp_path / f"deep-colour.{suffix}")
+        assert found.kind == "rgb"
+        np.testing.assert_array_equal(found.pixels[..., 0], DEEP >> 8)
+
+
+def test_jpeg_gives_its_tables_in_colour_and_grey(tmp_path: Path) -> None:
+    smooth = cv2.GaussianBlur(COLOUR, (0, 0), 2.0)
+    for mode, sampling in (("RGB", "4:2:2"), ("RGB", "4:2:0"), ("L", "4:4:4")):
+        file = tmp_path / "a.jpg"
+        options = {} if mode == "L" else {"subsampling": sampling}
+        Image.fromarray(smooth).convert(mode).save(file, quality=85, **options)
+        found = read(file)
+        assert (found.kind, found.subsampling, found.grey) == ("jpeg", sampling, mode == "L")
+        assert found.tables[0][0, 0] == 5  # ITU-T T.81, table K.1 begins with 16; quality 85 takes 30 % of it
+        np.testing.assert_array_equal(found.pixels, np.array(Image.open(file).convert("RGB")))
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_pictures_are_turned_upright(tmp_path: Path, orientation: int) -> None:
+    """Pillow's own turn is the oracle. A JPEG keeps its tables where its blocks stay on the grid."""
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    stored = Image.fromarray(COLOUR)
+    stored.save(tmp_path / "a.png", exif=exif)
+    stored.save(tmp_path / "a.jpg", exif=exif, subsampling="4:2:0", quality=90)
+    turn = getattr(Image.Transpose, {
+        2: "FLIP_LEFT_RIGHT", 3: "ROTATE_180", 4: "FLIP_TOP_BOTTOM", 5: "TRANSPOSE", 6: "ROTATE_270", 7: "TRANSVERSE",
+        8: "ROTATE_90",
+    }.get(orientation, ""), None)  # fmt: skip
+    seen = stored if turn is None else stored.transpose(turn)
+    np.testing.assert_array_equal(read(tmp_path / "a.png").pixels, np.array(seen))
+    np.testing.assert_array_equal(upright(COLOUR, orientation), np.array(seen))
+    found = read(tmp_path / "a.jpg")
+    assert (found.kind, found.orientation) == ("jpeg", orientation)
+    stored.crop((0, 0, 24, 16)).save(tmp_path / "b.jpg", exif=exif, subsampling="4:2:0")
+    assert read(tmp_path / "b.jpg").kind == ("jpeg" if orientation == 1 else "rgb")
+
+
+def test_a_plane_of_opacity_is_no_chroma(tmp_path: Path) -> None:
+    for second, kind in ((np.full_like(GREY, 255), "rgb"), (np.full_like(GREY, 128), "yuyv")):
+        Image.fromarray(np.stack([GREY, second], axis=-1)).save(tmp_path / "a.png")
+        assert read(tmp_path / "a.png").kind == kind
+
+
+def _tiff_with_tag(tag: int) -> bytes:
+    entries = ((256, 1), (257, 1), (tag, 0x00000401))
+    body = b"".join(struct.pack("<HHII", key, 4, 1, value) for key, value in entries)
+    return b"II*\0" + struct.pack("<IH", 8, len(entries)) + body + bytes(4)
+
+
+FOREIGN = {
+    "HEIC": ("a.heic", b"\0\0\0\x18ftypheic\0\0\0\0mif1heic", "heif-convert"),
+    "AVIF": ("a.avif", b"\0\0\0\x1cftypavif\0\0\0\0avifmif1", "avifdec"),
+    "Canon CR3": ("a.cr3", b"\0\0\0\x18ftypcrx \0\0\0\1crx isom", "LibRaw"),
+    "DNG": ("a.dng", _tiff_with_tag(0xC612), "dcraw -D -4"),
+    "Canon CR2": ("a.cr2", b"II*\0\x10\0\0\0CR\2\0" + bytes(40), "dcraw"),
+    "Nikon NEF": ("a.nef", _tiff_with_tag(300), "dcraw"),
+    "Fujifilm RAF": ("a.raf", b"FUJIFILMCCD-RAW 0201", "dcraw"),
+    "WebP": ("a.webp", b"RIFF\x24\0\0\0WEBPVP8 ", "dwebp"),
+    "GIF": ("a.gif", b"GIF89a" + bytes(20), "magick"),
+    "BMP": ("a.png", b"BM" + bytes(60), "magick"),  # under another name
+    "JPEG XL": ("a.jxl", b"\xff\x0a" + bytes(20), "magick"),
+}
+
+
+@pytest.mark.parametrize("name", FOREIGN)
+def test_other_formats_are_refused_by_name(tmp_path: Path, name: str) -> None:
+    file, data, remedy = FOREIGN[name]
+    (tmp_path / file).write_bytes(data)
+    with pytest.raises(DatasetError) as error:
+        read(tmp_path / file)
+    text = str(error.value)
+    assert f"is a {name} file" in text
+    assert remedy in text
+    assert "\n" not in text
+
+
+def test_what_a_camera_does_not_write_is_told(tmp_path: Path) -> None:
+    Image.fromarray(COLOUR).convert("CMYK").save(tmp_path / "print.jpg")
+    pages = [Image.fromarray(GREY), Image.fromarray(GREY)]
+    pages[0].save(tmp_path / "pages.tif", save_all=True, append_images=pages[1:])
+    (tmp_path / "video.mp4").write_bytes(b"\0\0\0\x18ftypisom\0\0\2\0isomiso2")
+    exif = Image.Exif()
+    exif[0x0112] = 3
+    buffer = io.BytesIO()
+    Image.fromarray(DEEP).save(buffer, "PNG", exif=exif)
+    (tmp_path / "turned.png").write_bytes(buffer.getvalue())
+    for file, word in (
+        ("print.jpg", "CMYK"),
+        ("pages.tif", "2 pictures"),
+        ("video.mp4", "ffmpeg"),
+        ("turned.png", "EXIF"),
+    ):
+        with pytest.raises(DatasetError, match=word):
+            read(tmp_path / file)
