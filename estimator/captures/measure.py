@@ -14,7 +14,7 @@ rays over its standard deviation, rig included, is chi^2 of one degree of freedo
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -25,12 +25,14 @@ from phibench.datasets.frames.sensor_file import SensorFile, read_sensor_file
 from phibench.estimator.calibration.bundle import calibrate
 from phibench.estimator.calibration.file import Calibration, read_calibration
 from phibench.estimator.calibration.spots import method_for
+from phibench.estimator.captures.moved_camera import moved_between
 from phibench.estimator.captures.pair_photos import (
     LEAST_STROKE_M,
     MOST_STROKE_M,
     PairPhotos,
     contradiction,
     frames_note,
+    moved_note,
     nothing_found,
     pair_of_photos,
 )
@@ -218,7 +220,7 @@ def measure(photos: PairPhotos, stroke_m: float, setting: Setting) -> Measuremen
     if int(depth.status) != Status.OK:
         raise contradiction(ready, photos, describe(int(depth.status)))
     frames = frames_note(photos)
-    tests = _doubt(depth), _torn(down, "down"), _torn(up, "up")
+    tests = _doubt(depth), _torn(down, "down"), _torn(up, "up"), *_moved(pair, photos)
     notes = tuple(text for text in (chosen.note, note, _shape_note(shape, setting), frames, *tests) if text)
     return Measurement(depth, down, up, rig, stroke, outlines, setting.known.rig, ready, chosen, notes)
 
@@ -348,6 +350,12 @@ def seen_spots(answer: Answer) -> dict[str, SeenSpot]:
 
 
 _DOUBTFUL_SPOTS = "doubtful: the spot"
+
+
+def _moved(pair: Pair, photos: PairPhotos) -> Iterator[str]:
+    """Sentences on laser-off pictures that are shifted: edges of the room then count as light of the spot."""
+    for position, shift in moved_between(pair):
+        yield f"{_DOUBTFUL_SPOTS} {position} lies on edges: {moved_note(photos, position, shift)}"
 
 
 def _torn(spot: SeenSpot, position: str) -> str:

@@ -14,6 +14,7 @@ import numpy as np
 
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.frames.sensor_card import SensorCard
+from phibench.estimator.captures.moved_camera import moved_between, relit_between
 from phibench.estimator.captures.picture_files import Photo, require_one_camera
 from phibench.estimator.captures.rig_file import MeasuredRig
 from phibench.estimator.geometry.reflection import reflect
@@ -135,10 +136,18 @@ def known_fault(pair: Pair, photos: PairPhotos) -> DatasetError | None:
             f"the pictures with the laser off are exchanged: {photos.up.off[0].path} shows what {down} does; give it "
             "to --down-off, and the other to --up-off"
         )
+    if moved := next(moved_between(pair), None):
+        return DatasetError(f"{moved_note(photos, *moved)}; take both again, with rig and camera at rest")
     if _both(detect(replace(pair, down=pair.up, up=pair.down, down_off=pair.up_off, up_off=pair.down_off))):
         return DatasetError(
             f"down and up are swapped: the spot moves the wrong way from {down} to {up}, but the right one if they "
             "change places; give them to --down and --up the other way round"
+        )
+    if (position := next(relit_between(pair), None)) is not None:
+        name, ratio = position
+        return DatasetError(
+            f"the light changed between laser on and off: {getattr(photos, name).off[0].path} has {ratio:.2f} times "
+            "the codes of the picture with the laser on; fix exposure and white balance, and leave the lamps alone"
         )
     if pair.down_off is not None and pair.up_off is not None:
         other = replace(pair, down=pair.down_off, up=pair.up_off, down_off=pair.down, up_off=pair.up)
@@ -148,6 +157,13 @@ def known_fault(pair: Pair, photos: PairPhotos) -> DatasetError | None:
                 f"{photos.up.off[0].path}; give these to --down and --up, the others to --down-off and --up-off"
             )
     return next(_strokes_faults(pair), None)
+
+
+def moved_note(photos: PairPhotos, position: str, shift_px: float) -> str:
+    """Sentence on a camera that moved between laser on and off."""
+    group: PositionPhotos = getattr(photos, position)
+    files = f"from {group.on[0].path} to {group.off[0].path}"
+    return f"the camera moved between laser on and off, by {shift_px:.1f} px {files}"
 
 
 def _offs_exchanged(pair: Pair) -> bool:

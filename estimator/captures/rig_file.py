@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from pydantic import Field
 
@@ -18,6 +19,7 @@ from phibench.datasets.input_files import SETTINGS_BYTES, InputFile
 from phibench.datasets.recipe.build import build_rig, idle_holder_keys
 from phibench.datasets.recipe.distributions import Table
 from phibench.datasets.recipe.tables import LaserTable, RigTable
+from phibench.estimator.captures.foreign_rig import foreign_calibration
 from phibench.scenes.catalog import RIGS
 from phibench.scenes.laser import Beam
 from phibench.scenes.rig import Rig
@@ -67,7 +69,7 @@ def read_rig_file(path: Path) -> MeasuredRig:
         sentence.
     """
     file = InputFile(path, _REMEDY, limit_bytes=SETTINGS_BYTES)
-    raw = file.toml()
+    raw = _tables(file)
     if faults := structural_faults(RigFile, raw):
         raise file.fault("; ".join(str(fault) for fault in faults))
     document = RigFile.model_validate(raw)
@@ -81,6 +83,20 @@ def read_rig_file(path: Path) -> MeasuredRig:
     except SceneError as error:
         raise file.fault(f"describes no rig: {error}") from error
     return MeasuredRig(rig, None if document.laser is None else _beam(document.laser))
+
+
+def _tables(file: InputFile) -> dict[str, Any]:
+    """Tables of the file; a calibration of another program is told what to copy from it."""
+    data = file.read()
+    if data.startswith(b"MATLAB"):
+        raise file.fault(foreign_calibration("MATLAB 5.0"))
+    text = file.text(data, "utf-8-sig")
+    try:
+        return file.toml_of(text)
+    except DatasetError:
+        if fault := foreign_calibration(text):
+            raise file.fault(fault) from None
+        raise
 
 
 def _focal_fault(table: MeasuredRigTable) -> str:
