@@ -25,13 +25,13 @@ from phibench.datasets.frames.sensor_file import SensorFile, read_sensor_file
 from phibench.estimator.calibration.bundle import calibrate
 from phibench.estimator.calibration.file import Calibration, read_calibration
 from phibench.estimator.calibration.spots import method_for
-from phibench.estimator.captures.moved_camera import moved_between
 from phibench.estimator.captures.pair_photos import (
     LEAST_STROKE_M,
     MOST_STROKE_M,
     PairPhotos,
     contradiction,
     frames_note,
+    moved_between,
     moved_note,
     nothing_found,
     pair_of_photos,
