@@ -20,6 +20,9 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from phibench.datasets.errors import DatasetError
+from phibench.datasets.frames.distractors import Distractor, distractors
+from phibench.datasets.frames.request import FrameOptions, FrameRequest
+from phibench.datasets.frames.sample_request import sample_request
 from phibench.datasets.frames.source import Frames, FrameSource
 from phibench.datasets.input_files import first_fault
 from phibench.datasets.recipe.build import spot_albedo
@@ -302,8 +305,9 @@ class Sample:
     def camera_frames(self, preset: str = "mjpeg", draw: int = 0, *, laser_off: bool = False, **options: Any) -> Frames:
         """Draw the pair as the C310 delivers it: `frames.down`, `frames.up`, for MJPEG also `frames.jpeg`.
 
-        A pure function of data set, its seed, sample, position, laser on or off, draw and request. The layers are read
-        anew each time: to draw many, keep `frame_source` or `region_frames`.
+        They are the frames that a score shows a method: exposure, lamps, laser, camera and sensor are those of the
+        recipe's `[frames]`, with auto exposure by default. Layers are read anew each time: to draw many, keep
+        `frame_source` or `region_frames`.
 
         Parameters
         ----------
@@ -312,9 +316,9 @@ class Sample:
         laser_off : bool
             Also `frames.down_off` and `frames.up_off`.
         **options
-            Of `FrameRequest`: exposure (seconds, "auto", or None for the preset's time; by default "auto" for srgb8 and
-            mjpeg, as the camera would, and the preset's time for the others), lamp_level, laser_level,
-            carriage_speed_m_s, region, camera_seed, and any number of the preset, such as ``jpeg_quality=60``.
+            In place of the recipe's: exposure (seconds, "auto", or None for the preset's time), lamp_level,
+            laser_level, carriage_speed_m_s, region, camera_seed, and any number of the preset, such as
+            ``jpeg_quality=60``.
 
         Raises
         ------
@@ -325,11 +329,20 @@ class Sample:
 
     def frame_source(self, preset: str = "mjpeg", **options: Any) -> FrameSource:
         """Layers read once, for many draws: `source.frames(k)`; options as for `camera_frames`."""
-        return FrameSource.of(self, preset, **options)
+        return FrameSource.from_request(self, self.frame_request(FrameOptions(preset, options)))
 
     def region_frames(self, preset: str = "mjpeg", side_px: int = 64, **options: Any) -> FrameSource:
         """Return the source of squares around each spot: the pixels of the whole frames, to the bit."""
-        return FrameSource.of(self, preset, region=side_px, **options)
+        return self.frame_source(preset, region=side_px, **options)
+
+    def frame_request(self, options: FrameOptions) -> FrameRequest:
+        """Request of this sample's frames: the recipe's `[frames]`, and the options in its place."""
+        return sample_request(self.stream_names, self.dataset.recipe.frames, options)
+
+    @property
+    def distractors(self) -> tuple[Distractor, ...]:
+        """Other lights of the sample; computed when first asked for."""
+        return distractors(self)
 
     def frame(self, position: str, laser: bool = True) -> NDArray[np.float64]:
         """Old name of `expected_image`, kept for one version."""

@@ -10,7 +10,7 @@ An item is a function of (seed, epoch, index) alone. The number of processes tha
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -20,10 +20,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phibench.datasets.errors import DatasetError
-from phibench.datasets.frames.request import FrameRequest, in_one_sentence, whole_number
+from phibench.datasets.frames.request import FrameOptions, FrameRequest, in_one_sentence, whole_number
+from phibench.datasets.frames.sample_request import sample_request
 from phibench.datasets.frames.sensor_card import SensorCard, card_of
 from phibench.datasets.frames.source import FrameSource
-from phibench.datasets.read import Dataset, open_finished
+from phibench.datasets.read import Dataset, Sample, open_finished
+from phibench.datasets.recipe.tables import FramesTable
 from phibench.datasets.store.layers import SpotWindow
 from phibench.render.sensor.camera_chain import Chain, auto_exposed
 from phibench.render.sensor.light import Light, Region
@@ -69,7 +71,7 @@ class PairDataset:
         laser_off: bool = False,
         **options: Any,
     ) -> None:
-        self.folder, self.request = Path(folder), FrameRequest.of(preset, options)
+        self.folder, self.options = Path(folder), FrameOptions(preset, options)
         dataset = _opened(self.folder)
         names = [row.sample_id for row in dataset.rows] if samples is None else list(samples)
         self.sample_ids = tuple(dataset[name].row.sample_id for name in names)
@@ -83,7 +85,7 @@ class PairDataset:
         return len(self.sample_ids)
 
     def __getitem__(self, index: int) -> Item:
-        source = _source(self.folder, self.sample_ids[_place(index, len(self))], _Hashed(self.request))
+        source = _source(self.folder, self.sample_ids[_place(index, len(self))], _Hashed(self.options))
         row = _opened(self.folder)[source.names[2]].row
         item: Item = {"sample_id": row.sample_id, "depth_m": row.depth_m, "stroke_m": row.stroke_m}
         for position in POSITIONS:
@@ -182,8 +184,8 @@ class SpotCrops:
     Parameters
     ----------
     folders : folders of finished data sets
-    requests : sequence of FrameRequest
-        One of them is drawn for every crop.
+    options : sequence of FrameOptions
+        One of them is drawn for every crop; what they do not give is the recipe's `[frames]` of the spot's sample.
     length : int
         Crops in an epoch.
     seed : int
@@ -201,7 +203,7 @@ class SpotCrops:
     def __init__(
         self,
         folders: Sequence[str | Path],
-        requests: Sequence[FrameRequest],
+        options: Sequence[FrameOptions],
         length: int,
         *,
         seed: int = 0,
@@ -209,16 +211,16 @@ class SpotCrops:
         samples: Sequence[str] | None = None,
         laser_off: bool = False,
     ) -> None:
-        self.settings, self.requests, self.laser_off = settings or CropSettings(), tuple(requests), laser_off
+        self.settings, self.options, self.laser_off = settings or CropSettings(), tuple(options), laser_off
         self.length, self.seed, self.epoch = whole_number("length", length, 1), whole_number("seed", seed), 0
-        if not self.requests:
-            raise DatasetError("requests is empty: give at least one FrameRequest")
-        if any(request.region is not None for request in self.requests):
+        if not self.options:
+            raise DatasetError("options is empty: give at least one FrameOptions")
+        if any(one.region is not None for one in self.options):
             raise DatasetError("region: the crops have a side of their own, CropSettings.side_px")
         self._sides = tuple(_sides([open_finished(folder) for folder in folders], self.settings, samples))
         if not self._sides:
             raise DatasetError("no spot is seen in these data sets: there is nothing to crop")
-        self._sensors: dict[tuple[int, int], Chain] = {}
+        self._cameras: dict[tuple[str, int], tuple[FrameRequest, Chain]] = {}
 
     def set_epoch(self, epoch: int) -> None:
         """Choose new crops; call it before a loader starts its workers."""
@@ -239,15 +241,15 @@ class SpotCrops:
         names = ("crops", self.seed, self.epoch, k)
         draw, s = generator(*names), self.settings
         side = self._sides[int(draw.integers(len(self._sides)))]
-        number = int(draw.integers(len(self.requests)))
+        number = int(draw.integers(len(self.options)))
         low, high = np.log(s.laser_levels)
         level = float(np.exp(draw.uniform(low, high)))
         phase = draw.integers(PERIOD_PX, size=2)
         place = (s.side_px - 1) / 2 + draw.uniform(-s.spread_px, s.spread_px, 2)
         first = _MARGIN_PX + phase  # of the crop, in the square
-        request = self.requests[number]
+        request, camera = self._camera(side, number)
         light = side.moved(first + place, s.patch_px, request.lamp_level, request.laser_level * level)
-        chain = replace(self._chain(side, number), camera_seed=int(draw.integers(s.cameras)))
+        chain = replace(camera, camera_seed=int(draw.integers(s.cameras)))
         region = Region(*(int(x) for x in (*first, *(first + s.side_px))))
         with in_one_sentence():
             image = chain.frame(light, NoiseStream((*names, "noise")), region)
@@ -255,27 +257,30 @@ class SpotCrops:
         card = card_of(chain.sensor)
         return Crop(image, off, place, phase, card, side.sample_id, side.position, request.preset, level)
 
-    def _chain(self, side: _Side, number: int) -> Chain:
-        """Camera of a spot for a request; its exposure is that of the whole image."""
-        key = id(side), number
-        if key not in self._sensors:
-            request, sensor = self.requests[number], self.requests[number].sensor()
+    def _camera(self, side: _Side, number: int) -> tuple[FrameRequest, Chain]:
+        """Request of a spot's sample, and its camera with the exposure of the whole down image."""
+        key = side.sample_id, number
+        if key not in self._cameras:
+            request = sample_request(side.names, side.frames, self.options[number])
+            sensor = request.sensor()
             if request.exposure == "auto":
                 # it looks at every eighth pixel: repeated, so that it finds these where it looks
                 planes = side.coarse.repeat(_STEP_PX, 1).repeat(_STEP_PX, 2)
                 sensor = auto_exposed(sensor, Light(planes, lamp_level=request.lamp_level, f_number=side.f_number))
-            self._sensors[key] = Chain(sensor)
-        return self._sensors[key]
+            self._cameras[key] = request, Chain(sensor)
+        return self._cameras[key]
 
     def __getstate__(self) -> Mapping[str, Any]:
-        return {**self.__dict__, "_sensors": {}}  # filled anew in each process
+        return {**self.__dict__, "_cameras": {}}  # filled anew in each process
 
 
 @dataclass(frozen=True, eq=False)
 class _Side:
-    """One spot: its window, what surrounds it, and every eighth pixel of the whole image for auto exposure."""
+    """One spot: its window, what surrounds it, and every eighth pixel of the down image for auto exposure."""
 
     sample_id: str
+    names: tuple[str, int, str]
+    frames: FramesTable | None
     position: str
     uv_px: Array
     window: SpotWindow
@@ -311,33 +316,30 @@ _STEP_PX = 8
 
 def _sides(datasets: Sequence[Dataset], settings: CropSettings, chosen: Sequence[str] | None) -> list[_Side]:
     """Spots that are seen, of all samples or of the chosen ones, with light enough around them for every phase."""
+    samples = (sample for dataset in datasets for sample in dataset.samples)
+    return [side for s in samples if chosen is None or s.row.sample_id in chosen for side in _sides_of(s, settings)]
+
+
+def _sides_of(sample: Sample, settings: CropSettings) -> Iterator[_Side]:
     reach = settings.patch_px
-    found = []
-    for dataset in datasets:
-        for sample in dataset.samples:
-            if chosen is not None and sample.row.sample_id not in chosen:
-                continue
-            for position in POSITIONS:
-                truth = sample.truth_row(position)
-                if not truth.visible or truth.spot_file is None:
-                    continue
-                ambient, middle = sample.ambient(position), np.array([truth.u_px, truth.v_px])
-                u0, v0 = (max(int(x) - reach, 0) for x in middle)
-                around = ambient[:, v0 : int(middle[1]) + reach, u0 : int(middle[0]) + reach].copy()
-                coarse = ambient[:, ::_STEP_PX, ::_STEP_PX].copy()
-                found.append(
-                    _Side(
-                        sample.row.sample_id,
-                        position,
-                        middle,
-                        sample.spot(position),
-                        around,
-                        (u0, v0),
-                        coarse,
-                        sample.rig.camera.f_number,
-                    )
-                )
-    return found
+    truths = {position: sample.truth_row(position) for position in POSITIONS}
+    seen = {p: truth for p, truth in truths.items() if truth.visible and truth.spot_file is not None}
+    coarse = sample.ambient("down")[:, ::_STEP_PX, ::_STEP_PX].copy() if seen else np.empty((3, 0, 0), np.float32)
+    for position, truth in seen.items():
+        ambient, middle = sample.ambient(position), np.array([truth.u_px, truth.v_px])
+        u0, v0 = (max(int(x) - reach, 0) for x in middle)
+        yield _Side(
+            sample.row.sample_id,
+            sample.stream_names,
+            sample.dataset.recipe.frames,
+            position,
+            middle,
+            sample.spot(position),
+            ambient[:, v0 : int(middle[1]) + reach, u0 : int(middle[0]) + reach].copy(),
+            (u0, v0),
+            coarse,
+            sample.rig.camera.f_number,
+        )
 
 
 _PAD_PX = 2
@@ -359,10 +361,10 @@ def shifted_spot(window: SpotWindow, du_px: float, dv_px: float) -> Array:
 
 
 class _Hashed:
-    """A request as a key of a cache: its numbers are a dict."""
+    """Options as a key of a cache: they are a dict."""
 
-    def __init__(self, request: FrameRequest) -> None:
-        self.request, self._key = request, repr(request.document())
+    def __init__(self, options: FrameOptions) -> None:
+        self.options, self._key = options, repr(options.document())
 
     def __hash__(self) -> int:
         return hash(self._key)
@@ -377,8 +379,9 @@ def _opened(folder: Path) -> Dataset:
 
 
 @lru_cache(maxsize=_OPENED_SOURCES)
-def _source(folder: Path, sample_id: str, request: _Hashed) -> FrameSource:
-    return FrameSource.from_request(_opened(folder)[sample_id], request.request)
+def _source(folder: Path, sample_id: str, options: _Hashed) -> FrameSource:
+    sample = _opened(folder)[sample_id]
+    return FrameSource.from_request(sample, sample.frame_request(options.options))
 
 
 def _place(index: int, length: int) -> int:

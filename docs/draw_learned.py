@@ -32,7 +32,7 @@ import numpy as np
 import polars as pl
 
 from phibench.datasets.exposures.pair_draws import CachedSample, PairDraw, pair_draws
-from phibench.datasets.frames.request import FrameRequest
+from phibench.datasets.frames.request import FrameOptions
 from phibench.datasets.frames.sensor_card import card_of
 from phibench.datasets.frames.source import frame_stream
 from phibench.datasets.read import open_finished
@@ -142,7 +142,7 @@ def measure(dev: Path, test: Path, networks: Path, out: Path) -> None:
     files = {file.stem: file for file in sorted(networks.glob("*.onnx"))}
     tables: dict[str, Any] = {}
     for size, numbers in SIZES.items():
-        request = FrameRequest(size.split()[0], "auto", overrides=numbers)
+        request = FrameOptions(size.split()[0], {"exposure": "auto", **numbers})
         crops = made(_crops(test, request), test)
         lead = crops.answers(files[LEAD])
         full = crops.planes[:, 3, 10:22, 10:22].any(axis=(1, 2))
@@ -156,7 +156,7 @@ def measure(dev: Path, test: Path, networks: Path, out: Path) -> None:
             tables[size + part] = table_of(crops, files, size + part, chosen)
             print(size + part, {k: v["rms_px"] if isinstance(v, dict) else v for k, v in tables[size + part].items()})
     for size in ("bayer-raw", "mjpeg 80"):
-        request = FrameRequest(size.split()[0], "auto", overrides=SIZES[size])
+        request = FrameOptions(size.split()[0], {"exposure": "auto", **SIZES[size]})
         for part, settings in OUTSIDE.items():
             crops = made(_crops(test, request, settings, OUTSIDE_COUNT), test)
             name = f"{size}, {part}"
@@ -172,7 +172,7 @@ def held(dev: Path, networks: Path) -> None:
     files = {file.stem: file for file in sorted(networks.glob("*.onnx"))}
     samples = rooms_of(dev, 0)[1]
     for size, numbers in {**SIZES, "mjpeg 95": {"jpeg_quality": 95}}.items():
-        request = FrameRequest(size.split()[0], "auto", overrides=numbers)
+        request = FrameOptions(size.split()[0], {"exposure": "auto", **numbers})
         crops = made(
             SpotCrops([dev], [request], COUNT, seed=79, settings=SETTINGS, samples=samples, laser_off=True), dev
         )
@@ -188,8 +188,8 @@ def held(dev: Path, networks: Path) -> None:
             print(size, name, shown, "thirds, faint ones first:", [round(x, 3) for x in thirds], flush=True)
 
 
-def _crops(folder: Path, request: FrameRequest, settings: CropSettings = SETTINGS, count: int = COUNT) -> SpotCrops:
-    return SpotCrops([folder], [request], count, seed=77, settings=settings, laser_off=True)
+def _crops(folder: Path, options: FrameOptions, settings: CropSettings = SETTINGS, count: int = COUNT) -> SpotCrops:
+    return SpotCrops([folder], [options], count, seed=77, settings=settings, laser_off=True)
 
 
 def leak(dev: Path, files: dict[str, Path]) -> dict[str, Any]:

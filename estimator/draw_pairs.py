@@ -62,7 +62,7 @@ class DrawnPairs:
     def pair_and_frames(self, number: int) -> tuple[Pair, Frames]:
         """Pair as a method sees it, and the first frame of each image, with the camera's JPEG file."""
         pair_draw, sample, source = self.drawn_from(number)
-        frames = source.frames(pair_draw.noise_draw, laser_off=pair_draw.laser_off)
+        frames = source.frames(pair_draw.draw, laser_off=pair_draw.laser_off)
         images = {name: _each(source, pair_draw, frame) for name, frame in frames.by_name.items()}
         box_down, box_up = (None, None) if pair_draw.boxes is None else tuple(map(_box, pair_draw.boxes))
         pair = Pair.of_frames(
@@ -80,7 +80,7 @@ class DrawnPairs:
     def image(self, number: int, position: str, laser: bool) -> Image:
         """First frame of one image of a pair, alone; the same bytes as in `pair`."""
         pair_draw, _, source = self.drawn_from(number)
-        return source.frame(position, pair_draw.noise_draw, laser).image
+        return source.frame(position, pair_draw.draw, laser).image
 
     def card(self, number: int) -> SensorCard:
         """Numbers of the sensor, with the exposure that was chosen; no frame is simulated."""
@@ -133,8 +133,8 @@ def pairs_of(
 
 def _each(source: FrameSource, pair_draw: PairDraw, first: Frame) -> list[Image]:
     """Frames of one image."""
-    others = pair_draw.frame_draws(first.laser)[1:]
-    images = [first.image, *(source.frame(first.position, draw, first.laser).image for draw in others)]
+    others = range(1, pair_draw.frames[0 if first.laser else 1])
+    images = [first.image, *(source.frame(first.position, first.draw, first.laser, k).image for k in others)]
     return [_sealed(image) for image in images]
 
 

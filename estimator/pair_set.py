@@ -91,6 +91,8 @@ class PairTruth:
         The stroke in `Pair.stroke_m`; None if it is the true one.
     calibration_covariance : array, shape (p, p), or None
         That of the pair: the predicted error of D then includes the calibration's.
+    exposure_s, analogue_gain, laser_level, lamp_level : float or None
+        Of both images; None where nobody knows.
     depth_sigma_m : float
         Of `depth_m` where it was measured by a tape; 0 of an exact one.
     """
@@ -109,6 +111,10 @@ class PairTruth:
     up: SpotTruth
     nominal_stroke_m: float | None = None
     calibration_covariance: Array | None = None
+    exposure_s: float | None = None
+    analogue_gain: float | None = None
+    laser_level: float | None = None
+    lamp_level: float | None = None
     depth_sigma_m: float = 0.0
 
 

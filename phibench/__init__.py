@@ -15,13 +15,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from phibench.datasets.read import open_dataset
     from phibench.datasets.training import PairDataset
     from phibench.estimator.benchmark.score import score
     from phibench.estimator.geometry.triangulate import depth_exact
     from phibench.estimator.interface import Answer, Pair, Spot
     from phibench.estimator.paper.sensitivity_table import make
     from phibench.estimator.sandbox.easy_pairs import EasyPairs
+    from phibench.estimator.scored_dataset import open_dataset
     from phibench.estimator.spots.simple_spots import find_spot
 
     __version__: str
@@ -49,7 +49,7 @@ _HOMES = {
     "depth_exact": "phibench.estimator.geometry.triangulate",
     "find_spot": "phibench.estimator.spots.simple_spots",
     "make": "phibench.estimator.paper.sensitivity_table",
-    "open_dataset": "phibench.datasets.read",
+    "open_dataset": "phibench.estimator.scored_dataset",
     "score": "phibench.estimator.benchmark.score",
 }
 

@@ -58,6 +58,7 @@ estimator/calibration
 estimator/sandbox
 estimator/captures
 estimator/benchmark
+estimator/scored_dataset
 estimator/sealed
 estimator/paper
 estimator/studies

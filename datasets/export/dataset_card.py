@@ -85,7 +85,7 @@ def column_texts(request: ExportRequest) -> dict[str, str]:
     found = manifest_texts()
     frame = {name: described_field(field) for name, field in columns(FrameRow)}
     found |= {f"{p}.{name}": frame[name] for p in ("down", "up") for name in POSITION_FIELDS}
-    found |= {name: frame[name] for name in ("draw", "preset")}
+    found |= {name: frame[name] for name in ("draw", "preset", "jpeg_quality", "laser_level", "lamp_level")}
     found |= {"key": "name of the pair in this draw", "split": "train, validation or test"}
     places = {"parquet": "shard and name", "webdataset": "shard and member", "frames": "file"}
     return found | {column: f"{places[request.form]} of the image" for column, _, _ in request.images}

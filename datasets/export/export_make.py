@@ -143,7 +143,7 @@ def perform(shard: Shard) -> tuple[ShardRow, bool]:
     for sample_id, draw in shard.pairs:
         sample = dataset[sample_id]
         if source is None or sample_id != last:
-            source, last = FrameSource.from_request(sample, shard.request.frames), sample_id
+            source, last = FrameSource.from_request(sample, sample.frame_request(shard.request.frames)), sample_id
         pairs.append(drawn_pair(source, sample.row, draw, shard.request))
     drawn = [(pair.sample_id, {"key": pair.key, "split": shard.split, **pair.added}) for pair in pairs]
     with working(shard.out):

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.frames.frame_files import png_bytes, suffix
-from phibench.datasets.frames.request import FrameRequest, whole_number
+from phibench.datasets.frames.request import FrameOptions, whole_number
 from phibench.datasets.frames.source import FrameSource
 from phibench.datasets.read import Dataset
 from phibench.datasets.store.documents import to_table
@@ -40,7 +40,8 @@ class ExportRequest:
     Parameters
     ----------
     form : "parquet", "webdataset" or "frames"
-    frames : FrameRequest
+    frames : FrameOptions
+        What they do not give is the recipe's `[frames]` of each sample.
     draws : int
         Draws 0 to draws - 1 of every pair.
     laser_off : bool
@@ -54,7 +55,7 @@ class ExportRequest:
     """
 
     form: Form
-    frames: FrameRequest
+    frames: FrameOptions
     draws: int = 1
     laser_off: bool = False
     split_by: SplitBy = "both"
@@ -103,7 +104,7 @@ class DrawnPair:
     sample_id: str
     draw: int
     images: Mapping[str, bytes]
-    added: Mapping[str, float | int | str]
+    added: Mapping[str, float | int | str | None]
 
 
 def pair_key(sample_id: str, draw: int) -> str:
@@ -117,7 +118,9 @@ def pair_key(sample_id: str, draw: int) -> str:
 def drawn_pair(source: FrameSource, row: ManifestRow, draw: int, request: ExportRequest) -> DrawnPair:
     """Draw one pair."""
     images: dict[str, bytes] = {}
-    added: dict[str, float | int | str] = {"draw": draw, "preset": request.frames.preset}
+    asked = source.request
+    added: dict[str, float | int | str | None] = {"draw": draw, "preset": asked.preset}
+    added |= {"jpeg_quality": source.jpeg_quality, "laser_level": asked.laser_level, "lamp_level": asked.lamp_level}
     for column, position, laser in request.images:
         frame = source.frame(position, draw, laser)
         images[column] = frame.jpeg if frame.jpeg is not None else png_bytes(frame.image)
@@ -141,7 +144,8 @@ def pair_table(rows: Sequence[ManifestRow], drawn: Sequence[tuple[str, Mapping[s
     """
     import polars
 
-    added = polars.DataFrame([{"sample_id": sample_id, **values} for sample_id, values in drawn])
+    kinds = {"jpeg_quality": polars.Int64} if drawn and "jpeg_quality" in drawn[0][1] else {}  # it may be null in all
+    added = polars.DataFrame([{"sample_id": name, **values} for name, values in drawn], schema_overrides=kinds)
     table = added.join(to_table(rows), on="sample_id", how="left", maintain_order="left")
     first = [name for name in ("key", "split") if name in table.columns]
     return table.select(*first, *(name for name in table.columns if name not in first))

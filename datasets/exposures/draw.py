@@ -32,7 +32,7 @@ from phibench.datasets.frames.frame_files import (
     write_index,
     write_preview,
 )
-from phibench.datasets.frames.request import FrameRequest, whole_number
+from phibench.datasets.frames.request import FrameOptions, FrameRequest, whole_number
 from phibench.datasets.frames.source import Frame, FrameSource, has_place
 from phibench.datasets.parallel import parallel_map
 from phibench.datasets.progress import Steps, progress_console
@@ -80,18 +80,18 @@ class SampleJob:
     dataset: Path
     out: Path
     sample_id: str
-    request: FrameRequest
+    options: FrameOptions
     items: tuple[Item, ...]
     known: Mapping[str, FrameRow] = field(default_factory=dict)
 
     def file(self, item: Item) -> str:
         """Name of one of them."""
-        return item.file(self.sample_id, suffix(self.request.sensor(), self.request.region is None))
+        return item.file(self.sample_id, suffix(self.options.sensor(), self.options.region is None))
 
 
 def draw_frames(
     folder: str | Path,
-    request: FrameRequest,
+    options: FrameOptions,
     draws: int = 1,
     *,
     out: str | Path | None = None,
@@ -105,7 +105,8 @@ def draw_frames(
     Parameters
     ----------
     folder : data set
-    request : FrameRequest
+    options : FrameOptions
+        What they do not give is the recipe's `[frames]` of each sample.
     draws : draws 0 to draws - 1 of every image
     out : folder to write; by default beside the data set, `<folder>-frames`
     samples : ids; all by default
@@ -116,19 +117,19 @@ def draw_frames(
     Raises
     ------
     DatasetError
-        If the data set, the request or the folder will not do; in one sentence.
+        If the data set, the options or the folder will not do; in one sentence.
     """
     dataset, console = open_finished(folder), console or progress_console()
     target = Path(out) if out is not None else Path(f"{Path(folder).resolve()}-frames")
     whole_number("draws", draws, 1)
     count = whole_number("workers", os.cpu_count() or 1 if workers is None else workers, 1)
     _check_folder(target, Path(folder))
-    jobs, notes = _jobs(dataset, target, request, _items(request, draws, laser_off), samples)
+    jobs, notes = _jobs(dataset, target, options, _items(options, draws, laser_off), samples)
     try:
         target.mkdir(parents=True, exist_ok=True)
         with only_run(target):
             remove_temporary(target)
-            made, kept = _draw(jobs, dataset, target, request, count, console)
+            made, kept = _draw(jobs, dataset, target, options, count, console)
     except OSError as error:
         text = str(error) if isinstance(error, WriteError) else f"could not write to {target}: {error}"
         raise DatasetError(f"{text}; then run the same command again") from error
@@ -138,14 +139,14 @@ def draw_frames(
 def perform(job: SampleJob) -> tuple[list[FrameRow], int]:
     """Do a job: rows of all its files, and how many were written."""
     sample = _opened(job.dataset, sha256(job.dataset / schema.CHECKSUMS))[job.sample_id]
-    base, source = sample_key(sample, job.request), None
+    base, source = sample_key(sample, job.options), None
     rows, made = [], 0
     with working(job.out):
         for item in job.items:
             name, key = job.file(item), _hash([base, repr(item)])
             row = job.known.get(name)
             if row is None or row.key != key or not _is_whole(job.out / name, row.sha256):
-                source = source or FrameSource.from_request(sample, job.request)
+                source = source or FrameSource.from_request(sample, sample.frame_request(job.options))
                 row = _written(job, sample.row, source, item, name, key)
                 made += 1
             rows.append(row)
@@ -159,10 +160,10 @@ def _opened(folder: Path, _checksums_sha256: str) -> Dataset:
 
 
 def _draw(
-    jobs: list[SampleJob], dataset: Dataset, out: Path, request: FrameRequest, count: int, console: Console
+    jobs: list[SampleJob], dataset: Dataset, out: Path, options: FrameOptions, count: int, console: Console
 ) -> tuple[int, int]:
     rows = read_index(out)
-    claim(out, _names(dataset), _document(request))
+    claim(out, _names(dataset), options.document())
     jobs = [_knowing(part, rows) for job in jobs for part in _parts(job)]
     made, total, due = 0, 0, time.monotonic() + _SAVE_EVERY_S
     try:
@@ -220,9 +221,12 @@ def _row(
         position="down" if item.position == "down" else "up",
         laser="on" if item.laser else "off",
         draw=item.draw,
-        preset=job.request.preset,
+        preset=source.request.preset,
         exposure_s=frame.sensor.exposure_s,
         analogue_gain=frame.sensor.analogue_gain,
+        jpeg_quality=source.jpeg_quality,
+        laser_level=source.request.laser_level,
+        lamp_level=source.request.lamp_level,
         u0_px=frame.region.u0_px,
         v0_px=frame.region.v0_px,
         width_px=width,
@@ -231,31 +235,31 @@ def _row(
         stroke_m=sample.stroke_m,
         **{name: getattr(spot, name) for name in TRUTH},
         sensor=frame.sensor.model_dump(mode="json"),
-        request=_document(job.request),
+        request=_document(source.request),
         key=key,
     )
 
 
-def _items(request: FrameRequest, draws: int, laser_off: bool) -> tuple[Item, ...]:
+def _items(options: FrameOptions, draws: int, laser_off: bool) -> tuple[Item, ...]:
     images = [(position, laser) for position in POSITIONS for laser in ((True, False) if laser_off else (True,))]
     items = [Item(*image, draw) for image in images for draw in range(draws)]
-    if has_preview(request.sensor()):
+    if has_preview(options.sensor()):
         items += [Item(*image, 0, preview=True) for image in images]
     return tuple(items)
 
 
 def _jobs(
-    dataset: Dataset, out: Path, request: FrameRequest, items: tuple[Item, ...], samples: Sequence[str] | None
+    dataset: Dataset, out: Path, options: FrameOptions, items: tuple[Item, ...], samples: Sequence[str] | None
 ) -> tuple[list[SampleJob], list[str]]:
     """One job per sample; a region needs a place of the spot in both images."""
     jobs, notes = [], []
     for sample in dataset if samples is None else [dataset[name] for name in dict.fromkeys(samples)]:
         size = sample.rig.camera.height_px, sample.rig.camera.width_px
         hidden = [p for p in POSITIONS if not has_place(sample.truth_row(p), size)]
-        if isinstance(request.region, int) and hidden:
+        if isinstance(options.region, int) and hidden:
             notes.append(f"{sample.row.sample_id} is left out: no image of the spot to put a region around")
         else:
-            jobs.append(SampleJob(dataset.folder, out, sample.row.sample_id, request, items))
+            jobs.append(SampleJob(dataset.folder, out, sample.row.sample_id, options, items))
     return jobs, notes
 
 
@@ -290,17 +294,19 @@ def _document(request: FrameRequest) -> dict[str, object]:
     return document
 
 
-def sample_key(sample: Sample, request: FrameRequest) -> str:
+def sample_key(sample: Sample, options: FrameOptions) -> str:
     """Hash of all that the frames of a sample depend on: names, numbers, layers, code, libraries."""
-    listed = read_checksums(sample.dataset.folder)
-    layers = [listed.get(schema.RIGS)]
+    listed, request = read_checksums(sample.dataset.folder), sample.frame_request(options)
+    layers = [listed.get(schema.RIGS), listed.get(schema.ROOMS)]
     for position in POSITIONS:
         row = sample.truth_row(position)
         layers += [listed.get(row.view_ambient_file), listed.get(row.spot_file or "")]
     libraries = [f"{name} {version(name)}" for name in ("numpy", "scipy", "pillow", "OpenEXR")]
     code = [code_behind(f"phibench.datasets.frames.{name}") for name in ("source", "frame_files")]
     numbers = request.sensor().model_dump(mode="json")
-    return _hash([sample.stream_names, row_line(sample.row), _document(request), numbers, layers, libraries, code])
+    lights = [table.model_dump(mode="json") for table in sample.dataset.recipe.distractors]
+    parts = [sample.stream_names, row_line(sample.row), _document(request), numbers, lights, layers, libraries, code]
+    return _hash(parts)
 
 
 def _hash(parts: object) -> str:

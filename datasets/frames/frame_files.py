@@ -128,6 +128,9 @@ class FrameRow(Document):
     preset: str = described("-", "preset of the sensor")
     exposure_s: float = described("s", "exposure time that was used")
     analogue_gain: float = described("1", "gain before the converter that was used")
+    jpeg_quality: int | None = described("-", "libjpeg's quality; null unless the camera sends JPEG")
+    laser_level: float = described("1", "factor of the laser's light")
+    lamp_level: float = described("1", "factor of the room's light")
     u0_px: int = described("px", "column of the sensor that is the file's first column")
     v0_px: int = described("px", "row of the sensor that is the file's first row")
     width_px: int = described("px", "columns of the file")
@@ -188,9 +191,14 @@ def claim(folder: Path, dataset: tuple[str, int], wanted: dict[str, Any]) -> Non
         write_text(path, json.dumps(meant, indent=1, allow_nan=False) + "\n")
         return
     held = InputFile(path, "give another folder, `--out FOLDER`").json()
-    if other := [name for name in meant if held.get(name) != meant[name]]:
-        texts = ", ".join(f"{name} {printable_line(str(held.get(name)), 60)}, not {meant[name]}" for name in other)
+    meant = json.loads(json.dumps(meant))
+    if other := [name for name in {**meant, **held} if held.get(name) != meant.get(name)]:
+        texts = ", ".join(f"{name} {_shown(held.get(name))}, not {_shown(meant.get(name))}" for name in other)
         raise DatasetError(f"{folder} holds frames with {texts}: give another folder, `--out FOLDER`")
+
+
+def _shown(value: Any) -> str:
+    return "not given" if value is None else printable_line(str(value), 60)
 
 
 def _has_frames(folder: Path) -> bool:

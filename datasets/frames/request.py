@@ -1,6 +1,7 @@
 """FrameRequest: preset, exposure, brightness of lamps and laser, carriage speed, crop and camera seed of a frame.
 
-A request is checked and frozen. The preset is one of the sensor's.
+A request is checked and frozen. The preset is one of the sensor's. `FrameOptions` are what a caller asks of a data
+set's frames; `sample_request` makes the request of a sample of them and of the recipe's `[frames]`.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ import numbers
 import operator
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -20,8 +21,8 @@ from phibench.render.sensor.light import Region
 from phibench.render.sensor.settings import Sensor, SensorError, sensor
 
 Exposure = float | Literal["auto"] | None
-AUTO_EXPOSED = ("srgb8", "yuyv", "mjpeg")
-"""Presets that deliver what the camera has processed: exposed as it would, unless an exposure is given."""
+AUTO: Literal["auto"] = "auto"
+"""Exposure where neither caller nor recipe gives one, in every preset: a camera exposes by itself."""
 
 _JPEG = b"\xff\xd8"  # start of image
 _RANGES = {"lamp_level": (0.0, 1e6), "laser_level": (0.0, 1e6), "carriage_speed_m_s": (-1e3, 1e3)}
@@ -36,8 +37,7 @@ class FrameRequest:
     preset : str
         Sensor preset: "ideal", "mono-raw", "bayer-raw", "srgb8", "yuyv" or "mjpeg".
     exposure : float, "auto" or None
-        Seconds; "auto" is the camera's auto exposure, for each position by itself; None is the preset's time.
-        `FrameRequest.of` and the command line choose it where none is given: `default_exposure`.
+        Seconds; "auto" is the camera's auto exposure for the down image, kept for all; None is the preset's time.
     lamp_level, laser_level : float
         Factors of the room's light and of the spot.
     carriage_speed_m_s : float
@@ -51,7 +51,7 @@ class FrameRequest:
     """
 
     preset: str = "mjpeg"
-    exposure: Exposure = None
+    exposure: Exposure = AUTO
     lamp_level: float = 1.0
     laser_level: float = 1.0
     carriage_speed_m_s: float = 0.0
@@ -60,8 +60,10 @@ class FrameRequest:
     overrides: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if self.exposure is not None and "exposure_s" in self.overrides:
-            raise DatasetError("exposure and exposure_s are both given: give one of them")
+        if "exposure_s" in self.overrides:
+            if self.exposure not in (None, AUTO):
+                raise DatasetError("exposure and exposure_s are both given: give one of them")
+            object.__setattr__(self, "exposure", None)
         if isinstance(self.exposure, str) and self.exposure != "auto":
             raise DatasetError(f"exposure = '{self.exposure}': give seconds above 0, or 'auto'")
         if not isinstance(self.preset, str):
@@ -79,16 +81,6 @@ class FrameRequest:
         with in_one_sentence():
             self.sensor()  # refused now rather than at the first draw
 
-    @classmethod
-    def of(cls, preset: str, options: Mapping[str, Any]) -> FrameRequest:
-        """Request from keywords: those that are not ours are numbers of the preset; see `default_exposure`."""
-        if "overrides" in options:
-            raise DatasetError("overrides: give the numbers of the preset by name, such as jpeg_quality=60")
-        ours = {key: value for key, value in options.items() if key in cls.__dataclass_fields__}
-        if "exposure" not in options and "exposure_s" not in options:
-            ours["exposure"] = default_exposure(preset)
-        return cls(preset, overrides={key: options[key] for key in options if key not in ours}, **ours)
-
     def sensor(self) -> Sensor:
         """Sensor before auto exposure."""
         seconds = {} if self.exposure in (None, "auto") else {"exposure_s": self.exposure}
@@ -99,9 +91,60 @@ class FrameRequest:
         return {**asdict(self), "overrides": dict(self.overrides)}
 
 
-def default_exposure(preset: str) -> Exposure:
-    """Exposure where none is given: "auto" for `AUTO_EXPOSED`, otherwise the preset's time."""
-    return "auto" if preset in AUTO_EXPOSED else None
+@dataclass(frozen=True)
+class FrameOptions:
+    """Options of a data set's frames as a caller gives them; all else is the recipe's `[frames]`, or its default.
+
+    Parameters
+    ----------
+    preset : str
+        Sensor preset, as in `FrameRequest`.
+    given : mapping
+        Fields of `FrameRequest` by name, and any number of the preset, such as ``jpeg_quality=60``.
+
+    Raises
+    ------
+    DatasetError
+        If an option has no such value; in one sentence.
+    """
+
+    preset: str = "mjpeg"
+    given: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if "overrides" in self.given:
+            raise DatasetError("overrides: give the numbers of the preset by name, such as jpeg_quality=60")
+        if self.given.get("exposure") is not None and "exposure_s" in self.given:
+            raise DatasetError("exposure and exposure_s are both given: give one of them")
+        numbers = self.over(FrameRequest(self.preset)).overrides  # refused now rather than at the first draw
+        fields = {key: value for key, value in self.given.items() if key not in numbers}
+        object.__setattr__(self, "given", {**fields, **numbers})  # tables, where a file was given
+
+    def over(self, request: FrameRequest) -> FrameRequest:
+        """Request of this preset with what is given in place of its own."""
+        fields = {key: value for key, value in self.given.items() if key in FrameRequest.__dataclass_fields__}
+        numbers = {key: value for key, value in self.given.items() if key not in fields}
+        if "exposure" in fields or "exposure_s" in numbers:
+            request = replace(request, overrides=_without(request.overrides, "exposure_s"))
+        return replace(request, **fields, overrides={**request.overrides, **numbers})
+
+    @property
+    def region(self) -> int | Region | None:
+        """The crop that is asked for, as in `FrameRequest`."""
+        return self.given.get("region")
+
+    def sensor(self) -> Sensor:
+        """Sensor without the recipe's numbers: its output and mosaic are those of every frame."""
+        return self.over(FrameRequest(self.preset)).sensor()
+
+    def document(self) -> dict[str, Any]:
+        """The options as JSON can hold them."""
+        plain = {key: asdict(value) if isinstance(value, Region) else value for key, value in self.given.items()}
+        return {"preset": self.preset, **plain}
+
+
+def _without(numbers: Mapping[str, Any], name: str) -> dict[str, Any]:
+    return {key: value for key, value in numbers.items() if key != name}
 
 
 def jpeg_tables(path: Path) -> tuple[tuple[int, ...], tuple[int, ...]]:

@@ -16,11 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phibench.datasets.errors import DatasetError
+from phibench.datasets.frames.distractors import Distractor
 from phibench.datasets.frames.request import FrameRequest, in_one_sentence, whole_number
 from phibench.datasets.store.layers import SpotWindow
 from phibench.datasets.store.schema import ManifestRow, SpotRow
 from phibench.render.sensor.camera_chain import Chain, auto_exposed
-from phibench.render.sensor.light import Light, OtherSpot, Region
+from phibench.render.sensor.light import Light, Region
 from phibench.render.sensor.noise_tiles import frame_stream
 from phibench.render.sensor.processing import decoded
 from phibench.render.sensor.rolling_shutter import moved_spot, spot_velocity_px_per_s
@@ -113,7 +114,24 @@ class Frames:
         return self.by_name[name].image
 
 
-NO_OTHERS: Mapping[str, tuple[OtherSpot, ...]] = MappingProxyType({})
+_FIRST = ("mono-raw", "bayer-raw", "srgb8", "mjpeg")  # presets of the first version: their draws keep their numbers
+_FIRST_OF = {"yuyv": 2**32}  # first draw of a later preset
+_OTHER_BITS = 64  # presets of others begin above
+_REPEATS = 2**40  # draws between the frames of one image: more than any data set has
+
+
+def noise_draw(preset: str, draw: int, repeat: int = 0) -> int:
+    """Number of a noise stream: another one in each preset, or JPEG frames would have a raw twin's noise.
+
+    `repeat` counts the frames of one image in one draw, from 0.
+    """
+    if preset in _FIRST:
+        number = draw * len(_FIRST) + _FIRST.index(preset)
+    elif preset in _FIRST_OF:
+        number = _FIRST_OF[preset] + draw
+    else:
+        number = (int.from_bytes(preset.encode()) << _OTHER_BITS) + draw
+    return number + repeat * _REPEATS
 
 
 class SampleLayers(Protocol):
@@ -143,6 +161,10 @@ class SampleLayers(Protocol):
 
     def spot(self, position: str) -> SpotWindow:
         """Spot layer."""
+
+    @property
+    def distractors(self) -> tuple[Distractor, ...]:
+        """Other lights, standing still."""
 
 
 @dataclass(frozen=True)
@@ -175,30 +197,24 @@ class FrameSource:
     sides: Mapping[str, Side]
 
     @classmethod
-    def of(cls, sample: SampleLayers, preset: str = "mjpeg", **options: Any) -> FrameSource:
-        """Read the layers of a sample; options as in `FrameRequest`.
+    def from_request(cls, sample: SampleLayers, request: FrameRequest) -> FrameSource:
+        """Read the layers of a sample; auto exposure looks at the down image, without spots.
 
         Raises
         ------
         DatasetError
             If the request cannot be met or a layer cannot be read; in one sentence.
         """
-        return cls.from_request(sample, FrameRequest.of(preset, options))
-
-    @classmethod
-    def from_request(
-        cls, sample: SampleLayers, request: FrameRequest, others: Mapping[str, tuple[OtherSpot, ...]] = NO_OTHERS
-    ) -> FrameSource:
-        """As `of`, for a request that was checked before; `others` are further lights by position, standing still."""
         with in_one_sentence():
-            sides = {position: _side(sample, position, request, others.get(position, ())) for position in POSITIONS}
+            sensor = _exposed(sample, request)
+            sides = {position: _side(sample, position, request, sensor) for position in POSITIONS}
         return cls(request, sample.stream_names, sides)
 
-    @staticmethod
-    def exposed(sample: SampleLayers, request: FrameRequest) -> Sensor:
-        """Sensor with the exposure and the gain of the down image, without other lights; errors as of `of`."""
-        with in_one_sentence():
-            return _side(sample, "down", request, ()).chain.sensor
+    @property
+    def jpeg_quality(self) -> int | None:
+        """libjpeg's quality; None unless the output is MJPEG."""
+        sensor = self.sides["down"].chain.sensor
+        return sensor.jpeg_quality if sensor.output == "mjpeg" else None
 
     def frames(self, draw: int = 0, *, laser_off: bool = False) -> Frames:
         """Both positions with the laser on, and, if asked for, both with the laser off."""
@@ -206,8 +222,8 @@ class FrameSource:
             [self.frame(p, draw, on) for on in ((True, False) if laser_off else (True,)) for p in POSITIONS]
         )
 
-    def frame(self, position: str, draw: int = 0, laser: bool = True) -> Frame:
-        """One frame.
+    def frame(self, position: str, draw: int = 0, laser: bool = True, repeat: int = 0) -> Frame:
+        """One frame; `repeat` counts the frames of one image, where a pair has several of each.
 
         Raises
         ------
@@ -217,7 +233,7 @@ class FrameSource:
         if position not in self.sides:
             raise DatasetError(f"position '{position}': must be 'down' or 'up'")
         side, draw = self.sides[position], whole_number("draw", draw)
-        stream = frame_stream(*self.names, position, laser, draw)
+        stream = frame_stream(*self.names, position, laser, noise_draw(self.request.preset, draw, repeat))
         light, jpeg = side.light if laser else side.light.laser_off(), None
         with in_one_sentence():
             if side.chain.sensor.output == "mjpeg" and side.region == Region.whole(light.size):
@@ -228,7 +244,15 @@ class FrameSource:
         return Frame(image, jpeg, position, laser, draw, side.chain.sensor, side.region)
 
 
-def _side(sample: SampleLayers, position: str, request: FrameRequest, others: tuple[OtherSpot, ...]) -> Side:
+def _exposed(sample: SampleLayers, request: FrameRequest) -> Sensor:
+    """Sensor of all frames of a pair."""
+    if request.exposure != "auto":
+        return request.sensor()
+    ambient, f_number = sample.ambient("down"), sample.rig.camera.f_number
+    return auto_exposed(request.sensor(), Light(ambient, lamp_level=request.lamp_level, f_number=f_number))
+
+
+def _side(sample: SampleLayers, position: str, request: FrameRequest, sensor: Sensor) -> Side:
     camera = sample.rig.camera
     spot = sample.spot(position)
     light = Light(
@@ -237,9 +261,8 @@ def _side(sample: SampleLayers, position: str, request: FrameRequest, others: tu
         lamp_level=request.lamp_level,
         laser_level=request.laser_level,
         f_number=camera.f_number,
-        others=others,
+        others=tuple(one.other(position, request.laser_level) for one in sample.distractors),
     )
-    sensor = auto_exposed(request.sensor(), light) if request.exposure == "auto" else request.sensor()
     moving = _moving(sample, position, spot, sensor, request.carriage_speed_m_s)
     region = _region(sample.row, position, request.region, light.size)
     return Side(Chain(sensor, request.camera_seed, camera), replace(light, spot=moving), region)

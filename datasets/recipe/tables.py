@@ -403,7 +403,7 @@ class FramesTable(Table):
     )
     draws: int = Field(default=1, ge=1, le=10_000, description="draws of the noise, per sample and preset")
     exposure_s: Exposure | None = Field(
-        default=None, description="exposure time; 'auto' is the camera's for the down image, kept for the others"
+        default="auto", description="exposure time; 'auto' is the camera's for the down image, kept for the others"
     )
     laser_level: Level = Field(default=_ONE, description="factor of the laser's light")
     lamp_level: Level = Field(default=_ONE, description="factor of the room's light")

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -40,9 +41,10 @@ from phibench.scenes.frames import Array
 from phibench.scenes.laser import Beam
 from phibench.scenes.rig import Rig
 
-TASK_VERSION = 5
+TASK_VERSION = 6
 """Version of the task: what a method is given, what it must answer and what is counted. A change of any raises it.
 
+6: every preset exposes by itself, unless the recipe's `[frames]` says otherwise.
 5: spots may be hidden in one image, and a D of such a pair is false.
 4: a missed pair counts as the best constant depth would; a sealed set shows each sample once.
 """
@@ -96,7 +98,7 @@ class DatasetPairs(DrawnPairs):
             sample_id=pair_draw.sample_id,
             draw=pair_draw.draw,
             preset=pair_draw.preset,
-            jpeg_quality=sensor.jpeg_quality if sensor.output == "mjpeg" else None,
+            jpeg_quality=source.jpeg_quality,
             hinted=pair_draw.boxes is not None,
             depth_m=sample.row.depth_m,
             stroke_m=sample.row.stroke_m,
@@ -105,7 +107,31 @@ class DatasetPairs(DrawnPairs):
             down=_spot_truth(sample, source, "down", self._counts(pair_draw)),
             up=_spot_truth(sample, source, "up", self._counts(pair_draw)),
             nominal_stroke_m=sample.row.nominal_stroke_m,
+            exposure_s=sensor.exposure_s,
+            analogue_gain=sensor.analogue_gain,
+            laser_level=source.request.laser_level,
+            lamp_level=source.request.lamp_level,
         )
+
+    def number_of(self, sample_id: str, draw: int = 0, preset: str | None = None) -> int:
+        """Number of the pair of a sample in a draw of the noise, as scores name it.
+
+        Raises
+        ------
+        DatasetError
+            If there is none, or several for want of a preset.
+        """
+        found = [one for one in self.pair_draws if (one.sample_id, one.draw) == (sample_id, draw)]
+        found = [one for one in found if preset in (None, one.preset)]
+        if len(found) != 1:
+            presets = sorted({one.preset for one in found})
+            say = f"it is there in {', '.join(presets)}: give one" if found else "there is no such pair"
+            raise DatasetError(f"sample '{sample_id}', draw {draw}, preset {preset or 'any'}: {say}")
+        return found[0].number
+
+    def __iter__(self) -> Iterator[tuple[Pair, PairTruth]]:
+        """Pairs with their truths, by number."""
+        return ((self.pair(number), self.truth(number)) for number in range(len(self)))
 
     def _counts(self, pair_draw: PairDraw) -> FrameCounts | None:
         """Frames that the bound counts; None for a single frame with the laser on."""

@@ -31,7 +31,7 @@ from phibench.estimator.benchmark.strata import Stratum, count_pairs, measured, 
 from phibench.scenes.validation import printable_line
 
 KIND: Literal["phibench score"] = "phibench score"
-VERSION = 3
+VERSION = 4
 SCORER = "phibench.estimator.benchmark.score"
 """Module whose code, with all that it imports, is behind a score."""
 
@@ -127,6 +127,38 @@ class Flag(Document):
         return f"knows more than the images: {self.quantity} {times} ({self.pairs} pairs, by chance {chance})"
 
 
+class Spread(Document):
+    """Least, median and greatest of a number over the pairs."""
+
+    low: float
+    median: float
+    high: float
+
+    @classmethod
+    def of(cls, values: pl.Series) -> Spread | None:
+        """Of the values that are known; None where there are none."""
+        known = values.drop_nulls().cast(pl.Float64)
+        if not len(known):
+            return None
+        return cls.model_validate({"low": known.min(), "median": known.median(), "high": known.max()})
+
+    def text(self, factor: float = 1.0, unit: str = "") -> str:
+        """Median, with the range where there is one."""
+        low, median, high = (f"{factor * x:.3g}" for x in (self.low, self.median, self.high))
+        end = f" {unit}" if unit else ""
+        return f"{median}{end}" if low == high else f"{median}{end} ({low} to {high})"
+
+
+FRAME_COLUMNS = ("exposure_s", "analogue_gain", "jpeg_quality", "laser_level", "lamp_level")
+"""Columns of the records that say how frames were taken."""
+
+
+def frame_numbers(records: pl.DataFrame) -> dict[str, Spread | None]:
+    """Numbers of a score's frames: each of `FRAME_COLUMNS` over its pairs."""
+    pairs = records.filter(pl.col("image") == "down")
+    return {name: Spread.of(pairs[name]) for name in FRAME_COLUMNS}
+
+
 class EncodedPicture(Document):
     """Part of a frame as a picture: (u, v) lies at ((u - first_u + 0.5) / step, ...) from its upper left corner."""
 
@@ -179,6 +211,8 @@ class ScoreDocument(Document):
     pairs: int
     images: int
     samples: int
+    draws: int = Field(description="draws of the noise of a sample and preset, at most")
+    frames: dict[str, Spread | None] = Field(description="how they were taken; null where nobody knows")
     seed: int
     rules: dict[str, float]
     limits: dict[str, Any]
@@ -229,6 +263,8 @@ def document_of(
         pairs=table["number"].n_unique(),
         images=len(table),
         samples=table["sample_id"].n_unique(),
+        draws=table["draw"].n_unique(),
+        frames=frame_numbers(table),
         seed=seed,
         rules={name: float(value) for name, value in asdict(rules).items()},
         limits=dict(limits),

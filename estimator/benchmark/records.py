@@ -48,6 +48,10 @@ COLUMNS: dict[str, str] = {
     "image": "down or up",
     "preset": "preset of the sensor",
     "jpeg_quality": "libjpeg's quality; null unless MJPEG",
+    "exposure_s": "exposure time of both images",
+    "analogue_gain": "gain before the converter",
+    "laser_level": "factor of the laser's light",
+    "lamp_level": "factor of the room's light",
     "hinted": "whether the method got boxes",
     "depth_m": "D",
     "stroke_m": "h",
@@ -114,6 +118,7 @@ COUNTED: dict[str, str] = {
 """Columns that follow from all pairs together: `with_missed`."""
 
 
+_OF_FRAMES = ("exposure_s", "analogue_gain", "laser_level", "lamp_level")
 _WHOLE = ("number", "draw", "jpeg_quality")
 _TEXTS = (
     *("sample_id", "image", "preset", "unseen_because", "bayer"),
@@ -127,6 +132,7 @@ _TYPES = {
     **dict.fromkeys(_WHOLE, pl.Int64()),
     **dict.fromkeys(_TEXTS, pl.String()),
     **dict.fromkeys(_TRUTH_VALUES, pl.Boolean()),
+    **dict.fromkeys(_OF_FRAMES, pl.Float64()),
 }
 COLUMN_TYPES: dict[str, pl.DataType] = {name: _TYPES.get(name, pl.Float64()) for name in (*COLUMNS, *COUNTED)}
 """Type of every column."""
@@ -369,6 +375,7 @@ def _pair_columns(
         "draw": [t.draw for t in truths],
         "preset": [t.preset for t in truths],
         "jpeg_quality": [t.jpeg_quality for t in truths],
+        **{name: [getattr(t, name) for t in truths] for name in _OF_FRAMES},
         "hinted": [t.hinted for t in truths],
         "depth_m": true_m,
         "stroke_m": h,

@@ -35,6 +35,7 @@ from phibench.estimator.benchmark.score_tables import (
     FULL_OF_FALSE,
     HEADS,
     false_line,
+    frames_line,
     head,
     rank_key,
     rank_words,
@@ -204,6 +205,7 @@ def report_html(
     environment.globals.update(
         applies=applies,
         head=head,
+        frames_line=frames_line,
         parts=shown_parts,
         ranked_by=rank_words(by),
         definitions=CAUSES,

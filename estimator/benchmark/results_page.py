@@ -36,6 +36,7 @@ from phibench.estimator.benchmark.score_tables import (
     cause_table,
     cell_parts,
     differences_json,
+    frames_line,
     markdown,
     ranked,
     shown_parts,
@@ -167,7 +168,8 @@ def _board(part: Part, title: str, names: Sequence[str]) -> Grid:
     for one in part.scores:
         cells = (" ".join(shown_parts(m, one.metrics[m])) if applies(m, one.method.sees) else "" for m in names)
         rows.append((f"{one.method.name}{FLAGGED if one.flags else ''}", *(_cut(cell) for cell in cells)))
-    return Grid(title, ("method", *map(_head, names)), tuple(rows), "l" + "r" * len(names))
+    note = frames_line(part.scores[0])
+    return Grid(title, ("method", *map(_head, names)), tuple(rows), "l" + "r" * len(names), note)
 
 
 def _cut(cell: str) -> str:

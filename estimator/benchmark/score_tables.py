@@ -12,9 +12,9 @@ import json
 import math
 import sys
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Any, Literal, Protocol
 
 import polars as pl
 from rich.box import SIMPLE_HEAD
@@ -119,7 +119,7 @@ def leaderboard(documents: Sequence[ScoreDocument], by: str = "phi", wide: bool 
     interval = f" {100 * first.rules['confidence']:g} % intervals over samples below the values." if wide else ""
     title = f"{_pairs_in_words(first)}, {rank_words(by)}"
     flagged = _FLAG_NOTE if any(document.flags for document in documents) else ""
-    note = " ".join(filter(None, (interval.strip(), flagged)))
+    note = " ".join(filter(None, (frames_line(first), interval.strip(), flagged)))
     return Grid(title, ("method", *map(head, names)), tuple(rows), "L" + "r" * len(names), note)
 
 
@@ -132,7 +132,7 @@ def score_table(document: ScoreDocument, by: str = "phi") -> Grid:
         order = [name for name in order if document.metrics[name].value is not None]
     rows = ((METRICS[name].text, METRICS[name].shown[1], *_parts(name, document.metrics[name])) for name in order)
     interval = f"{100 * document.rules['confidence']:g} % interval"
-    return Grid(title, ("metric", "unit", "value", interval), tuple(rows), "LlrL")
+    return Grid(title, ("metric", "unit", "value", interval), tuple(rows), "LlrL", frames_line(document))
 
 
 def strata_table(document: ScoreDocument, wide: bool = False) -> Grid:
@@ -179,6 +179,21 @@ def _pairs_in_words(document: ScoreDocument) -> str:
     return " ".join(filter(None, (f"{document.pairs} pairs", presets)))
 
 
+def frames_line(document: ScoreDocument) -> str:
+    """Sentence on how the frames of a score were taken; "" where nobody knows."""
+    shown = {
+        "exposure_s": ("exposure", 1e3, "ms"),
+        "analogue_gain": ("gain", 1.0, ""),
+        "jpeg_quality": ("JPEG quality", 1.0, ""),
+        "laser_level": ("laser", 1.0, ""),
+        "lamp_level": ("lamps", 1.0, ""),
+    }
+    there = {name: spread for name in shown if (spread := document.frames.get(name)) is not None}
+    words = [f"{shown[name][0]} {spread.text(*shown[name][1:])}" for name, spread in there.items()]
+    draws = f"{document.draws} draw{'s' * (document.draws != 1)} of the noise"
+    return f"Frames: {', '.join([*words, draws])}." if "exposure_s" in there else ""
+
+
 # -- lines beside the tables ---------------------------------------------------------------------------------------
 
 
@@ -212,7 +227,13 @@ def failure_line(records: pl.DataFrame) -> str:
     ((failure, message), number) = min(said.items(), key=lambda item: (-item[1], item[0]))
     often = "for example" if number == 1 else "each time" if number == len(asked) else f"{number} times"
     pairs = "the only pair" if len(asked) == 1 else f"all {len(asked)} pairs, {often}"
-    return f"failed on {pairs} with {': '.join(filter(None, (failure, message)))}"
+    first = asked.filter(failure=failure, message=message).row(0, named=True)
+    return f"failed on {pairs} with {': '.join(filter(None, (failure, message)))}; {pair_in_words(first)}"
+
+
+def pair_in_words(row: Mapping[str, Any]) -> str:
+    """Name of a pair: `dataset.pairs(preset).number_of` takes these words."""
+    return f"first pair: sample {row['sample_id']}, draw {row['draw']}, {row['preset']}"
 
 
 def _printed(one: HasScore) -> list[str]:
@@ -225,7 +246,11 @@ def silences(records: pl.DataFrame, count: int = 3) -> list[str]:
     words = pl.when(pl.col("message") != "").then(pl.col("failure") + ": " + pl.col("message"))
     said = records.filter(pl.col("u_px").is_null()).with_columns(words=words.otherwise(pl.col("status")))
     most = said.group_by("words").len().sort("len", "words", descending=[True, False]).head(count)
-    return [f"{number} of {len(records)} images without a position: {text}" for text, number in most.rows()]
+    return [
+        f"{number} of {len(records)} images without a position: {text}; "
+        f"{pair_in_words(said.filter(words=text).row(0, named=True))}"
+        for text, number in most.rows()
+    ]
 
 
 def depth_line(document: ScoreDocument) -> str:

@@ -14,6 +14,7 @@ from phibench.estimator.cli.options import DATA, DEFAULT_PRESET, OwnOrPreset, Pr
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from phibench.datasets.frames.request import FrameOptions
     from phibench.datasets.read import Sample
 
 dataset = App(name="dataset", group=DATA, help="Make, check and show data sets; draw frames and panoramas.")
@@ -206,7 +207,7 @@ def frames(
     laser_off: bool = False,
     exposure: str | None = None,
     region: Whole | None = None,
-    camera_seed: Whole = 0,
+    camera_seed: Whole | None = None,
     workers: Whole | None = None,
 ) -> int:
     """Draw camera frames with noise, as PNG, JPEG or EXR files with an index; what is there already is kept.
@@ -230,28 +231,39 @@ def frames(
     laser_off
         Also every image without the spot.
     exposure
-        Seconds, "auto", or "preset" for the preset's time; by default "auto" for srgb8, yuyv and mjpeg, else "preset".
+        Seconds, "auto", or "preset" for the preset's time; by default that of the recipe's [frames], else "auto".
     region
         Side in pixels of a square around the spot, instead of the whole image.
     camera_seed
-        Names the camera whose fixed pattern the frames share.
+        Names the camera whose fixed pattern the frames share; by default the recipe's cameras.
     workers
         Number of processes; one for each core by default.
     """
     from phibench.datasets.exposures.draw import draw_frames
-    from phibench.datasets.frames.request import FrameRequest, default_exposure, exposure_of
     from phibench.datasets.frames.sensor_file import read_sensor_file
 
     file = None if sensor is None else read_sensor_file(sensor)
     preset = preset or (DEFAULT_PRESET if file is None else file.preset)
-    seconds = default_exposure(preset) if exposure is None else exposure_of(exposure)
     numbers = {} if file is None else dict(file.numbers)
-    request = FrameRequest(preset, seconds, region=region, camera_seed=camera_seed, overrides=numbers)
-    done = draw_frames(directory, request, draws, out=out, samples=sample or None, laser_off=laser_off, workers=workers)
+    options = _options(preset, exposure, region, camera_seed, numbers)
+    done = draw_frames(directory, options, draws, out=out, samples=sample or None, laser_off=laser_off, workers=workers)
     for note in done.notes:
         print(f"note: {note}")
     print(f"{done.folder}: {done.made} files written, {done.kept} kept, index frames.jsonl and frames.parquet")
     return 0
+
+
+def _options(
+    preset: str, exposure: str | None, region: int | None, camera_seed: int | None, numbers: dict[str, Any]
+) -> FrameOptions:
+    """Options of frames from a command's; what is not given is the recipe's."""
+    from phibench.datasets.frames.request import FrameOptions, exposure_of
+
+    asked: dict[str, Any] = {"region": region, "camera_seed": camera_seed}
+    given = {key: value for key, value in asked.items() if value is not None}
+    if exposure is not None:
+        given["exposure"] = exposure_of(exposure)
+    return FrameOptions(preset, {**numbers, **given})
 
 
 def export(
@@ -264,7 +276,7 @@ def export(
     laser_off: bool = False,
     exposure: str | None = None,
     region: Whole | None = None,
-    camera_seed: Whole = 0,
+    camera_seed: Whole | None = None,
     split_by: Literal["both", "rig", "room"] = "both",
     validation: float = 0.1,
     test: float = 0.1,
@@ -294,7 +306,7 @@ def export(
     region
         Side in pixels of a square around the spot, instead of the whole image.
     camera_seed
-        Names the camera whose fixed pattern the frames share.
+        Names the camera whose fixed pattern the frames share; by default the recipe's cameras.
     split_by
         What no two splits share: "both" rig and room, or one of them.
     validation
@@ -308,11 +320,9 @@ def export(
     """
     from phibench.datasets.export.export_make import export as export_pairs
     from phibench.datasets.export.pair_rows import ExportRequest
-    from phibench.datasets.frames.request import FrameRequest, default_exposure, exposure_of
 
-    seconds = default_exposure(preset) if exposure is None else exposure_of(exposure)
-    frames_request = FrameRequest(preset, seconds, region=region, camera_seed=camera_seed)
-    request = ExportRequest(to, frames_request, draws, laser_off, split_by, validation, test, pairs_per_shard)
+    options = _options(preset, exposure, region, camera_seed, {})
+    request = ExportRequest(to, options, draws, laser_off, split_by, validation, test, pairs_per_shard)
     done = export_pairs(directory, request, out, workers=workers)
     for note in done.notes:
         print(f"note: {note}")

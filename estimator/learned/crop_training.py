@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phibench.datasets.errors import DatasetError
-from phibench.datasets.frames.request import FrameRequest
+from phibench.datasets.frames.request import FrameOptions
 from phibench.datasets.read import open_finished
 from phibench.datasets.training import Crop, CropSettings, SpotCrops
 from phibench.estimator.learned.network_input import (
@@ -99,10 +99,10 @@ class TrainingSettings:
     checked: int = 1500
 
     @property
-    def requests(self) -> tuple[FrameRequest, ...]:
-        """Requests of the crops, each drawn as often."""
+    def options(self) -> tuple[FrameOptions, ...]:
+        """Options of the crops, each drawn as often."""
         return tuple(
-            FrameRequest(preset, "auto", overrides=dict(numbers))
+            FrameOptions(preset, {"exposure": "auto", **numbers})
             for preset in self.presets
             for numbers in REQUESTS[preset]
         )
@@ -131,7 +131,7 @@ def crops_of(
 ) -> SpotCrops:
     """Crops with and without the laser, of some samples; `numbers` change `CROP_SETTINGS`."""
     chosen = replace(CROP_SETTINGS, **numbers)
-    return SpotCrops([folder], settings.requests, length, seed=seed, settings=chosen, samples=samples, laser_off=True)
+    return SpotCrops([folder], settings.options, length, seed=seed, settings=chosen, samples=samples, laser_off=True)
 
 
 # -- items -----------------------------------------------------------------------------------------------------------

@@ -147,8 +147,8 @@ def spot_crops(
     folder: Path, samples: Sequence[str], length: int, seed: int, settings: CropSettings = _SPOTS
 ) -> SpotCrops:
     """Crops that tiles are cut from."""
-    requests = TrainingSettings().requests
-    return SpotCrops([folder], requests, length, seed=seed, settings=settings, samples=samples, laser_off=True)
+    options = TrainingSettings().options
+    return SpotCrops([folder], options, length, seed=seed, settings=settings, samples=samples, laser_off=True)
 
 
 def _cut(crops: SpotCrops) -> Iterator[tuple[Any, ...]]:
@@ -191,7 +191,7 @@ def _maps_of(cached: CachedSample, draw: PairDraw, dataset: Dataset) -> Iterator
     inside = outline_mask(cached.nominal_rig, box)[::2, ::2]
     card = card_of(source.sides["down"].chain.sensor)
     for position in POSITIONS:
-        on, off = (source.frame(position, draw.noise_draw, laser).image[box.slices] for laser in (True, False))
+        on, off = (source.frame(position, draw.draw, laser).image[box.slices] for laser in (True, False))
         planes, red = frame_input(on, off, card)
         truth = dataset[draw.sample_id].truth_row(position)
         followers = [one.truths[position] for one in cached.distractors if one.follows_laser]

@@ -100,6 +100,10 @@ class TruthRow(Document):
     down: SpotTruthRow
     up: SpotTruthRow
     nominal_stroke_m: _Real | None
+    exposure_s: _Real | None = None
+    analogue_gain: _Real | None = None
+    laser_level: _Real | None = None
+    lamp_level: _Real | None = None
 
     @model_validator(mode="before")
     @classmethod

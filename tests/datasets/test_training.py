@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from phibench.datasets.errors import DatasetError
-from phibench.datasets.frames.request import FrameRequest
+from phibench.datasets.frames.request import FrameOptions
 from phibench.datasets.read import open_dataset
 from phibench.datasets.store.layers import SpotWindow
 from phibench.datasets.training import PERIOD_PX, CropSettings, PairDataset, SpotCrops, shifted_spot
@@ -71,7 +71,7 @@ def test_a_moved_spot_is_the_rendered_one(tiny_dataset: Path) -> None:
 
 
 def crops(dataset: Path, length: int = 400, preset: str = "bayer-raw", **options: Any) -> SpotCrops:
-    return SpotCrops([dataset], [FrameRequest.of(preset, options)], length, settings=CropSettings(side_px=24))
+    return SpotCrops([dataset], [FrameOptions(preset, options)], length, settings=CropSettings(side_px=24))
 
 
 def test_truth_of_crops_is_where_the_light_is(tiny_dataset: Path) -> None:
@@ -131,7 +131,7 @@ def test_items_depend_on_seed_epoch_and_index_alone(tiny_dataset: Path, kind: st
 def test_crops_with_the_laser_off_are_the_same_crops_without_the_spot(tiny_dataset: Path) -> None:
     """Expected electrons without noise: what is taken away is the spot, and the item is otherwise the same."""
     sample = open_dataset(tiny_dataset).samples[0].row.sample_id
-    request, settings = FrameRequest.of("ideal", {}), CropSettings(side_px=24)
+    request, settings = FrameOptions("ideal", {}), CropSettings(side_px=24)
     both = SpotCrops([tiny_dataset], [request], 8, settings=settings, samples=[sample], laser_off=True)
     alone = SpotCrops([tiny_dataset], [request], 8, settings=settings, samples=[sample])
     checked = 0
@@ -187,9 +187,9 @@ def test_bad_settings_are_refused(settings: dict[str, Any], text: str) -> None:
 
 
 def test_bad_crops_are_refused(tiny_dataset: Path, tmp_path: Path) -> None:
-    with pytest.raises(DatasetError, match="requests is empty"):
+    with pytest.raises(DatasetError, match="options is empty"):
         SpotCrops([tiny_dataset], [], 10)
     with pytest.raises(DatasetError, match="a side of their own"):
         crops(tiny_dataset, region=64)
     with pytest.raises(DatasetError, match="there is nothing to crop"):
-        SpotCrops([], [FrameRequest()], 10)
+        SpotCrops([], [FrameOptions()], 10)

@@ -98,8 +98,8 @@ def _write_frames(pairs, number: int, image: str, stem: Path) -> str:
     """Names of one image's files, as `pairs.csv` has them."""
     pair_draw, _, source = pairs.drawn_from(number)
     laser, names = not image.endswith("_off"), []
-    for k, draw in enumerate(pair_draw.frame_draws(laser)):
-        frame = source.frame(image.removesuffix("_off"), draw, laser)
+    for k in range(pair_draw.frames[0 if laser else 1]):
+        frame = source.frame(image.removesuffix("_off"), pair_draw.draw, laser, k)
         file = stem.with_name(f"{stem.name}-{image}-{k}.{'png' if frame.jpeg is None else 'jpg'}")
         file.write_bytes(png_bytes(frame.image) if frame.jpeg is None else frame.jpeg)
         names.append(file.name)

@@ -19,7 +19,7 @@ from phibench.datasets.build.tasks import Done, Failed, Task
 from phibench.datasets.errors import DatasetError, IncompleteError
 from phibench.datasets.export.export_make import export
 from phibench.datasets.export.pair_rows import ExportRequest
-from phibench.datasets.frames.request import FrameRequest
+from phibench.datasets.frames.request import FrameOptions
 from phibench.datasets.make import dry_run, make
 from phibench.datasets.merge_repair import merge, repair
 from phibench.datasets.plan import sampling
@@ -370,7 +370,7 @@ def test_a_list_that_is_none_is_refused(finished: Path, tmp_path: Path, entry: A
 
 
 def test_pairs_are_exported_and_scored(finished: Path, tmp_path: Path) -> None:
-    request = ExportRequest("parquet", FrameRequest("mjpeg", None), 1, False, "both", 0.1, 0.1, 64)
+    request = ExportRequest("parquet", FrameOptions("mjpeg"), 1, False, "both", 0.1, 0.1, 64)
     done = export(finished, request, tmp_path / "export", workers=1)
     assert sum(done.pairs.values()) == 3
     score = tmp_path / "score.json"

@@ -20,7 +20,7 @@ from PIL import Image
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.export.export_make import Exported, export, verify_export
 from phibench.datasets.export.pair_rows import ExportRequest, Form, pair_key, splits
-from phibench.datasets.frames.request import FrameRequest
+from phibench.datasets.frames.request import FrameOptions
 from phibench.datasets.read import open_dataset
 from phibench.estimator.cli.main import main
 
@@ -31,7 +31,8 @@ def snapshot(folder: Path) -> dict[str, bytes]:
 
 
 def request_of(form: Form, **options: Any) -> ExportRequest:
-    frames = FrameRequest.of(options.pop("preset", "srgb8"), {"region": options.pop("region", None)})
+    given = {"region": options.pop("region")} if "region" in options else {}
+    frames = FrameOptions(options.pop("preset", "srgb8"), given)
     return ExportRequest(form, frames, **{"draws": 2, "pairs_per_shard": 3, **options})
 
 
@@ -212,7 +213,7 @@ def test_parquet_without_its_package_is_refused_before_anything_is_written(
         raise importlib.metadata.PackageNotFoundError(name)
 
     monkeypatch.setattr(importlib.metadata, "version", missing)
-    request = ExportRequest("parquet", FrameRequest("srgb8"))
+    request = ExportRequest("parquet", FrameOptions("srgb8"))
     with pytest.raises(DatasetError, match=r"need pyarrow: pip install 'phibench\[export\]'"):
         export(tiny_dataset, request, tmp_path / "out", workers=1)
     assert not (tmp_path / "out").exists()

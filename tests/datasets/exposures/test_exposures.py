@@ -21,6 +21,7 @@ from phibench.datasets.errors import DatasetError, RecipeError
 from phibench.datasets.exposures import pair_draws as module
 from phibench.datasets.exposures.pair_draws import BOX_MARGIN_PX, CachedSample, PairDraw, pair_draws
 from phibench.datasets.frames.sensor_file import SensorFile
+from phibench.datasets.frames.source import noise_draw
 from phibench.datasets.make import make, make_from_plan
 from phibench.datasets.plan.plan import make_plan
 from phibench.datasets.read import Dataset, open_dataset, open_finished
@@ -28,7 +29,8 @@ from phibench.datasets.recipe.build import build_rig
 from phibench.datasets.recipe.load import load_recipe, parse_recipe, recipe_text, with_numbers
 from phibench.datasets.recipe.tables import Recipe, RigTable
 from phibench.datasets.store.documents import recipe_sha256
-from phibench.render.sensor.light import Region
+from phibench.render.sensor.camera_chain import auto_exposed
+from phibench.render.sensor.light import Light, Region
 
 TINY_BENCH = Path(__file__).resolve().parents[2] / "tiny_bench.toml"
 FALSE_ALARM = 1e-4
@@ -202,8 +204,9 @@ def test_automatic_exposure_is_the_down_images_and_kept(dataset: Dataset) -> Non
     kept = CachedSample(dataset[pair_draw.sample_id])
     sensors = [kept.source(pair_draw).sides[position].chain.sensor for position in ("down", "up")]
     alone = dataset[pair_draw.sample_id].frame_source("srgb8", exposure="auto").sides
-    assert sensors[0] == sensors[1] == alone["down"].chain.sensor
-    assert alone["up"].chain.sensor != sensors[1]  # the camera by itself would have chosen another
+    assert sensors[0] == sensors[1] == alone["down"].chain.sensor == alone["up"].chain.sensor
+    up = Light(kept.ambient("up"), f_number=kept.rig.camera.f_number, lamp_level=pair_draw.request.lamp_level)
+    assert auto_exposed(pair_draw.request.sensor(), up) != sensors[1]  # of the up image it would have been another
 
 
 # Nothing of the tables is rendered
@@ -357,10 +360,10 @@ def test_no_two_pair_draws_of_a_sample_share_their_noise(dataset: Dataset) -> No
     found = pair_draws(
         with_tables(dataset, frames={"presets": ["mono-raw", "bayer-raw", "srgb8", "yuyv", "mjpeg"], "draws": 3})
     )
-    keys = {(pair_draw.sample_id, pair_draw.noise_draw) for pair_draw in found}
-    assert len(keys) == len(found) == 15 * len(dataset)
+    keys = {(one.sample_id, noise_draw(one.preset, one.draw, k)) for one in found for k in range(2)}
+    assert len(keys) == 2 * len(found) == 30 * len(dataset)
     # a later preset moves none of the older ones' numbers: their frames stay the same to the byte
-    assert {one.noise_draw for one in found if (one.preset, one.draw) == ("mjpeg", 2)} == {11}
+    assert noise_draw("mjpeg", 2) == 11
 
 
 def test_all_pair_draws_of_a_sample_have_one_pair_of_boxes(dataset: Dataset) -> None:

@@ -25,7 +25,7 @@ from phibench.datasets.frames.frame_files import (
     read_index,
     write_index,
 )
-from phibench.datasets.frames.request import FrameRequest
+from phibench.datasets.frames.request import FrameOptions
 from phibench.datasets.frames.source import Frame
 from phibench.datasets.read import open_dataset
 from phibench.datasets.store.checksums import damaged, strays
@@ -88,7 +88,7 @@ def test_files_are_what_the_api_gives(tiny_dataset: Path, tmp_path: Path, preset
 
 def test_the_index_as_a_table_says_the_same(tiny_dataset: Path, tmp_path: Path) -> None:
     out = tmp_path / "f"
-    draw_frames(tiny_dataset, FrameRequest.of("mjpeg", {"jpeg_quality": 60}), 2, out=out, laser_off=True, workers=1)
+    draw_frames(tiny_dataset, FrameOptions("mjpeg", {"jpeg_quality": 60}), 2, out=out, laser_off=True, workers=1)
     lines = [json.loads(line) for line in (out / INDEX).read_text().splitlines()]
     table = polars.read_parquet(out / INDEX_TABLE)
     assert table.columns == list(FrameRow.model_fields)
@@ -100,9 +100,9 @@ def test_the_index_as_a_table_says_the_same(tiny_dataset: Path, tmp_path: Path) 
 
 
 def test_an_exposure_that_is_not_given_is_the_cameras(tiny_dataset: Path, tmp_path: Path) -> None:
-    """Processed presets are auto exposed; the others keep the preset's time."""
+    """Without `[frames]` every preset is auto exposed."""
     options = ("--sample", SEEN, "--region", 16, "--workers", 1)
-    for preset, exposure in (("mjpeg", "auto"), ("srgb8", "auto"), ("bayer-raw", None)):
+    for preset, exposure in (("mjpeg", "auto"), ("srgb8", "auto"), ("bayer-raw", "auto")):
         assert run(tiny_dataset, "--preset", preset, *options, "--out", tmp_path / preset) == 0
         rows = [row for row in read_index(tmp_path / preset).values() if row.kind == "frame"]
         assert {row.request["exposure"] for row in rows} == {exposure}
@@ -114,7 +114,7 @@ def test_an_exposure_that_is_not_given_is_the_cameras(tiny_dataset: Path, tmp_pa
 
 
 def test_raw_files_hold_ten_bits_unscaled(tiny_dataset: Path, tmp_path: Path) -> None:
-    draw_frames(tiny_dataset, FrameRequest("bayer-raw"), out=tmp_path / "f", samples=[SEEN], workers=1)
+    draw_frames(tiny_dataset, FrameOptions("bayer-raw"), out=tmp_path / "f", samples=[SEEN], workers=1)
     image = image_in(tmp_path / "f" / f"{SEEN}-up-on-0000.png")
     assert image.dtype == np.uint16
     assert 64 < np.median(image) <= 1023
@@ -158,7 +158,7 @@ def test_workers_give_the_same_bytes(tiny_dataset: Path, tmp_path: Path) -> None
 def test_changed_layers_are_drawn_again(tiny_dataset: Path, tmp_path: Path) -> None:
     """The hash of a layer in SHA256SUMS enters the key of the frames that come from it."""
     copy, out = Path(shutil.copytree(tiny_dataset, tmp_path / "copy")), tmp_path / "f"
-    request = FrameRequest("bayer-raw", region=16)
+    request = FrameOptions("bayer-raw", {"region": 16})
     assert draw_frames(copy, request, out=out, samples=[SEEN], workers=1).made == 4
     sums = (copy / "SHA256SUMS").read_text().splitlines()
     changed = ["0" * 64 + line[64:] if line.endswith(f"{SEEN}-up.exr") else line for line in sums]
@@ -207,13 +207,13 @@ def test_mistakes_are_one_sentence(
 
 
 def test_folders_that_will_not_do_are_refused(tiny_dataset: Path, tmp_path: Path) -> None:
-    request, only = FrameRequest("bayer-raw", region=8), {"samples": [SEEN], "workers": 1}
+    request, only = FrameOptions("bayer-raw", {"region": 8}), {"samples": [SEEN], "workers": 1}
     with pytest.raises(DatasetError, match="lies inside the data set"):
         draw_frames(tiny_dataset, request, out=tiny_dataset / "frames", **only)  # type: ignore[arg-type]
     out = tmp_path / "f"
     draw_frames(tiny_dataset, request, out=out, **only)  # type: ignore[arg-type]
     with pytest.raises(DatasetError, match="holds frames with region 8, not 16: give another folder"):
-        draw_frames(tiny_dataset, FrameRequest("bayer-raw", region=16), out=out, **only)  # type: ignore[arg-type]
+        draw_frames(tiny_dataset, FrameOptions("bayer-raw", {"region": 16}), out=out, **only)  # type: ignore[arg-type]
     (out / INDEX).write_text("{}\n")
     with pytest.raises(DatasetError, match=r"frames\.jsonl line 1 is damaged"):
         draw_frames(tiny_dataset, request, out=out, **only)  # type: ignore[arg-type]
@@ -252,7 +252,7 @@ def test_a_folder_is_claimed_before_its_first_frame(tiny_dataset: Path, tmp_path
     (out / INDEX).unlink()
     claimed = (out / REQUEST).read_bytes()
     with pytest.raises(DatasetError, match=r"exposure .*give another folder"):
-        draw_frames(tiny_dataset, FrameRequest("mjpeg", "auto", region=16), out=out, samples=[SEEN], workers=1)
+        draw_frames(tiny_dataset, FrameOptions("mjpeg", {"region": 16}), out=out, samples=[SEEN], workers=1)
     assert (out / REQUEST).read_bytes() == claimed
 
 
@@ -280,7 +280,7 @@ def test_a_frame_that_goes_while_others_are_drawn_ends_the_run(
         return write_index(folder, rows)
 
     def again() -> Drawn:
-        return draw_frames(smallest_dataset, FrameRequest.of("mjpeg", {}), out=tmp_path, samples=[SEEN], workers=1)
+        return draw_frames(smallest_dataset, FrameOptions("mjpeg", {}), out=tmp_path, samples=[SEEN], workers=1)
 
     with monkeypatch.context() as patch:
         patch.setattr("phibench.datasets.exposures.draw.write_index", removing)

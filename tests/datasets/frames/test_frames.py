@@ -17,7 +17,7 @@ from PIL import Image
 from scipy import stats
 
 from phibench.datasets.errors import DatasetError
-from phibench.datasets.frames.request import AUTO_EXPOSED, FrameRequest, jpeg_tables
+from phibench.datasets.frames.request import FrameOptions, jpeg_tables
 from phibench.datasets.frames.source import FrameSource
 from phibench.datasets.read import Dataset, Sample, open_dataset
 from phibench.render.sensor.light import Region
@@ -90,7 +90,7 @@ def test_a_region_is_a_crop_of_the_frame(sample: Sample, preset: str) -> None:
         row = sample.truth_row(frame.position)
         assert frame.region == Region.around(row.u_px, row.v_px, (180, 320), 64)
         slices = frame.region.slices()
-        expected = getattr(whole, name)[slices if preset in AUTO_EXPOSED else (..., *slices)]
+        expected = getattr(whole, name)[slices if preset in ("srgb8", "yuyv", "mjpeg") else (..., *slices)]
         np.testing.assert_array_equal(frame.image, expected)
     assert part.jpeg == {}
 
@@ -122,6 +122,7 @@ def test_auto_exposure_looks_at_the_room_alone(sample: Sample) -> None:
     # pixels at the converter's end count less under half the light
     assert 1.9 * light < half < 2.1 * light
     assert sample.frame_source("srgb8").frame("down").sensor == on.sensor  # what is not given is the camera's choice
+    assert source.frame("up").sensor == on.sensor  # one exposure for both images of a pair
     fixed = sample.frame_source("srgb8", exposure=None).frame("down").sensor
     assert fixed.exposure_s == pytest.approx(1 / 60)
 
@@ -335,13 +336,13 @@ def test_tables_of_a_file_go_into_the_frames(tmp_path: Path) -> None:
     words = [str(step) for step in (*luma, *chroma)]
     rows = (" ".join(words[k : k + 8]) for k in range(0, 128, 8))
     (tmp_path / "tables.txt").write_text("# of a camera\n" + "\n".join(rows))
-    request = FrameRequest.of("mjpeg", {"jpeg_qtables": tmp_path / "tables.txt"})
+    request = FrameOptions("mjpeg", {"jpeg_qtables": tmp_path / "tables.txt"})
     assert request.sensor().jpeg_qtables == (luma, chroma)
-    assert json.loads(json.dumps(request.document()))["overrides"]["jpeg_qtables"][1][0] == 40
+    assert json.loads(json.dumps(request.document()))["jpeg_qtables"][1][0] == 40
     for text, complaint in (("1 2 3", "no quantisation"), ("0 " * 64, "steps outside 1 to 255"), ("x", "no quant")):
         (tmp_path / "bad.txt").write_text(text)
         with pytest.raises(DatasetError, match=complaint) as caught:
-            FrameRequest.of("mjpeg", {"jpeg_qtables": str(tmp_path / "bad.txt")})
+            FrameOptions("mjpeg", {"jpeg_qtables": str(tmp_path / "bad.txt")})
         assert "bad.txt" in str(caught.value)
         assert "\n" not in str(caught.value)
     Image.new("RGB", (16, 16)).save(tmp_path / "frame.png")

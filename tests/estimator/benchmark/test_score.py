@@ -195,8 +195,8 @@ def test_crops_hold_the_spot_and_end_with_the_image():
         ("[]", "does not hold a JSON object"),
         ('{"kind": "other"}', "is no score"),
         ('{"kind": "phibench score", "version": 99}', "has version 99"),
-        ('{"kind": "phibench score", "version": 2}', "has version 2, this program reads 3: score again"),
-        ('{"kind": "phibench score", "version": 3}', "method"),
+        ('{"kind": "phibench score", "version": 3}', "has version 3, this program reads 4: score again"),
+        ('{"kind": "phibench score", "version": 4}', "method"),
     ],
 )
 def test_a_file_that_is_no_score(tmp_path, text, words):

@@ -62,7 +62,7 @@ def test_the_truths_file_written_again_is_the_same(sealed: Sealed, submitted: Pa
     ("change", "words"),
     [
         (lambda d: d.update(seal="0" * 16), "answers the seal 0000000000000000, not"),
-        (lambda d: d.update(task_version=9), "of task version 9, the seal of 5"),
+        (lambda d: d.update(task_version=9), "of task version 9, the seal of 6"),
         (lambda d: d["answers"].pop(1), "lacks pair 1 (1 of 3 are missing)"),
         (lambda d: d["answers"].append(d["answers"][1]), "answers pair 1 twice"),
         (lambda d: d["answers"][2].update(number=1), "answers pair 1 twice"),

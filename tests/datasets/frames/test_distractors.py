@@ -12,9 +12,9 @@ from helpers.bench_samples import hidden, many, with_tables
 from helpers.oracles import true_pixel
 from helpers.sensor_light import room, spot_at
 
-from phibench.datasets.exposures.distractors import MIN_APART_PX, Distractor, distractors, present
 from phibench.datasets.exposures.expected import expected_of_light
 from phibench.datasets.exposures.pair_draws import CachedSample, pair_draws
+from phibench.datasets.frames.distractors import MIN_APART_PX, Distractor, distractors, present
 from phibench.datasets.read import Dataset, Sample, open_dataset
 from phibench.render.sensor.camera_chain import Chain
 from phibench.render.sensor.electrons import expected_electrons

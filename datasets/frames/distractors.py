@@ -10,15 +10,17 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import Protocol
 
 import numpy as np
 
-from phibench.datasets.read import Sample
 from phibench.datasets.recipe.build import spot_albedo
 from phibench.datasets.recipe.distributions import DistributionTable, quantile
 from phibench.datasets.recipe.spot_placement import by_ray, on_board
-from phibench.datasets.recipe.tables import DistractorTable
+from phibench.datasets.recipe.tables import DistractorTable, Recipe
 from phibench.datasets.store.layers import SpotWindow
+from phibench.datasets.store.schema import ManifestRow, SpotRow
+from phibench.datasets.store.stored_rooms import Rooms
 from phibench.render.optics.room_tracer import room_geometry
 from phibench.render.optics.spot_layer import SpotLayer, spot_layer
 from phibench.render.optics.truth import SpotTruth, spot_truth
@@ -27,7 +29,7 @@ from phibench.scenes.catalog import BOARD_SIZE_M
 from phibench.scenes.frames import Vector
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.random_streams import Name, generator
-from phibench.scenes.rig import POSITIONS
+from phibench.scenes.rig import POSITIONS, View
 from phibench.scenes.room import Room
 
 MIN_APART_PX = 12.0
@@ -35,6 +37,40 @@ MIN_APART_PX = 12.0
 TRIES = 20
 
 Names = tuple[str, int, str]
+
+
+class _Rooms(Protocol):
+    """Data set as distractors need it."""
+
+    @property
+    def recipe(self) -> Recipe:
+        """Its recipe."""
+
+    @property
+    def rooms(self) -> Rooms:
+        """Its rooms."""
+
+
+class _Sample(Protocol):
+    """Sample as distractors need it; `phibench.datasets.read.Sample` is one."""
+
+    @property
+    def dataset(self) -> _Rooms:
+        """Its data set."""
+
+    @property
+    def row(self) -> ManifestRow:
+        """Exact numbers."""
+
+    @property
+    def stream_names(self) -> Names:
+        """Data set, its seed, sample id."""
+
+    def truth_row(self, position: str) -> SpotRow:
+        """Exact answer for the spot."""
+
+    def view(self, position: str) -> View:
+        """Rig at a position."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +109,7 @@ def present(names: Names, tables: tuple[DistractorTable, ...]) -> tuple[int, ...
     return tuple(i for i, table in enumerate(tables) if _unit(names, i, "present") < table.probability)
 
 
-def distractors(sample: Sample) -> tuple[Distractor, ...]:
+def distractors(sample: _Sample) -> tuple[Distractor, ...]:
     """Distractors of a sample, in the order of the recipe; those that find no place are left out.
 
     They stay with the sample, which is frozen: all presets and draws have the same, and their room takes long to build.
@@ -88,7 +124,7 @@ def distractors(sample: Sample) -> tuple[Distractor, ...]:
 _KEPT = "_distractors"
 
 
-def _found(sample: Sample) -> tuple[Distractor, ...]:
+def _found(sample: _Sample) -> tuple[Distractor, ...]:
     tables = sample.dataset.recipe.distractors
     if not any(sample.truth_row(position).visible for position in POSITIONS):
         return ()
@@ -100,7 +136,7 @@ def _found(sample: Sample) -> tuple[Distractor, ...]:
     return tuple(one for one in placed if one is not None)
 
 
-def _placed(sample: Sample, room: Room, number: int, table: DistractorTable) -> Distractor | None:
+def _placed(sample: _Sample, room: Room, number: int, table: DistractorTable) -> Distractor | None:
     """First of `TRIES` places that the down image shows, apart from the spot in both images."""
     views = {position: sample.view(position) for position in POSITIONS}
     rooms = {position: room_geometry(room, view) for position, view in views.items()}
@@ -121,13 +157,13 @@ def _placed(sample: Sample, room: Room, number: int, table: DistractorTable) -> 
     return None
 
 
-def _ratio(sample: Sample, position: str, layer: SpotLayer) -> float:
+def _ratio(sample: _Sample, position: str, layer: SpotLayer) -> float:
     """Electrons relative to the spot's; 0 where the spot is not seen."""
     row = sample.truth_row(position)
     return float(layer.total_electrons_per_s.sum() / sum(row.electrons_per_s)) if row.visible else 0.0
 
 
-def _too_near(sample: Sample, position: str, truth: SpotTruth) -> bool:
+def _too_near(sample: _Sample, position: str, truth: SpotTruth) -> bool:
     row = sample.truth_row(position)
     return math.hypot(truth.u_px - row.u_px, truth.v_px - row.v_px) < MIN_APART_PX  # False where one is NaN
 
@@ -142,7 +178,7 @@ def _scaled(layer: SpotLayer, factor: float) -> SpotLayer:
     )
 
 
-def _drawn_spot(sample: Sample, room: Room, number: int, table: DistractorTable, attempt: int) -> LaserSpot | None:
+def _drawn_spot(sample: _Sample, room: Room, number: int, table: DistractorTable, attempt: int) -> LaserSpot | None:
     """Disc at one drawn place; None where there can be none."""
     place = _ray_place if table.azimuth_deg is not None else _board_place
     found = place(sample, room, number, table, attempt)
@@ -160,7 +196,7 @@ def _drawn_spot(sample: Sample, room: Room, number: int, table: DistractorTable,
 
 
 def _ray_place(
-    sample: Sample, room: Room, number: int, table: DistractorTable, attempt: int
+    sample: _Sample, room: Room, number: int, table: DistractorTable, attempt: int
 ) -> tuple[Vector, Vector] | None:
     """Position and normal on a horizontal ray from the axis: free in the room, or where it ends."""
     names = sample.stream_names
@@ -181,7 +217,7 @@ def _ray_place(
 
 
 def _board_place(
-    sample: Sample, _room: Room, number: int, table: DistractorTable, attempt: int
+    sample: _Sample, _room: Room, number: int, table: DistractorTable, attempt: int
 ) -> tuple[Vector, Vector] | None:
     """Position and normal anywhere on a board that is not the sample's own."""
     recipe, names = sample.dataset.recipe, sample.stream_names
