@@ -83,12 +83,8 @@ def test_a_method_that_fails_on_every_pair_is_told_in_a_sentence(scored, capsys,
     one = failed(["KeyError: 'red'"])
     print_scores([one], "terminal", "phi", wide=False)
     shown = capsys.readouterr().out
-    assert (
-        shown.count(
-            "broken: failed on all 20 pairs, each time with error: KeyError: 'red'; first pair: sample s0000, draw 0, mjpeg\n"
-        )
-        == 1
-    )
+    first = "first pair: sample s0000, draw 0, mjpeg"
+    assert shown.count(f"broken: failed on all 20 pairs, each time with error: KeyError: 'red'; {first}\n") == 1
     assert shown.count("KeyError") == 1
     assert "no spot detected" not in shown
     rows = [line.split() for line in shown.splitlines()]

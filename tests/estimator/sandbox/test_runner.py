@@ -334,7 +334,7 @@ def test_a_method_sees_nothing_of_the_truth(tmp_path: Path, monkeypatch: pytest.
 def forbidden() -> set[str]:
     """Fields of the truth that a pair does not have under the same name."""
     truth = {field.name for kind in (PairTruth, SpotTruth) for field in fields(kind)}
-    return truth - {"number", "stroke_m", "down", "up", "jpeg_quality", "calibration_covariance"}
+    return truth - {"number", "stroke_m", "down", "up", "jpeg_quality", "exposure_s", "calibration_covariance"}
 
 
 def test_the_working_directory_is_fresh_and_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
