@@ -173,8 +173,12 @@ def test_accuracy_of_a_tilts_sign() -> None:
 def test_accuracy_of_moments_given_an_ellipse() -> None:
     """Mean and covariance of all parameters against weighted draws, with errors of vertex and ellipse correlated.
 
-    3000 draws of the fit without the ellipse, weighted by the ellipse of each, leave some 700: a standard deviation is
-    good to 3 %, a mean to 4 % of it. Means are within 5 of them for each of 26 numbers, false alarms 2e-5.
+    3000 draws of the fit without the ellipse, weighted by the ellipse of each, leave some 700. The standard error of a
+    weighted mean m is sqrt(sum w^2 (x - m)^2), that of a deviation s is sqrt(sum w^2 ((x - m)^2 - s^2)^2) / (2 s): few
+    draws with large weights count by themselves. Means are within 5 of them, false alarms 2e-5. Deviations may differ
+    by 10 % more: the fit's moments are linear in the deviations, the draws' outlines are not. 16 000 draws found its
+    deviations to be 0.935 to 1.091 of theirs, +-0.011. The draws come by Cholesky's factor, which is unique:
+    eigenvectors are not, and gave other draws on other processors.
     """
     nominal, rng, sigmas = nominal_of("hyperboloid"), generator("moments"), prior_sigmas(DRAWN)
     true = changed(nominal, rng.normal(0.0, sigmas))
@@ -189,7 +193,9 @@ def test_accuracy_of_moments_given_an_ellipse() -> None:
     without = calibrate(nominal, Measured(place, wide), sigmas=sigmas)
     free = np.flatnonzero(sigmas)
     draws = np.tile(without.values, (3000, 1))
-    draws[:, free] = rng.multivariate_normal(without.values[free], without.covariance[np.ix_(free, free)], 3000)
+    draws[:, free] = rng.multivariate_normal(
+        without.values[free], without.covariance[np.ix_(free, free)], 3000, method="cholesky"
+    )
     off = np.array([apparent_outline(nominal, changed(nominal, draw)) for draw in draws]) - place
     B = np.linalg.solve(C[:3, :3], C[:3, 3:]).T
     left = off[:, 3:] - off[:, :3] @ B.T
@@ -201,9 +207,12 @@ def test_accuracy_of_moments_given_an_ellipse() -> None:
     ratio = np.sqrt(np.diag(found.covariance)[free]) / spread
     print(f"{count:.0f} draws count; sigmas over theirs {ratio.min():.3f} to {ratio.max():.3f}")
     assert count > 300
-    assert np.abs(found.values[free] - mean).max() < 5.0 * (spread / np.sqrt(count)).max()
-    assert (np.abs((found.values[free] - mean) / spread) < 5.0 / np.sqrt(count)).all()
-    assert (np.abs(ratio - 1.0) < 5.0 / np.sqrt(2.0 * count)).all()
+    apart = draws[:, free] - mean
+    of_mean = np.sqrt(weight**2 @ apart**2)
+    of_ratio = np.sqrt(weight**2 @ (apart**2 - spread**2) ** 2) / (2.0 * spread**2)
+    assert of_ratio.max() < 0.1  # or nothing is shown
+    assert (np.abs(found.values[free] - mean) < 5.0 * of_mean).all()
+    assert (np.abs(ratio - 1.0) < 0.1 + 5.0 * of_ratio).all()
     turns = [PARAMETERS.index(f"mirror_tilt_{axis}_rad") for axis in "xy"]
     before = np.sqrt(np.diag(without.covariance)[turns])
     assert (np.sqrt(np.diag(found.covariance)[turns]) < 0.95 * before).any()  # the ellipse told something
