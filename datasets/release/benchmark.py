@@ -21,7 +21,7 @@ from phibench.datasets.recipe.load import recipe_text
 from phibench.datasets.store.schema import Document
 from phibench.scenes.validation import nearest
 
-VERSION = "3.0"
+VERSION = "4.0"
 """Version of the benchmark. The first number counts sets of recipes, the second one additions that change no sample."""
 MANIFEST = "MANIFEST.json"
 FORMAT = "phibench release 1"

@@ -69,7 +69,7 @@ def fetch(
 
     Parameters
     ----------
-    name : title or last word of it: "phibench-v3-dev" or "dev"
+    name : title or last word of it: "phibench-v4-dev" or "dev"
     out : folder that the data set will be; not there yet, or this very data set
     source : folder of a release, or its HTTP address; by default that of `PHIBENCH_SOURCE`
     manifest_sha256 : SHA-256 that `MANIFEST.json` must have, for who got it from elsewhere

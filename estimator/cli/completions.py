@@ -32,7 +32,7 @@ BUILT_IN = (
     "trackpy_refine",
 )
 PARTS = ("dev", "test", "paper", "mirrors", "films", "drives")
-TITLE = "phibench-v3-"
+TITLE = "phibench-v4-"
 POLICIES = ("paper", "greedy", "drive-only", "random", "oracle")
 METHOD_PACKAGES = "phibench.methods"
 _MOST_FILES = 200

@@ -394,7 +394,7 @@ def fetch(
     Parameters
     ----------
     name
-        "phibench-v3-dev", or its last word.
+        "phibench-v4-dev", or its last word.
     out
         Folder that the data set will be. It has this name only when all of it is there.
     from_

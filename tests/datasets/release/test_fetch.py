@@ -34,7 +34,7 @@ def test_fetched_from_a_folder(made: Made, tmp_path: Path, smallest_dataset: Pat
     found = snapshot(tmp_path / "set")
     assert found == {name: digest for name, digest in snapshot(smallest_dataset).items() if name in found}
     assert damaged(tmp_path / "set") == []
-    assert fetch("phibench-v3-small", tmp_path / "set", str(made.out)).fetched == 0
+    assert fetch("phibench-v4-small", tmp_path / "set", str(made.out)).fetched == 0
     fetch("films", tmp_path / "films", str(made.out))
     assert film_faults(tmp_path / "films") == []
     fetch("hidden", tmp_path / "hidden", str(made.out))
@@ -114,7 +114,7 @@ def served(server: Server) -> Iterator[Server]:
 
 
 def test_a_download_that_breaks_off_loses_nothing_and_goes_on(made: Made, tmp_path: Path) -> None:
-    archives = [archive.name for archive in made.released.manifest.parts["phibench-v3-small"].archives]
+    archives = [archive.name for archive in made.released.manifest.parts["phibench-v4-small"].archives]
     with served(Server(made.out, {archives[2]: 1})) as server:
         with pytest.raises(DatasetError, match=rf"{archives[2]} from .* broke off: .*run the same command again"):
             fetch("small", tmp_path / "set", server.address, tries=1)
@@ -128,7 +128,7 @@ def test_a_download_that_breaks_off_loses_nothing_and_goes_on(made: Made, tmp_pa
 
 
 def test_a_file_is_asked_for_again_before_the_fetch_ends(made: Made, tmp_path: Path) -> None:
-    name = made.released.manifest.parts["phibench-v3-films"].archives[0].name
+    name = made.released.manifest.parts["phibench-v4-films"].archives[0].name
     with served(Server(made.out, {name: 1, "MANIFEST.json": 1})) as server:
         assert fetch("films", tmp_path / "set", server.address, tries=2).fetched > 0
         assert (server.asked[name], server.asked["MANIFEST.json"]) == (2, 2)
@@ -141,7 +141,7 @@ LOST = 1 << 14
 
 def one_archive(made: Made) -> Archive:
     """Largest archive of the films; half of it is more than the client's buffer, so that a loss is seen."""
-    archive = max(made.released.manifest.parts["phibench-v3-films"].archives, key=lambda one: one.size)
+    archive = max(made.released.manifest.parts["phibench-v4-films"].archives, key=lambda one: one.size)
     assert archive.size // 2 > 2 * LOST
     return archive
 
@@ -255,7 +255,7 @@ def test_flipped_bits_and_strange_sources_are_refused(made: Made, tmp_path: Path
 
     copy = tmp_path / "copy"
     shutil.copytree(made.out, copy)
-    victim = made.released.manifest.parts["phibench-v3-small"].archives[1].name
+    victim = made.released.manifest.parts["phibench-v4-small"].archives[1].name
     flip(copy / victim)
     assert f"{victim} from {copy} is damaged" in told(copy)
     with served(Server(copy)) as server:
@@ -274,7 +274,7 @@ def test_flipped_bits_and_strange_sources_are_refused(made: Made, tmp_path: Path
     assert "its format is not" in told(copy)
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "mine.txt").write_text("mine")
-    assert "holds something else than phibench-v3-small" in told(made.out, out="full")
+    assert "holds something else than phibench-v4-small" in told(made.out, out="full")
     later = fetch("small", tmp_path / "whole", str(made.out)).folder
     with next(later.rglob("*.exr")).open("ab") as file:
         file.write(b"0")
@@ -285,13 +285,13 @@ def test_flipped_bits_and_strange_sources_are_refused(made: Made, tmp_path: Path
     assert "holds other files" in told(made.out, out="new")
     assert (tmp_path / "new.part" / "mine.txt").read_text() == "mine"
     # set.part holds what was fetched of another release
-    (tmp_path / "set.part" / "fetch.json").write_text('{"title": "phibench-v3-small", "sums_sha256": "0"}')
+    (tmp_path / "set.part" / "fetch.json").write_text('{"title": "phibench-v4-small", "sums_sha256": "0"}')
     assert "another data set or version" in told(made.out)
 
 
 def test_what_is_changed_before_it_has_its_name_is_fetched_again(made: Made, tmp_path: Path) -> None:
     """A bit flips in the growing set between two runs."""
-    archives = made.released.manifest.parts["phibench-v3-small"].archives
+    archives = made.released.manifest.parts["phibench-v4-small"].archives
     with served(Server(made.out, {archives[-1].name: 1})) as server:
         with pytest.raises(DatasetError, match="broke off"):
             fetch("small", tmp_path / "set", server.address, tries=1)
@@ -300,7 +300,7 @@ def test_what_is_changed_before_it_has_its_name_is_fetched_again(made: Made, tmp
             fetch("small", tmp_path / "set", server.address, tries=1)
         assert not (tmp_path / "set").exists()
         assert fetch("small", tmp_path / "set", server.address, tries=1) == Fetched(
-            tmp_path / "set", "phibench-v3-small", len(archives), len(archives)
+            tmp_path / "set", "phibench-v4-small", len(archives), len(archives)
         )
 
 

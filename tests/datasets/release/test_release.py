@@ -35,7 +35,7 @@ def test_frozen_recipes_are_unchanged() -> None:
     assert [part.name for part in PARTS] == ["dev", "test", "paper", "mirrors", "films", "drives"]
     for part in PARTS:
         assert content_sha256(part.text()) == part.sha256
-        assert part.title == f"phibench-v3-{part.name}"
+        assert part.title == f"phibench-v4-{part.name}"
 
 
 def test_frozen_samples_are_unchanged() -> None:
@@ -59,7 +59,7 @@ def test_comments_do_not_count_and_numbers_do(tmp_path: Path) -> None:
     assert part.text()
     assert text.count("[0.25, 1.0]") == 1
     changed.write_text(text.replace("[0.25, 1.0]", "[0.25, 1.001]"))
-    with pytest.raises(DatasetError, match=r"not the frozen one of version 3\.0"):
+    with pytest.raises(DatasetError, match=r"not the frozen one of version 4\.0"):
         part.text()
 
 
@@ -89,13 +89,13 @@ def test_citation_names_this_version() -> None:
 def test_archives_hold_the_data_sets_and_no_secret(made: Made, smallest_dataset: Path, film_windows: Path) -> None:
     parts = made.released.manifest.parts
     assert {name: part.kind for name, part in parts.items()} == {
-        "phibench-v3-small": "pairs",
-        "phibench-v3-hidden": "sealed",
-        "phibench-v3-films": "films",
+        "phibench-v4-small": "pairs",
+        "phibench-v4-hidden": "sealed",
+        "phibench-v4-films": "films",
     }
-    assert len(parts["phibench-v3-small"].archives) > 3
+    assert len(parts["phibench-v4-small"].archives) > 3
     assert differing_files(made.out, read_checksums(made.out)) == []
-    for title, source in (("phibench-v3-small", smallest_dataset), ("phibench-v3-films", film_windows)):
+    for title, source in (("phibench-v4-small", smallest_dataset), ("phibench-v4-films", film_windows)):
         found = {}
         for archive in parts[title].archives:
             with tarfile.open(made.out / archive.name) as tar:
@@ -108,7 +108,7 @@ def test_archives_hold_the_data_sets_and_no_secret(made: Made, smallest_dataset:
     secret = made.request.secret_seed.read_text().strip()
     assert stat.S_IMODE(made.request.secret_seed.stat().st_mode) == 0o600
     assert int(secret) > 2**62
-    truth = list((made.request.work / "phibench-v3-hidden").glob("seal_*.truth.json"))
+    truth = list((made.request.work / "phibench-v4-hidden").glob("seal_*.truth.json"))
     assert len(truth) == 1
     for path in made.out.iterdir():
         assert secret.encode() not in path.read_bytes()
@@ -156,7 +156,7 @@ def test_a_damaged_data_set_is_not_released(smallest_dataset: Path, tmp_path: Pa
 def test_a_dry_run_says_sizes_and_writes_nothing(made: Made, tmp_path: Path) -> None:
     request = ask(tmp_path, list(made.request.parts), use=made.request.use)
     lines = list(dry_run(request))
-    assert [line.split(":")[0] for line in lines] == ["phibench-v3-small", "phibench-v3-hidden", "phibench-v3-films"]
+    assert [line.split(":")[0] for line in lines] == ["phibench-v4-small", "phibench-v4-hidden", "phibench-v4-films"]
     assert all(re.search(r"\d+ MB", line) for line in lines)
     assert "CPU-hours" in lines[1]
     assert list(tmp_path.iterdir()) == []
@@ -207,7 +207,7 @@ def test_command_line_speaks_in_sentences(tmp_path: Path, capsys: pytest.Capture
     assert main(["release", "--part", "tset", *options]) == 2
     assert "there is no part 'tset'" in capsys.readouterr().err
     assert main(["release", "--part", "films", "--dry-run", *options]) == 0
-    assert "phibench-v3-films: 6 films" in capsys.readouterr().out
+    assert "phibench-v4-films: 6 films" in capsys.readouterr().out
     assert main(["fetch", "dev", "--out", str(tmp_path / "d")]) == 2
     assert fetching.SOURCE in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []

@@ -133,7 +133,7 @@ def test_a_fault_of_the_records_is_told(honest: Path, bench_dataset: Path, tmp_p
 def test_the_data_set_is_the_releases(honest: Path, bench_dataset: Path, tmp_path: Path) -> None:
     release = tmp_path / "MANIFEST.json"
     for digest, count in ((sha256(bench_dataset / "SHA256SUMS"), 0), ("0" * 64, 1)):
-        release.write_text(json.dumps({"parts": {"phibench-v3-dev": {"sums_sha256": digest}}}))
+        release.write_text(json.dumps({"parts": {"phibench-v4-dev": {"sums_sha256": digest}}}))
         assert len(check_score(honest, release=release).faults) == count
 
 
