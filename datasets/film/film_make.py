@@ -29,12 +29,14 @@ from phibench.datasets.film.film_store import (
     LIGHTS,
     RECIPE,
     SCHEMA_VERSION,
+    FilmCost,
     FilmFolder,
     FilmInfo,
     FrameTruth,
     SetInfo,
     finite_or_none,
     light_record,
+    log_film,
     read_document,
     view_name,
     write_checksums,
@@ -132,7 +134,8 @@ def _make(plan: Plan, films: Sequence[FilmPlan], text: str, out: Path, workers: 
         (out / CHECKSUMS).unlink(missing_ok=True)
         one = partial(make_film, out, plan, keys)
         with Steps(console, "films", len(todo)) as steps:
-            for _ in parallel_map(one, todo, workers, in_order=False):
+            for cost in parallel_map(one, todo, workers, in_order=False):
+                log_film(out, cost)
                 steps.advance()
     names = tuple(film.film_id for film in films)
     dataset = plan.recipe.dataset
@@ -166,8 +169,8 @@ def _is_done(out: Path, film: FilmPlan, key: str) -> bool:
     return info.key == key and folder.is_whole(info)
 
 
-def make_film(out: Path, plan: Plan, keys: dict[str, str], film: FilmPlan) -> str:
-    """Make one film; return its id."""
+def make_film(out: Path, plan: Plan, keys: dict[str, str], film: FilmPlan) -> FilmCost:
+    """Make one film; the start of the renderer and the light map are not counted."""
     room = plan.room(film.pair.room)
     render = renderer(plan, film, room)
     folder = FilmFolder.of(out, film.film_id)
@@ -197,11 +200,10 @@ def make_film(out: Path, plan: Plan, keys: dict[str, str], film: FilmPlan) -> st
         key_counts=counts,
         pixel_ratio=finite_or_none(error.pixel_ratio),
         position_ratio=finite_or_none(error.position_ratio),
-        cpu_s=round(time.process_time() - began, 3),
         sha256={name: sha256(folder.path / name) for name in names},
     )
     write_document(folder.done, info)
-    return film.film_id
+    return FilmCost(film.film_id, round(time.process_time() - began, 3))
 
 
 def _make_lights(film: FilmPlan, room: Room, folder: FilmFolder) -> list[str]:

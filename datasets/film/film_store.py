@@ -9,6 +9,7 @@ films/<film>/lights.parquet  truth of other lights, a row per light and frame; l
 films/<film>/views/k0_0.150000.exr  key views of the room: part of the poses, and place there
 films/<film>/done.json     what the film was made from; a film that has it is complete
 SHA256SUMS
+log.jsonl                  diary of the runs: when each film was made, and what it took; no part of the data
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import json
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -31,7 +33,7 @@ from phibench.datasets.input_files import InputFile, first_fault
 from phibench.datasets.store.checksums import checksums_text
 from phibench.datasets.store.files import sha256, write_bytes, write_text
 from phibench.datasets.store.layers import read_exr, write_exr
-from phibench.datasets.store.schema import CROISSANT, Document, described
+from phibench.datasets.store.schema import CROISSANT, LOG, Document, described
 from phibench.render.film.film_truth import RATES, InstantTruth
 from phibench.render.film.moving_rows import RowsImage
 from phibench.render.sensor.light import Region
@@ -40,7 +42,7 @@ from phibench.scenes.frames import Array
 
 INFO, RECIPE, CHECKSUMS = "film.json", "recipe.toml", "SHA256SUMS"
 LIGHTS, LIGHT_IMAGES = "lights.parquet", "light{:02d}.npz"
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 3
 _Model = TypeVar("_Model", bound=Document)
 _AGAIN = "run `phibench film make` again"
 _ARRAYS = {
@@ -71,7 +73,6 @@ class FilmInfo(Document):
     )
     pixel_ratio: float | None = described("1", "held-out view: rms error of a pixel near the spot, over its noise")
     position_ratio: float | None = described("1", "held-out view: error of the spot's position, over its bound")
-    cpu_s: float = described("s", "processor time of making it, start of the renderer and light map not counted")
     sha256: dict[str, str] = described("-", "hash of each file, relative to the film's folder")
 
     @property
@@ -137,6 +138,21 @@ class FilmFolder:
         """True if all files are there with the right bytes."""
         files = ((self.path / name, digest) for name, digest in info.sha256.items())
         return all(path.is_file() and sha256(path) == digest for path, digest in files)
+
+
+@dataclass(frozen=True)
+class FilmCost:
+    """Processor time that a film took."""
+
+    film: str
+    cpu_s: float
+
+
+def log_film(out: Path, cost: FilmCost) -> None:
+    """Add a line to the diary of a data set's runs."""
+    line = json.dumps({"time": datetime.now(UTC).isoformat(), **asdict(cost)})
+    with (out / LOG).open("a", encoding="utf-8") as log:
+        log.write(line + "\n")
 
 
 def read_document(path: Path, model: type[_Model]) -> _Model:

@@ -93,13 +93,11 @@ def show(
     from phibench.datasets.film.film_show import show_film
 
     films = open_films(directory)
-    print(f"{'film':32s} {'frames':>6s} {'region px':>11s} {'key views':>9s} {'of noise':>8s} {'CPU-s':>7s}")
+    print(f"{'film':32s} {'frames':>6s} {'region px':>11s} {'key views':>9s} {'of noise':>8s}")
     for one in films:
         info, ratios = one.info, (one.info.pixel_ratio or 0.0, one.info.position_ratio or 0.0)
         size = f"{info.width_px} x {info.height_px}"
-        print(
-            f"{info.film:32s} {info.frames:6d} {size:>11s} {len(info.keys_m):9d} {max(ratios):8.3f} {info.cpu_s:7.2f}"
-        )
+        print(f"{info.film:32s} {info.frames:6d} {size:>11s} {len(info.keys_m):9d} {max(ratios):8.3f}")
     chosen = films[name or next(iter(films.plans))]
     path = show_film(chosen, out or directory / f"{chosen.info.film}.mp4", preset, draw)
     print(f"{path}: {len(chosen)} frames, preset {preset}; the green cross is around the exact place of the spot")
