@@ -7,6 +7,12 @@
     [sigma]                       # standard deviation of a number above
     gain_dn_per_e = 0.0002
 
+    [findings]                    # what of the frames does not agree with this kind of sensor
+    photon_transfer = "a straight line does not fit: ..."
+
+    [assumed]                     # numbers above that the frames do not tell, and what stands for them
+    full_well_e = "no level of flat/ is saturated; set beyond the last code, where it changes nothing"
+
     [not_determined]              # numbers that keep the preset's value, and why
     dark_e_per_s = "no dark-exposure/SECONDS"
 
@@ -52,7 +58,9 @@ class Measured(Document):
 class FitTables(Document):
     """Tables of a sensor file beside the numbers."""
 
+    findings: dict[str, str] = Field(default_factory=dict)
     sigma: dict[str, float | list[float]] = Field(default_factory=dict)
+    assumed: dict[str, str] = Field(default_factory=dict)
     not_determined: dict[str, str] = Field(default_factory=dict)
     measured: dict[str, Measured] = Field(default_factory=dict)
     source: dict[str, str | float | int] = Field(default_factory=dict)

@@ -57,7 +57,18 @@ OWN_ALBEDO = "surface"
 LEVELS = ("laser_level", "lamp_level")
 SENSOR_KEYS = ("jpeg_quality", "sharpen_amount", "analogue_gain", "read_noise_e", "prnu")
 """Keys of `[frames]` that are numbers of the sensor's preset."""
-SENSOR_OF_FRAME = ("preset", "name", "exposure_s", "output", "sigma", "not_determined", "measured", "source")
+SENSOR_OF_FRAME = (
+    "preset",
+    "name",
+    "exposure_s",
+    "output",
+    "findings",
+    "sigma",
+    "assumed",
+    "not_determined",
+    "measured",
+    "source",
+)
 """What `[frames.sensor]` does not take: what belongs to frames, and a sensor file's tables beside its numbers."""
 
 _ONE = DistributionTable(choice=(1.0,))

@@ -8,8 +8,8 @@
     edge/*                     straight edges, 2 to 15 degrees from rows or columns
     chessboard/*               views of one chessboard
 
-Files are PNG or PGM with one plane of up to 16 bits (raw), headerless YUYV (`.yuyv`), PNG with R, G, B, or the camera's
-JPEG. `docs/capture.py` writes such a folder.
+Files are PNG, PGM, TIFF or BMP with one plane of up to 16 bits (raw), headerless YUYV (`.yuyv`), PNG with
+R, G, B, or the camera's JPEG. `docs/capture.py` writes such a folder.
 """
 
 from __future__ import annotations
@@ -35,8 +35,9 @@ from phibench.scenes.validation import printable_line
 Kind = Literal["bayer-raw", "mono-raw", "yuyv", "srgb8", "mjpeg"]
 RAW = ("bayer-raw", "mono-raw")
 MANIFEST = "capture.toml"
-_SUFFIXES = (".png", ".pgm", ".yuyv", ".jpg", ".jpeg")
-_DRIFT = 0.02  # of the signal, from the first to the last frame of one level
+_SUFFIXES = (".png", ".pgm", ".tif", ".tiff", ".bmp", ".yuyv", ".jpg", ".jpeg")
+_DRIFT = 0.02  # of the mean, from the least to the largest frame mean of one level
+_DRIFT_OF_RANGE = 0.0025  # of full scale: levels near zero jitter by more than a share of themselves
 _DRIFT_SIGMAS = 8.0
 _FRAME_BYTES = 512 * 2**20
 
@@ -74,11 +75,14 @@ class FrameGroup:
         By name.
     seconds : float or None
         Exposure time that the folder's name states.
+    photons : float or None
+        Mean number per pixel that a descriptor states.
     """
 
     name: str
     files: tuple[Path, ...]
     seconds: float | None = None
+    photons: float | None = None
 
 
 @dataclass(frozen=True)
@@ -149,15 +153,26 @@ class Capture:
 
     def _refuse_drift(self, group: FrameGroup, frames: NDArray[Any]) -> None:
         values = frames[..., 0] if self.kind == "yuyv" else frames
-        means = values.reshape(len(values), -1).mean(axis=1)
+        means = np.array([frame.mean() for frame in values])
         noise = float((values[1].astype(float) - values[0]).std()) / np.sqrt(0.5 * values[0].size)
         low, high = float(means.min()), float(means.max())
         # an exposure that the camera changes moves all pixels; single lines of noise move the mean by far less
-        if high - low > max(_DRIFT * high, _DRIFT_SIGMAS * noise):
-            raise CaptureError(
-                f"{self.folder / group.name}: the mean goes from {low:.1f} to {high:.1f} within one level; switch auto "
-                "exposure, auto gain and auto white balance off, and let lamp and camera warm up"
+        if high - low > max(_DRIFT * high, _DRIFT_OF_RANGE * self.full_scale, _DRIFT_SIGMAS * noise):
+            capped = group in (self.dark, *self.dark_exposures)
+            remedy = (
+                "cap the lens, darken the room and let the camera warm up"
+                if capped
+                else "switch auto exposure, auto gain and auto white balance off, and let lamp and camera warm up"
             )
+            raise CaptureError(
+                f"{self.folder / group.name}: the mean goes from {low:.1f} to {high:.1f} within one level, and "
+                f"{100.0 * _DRIFT:g} % of it or {100.0 * _DRIFT_OF_RANGE:g} % of full scale are allowed; {remedy}"
+            )
+
+    @property
+    def full_scale(self) -> int:
+        """Largest code."""
+        return int((1 << self.notes.bits) - 1) if self.kind in RAW else 255
 
 
 def open_capture(folder: Path) -> Capture:
@@ -170,7 +185,7 @@ def open_capture(folder: Path) -> Capture:
     """
     if not folder.is_dir():
         raise CaptureError(f"{folder} is no folder: give one with dark/, flat/LEVEL/ and others, see docs/capture.md")
-    notes = _notes(folder / MANIFEST)
+    notes = read_notes(folder / MANIFEST)
     groups = {
         "dark": _group(folder, "dark"),
         "edges": _group(folder, "edge"),
@@ -198,7 +213,7 @@ def read_frame(path: Path, notes: CaptureNotes) -> tuple[Kind, NDArray[Any]]:
     file = InputFile(path, "give the camera's own frame", CaptureError, _FRAME_BYTES)
     if path.suffix.lower() == ".yuyv":
         return "yuyv", _yuyv(file, notes)
-    picture = file.picture(("PNG", "PPM", "JPEG"))
+    picture = file.picture(("PNG", "PPM", "JPEG", "TIFF", "BMP"))
     if picture.format == "JPEG":
         return "mjpeg", np.asarray(picture.convert("RGB"))
     if picture.mode in ("I;16", "I", "I;16B", "L"):
@@ -225,7 +240,14 @@ def _yuyv(file: InputFile, notes: CaptureNotes) -> NDArray[np.uint8]:
     return np.frombuffer(data, np.uint8).reshape(notes.height_px, notes.width_px, 2)
 
 
-def _notes(path: Path) -> CaptureNotes:
+def read_notes(path: Path) -> CaptureNotes:
+    """Notes of a capture; without a file those of the default camera.
+
+    Raises
+    ------
+    CaptureError
+        If the file is not valid.
+    """
     if not path.exists():
         return CaptureNotes()
     file = InputFile(path, "docs/capture.md has an example", CaptureError, SETTINGS_BYTES)

@@ -25,6 +25,7 @@ from phibench.estimator.sensor_fit.capture_folder import (
     read_header,
 )
 from phibench.estimator.sensor_fit.edge_spread import Edge, EdgeFit, EdgeModel, edges_of, fit_edges
+from phibench.estimator.sensor_fit.emva_descriptor import open_descriptor
 from phibench.estimator.sensor_fit.lens_fit import LensFit, fit_lens
 from phibench.estimator.sensor_fit.noise_levels import stack_level
 from phibench.estimator.sensor_fit.photon_transfer import TransferFit, fit_transfer
@@ -71,6 +72,8 @@ class _Draft:
     numbers: dict[str, object] = field(default_factory=dict)
     sigma: dict[str, float | list[float]] = field(default_factory=dict)
     missing: dict[str, str] = field(default_factory=dict)
+    assumed: dict[str, str] = field(default_factory=dict)
+    findings: dict[str, str] = field(default_factory=dict)
     measured: dict[str, Measured] = field(default_factory=dict)
 
     def take(self, name: str, value: object, sigma: float | tuple[float, ...] | None = None) -> None:
@@ -78,12 +81,18 @@ class _Draft:
         if sigma is not None:
             self.sigma[name] = list(sigma) if isinstance(sigma, tuple) else sigma
 
-    def measure(self, name: str, value: float, sigma: float, unit: str) -> None:
+    def assume(self, name: str, value: object) -> None:
+        """A number that the chain needs and the frames do not tell; its reason tells what stands for it."""
+        self.numbers[name] = value
+        self.assumed[name] = self.missing.pop(name)
+
+    def measure(self, name: str, value: float | list[float], sigma: float | list[float], unit: str) -> None:
         self.measured[name] = Measured(value=value, sigma=sigma, unit=unit)
 
     def file(self, capture: Capture) -> SensorFile:
         kept, refused = allowed_numbers(capture.kind, self.numbers)
-        missing = dict(sorted((self.missing | refused).items()))
+        missing = dict(sorted((name, why) for name, why in (self.missing | refused).items() if name not in kept))
+        assumed = {name: why for name, why in self.assumed.items() if name in kept}
         sigma = {name: value for name, value in self.sigma.items() if name in kept}
         source: dict[str, str | float | int] = {
             "frames": capture.frames,
@@ -93,19 +102,26 @@ class _Draft:
         }
         if capture.notes.camera:
             source["camera"] = capture.notes.camera
-        tables = FitTables(sigma=sigma, not_determined=missing, measured=self.measured, source=source)
+        tables = FitTables(
+            findings=self.findings,
+            sigma=sigma,
+            assumed=assumed,
+            not_determined=missing,
+            measured=self.measured,
+            source=source,
+        )
         return SensorFile(capture.kind, kept, tables)
 
 
-def fit_sensor(folder: Path) -> SensorFit:
-    """Fit the frames of a folder; see `capture_folder` for its layout.
+def fit_sensor(frames: Path) -> SensorFit:
+    """Fit the frames of a folder, see `capture_folder`, or of a descriptor of EMVA 1288, see `emva_descriptor`.
 
     Raises
     ------
     CaptureError
         If the folder or its frames will not do; in one sentence.
     """
-    capture = open_capture(folder)
+    capture = open_descriptor(frames) if frames.is_file() else open_capture(frames)
     draft, transfer, tone, noise, jpeg = _Draft(), None, None, None, None
     if capture.kind in RAW:
         if capture.dark or capture.flats or not (capture.edges or capture.chessboards):
@@ -137,8 +153,12 @@ def _take_transfer(draft: _Draft, capture: Capture, found: TransferFit) -> None:
     for name, value in found.values.items():
         draft.take(name, value, found.sigmas[name])
     draft.missing |= found.reasons
+    draft.findings |= found.findings
+    for name, (quantity, sigma, unit) in found.measured.items():
+        draft.measure(name, quantity, sigma, unit)
     if "full_well_e" not in found.values:
-        _take_end(draft, top - found.values["black_level_dn"], capture)
+        range_dn = top - found.values["black_level_dn"]
+        _take_end(draft, float(found.response.linear(np.asarray(range_dn))), capture)
     if "row_noise_e" not in found.values and "row_noise_e" not in found.reasons:
         draft.missing["row_noise_e"] = "not above the noise of these frames"
     if found.ratios:
@@ -149,7 +169,8 @@ def _take_end(draft: _Draft, codes: float, capture: Capture) -> None:
     """Full well beyond the converter's end: the chain needs a number, and there it changes nothing."""
     gain = draft.numbers["gain_dn_per_e"]
     if isinstance(gain, float):
-        draft.take("full_well_e", float(round(1.05 * codes / (gain * capture.notes.analogue_gain))))
+        draft.missing["full_well_e"] += "; set beyond the last code, where it changes nothing"
+        draft.assume("full_well_e", float(round(1.05 * codes / (gain * capture.notes.analogue_gain))))
 
 
 # -- processed frames ------------------------------------------------------------------------------------------------
@@ -196,15 +217,15 @@ def _take_noise(draft: _Draft, capture: Capture, found: ProcessedNoise, edges: E
             draft.take("denoise_threshold_codes", *edges.threshold_codes)
         elif edges is None:
             draft.missing["denoise_threshold_codes"] = "needs edge/: flat frames do not show what is spared"
-    if "gain_dn_per_e" in found.values:
-        card = sensor_card(capture.kind)
-        _take_end(draft, card.top_dn - card.black_level_dn, capture)
-        draft.measure("noise_misfit", found.chi2, 0.0, "mean square of standardised residuals")
     draft.missing |= {
         "dsnu_e": "the tone curve starts at black",
         "black_level_dn": "the tone curve starts at black",
         "full_well_e": "processed frames end at white",
     }
+    if "gain_dn_per_e" in found.values:
+        card = sensor_card(capture.kind)
+        _take_end(draft, card.top_dn - card.black_level_dn, capture)
+        draft.measure("noise_misfit", found.chi2, 0.0, "mean square of standardised residuals")
 
 
 def _toned(card: SensorCard, tone: ToneFit | None) -> SensorCard:

@@ -41,7 +41,7 @@ def write_page(path: Path, found: SensorFit) -> Path:
     if path.suffix.lower() == ".md":
         lines = ["# Sensor fit", "", *_source_lines(found), "", "| number | value | sigma |", "|---|---|---|"]
         lines += [f"| {name} | {value} | {sigma} |" for name, value, sigma in rows]
-        lines += ["", *(f"* `{name}`: not determined, {why}" for name, why in found.file.tables.not_determined.items())]
+        lines += ["", *(f"* {said}" for said in remarks_of(found))]
         if plot is not None:
             picture = path.with_suffix(".png")
             write_bytes(picture, plot)
@@ -58,10 +58,20 @@ def numbers_of(found: SensorFit) -> list[tuple[str, str, str]]:
         sigma = tables.sigma.get(name)
         rows.append((name, _text(value), _sigma(sigma)))
     for name, one in tables.measured.items():
-        sigma_text = f"{one.sigma:.2g}" if isinstance(one.sigma, float) and one.sigma > 0.0 else ""
+        sigma_text = _sigma(one.sigma) if one.sigma != 0.0 else ""
         unit = "" if one.unit == "1" else f" {one.unit}"
         rows.append((f"measured {name}", f"{_text(one.value)}{unit}", sigma_text))
     return rows
+
+
+def remarks_of(found: SensorFit) -> list[str]:
+    """Sentences beside the numbers: findings, numbers that are assumed, and those not determined."""
+    tables = found.file.tables
+    return [
+        *(f"finding, {name}: {said}" for name, said in tables.findings.items()),
+        *(f"{name}: assumed: {why}" for name, why in tables.assumed.items()),
+        *(f"{name}: not determined from these frames: {why}" for name, why in tables.not_determined.items()),
+    ]
 
 
 def _sigma(sigma: float | list[float] | None) -> str:
@@ -82,10 +92,7 @@ def _source_lines(found: SensorFit) -> list[str]:
 
 def _html(found: SensorFit, rows: list[tuple[str, str, str]], plot: bytes | None) -> str:
     cells = "".join("<tr>" + "".join(f"<td>{html.escape(x)}</td>" for x in row) + "</tr>\n" for row in rows)
-    missing = "".join(
-        f"<li><code>{html.escape(name)}</code>: not determined, {html.escape(why)}</li>\n"
-        for name, why in found.file.tables.not_determined.items()
-    )
+    missing = "".join(f"<li>{html.escape(said)}</li>\n" for said in remarks_of(found))
     source = "".join(f"<li>{html.escape(line[2:])}</li>" for line in _source_lines(found))
     image = "" if plot is None else f'<img alt="plots" src="data:image/png;base64,{base64.b64encode(plot).decode()}">'
     return (
@@ -130,9 +137,14 @@ def _draw_transfer(axes: Axes, found: SensorFit) -> None:
     for site in dict.fromkeys(point.site for point in points):
         own = [point for point in points if point.site == site]
         axes.loglog([p.signal_dn for p in own], [max(p.variance_dn2, 1e-3) for p in own], ".", label=site)
-    gain = found.transfer.values["gain_dn_per_e"] * found.capture.notes.analogue_gain
-    signal: Any = np.array([min(p.signal_dn for p in points), max(p.signal_dn for p in points)])
+    response = found.transfer.response
+    gain = float(response.gain[0])
+    signal: Any = np.geomspace(max(min(p.signal_dn for p in points), 1.0), max(p.signal_dn for p in points), 100)
     axes.loglog(signal, gain * signal, "k-", lw=0.8, label=f"K = {gain:.4g} DN/e-")
+    if response.is_bent:
+        inside = signal[signal <= response.reach_dn]
+        noise = [gain * float(response.linear(y) / response.slope(y) ** 2) for y in inside]
+        axes.loglog(inside, noise, "k--", lw=0.8, label="bent response")
     axes.set(xlabel="signal, DN", ylabel="temporal variance less the dark's, DN$^2$", title="Photon transfer")
     axes.legend(fontsize=8)
 

@@ -2,10 +2,10 @@
 
 Terms and equations are those of EMVA 1288, release 4.0. The variance from frame to frame of a level against its mean
 has the slope K. The variance from pixel to pixel of the mean frame is the fixed pattern, after what temporal noise adds
-has been taken off. Three things differ:
+has been taken off. Four things differ:
 
-* Rounding at a noise below half a code adds neither 1/12 DN^2 nor nothing. Its exact moments are taken: the mean, the
-  temporal and the spatial variance of a rounded Gaussian whose place between two codes has the spread of the DSNU.
+* Whether the line is straight is asked, and a response that bends is fitted: see `response_fit`.
+* Rounding at a noise below half a code has its exact moments: see `block_sums`.
 * Shading of lamp and lens is removed by a mean over 5 x 5 pixels of one filter. Of white noise 24/25 of the variance
   remain.
 * Sigmas come from a jackknife over blocks of pixels: everything is estimated again without one block.
@@ -18,150 +18,24 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import uniform_filter
-from scipy.optimize import root
-from scipy.special import ndtr
 
+from phibench.estimator.sensor_fit.block_sums import (
+    BlockSums,
+    CommonNoise,
+    before_rounding,
+    block_sums,
+    common_noise,
+    jackknife_sigma,
+)
 from phibench.estimator.sensor_fit.capture_folder import Capture, CaptureError, FrameGroup
+from phibench.estimator.sensor_fit.response_fit import LightLevel, NoiseOfLevel, Response, fit_linearity, fit_response
 from phibench.scenes.frames import Array
 
-_BLOCKS = 8  # along each side; sigma of sigma is 1 / sqrt(2 x 63) = 9 %
-_BOX = 5  # pixels of one filter
 _MARGIN_SIGMAS = 6.0  # a level is used if so many deviations of its noise lie below saturation
 _HIDDEN_DN = 0.15  # noise below it leaves too few codes to be told from rounding
+_FAINT = 0.02  # of the range: below, a level's noise over its signal says nothing
+_BY_GAIN = ("gain_dn_per_e", "dark_e_per_s", "read_noise_e", "row_noise_e", "dsnu_e", "full_well_e")
 _SHAPE = "16 pixels or more of each filter along both sides are needed"
-
-
-@dataclass(frozen=True)
-class BlockSums:
-    """Sums over the pixels of one filter of one level: shape (blocks,), or (blocks + 1,) of the jackknife.
-
-    Attributes
-    ----------
-    pixels : count
-    mean : sum of the pixels' means, DN
-    temporal : sum of the pixels' variances from frame to frame, DN^2
-    spatial : sum of squares of the pixels' means after shading is removed, DN^2
-    frames : number of frames
-    full : share of values at the last code
-    """
-
-    pixels: Array
-    mean: Array
-    temporal: Array
-    spatial: Array
-    frames: int
-    full: float
-
-    def jackknife(self) -> BlockSums:
-        """Totals: first of all blocks, then without each one."""
-
-        def totals(x: Array) -> Array:
-            return np.concatenate([[x.sum()], x.sum() - x])
-
-        pixels, mean, temporal, spatial = (totals(x) for x in (self.pixels, self.mean, self.temporal, self.spatial))
-        return BlockSums(pixels, mean, temporal, spatial, self.frames, self.full)
-
-    @property
-    def mean_dn(self) -> Array:
-        """Mean."""
-        return self.mean / self.pixels
-
-    @property
-    def temporal_dn2(self) -> Array:
-        """Variance from frame to frame."""
-        return self.temporal / self.pixels
-
-    @property
-    def spatial_dn2(self) -> Array:
-        """Variance of the fixed pattern."""
-        return self.spatial / self.pixels - self.temporal_dn2 / self.frames
-
-
-def block_sums(frames: NDArray[Any], top_dn: int) -> BlockSums:
-    """Sums of one filter's pixels, shape (n, h, w), n >= 2."""
-    values = frames.astype(float)
-    pixel_mean = values.mean(axis=0)
-    # flicker of the lamp moves all pixels of a frame
-    values -= (values.mean(axis=(1, 2)) - pixel_mean.mean())[:, None, None]
-    temporal = values.var(axis=0, ddof=1)
-    rough = pixel_mean - uniform_filter(pixel_mean, _BOX, mode="reflect")
-    half, n = _BOX // 2, len(frames)
-    inner = (slice(half, -half),) * 2
-    spatial = rough[inner] ** 2 / (1.0 - 1.0 / _BOX**2)
-    pixels, mean, noise = (_by_blocks(x[inner]) for x in (np.ones_like(pixel_mean), pixel_mean, temporal))
-    return BlockSums(pixels, mean, noise, _by_blocks(spatial), n, float((frames >= top_dn).mean()))
-
-
-def _by_blocks(values: Array) -> Array:
-    """Sums over blocks, shape (blocks,), of an image."""
-    rows, columns = (np.linspace(0, side, _BLOCKS + 1).astype(int)[:-1] for side in values.shape)
-    return np.add.reduceat(np.add.reduceat(values, rows, axis=0), columns, axis=1).ravel()
-
-
-def row_variance(frames: NDArray[Any]) -> tuple[float, float]:
-    """Variance of row noise, DN^2, with its sigma: that of row means from frame to frame, less the pixels' share."""
-    values = frames.astype(float)
-    values = values - values.mean(axis=0)
-    values -= values.mean(axis=(1, 2), keepdims=True)
-    n, h, w = values.shape
-    freedom = n / (n - 1) * h / (h - 1)
-    rows = float((values.mean(axis=2) ** 2).mean()) * freedom
-    white = float(values.var()) * freedom / w
-    return rows - white, rows * float(np.sqrt(2.0 / ((n - 1) * (h - 1))))
-
-
-# -- rounding --------------------------------------------------------------------------------------------------------
-
-
-def rounded_moments(mean: float, temporal_sd: float, spatial_sd: float) -> Array:
-    """(mean, temporal variance, spatial variance), DN, of values rounded to codes.
-
-    A pixel's mean is Gaussian about `mean` with `spatial_sd`; its values are Gaussian about that with `temporal_sd`.
-    """
-    z = np.linspace(-5.0, 5.0, 201)
-    weights = np.exp(-0.5 * z * z)
-    weights /= weights.sum()
-    centre = mean + max(spatial_sd, 1e-9) * z
-    s = max(temporal_sd, 1e-6)
-    codes = np.arange(np.floor(centre.min() - 6.0 * s), np.ceil(centre.max() + 6.0 * s) + 1.0)
-    upper = ndtr((codes[None] + 0.5 - centre[:, None]) / s)
-    chance = np.diff(np.concatenate([np.zeros((len(z), 1)), upper], axis=1), axis=1)
-    chance[:, -1] += 1.0 - upper[:, -1]
-    first = chance @ (codes - mean)
-    second = chance @ (codes - mean) ** 2
-    total = float(weights @ first)
-    return np.array([mean + total, float(weights @ (second - first**2)), float(weights @ (first - total) ** 2)])
-
-
-def rounding_variance(mean: float, temporal_sd: float, spatial_sd: float) -> float:
-    """Temporal variance that rounding adds, DN^2; 1/12 where the noise is above 0.7 codes."""
-    if temporal_sd > 0.7:  # exp(-2 pi^2 0.49) = 6e-5 of a code^2 is left
-        return 1.0 / 12.0
-    return float(rounded_moments(mean, temporal_sd, spatial_sd)[1]) - temporal_sd**2
-
-
-def before_rounding(sums: BlockSums) -> Array:
-    """(mean, temporal variance, spatial variance) of dark frames before rounding, shape (replicates, 3).
-
-    Solved for the whole; the blocks' small changes follow by the derivative.
-    """
-    seen = np.stack([sums.mean_dn, sums.temporal_dn2, sums.spatial_dn2], axis=1)
-    start = np.array([seen[0, 0], max(seen[0, 1] - 1.0 / 12.0, 0.02), max(seen[0, 2], 1e-4)])
-
-    def model(x: Array) -> Array:
-        return rounded_moments(x[0], float(np.sqrt(abs(x[1]))), float(np.sqrt(abs(x[2]))))
-
-    solution = root(lambda x: model(x) - seen[0], start, method="hybr", tol=1e-9)
-    found = np.abs(solution.x)
-    if not solution.success and np.abs(solution.fun).max() > 1e-4:
-        found = start
-    steps = np.array([1e-3, 1e-3 * max(found[1], 1e-3), 1e-3 * max(found[2], 1e-3)])
-    jacobian = np.stack([(model(found + d) - model(found - d)) / (2.0 * d.sum()) for d in np.diag(steps)], axis=1)
-    return np.asarray(found + (seen - seen[0]) @ np.linalg.pinv(jacobian).T)
-
-
-# -- fit -------------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -185,6 +59,11 @@ class TransferFit:
     reasons : mapping of str to str
     points : tuple of TransferPoint
     ratios : mean signal of R, G, B over that of G, of the flat's light; empty for pixels without filters
+    response : Response
+    measured : mapping of str to (value, sigma, unit)
+        Quantities that are no number of `Sensor`.
+    findings : mapping of str to str
+        Sentences about what does not agree with a straight sensor.
     """
 
     values: dict[str, float]
@@ -192,6 +71,9 @@ class TransferFit:
     reasons: dict[str, str]
     points: tuple[TransferPoint, ...]
     ratios: tuple[float, ...]
+    response: Response
+    measured: dict[str, tuple[float | list[float], float | list[float], str]]
+    findings: dict[str, str]
 
 
 @dataclass(frozen=True)
@@ -199,6 +81,8 @@ class _Level:
     name: str
     site: str
     sums: BlockSums
+    light: tuple[float, str] | None = None  # photons or seconds
+    seconds: float | None = None
 
 
 def fit_transfer(capture: Capture) -> TransferFit:
@@ -215,17 +99,25 @@ def fit_transfer(capture: Capture) -> TransferFit:
         raise CaptureError(f"{capture.folder} has no flat frames: put frames of an even surface into flat/LEVEL/")
     top = (1 << capture.notes.bits) - 1
     dark_frames = _frames(capture, capture.dark, top)
-    levels = [
-        _Level(group.name, site, block_sums(part, top).jackknife())
-        for group in capture.flats
-        for site, part in _sites(_frames(capture, group, top), capture.kind)
-    ]
+    levels = [one for group in capture.flats for one in _levels(capture, group, top)]
+    exposures = [one for group in capture.exposures if len(group.files) > 1 for one in _levels(capture, group, top)]
     timed = [
         (float(group.seconds or 0.0), block_sums(_frames(capture, group, top), top).jackknife())
         for group in capture.dark_exposures
     ]
     dark = block_sums(dark_frames, top).jackknife()
-    return _Fit(capture, dark, levels, timed, row_variance(dark_frames), top).result()
+    return _Fit(capture, dark, levels, exposures, timed, common_noise(dark_frames), top).result()
+
+
+def _levels(capture: Capture, group: FrameGroup, top: int) -> list[_Level]:
+    """One level for each filter."""
+    light = (group.photons, "photons") if group.photons is not None else None
+    if group.name.startswith("exposure/"):
+        light = (group.seconds or 0.0, "seconds")
+    return [
+        _Level(group.name, site, block_sums(part, top).jackknife(), light, group.seconds)
+        for site, part in _sites(_frames(capture, group, top), capture.kind)
+    ]
 
 
 def _frames(capture: Capture, group: FrameGroup, top: int) -> NDArray[Any]:
@@ -256,31 +148,49 @@ class _Fit:
         capture: Capture,
         dark: BlockSums,
         levels: list[_Level],
+        exposures: list[_Level],
         timed: list[tuple[float, BlockSums]],
-        row: tuple[float, float],
+        common: CommonNoise,
         top: int,
     ) -> None:
         self.notes, self.folder, self.top = capture.notes, capture.folder, top
-        self.dark, self.levels, self.timed, self.row = dark, levels, timed, row
-        moments = before_rounding(dark)
+        self.dark, self.levels, self.exposures = dark, levels, exposures
+        self.timed, self.common = timed, common
+        moments = before_rounding(dark, common.seen_frame_dn2)
         self.black, self.dark_dn2, self.offset_dn2 = moments.T
         self.values: dict[str, Array] = {}
         self.extra: dict[str, float] = {}
         self.reasons: dict[str, str] = {}
+        self.measured: dict[str, tuple[float | list[float], float | list[float], str]] = {}
+        self.findings: dict[str, str] = {}
 
     def result(self) -> TransferFit:
         used = self._usable()
-        gain = self._gain(used)
-        self.values["gain_dn_per_e"] = gain / self.notes.analogue_gain
-        dark_rate = self._dark_current(gain)
-        self._noise(gain, dark_rate)
-        self._prnu(used)
-        self._full_well(gain)
+        response = self._response(used)
+        self.values["gain_dn_per_e"] = response.gain / self.notes.analogue_gain
+        dark_dn_per_s = self._dark_current(response.gain)
+        self._noise(response.gain, dark_dn_per_s / response.gain)
+        self._prnu(used, response)
+        self._full_well(response)
+        self._linearity(float(dark_dn_per_s[0]))
         points = tuple(self._point(level, level in used) for level in self.levels)
-        sigmas = {name: jackknife_sigma(x) for name, x in self.values.items()} | self.extra
+        values = {name: float(x[0]) for name, x in self.values.items()}
         return TransferFit(
-            {name: float(x[0]) for name, x in self.values.items()}, sigmas, self.reasons, points, self._ratios(used)
+            values,
+            {name: self._sigma(name, x, response) for name, x in self.values.items()},
+            self.reasons,
+            points,
+            self._ratios(used),
+            response,
+            self.measured,
+            self.findings,
         )
+
+    def _sigma(self, name: str, x: Array, response: Response) -> float:
+        """Of the blocks, of what frames and rows have in common, and of the choice of the response."""
+        own = self.extra.get(name, 0.0)
+        by_gain = abs(float(x[0])) * response.spread / float(response.gain[0]) if name in _BY_GAIN else 0.0
+        return float(np.sqrt(jackknife_sigma(x) ** 2 + own**2 + by_gain**2))
 
     def _usable(self) -> list[_Level]:
         ceiling = self._ceiling()
@@ -300,50 +210,63 @@ class _Fit:
 
     def _plateau(self) -> list[_Level]:
         """Levels at which the wells are full: hardly more noise than in the dark, below the last code."""
-        ratios = [
-            (one.sums.temporal_dn2[0] - self.dark.temporal_dn2[0]) / self._signal(one)[0]
-            for one in self.levels
-            if self._signal(one)[0] > 0.0
-        ]
-        usual = float(np.max(ratios)) if ratios else 0.0
+        if len(self.levels) < 2:
+            return []
+        bright = [one for one in self.levels if self._signal(one)[0] > _FAINT * self._range]
+        usual = max((self._excess(one) / float(self._signal(one)[0]) for one in bright), default=0.0)
         return [
-            one
-            for one in self.levels
-            if one.sums.temporal_dn2[0] - self.dark.temporal_dn2[0] < 0.02 * usual * self._signal(one)[0]
-            and one.sums.full == 0.0
-            and self._signal(one)[0] > 0.0
-            and len(self.levels) > 1
+            one for one in bright if self._excess(one) < 0.02 * usual * self._signal(one)[0] and one.sums.full == 0.0
         ]
+
+    def _excess(self, one: _Level) -> float:
+        return float(one.sums.temporal_dn2[0] - self.dark.temporal_dn2[0])
+
+    @property
+    def _range(self) -> float:
+        """Codes from black to the last."""
+        return self.top - float(self.black[0])
 
     def _ceiling(self) -> float:
         flat = [float(one.sums.mean_dn[0]) for one in self._plateau()]
         return min([float(self.top), *flat])
 
-    def _gain(self, used: list[_Level]) -> Array:
-        """K: slope of the temporal variance against the mean, through the dark frames' point."""
-        signal = np.stack([self._signal(one) for one in used])
-        spread = [float(np.sqrt(max(one.sums.spatial_dn2[0], 0.0))) for one in used]
-        seen = np.stack([one.sums.temporal_dn2 for one in used])
-        rounding = np.full(len(used), 1.0 / 12.0)
-        weights = (seen[:, :1] ** -2.0) * np.array([[one.sums.pixels[0] * (one.sums.frames - 1)] for one in used])
-        for _ in range(4):
-            excess = seen - rounding[:, None] - self.dark_dn2
-            gain = np.sum(weights * signal * excess, axis=0) / np.sum(weights * signal**2, axis=0)
-            model = np.sqrt(np.maximum(gain[0] * signal[:, 0] + self.dark_dn2[0], 0.0))
-            rounding = np.array(
-                [
-                    rounding_variance(float(one.sums.mean_dn[0]), s, d)
-                    for one, s, d in zip(used, model, spread, strict=True)
-                ]
+    def _response(self, used: list[_Level]) -> Response:
+        """K with the response: the temporal variance against the mean, through the dark frames' point."""
+        levels = [
+            NoiseOfLevel(
+                one.name,
+                self._signal(one),
+                one.sums.temporal_dn2,
+                float(one.sums.mean_dn[0]),
+                float(np.sqrt(max(one.sums.spatial_dn2[0], 0.0))),
+                float(one.sums.pixels[0] * (one.sums.frames - 1)),
             )
-        if gain[0] <= 0.0:
-            raise CaptureError(f"{self.folder}: the noise of flat/ does not grow with its level; are these raw frames?")
-        return np.asarray(gain)
+            for one in used
+        ]
+        try:
+            found = fit_response(levels, self.dark_dn2, self._range)
+        except ValueError:
+            raise CaptureError(
+                f"{self.folder}: the noise of flat/ does not grow with its level; are these raw frames?"
+            ) from None
+        if (said := found.finding()) is not None:
+            self.findings["photon_transfer"] = said
+        if found.is_bent:
+            unit = f"x = y (1 + a1 u + a2 u^2 + a3 u^3), u = y / {self._range:.6g} DN"
+            a, sigma = found.coefficients[0].tolist(), found.coefficient_sigmas.tolist()
+            self.measured["response_coefficients"] = (a, sigma, unit)
+            self.measured["straight_gain_dn_per_e"] = (
+                found.straight_gain / self.notes.analogue_gain,
+                found.straight_sigma / self.notes.analogue_gain,
+                "DN per electron, of a straight line",
+            )
+        return found
 
     def _dark_current(self, gain: Array) -> Array:
-        """Dark current, electrons per second; 0 where no series tells."""
+        """Growth of the dark level, DN per second; 0 where no series tells."""
         at = self.notes.exposure_s
         self.values["black_level_dn"] = self.black
+        self.extra["black_level_dn"] = float(np.sqrt(self.common.level_dn2 / self.dark.frames))
         times = [seconds for seconds, _ in self.timed] + ([at] if at is not None else [])
         if len(set(times)) < 2:
             self.reasons["dark_e_per_s"] = "needs dark-exposure/SECONDS with two exposure times or more"
@@ -356,18 +279,31 @@ class _Fit:
         t, means = np.array(times)[:, None], np.stack([s[:, 0] for s in series])
         centre = (weights * t).sum() / weights.sum()
         slope = np.sum(weights * (t - centre) * means, axis=0) / np.sum(weights * (t - centre) * t)
-        rate = slope / gain
-        self.values["dark_e_per_s"] = rate
+        black_share = (1.0 - (t - centre) * (weights * t).sum() / np.sum(weights * (t - centre) * t)) / weights.sum()
+        slope_share = (t - centre) / np.sum(weights * (t - centre) * t)
+        frames = np.array([sums.frames for _, sums in self.timed] + [self.dark.frames])[: len(t), None]
+        jitter2 = self.common.level_dn2 / frames  # of each level as a whole
+        slope_sigma = float(np.sqrt(np.sum((weights * slope_share) ** 2 * jitter2)))
+        self.extra["black_level_dn"] = float(np.sqrt(np.sum((weights * black_share) ** 2 * jitter2)))
         self.values["black_level_dn"] = np.sum(weights * (means - slope * t), axis=0) / weights.sum()
-        return np.asarray(rate)
+        if slope[0] > 0.0:
+            self.values["dark_e_per_s"] = slope / gain
+            self.extra["dark_e_per_s"] = slope_sigma / float(gain[0])
+        else:
+            sigma = float(np.hypot(jackknife_sigma(slope), slope_sigma) / gain[0])
+            self.reasons["dark_e_per_s"] = f"not above 0 in these frames, whose sigma is {sigma:.2g} electrons/s"
+        return np.asarray(slope)
 
     def _noise(self, gain: Array, dark_rate: Array) -> None:
         if self.dark_dn2[0] < _HIDDEN_DN**2:
             reason = f"below {_HIDDEN_DN} DN: rounding hides it; take dark frames at a higher gain"
             self.reasons |= {"read_noise_e": reason, "dsnu_e": reason, "row_noise_e": reason}
             return
-        row, row_sigma = self.row
-        share = row if row > 4.0 * row_sigma else 0.0
+        share, row_sigma = self.common.seen_row_dn2, self.common.row_sigma_dn2
+        if self.common.seen_frame_dn2:
+            value = float(np.sqrt(self.common.seen_frame_dn2)) / float(gain[0])
+            freedom = 2.0 * (self.dark.frames - 1)
+            self.measured["frame_noise_e"] = (value, value / float(np.sqrt(freedom)), "electrons, of whole frames")
         if share:
             self.values["row_noise_e"] = np.sqrt(share) / gain
             self.extra["row_noise_e"] = 0.5 * row_sigma / float(np.sqrt(share)) / float(gain[0])
@@ -380,8 +316,9 @@ class _Fit:
         else:
             self.reasons["dsnu_e"] = "lost in temporal noise and rounding: take more dark frames, at a higher gain"
 
-    def _prnu(self, used: list[_Level]) -> None:
-        signal = np.stack([self._signal(one) for one in used])
+    def _prnu(self, used: list[_Level], response: Response) -> None:
+        shown = np.stack([self._signal(one) for one in used])
+        signal = np.stack([response.linear(y) / response.slope(y) for y in shown])  # dy / y' is the change of x
         pattern = np.stack([one.sums.spatial_dn2 for one in used]) - self.dark.spatial_dn2
         temporal = np.array([one.sums.temporal_dn2[0] / one.sums.frames for one in used])
         weights = (signal[:, 0] ** 2 / (np.maximum(pattern[:, 0], 0.0) + temporal)) ** 2
@@ -391,21 +328,43 @@ class _Fit:
         else:
             self.reasons["prnu"] = "lost in temporal noise: take more frames of the brighter levels"
 
-    def _full_well(self, gain: Array) -> None:
+    def _full_well(self, response: Response) -> None:
         plateau = self._plateau()
         if plateau:
             level = np.mean([one.sums.mean_dn for one in plateau], axis=0)
-            self.values["full_well_e"] = (level - self.dark.mean_dn) / gain
+            self.values["full_well_e"] = response.linear(level - self.dark.mean_dn) / response.gain
             return
-        end_e = (self.top - float(self.black[0])) / float(gain[0])
+        gain = float(response.gain[0])
+        end_e = float(response.linear(np.asarray(self._range))) / gain
+        largest = max(float(response.linear(np.asarray(self._signal(one)[0]))) for one in self.levels) / gain
         self.reasons["full_well_e"] = (
             f"the converter ends first, at {end_e:.0f} electrons"
             if any(one.sums.full > 0.0 for one in self.levels)
-            else f"no level of flat/ is saturated; above {self._largest_e(gain):.0f} electrons"
+            else f"no level of flat/ is saturated; above {largest:.0f} electrons"
         )
 
-    def _largest_e(self, gain: Array) -> float:
-        return max(float(self._signal(one)[0] / gain[0]) for one in self.levels)
+    def _linearity(self, dark_dn_per_s: float) -> None:
+        """Signal against stated light: of an exposure series, or of flat levels whose photons are known."""
+        ceiling, start = self._ceiling(), self.notes.exposure_s or 0.0
+        named = self.exposures or [one for one in self.levels if one.light is not None]
+        levels: dict[str, list[_Level]] = {}
+        for one in named:
+            levels.setdefault(one.name, []).append(one)
+        lights, unit = [], "seconds"
+        for sites in levels.values():
+            if any(self._reach(one) >= ceiling or one.light is None for one in sites):
+                continue
+            light, unit = sites[0].light or (0.0, unit)
+            dark = dark_dn_per_s * ((sites[0].seconds or start) - start)
+            signal = float(np.mean([self._signal(one)[0] for one in sites])) - dark
+            flicker = float(np.mean([s.sums.flicker_dn2 for s in sites])) + self.common.level_dn2 / self.dark.frames
+            lights.append(LightLevel(light, signal, float(np.sqrt(flicker))))
+        found = fit_linearity(lights, unit)
+        if found is None:
+            return
+        self.measured["linearity_error"] = (found.mean_percent, found.sigma_percent, f"percent, against {unit}")
+        if (said := found.finding()) is not None:
+            self.findings["linearity"] = said
 
     def _ratios(self, used: list[_Level]) -> tuple[float, ...]:
         of_site = {
@@ -421,12 +380,4 @@ class _Fit:
         return level["R"] / green, 1.0, level["B"] / green
 
     def _point(self, one: _Level, used: bool) -> TransferPoint:
-        excess = float(one.sums.temporal_dn2[0] - self.dark.temporal_dn2[0])
-        return TransferPoint(one.name, one.site, float(self._signal(one)[0]), excess, used)
-
-
-def jackknife_sigma(replicates: Array) -> float:
-    """Standard deviation of an estimate, of its value and those without each block."""
-    left_out = replicates[1:]
-    n = len(left_out)
-    return float(np.sqrt((n - 1) / n * np.sum((left_out - left_out.mean()) ** 2)))
+        return TransferPoint(one.name, one.site, float(self._signal(one)[0]), self._excess(one), used)

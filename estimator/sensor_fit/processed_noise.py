@@ -19,9 +19,9 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from phibench.datasets.frames.sensor_card import SensorCard
+from phibench.estimator.sensor_fit.block_sums import jackknife_sigma
 from phibench.estimator.sensor_fit.edge_spread import Smoothing
 from phibench.estimator.sensor_fit.noise_levels import NoiseLevel
-from phibench.estimator.sensor_fit.photon_transfer import jackknife_sigma
 from phibench.estimator.sensor_fit.plane_model import Numbers, PlaneModel
 from phibench.scenes.frames import Array
 

@@ -1,0 +1,222 @@
+"""Sums over blocks of pixels of one filter of one level, and what of them is the converter's rounding.
+
+Rounding at a noise below half a code adds neither 1/12 DN^2 nor nothing. Its exact moments are taken: the mean, the
+temporal and the spatial variance of a rounded Gaussian whose place between two codes has the spread of the DSNU.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter
+from scipy.optimize import least_squares
+from scipy.special import ndtr
+
+from phibench.scenes.frames import Array
+
+_BLOCKS = 8  # along each side; sigma of sigma is 1 / sqrt(2 x 63) = 9 %
+_BOX = 5  # pixels of one filter
+_ROW_SIGMAS = 4.0
+_FRAME_SIGMAS = 8.0  # chi-square with 1 degree of freedom exceeds 1 + 8 sqrt 2 once in 2e3, with 15 once in 1e6
+
+
+@dataclass(frozen=True)
+class BlockSums:
+    """Sums over the pixels of one filter of one level: shape (blocks,), or (blocks + 1,) of the jackknife.
+
+    Attributes
+    ----------
+    pixels : count
+    mean : sum of the pixels' means, DN
+    temporal : sum of the pixels' variances from frame to frame, DN^2
+    spatial : sum of squares of the pixels' means after shading is removed, DN^2
+    frames : number of frames
+    full : share of values at the last code
+    flicker_dn2 : variance of the mean of all frames, of the scatter of the frames' means
+    """
+
+    pixels: Array
+    mean: Array
+    temporal: Array
+    spatial: Array
+    frames: int
+    full: float
+    flicker_dn2: float
+
+    def jackknife(self) -> BlockSums:
+        """Totals: first of all blocks, then without each one."""
+
+        def totals(x: Array) -> Array:
+            return np.concatenate([[x.sum()], x.sum() - x])
+
+        pixels, mean, temporal, spatial = (totals(x) for x in (self.pixels, self.mean, self.temporal, self.spatial))
+        return BlockSums(pixels, mean, temporal, spatial, self.frames, self.full, self.flicker_dn2)
+
+    @property
+    def mean_dn(self) -> Array:
+        """Mean."""
+        return self.mean / self.pixels
+
+    @property
+    def temporal_dn2(self) -> Array:
+        """Variance from frame to frame."""
+        return self.temporal / self.pixels
+
+    @property
+    def spatial_dn2(self) -> Array:
+        """Variance of the fixed pattern."""
+        return self.spatial / self.pixels - self.temporal_dn2 / self.frames
+
+
+def block_sums(frames: NDArray[Any], top_dn: int) -> BlockSums:
+    """Sums of one filter's pixels, shape (n, h, w), n >= 2."""
+    n = len(frames)
+    # flicker of the lamp moves all pixels of a frame
+    levels = np.array([float(frame.mean()) for frame in frames])
+    total, square = np.zeros(frames.shape[1:]), np.zeros(frames.shape[1:])
+    for frame, level in zip(frames, levels, strict=True):
+        change = frame - level
+        total += change
+        square += change * change
+    pixel_mean = total / n + levels.mean()
+    temporal = (square - total * total / n) / (n - 1)
+    rough = pixel_mean - uniform_filter(pixel_mean, _BOX, mode="reflect")
+    half = _BOX // 2
+    inner = (slice(half, -half),) * 2
+    spatial = rough[inner] ** 2 / (1.0 - 1.0 / _BOX**2)
+    pixels, mean, noise = (_by_blocks(x[inner]) for x in (np.ones_like(pixel_mean), pixel_mean, temporal))
+    full = sum(int((frame >= top_dn).sum()) for frame in frames) / frames.size
+    flicker = float(levels.var(ddof=1)) / n
+    return BlockSums(pixels, mean, noise, _by_blocks(spatial), n, full, flicker)
+
+
+def _by_blocks(values: Array) -> Array:
+    """Sums over blocks, shape (blocks,), of an image."""
+    rows, columns = (np.linspace(0, side, _BLOCKS + 1).astype(int)[:-1] for side in values.shape)
+    return np.add.reduceat(np.add.reduceat(values, rows, axis=0), columns, axis=1).ravel()
+
+
+def jackknife_sigma(replicates: Array) -> float:
+    """Standard deviation of an estimate, of its value and those without each block."""
+    left_out = replicates[1:]
+    n = len(left_out)
+    return float(np.sqrt((n - 1) / n * np.sum((left_out - left_out.mean()) ** 2)))
+
+
+@dataclass(frozen=True)
+class CommonNoise:
+    """Noise that rows or whole frames of dark frames have in common.
+
+    Attributes
+    ----------
+    row_dn2, row_sigma_dn2 : variance of row noise, with its sigma
+    frame_dn2, frame_sigma_dn2 : variance of whole frames' levels, with its sigma if nothing moved them
+    rows : number of rows
+    """
+
+    row_dn2: float
+    row_sigma_dn2: float
+    frame_dn2: float
+    frame_sigma_dn2: float
+    rows: int
+
+    @property
+    def seen_row_dn2(self) -> float:
+        """Variance of row noise, or 0 where it does not stand out."""
+        return self.row_dn2 if self.row_dn2 > _ROW_SIGMAS * self.row_sigma_dn2 else 0.0
+
+    @property
+    def seen_frame_dn2(self) -> float:
+        """Variance of whole frames, or 0 where it does not stand out."""
+        return self.frame_dn2 if self.frame_dn2 > _FRAME_SIGMAS * self.frame_sigma_dn2 else 0.0
+
+    @property
+    def level_dn2(self) -> float:
+        """Variance of one frame's mean that its pixels do not explain."""
+        return self.seen_frame_dn2 + self.seen_row_dn2 / self.rows
+
+
+def common_noise(frames: NDArray[Any]) -> CommonNoise:
+    """Common noise of dark frames, shape (n, h, w): that of row means and frame means, less the pixels' share."""
+    n, h, w = frames.shape
+    mean = np.zeros((h, w))
+    for frame in frames:
+        mean += frame / n
+    rows = square = 0.0
+    for frame in frames:
+        change = frame - mean
+        change -= change.mean()
+        rows += float((change.mean(axis=1) ** 2).mean()) / n
+        square += float((change * change).mean()) / n
+    freedom = n / (n - 1) * h / (h - 1)
+    rows, white = rows * freedom, square * freedom / w
+    levels = float(np.var([float(frame.mean()) for frame in frames], ddof=1))
+    own = rows / h  # of a frame's mean, where nothing moves whole frames
+    return CommonNoise(
+        rows - white,
+        rows * float(np.sqrt(2.0 / ((n - 1) * (h - 1)))),
+        levels - own,
+        own * float(np.sqrt(2.0 / (n - 1))),
+        h,
+    )
+
+
+# -- rounding --------------------------------------------------------------------------------------------------------
+
+
+def rounded_moments(mean: float, temporal_sd: float, spatial_sd: float) -> Array:
+    """(mean, temporal variance, spatial variance), DN, of values rounded to codes.
+
+    A pixel's mean is Gaussian about `mean` with `spatial_sd`; its values are Gaussian about that with `temporal_sd`.
+    """
+    z = np.linspace(-5.0, 5.0, 201)
+    weights = np.exp(-0.5 * z * z)
+    weights /= weights.sum()
+    centre = mean + max(spatial_sd, 1e-9) * z
+    s = max(temporal_sd, 1e-6)
+    codes = np.arange(np.floor(centre.min() - 6.0 * s), np.ceil(centre.max() + 6.0 * s) + 1.0)
+    upper = ndtr((codes[None] + 0.5 - centre[:, None]) / s)
+    chance = np.diff(np.concatenate([np.zeros((len(z), 1)), upper], axis=1), axis=1)
+    chance[:, -1] += 1.0 - upper[:, -1]
+    first = chance @ (codes - mean)
+    second = chance @ (codes - mean) ** 2
+    total = float(weights @ first)
+    return np.array([mean + total, float(weights @ (second - first**2)), float(weights @ (first - total) ** 2)])
+
+
+def rounding_variance(mean: float, temporal_sd: float, spatial_sd: float) -> float:
+    """Temporal variance that rounding adds, DN^2; 1/12 where the noise is above 0.7 codes."""
+    if temporal_sd > 0.7:  # exp(-2 pi^2 0.49) = 6e-5 of a code^2 is left
+        return 1.0 / 12.0
+    return float(rounded_moments(mean, temporal_sd, spatial_sd)[1]) - temporal_sd**2
+
+
+def before_rounding(sums: BlockSums, frame_dn2: float = 0.0) -> Array:
+    """(mean, temporal variance, spatial variance) of dark frames before rounding, shape (replicates, 3).
+
+    Solved for the whole; the blocks' small changes follow by the derivative. Whole frames that jitter, `frame_dn2`
+    after rounding, move across codes: they are put back into the noise, and taken off behind the solution.
+    """
+    seen = np.stack([sums.mean_dn, sums.temporal_dn2 + frame_dn2, sums.spatial_dn2], axis=1)
+    start = np.array([seen[0, 0], max(seen[0, 1] - 1.0 / 12.0, 0.02), max(seen[0, 2], 1e-4)])  # inside the bounds
+
+    def model(x: Array) -> Array:
+        return rounded_moments(x[0], float(np.sqrt(x[1])), float(np.sqrt(x[2])))
+
+    # a pattern that sampling noise takes below 0 has no solution: the nearest one is taken
+    low = [-np.inf, 1e-6, 0.0]
+    found = least_squares(
+        lambda x: model(x) - seen[0], start, bounds=(low, np.inf), x_scale=[1.0, 0.1, 0.1], xtol=1e-12
+    ).x
+    steps = np.diag([1e-3, 1e-3 * max(found[1], 1e-3), 1e-3 * max(found[2], 1e-3)])
+    lower = np.maximum(found - steps, low)
+    jacobian = np.stack(
+        [(model(found + d) - model(least)) / (found + d - least).sum() for d, least in zip(steps, lower, strict=True)],
+        axis=1,
+    )
+    replicates = found + (seen - seen[0]) @ np.linalg.pinv(jacobian).T
+    replicates[:, 1] -= frame_dn2 / jacobian[0, 0] ** 2  # rounding passes on less, or more, of a small shift
+    return np.asarray(replicates)
