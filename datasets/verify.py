@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -46,7 +46,10 @@ from phibench.datasets.store.layers import (
     read_spot,
     read_truth,
 )
-from phibench.datasets.store.schema import ManifestRow, PoseInfo, RoomInfo, SpotRow
+from phibench.datasets.store.schema import LightRow, ManifestRow, PoseInfo, RoomInfo, SpotRow
+from phibench.render.optics.ray_tracer import trace_pixels
+from phibench.render.optics.reflection_point import mirror_points
+from phibench.render.optics.truth import mirror_angles
 from phibench.render.room.light_map import texel_count
 from phibench.render.room.noise_budget import BUDGETS
 from phibench.scenes.laser import LaserSpot
@@ -54,6 +57,7 @@ from phibench.scenes.rig import POSITIONS, View
 from phibench.scenes.room import Room
 
 _FLOAT32 = 1e-6  # float32 rounds by 6e-8; other machines' libm adds a little
+_ANGLE_RAD = 1e-9  # closed form against ray tracer: 1.3e-7 px of the default rig
 _ANSWERS = 64  # of 0.1 MB each
 _EDGE_PIXELS = 8  # pixels whose ray grazes an edge may see another object on another machine
 
@@ -229,6 +233,8 @@ def _spot_faults(
     for field, expected in _expected(answer):
         if not _same(getattr(row, field), expected):
             yield f"{name}: {field} is {getattr(row, field)}, the parameters give {expected}"
+    if row.light is not None:
+        yield from _light_faults(sample, position, row.light, answer)
     if answer.certificate is not None and not answer.certificate.passed:
         yield f"{name}: the certificate does not pass when it is computed again"
     if row.spot_file is not None and row.spot_file not in bad:
@@ -240,6 +246,29 @@ def _spot_faults(
 def _expected(answer: SpotAnswer) -> list[tuple[str, Any]]:
     extra = {"coma_shift_px": answer.coma_shift_px, "electrons_per_s": tuple(answer.layer.total_electrons_per_s)}
     return list({**asdict(answer.truth), **extra}.items())
+
+
+def _light_faults(sample: Sample, position: str, light: LightRow, answer: SpotAnswer) -> Iterator[str]:
+    """The light's place by the certificate's rays from the film, its angles by the closed form's reflection point.
+
+    The closed form is asked for a point on the ray that leaves the mirror where the light's centre is seen.
+    """
+    name, view = f"{sample.row.sample_id} {position}", sample.view(position)
+    expected = answer.light(view)
+    if expected is None or not all(_same(getattr(light, field), value) for field, value in expected):
+        yield f"{name}: light is {light}, the parameters give {expected}"
+        return
+    if answer.certificate is None:
+        return
+    ray = trace_pixels(view, np.array([[light.u_px, light.v_px]]))
+    point = ray.points_m[0] + answer.truth.path_spot_mirror_m * ray.directions[0]
+    bare = replace(sample.rig, holder=None).at(view.offset_m)  # the ray as it leaves the mirror, before any glass
+    back = mirror_points(bare, point[None], view.camera_centre_m[None])
+    leaving = point - back.points_m
+    angles = mirror_angles(back.normals, leaving / np.linalg.norm(leaving))
+    for field, value in vars(angles).items():
+        if not abs(value[0] - getattr(light, field)) <= _ANGLE_RAD:
+            yield f"{name}: light.{field} is {getattr(light, field)}, the closed form gives {value[0]}"
 
 
 def _same(a: Any, b: Any) -> bool:

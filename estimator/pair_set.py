@@ -5,6 +5,7 @@ A truth is never shown to a method. Positions are pixels (u, v), integers at pix
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import dataclass
 from functools import cache
@@ -31,7 +32,8 @@ class SpotTruth:
 
     Attributes
     ----------
-    uv_px : (u, v), the chief ray's; NaN where there is none, or a visible spot's place is not known: of a real pair
+    uv_px : (u, v), the centre of the light; NaN where there is none, or a visible spot's place is not known: of a real
+        pair
     phi_rad : dict of "ray", "normal", "incidence" to float
     azimuth_rad : float
     visible : bool
@@ -52,6 +54,7 @@ class SpotTruth:
     raw_bound_px2 : array, shape (2, 2), or None
         Bound of the raw pixels behind this image, whatever the output.
     distractions : tuple of Distraction
+    axis_px : (u, v), the image of the beam's axis; NaN where it is not known
     """
 
     uv_px: tuple[float, float]
@@ -66,6 +69,7 @@ class SpotTruth:
     bound_px2: Array | None
     raw_bound_px2: Array | None
     distractions: tuple[Distraction, ...] = ()
+    axis_px: tuple[float, float] = (math.nan, math.nan)
 
 
 @dataclass(frozen=True)
@@ -84,6 +88,7 @@ class PairTruth:
     hinted : bool
         The method got search boxes.
     depth_m, stroke_m : float
+        D of the light on the surfaces, and the true stroke.
     true_rig, nominal_rig : Rig
         The rig that was rendered, and the one in `Pair.rig`.
     down, up : SpotTruth
@@ -95,6 +100,8 @@ class PairTruth:
         Of both images; None where nobody knows.
     depth_sigma_m : float
         Of `depth_m` where it was measured by a tape; 0 of an exact one.
+    axis_depth_m : float
+        D of the beam's axis; NaN where it is not known.
     """
 
     number: int
@@ -116,6 +123,7 @@ class PairTruth:
     laser_level: float | None = None
     lamp_level: float | None = None
     depth_sigma_m: float = 0.0
+    axis_depth_m: float = math.nan
 
 
 class Pairs(Protocol):

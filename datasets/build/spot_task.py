@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -14,11 +15,13 @@ from phibench.datasets.plan.plan import PairPlan
 from phibench.datasets.rooms.room_sources import RoomSource, room_of
 from phibench.datasets.store import schema
 from phibench.datasets.store.layers import SpotWindow, write_spot
-from phibench.datasets.store.schema import CertificateRow, ManifestRow, SpotRow
+from phibench.datasets.store.schema import CertificateRow, LightRow, ManifestRow, SpotRow
 from phibench.render.optics.certificate import Certificate, certify
+from phibench.render.optics.ray_tracer import trace_pixels
 from phibench.render.optics.room_tracer import room_geometry
 from phibench.render.optics.spot_layer import SpotLayer, spot_layer
-from phibench.render.optics.truth import SpotTruth, depth_m, spot_truth
+from phibench.render.optics.truth import SpotTruth, depth_m, mirror_angles, spot_truth
+from phibench.scenes.frames import Array
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.rig import POSITIONS, Rig, Stroke, View
 from phibench.scenes.room import Room
@@ -40,6 +43,15 @@ class SpotAnswer:
         """Energy centroid minus chief ray, pixels (u, v)."""
         u_px, v_px = self.layer.centroid_uv_px
         return float(u_px) - self.truth.u_px, float(v_px) - self.truth.v_px
+
+    def light(self, view: View) -> LightRow | None:
+        """Centre of the light; None where none reaches the lens."""
+        uv = self.layer.centroid_uv_px
+        if not np.isfinite(uv).all():
+            return None
+        rays = trace_pixels(view, uv[None])
+        angles = {name: float(value[0]) for name, value in vars(mirror_angles(rays.normals, rays.directions)).items()}
+        return LightRow(u_px=float(uv[0]), v_px=float(uv[1]), **angles, place_world_m=_triple(self.layer.place_m))
 
 
 def answer_spot(view: View, spot: LaserSpot, room: Room) -> SpotAnswer:
@@ -105,6 +117,7 @@ def _write_layer(out: Path, dataset: str, pair: PairPlan, position: str, answer:
 
 def manifest_row(rig: Rig, spot: LaserSpot, pair: PairPlan, down: SpotRow, up: SpotRow) -> ManifestRow:
     """One row of the manifest."""
+    centre = rig.at(0.0).sphere_centre_m
     return ManifestRow(
         sample_id=pair.sample_id,
         experiment=pair.experiment,
@@ -112,7 +125,8 @@ def manifest_row(rig: Rig, spot: LaserSpot, pair: PairPlan, down: SpotRow, up: S
         rig=pair.rig,
         nominal_rig=pair.nominal_rig,
         room=pair.room,
-        depth_m=float(depth_m(np.array(spot.position_world_m), rig.at(0.0).sphere_centre_m)),
+        depth_m=float(depth_m(np.array(spot.position_world_m), centre)),
+        light_depth_m=light_depth_m((down, up), centre),
         stroke_m=pair.stroke_m,
         nominal_stroke_m=pair.nominal_stroke_m,
         spot_world_m=_triple(spot.position_world_m),
@@ -126,6 +140,12 @@ def manifest_row(rig: Rig, spot: LaserSpot, pair: PairPlan, down: SpotRow, up: S
     )
 
 
+def light_depth_m(rows: Iterable[SpotRow], sphere_centre_down_m: Array) -> float:
+    """D of the light on the surfaces: of the mean place of the views that see the spot; NaN where none does."""
+    places = [row.light.place_world_m for row in rows if row.visible and row.light is not None]
+    return float(depth_m(np.mean(places, axis=0), sphere_centre_down_m)) if places else math.nan
+
+
 def _spot_row(pose_id: str, view: View, answer: SpotAnswer, file: str | None) -> SpotRow:
     certificate = answer.certificate
     return SpotRow(
@@ -133,6 +153,7 @@ def _spot_row(pose_id: str, view: View, answer: SpotAnswer, file: str | None) ->
         offset_m=view.offset_m,
         **asdict(answer.truth),
         coma_shift_px=answer.coma_shift_px,
+        light=answer.light(view),
         electrons_per_s=_triple(answer.layer.total_electrons_per_s),
         view_ambient_file=schema.view_file(pose_id, "ambient"),
         view_truth_file=schema.view_file(pose_id, "truth"),

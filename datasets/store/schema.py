@@ -20,10 +20,11 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSeriali
 from phibench.datasets.input_files import FileName, Name, NoFileName, Text
 from phibench.datasets.rooms.room_sources import ONLY_ROOM
 
-SCHEMA_VERSION = 6
-READABLE_VERSIONS = (4, 5, 6)
+SCHEMA_VERSION = 7
+READABLE_VERSIONS = (4, 5, 6, 7)
 """Version 5 gave mirrors a form, `mirror.form` in `rigs.jsonl`; in version 4 every mirror is a perfect sphere.
-Version 6 gave samples rooms of their own, `rooms.jsonl`; before, `dataset.json` held the only one, shape by shape."""
+Version 6 gave samples rooms of their own, `rooms.jsonl`; before, `dataset.json` held the only one, shape by shape.
+Version 7 gave spots the centre of their light, `light`; before, there is the axis of the beam alone."""
 Position = Literal["down", "up"]
 
 
@@ -72,7 +73,13 @@ class CertificateRow(Document):
     centroid_tolerance_px: float = described("px", "largest allowed centroid_difference_px")
     flux_difference: float = described("1", "relative difference of the spot's electrons per second, same two")
     flux_tolerance: float = described("1", "largest allowed flux_difference")
-    passed: bool = described("-", "all three differences are within their tolerances; false is never shipped")
+    place_difference_m: Number = described(
+        "m", "place of the light on the surfaces, same two; null before version 7", default=math.nan
+    )
+    place_tolerance_m: Number = described(
+        "m", "largest allowed place_difference_m; null before version 7", default=math.nan
+    )
+    passed: bool = described("-", "all differences are within their tolerances; false is never shipped")
 
 
 class NoiseRow(Document):
@@ -80,6 +87,18 @@ class NoiseRow(Document):
 
     phi_sensor_rad: Number = described("rad", "standard deviation from photons and read noise, known shape and blur")
     phi_render_rad: Number = described("rad", "what the ambient layer's own noise adds, within the budget of `quality`")
+
+
+class LightRow(Document):
+    """Centre of a spot's light that reaches the image: what a perfect method finds."""
+
+    u_px: Number = described("px", "centre of the light in the image, to the right")
+    v_px: Number = described("px", "centre of the light in the image, downwards")
+    phi_ray_rad: Number = described("rad", "theta / 2 of the ray through (u_px, v_px) and the lens centre")
+    phi_normal_rad: Number = described("rad", "polar angle of the mirror normal where that ray meets it")
+    phi_incidence_rad: Number = described("rad", "angle of incidence there")
+    azimuth_rad: Number = described("rad", "azimuth of that normal")
+    place_world_m: Vector3 = described("m", "place of the light on the surfaces, weighted by power")
 
 
 class SpotRow(Document):
@@ -101,6 +120,9 @@ class SpotRow(Document):
     visible: bool = described("-", "whether the chief ray reaches the sensor")
     cause: str = described("-", "why not; 'none' if visible")
     coma_shift_px: Vector2 = described("px", "energy centroid of the spot minus (u_px, v_px)")
+    light: LightRow | None = described(
+        "-", "centre of the light; null where none reaches the image, and before version 7", default=None
+    )
     electrons_per_s: Vector3 = described("1/s", "electrons per second of the whole spot behind R, G, B")
     view_ambient_file: FileName = described("-", "ambient layer of the view")
     view_truth_file: FileName = described("-", "truth layer of the view")
@@ -113,11 +135,24 @@ class SpotRow(Document):
         """A visible spot has every number, a layer and a passed certificate."""
         if not self.visible:
             return self
-        if missing := [name for name, value in self if name != "noise" and not _is_finite(value)]:
+        if missing := [name for name, value in self if name not in ("noise", "light") and not _is_finite(value)]:
             raise ValueError(f"the spot is visible but has no {', '.join(missing)}")
+        if self.light is not None and not all(_is_finite(value) for _, value in self.light):
+            raise ValueError("the spot is visible but its light has no centre")
         if self.certificate is None or not self.certificate.passed:
             raise ValueError("the spot is visible but its certificate is missing or not passed")
         return self
+
+    @property
+    def centre(self) -> LightRow:
+        """Place that a perfect method finds: the centre of the light; the beam's axis where there is none."""
+        if self.light is not None and self.visible:
+            return self.light
+        angles = {name: getattr(self, name) for name in _ANGLES}
+        return LightRow(u_px=self.u_px, v_px=self.v_px, **angles, place_world_m=(math.nan, math.nan, math.nan))
+
+
+_ANGLES = ("phi_ray_rad", "phi_normal_rad", "phi_incidence_rad", "azimuth_rad")
 
 
 class ManifestRow(Document):
@@ -133,6 +168,11 @@ class ManifestRow(Document):
     room: RoomId = described("-", "id of the room, in `rooms.jsonl`", default=ONLY_ROOM)
     depth_m: float = described(
         "m", "D: horizontal distance of the spot from the vertical through the sphere centre, down"
+    )
+    light_depth_m: Number = described(
+        "m",
+        "D of the light on the surfaces, mean of both views; null where none is seen, and before version 7",
+        default=math.nan,
     )
     stroke_m: float = described("m", "stroke (baseline) h, the true one")
     nominal_stroke_m: float = described("m", "nominal stroke, which estimators are given")
@@ -152,6 +192,11 @@ class ManifestRow(Document):
     def position(self, name: str) -> SpotRow:
         """Truth of the stroke position "down" or "up"."""
         return {"down": self.down, "up": self.up}[name]
+
+    @property
+    def centre_depth_m(self) -> float:
+        """D that a perfect method finds: that of the light; that of the beam's axis where there is none."""
+        return self.light_depth_m if math.isfinite(self.light_depth_m) else self.depth_m
 
 
 class PoseInfo(Document):

@@ -45,6 +45,7 @@ TASK_VERSION = 6
 """Version of the task: what a method is given, what it must answer and what is counted. A change of any raises it.
 
 6: every preset exposes by itself, unless the recipe's `[frames]` says otherwise.
+6: positions, phi and D refer to the centre of the light, no longer to the beam's axis.
 5: spots may be hidden in one image, and a D of such a pair is false.
 4: a missed pair counts as the best constant depth would; a sealed set shows each sample once.
 """
@@ -100,7 +101,7 @@ class DatasetPairs(DrawnPairs):
             preset=pair_draw.preset,
             jpeg_quality=source.jpeg_quality,
             hinted=pair_draw.boxes is not None,
-            depth_m=sample.row.depth_m,
+            depth_m=sample.row.centre_depth_m,
             stroke_m=sample.row.stroke_m,
             true_rig=sample.rig,
             nominal_rig=sample.nominal_rig,
@@ -111,6 +112,7 @@ class DatasetPairs(DrawnPairs):
             analogue_gain=sensor.analogue_gain,
             laser_level=source.request.laser_level,
             lamp_level=source.request.lamp_level,
+            axis_depth_m=sample.row.depth_m,
         )
 
     def number_of(self, sample_id: str, draw: int = 0, preset: str | None = None) -> int:
@@ -231,17 +233,19 @@ def _with_boxes(dataset: Dataset, chosen: tuple[PairDraw, ...], side_px: int, hi
 
 def _spot_truth(sample: CachedSample, source: FrameSource, position: str, frames: FrameCounts | None) -> SpotTruth:
     row, side = sample.row.position(position), source.sides[position]
-    uv_px = (row.u_px, row.v_px)
-    beam, depth_m = Beam(sample.row.spot_diameter_m, 0.0), sample.row.depth_m
+    centre = row.centre
+    uv_px = (centre.u_px, centre.v_px)
+    beam, depth_m = Beam(sample.row.spot_diameter_m, 0.0), sample.row.centre_depth_m
     bounds = spot_bounds(
         side, sample.rig, uv_px, row.electrons_per_s, row.visible, depth_m=depth_m, beam=beam, frames=frames
     )
     return SpotTruth(
         uv_px=uv_px,
-        phi_rad={"ray": row.phi_ray_rad, "normal": row.phi_normal_rad, "incidence": row.phi_incidence_rad},
-        azimuth_rad=row.azimuth_rad,
+        phi_rad={"ray": centre.phi_ray_rad, "normal": centre.phi_normal_rad, "incidence": centre.phi_incidence_rad},
+        azimuth_rad=centre.azimuth_rad,
         visible=row.visible,
         cause=row.cause,
+        axis_px=(row.u_px, row.v_px),
         **vars(bounds),
         distractions=_distractions(sample, side, position),
     )

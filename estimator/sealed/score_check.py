@@ -30,7 +30,18 @@ from phibench.estimator.interface import Outcome
 RELATIVE, ABSOLUTE = 1e-6, 1e-12
 """Tolerance of a number that is computed again: other processors and versions of libraries round otherwise."""
 _TRUTHS = (
-    *("sample_id", "draw", "preset", "jpeg_quality", "hinted", "depth_m", "stroke_m", "azimuth_rad", "electrons"),
+    *(
+        "sample_id",
+        "draw",
+        "preset",
+        "jpeg_quality",
+        "hinted",
+        "depth_m",
+        "axis_depth_m",
+        "stroke_m",
+        "azimuth_rad",
+        "electrons",
+    ),
     *("snr", "saturated", "visible", "unseen_because", "u_true_px", "v_true_px", "from_centre_px", "bayer"),
     *("bound_px2", "raw_bound_px2", "bound_phi_rad2", "pair_bound_px2", "pair_bound_phi_rad2", "bound_depth_m2"),
     *("pair_bound_depth_m2", "pair_visible", "pair_electrons"),

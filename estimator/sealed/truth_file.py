@@ -82,6 +82,7 @@ class SpotTruthRow(Document):
     bound_px2: _Matrix | None
     raw_bound_px2: _Matrix | None
     distractions: Annotated[tuple[DistractionRow, ...], Field(strict=False, max_length=1000)]
+    axis_px: _Place = (math.nan, math.nan)
 
 
 class TruthRow(Document):
@@ -104,6 +105,7 @@ class TruthRow(Document):
     analogue_gain: _Real | None = None
     laser_level: _Real | None = None
     lamp_level: _Real | None = None
+    axis_depth_m: _RealOrNan = math.nan
 
     @model_validator(mode="before")
     @classmethod

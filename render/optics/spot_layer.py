@@ -50,6 +50,8 @@ class SpotLayer:
         Energy centroid over spot and aperture before pixel sampling; NaN when dark.
     total_electrons_per_s : array, shape (3,)
         Electrons per second of the whole spot, window or not.
+    place_m : array, shape (3,)
+        Place of that light on the room's surfaces: the mean, weighted by power, world; NaN when dark.
     """
 
     u0_px: int
@@ -59,6 +61,7 @@ class SpotLayer:
     dv_electrons_per_s_px: Array
     centroid_uv_px: Array
     total_electrons_per_s: Array
+    place_m: Array
 
 
 def spot_layer(view: View, spot: LaserSpot, room: GeometryLike, log2_pairs: int | None = None) -> SpotLayer:
@@ -100,7 +103,7 @@ def splat(cloud: FilmCloud, sigma_px: float, electrons_per_joule: Array) -> Spot
         images += np.stack([down.T @ across, down.T @ d_across, d_down.T @ across])
     layer, du, dv = images[:, None] * electrons_per_joule[:, None, None]
     total = watts.sum() * electrons_per_joule
-    return SpotLayer(int(low[0]), int(low[1]), layer, du, dv, cloud.centroid_px(), total)
+    return SpotLayer(int(low[0]), int(low[1]), layer, du, dv, cloud.centroid_px(), total, cloud.place_m())
 
 
 def _pixel_integrals(centre: Array, low: int, high: int, sigma: float) -> tuple[Array, Array]:
@@ -129,7 +132,7 @@ def _integrals(edges_px: Array, sigma: float) -> tuple[Array, Array]:
 
 def _dark_layer() -> SpotLayer:
     zeros = np.zeros((3, 1, 1))
-    return SpotLayer(0, 0, zeros, zeros, zeros, np.full(2, np.nan), np.zeros(3))
+    return SpotLayer(0, 0, zeros, zeros, zeros, np.full(2, np.nan), np.zeros(3), np.full(3, np.nan))
 
 
 # Rough mirror.
@@ -163,7 +166,7 @@ def rough_cloud(view: View, spot: LaserSpot, room: RoomGeometry) -> FilmCloud:
     density = np.exp(-0.5 * (film**2).sum(axis=1)) / (2.0 * math.pi * _WIDER**2 * abs(np.linalg.det(spread)))
     watts = _power(view, spot, room, uv, lens, light) / density / 2**log2_samples
     seen = np.isfinite(watts)
-    return FilmCloud(uv[seen], watts[seen])
+    return FilmCloud(uv[seen], watts[seen], light.points_m[seen])
 
 
 def _log2_samples(spread_px: Array, blur_px: float) -> int:

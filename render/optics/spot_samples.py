@@ -148,15 +148,25 @@ class FilmCloud:
     ----------
     uv_px : array, shape (N, 2)
     watts : array, shape (N,)
+    points_m : array, shape (N, 3), or None
+        Places on the room's surfaces that the light comes from, world.
     """
 
     uv_px: Array
     watts: Array
+    points_m: Array | None = None
 
     def centroid_px(self) -> Array:
         """Energy centroid (u, v), shape (2,); NaN when there is no light."""
         with np.errstate(invalid="ignore"):
             return self.watts @ self.uv_px / self.watts.sum()
+
+    def place_m(self) -> Array:
+        """Mean place on the surfaces, weighted by power, shape (3,); NaN when there is no light or no place."""
+        if self.points_m is None or not len(self.watts):
+            return np.full(3, np.nan)
+        with np.errstate(invalid="ignore"):
+            return self.watts @ self.points_m / self.watts.sum()
 
 
 def specular_cloud(view: View, spot: LaserSpot, room: GeometryLike, log2_pairs: int | None = None) -> FilmCloud:
@@ -219,7 +229,12 @@ def _is_cut(view: View, spot: LaserSpot, room: RoomGeometry, probes: Deposit) ->
 def _joined(parts: Sequence[FilmCloud]) -> FilmCloud:
     if not parts:
         return FilmCloud(np.empty((0, 2)), np.empty(0))
-    return FilmCloud(np.concatenate([p.uv_px for p in parts]), np.concatenate([p.watts for p in parts]))
+    places = [p.points_m for p in parts if p.points_m is not None]
+    return FilmCloud(
+        np.concatenate([p.uv_px for p in parts]),
+        np.concatenate([p.watts for p in parts]),
+        np.concatenate(places) if len(places) == len(parts) else None,
+    )
 
 
 def film_position(view: View, lens_m: Array, mirror_m: Array) -> Array:
@@ -301,7 +316,7 @@ def _connect(view: View, spot: LaserSpot, room: RoomGeometry, light: Deposit, ey
     free = _unobstructed(room, (*way.legs, (eyes, mirror)), lit)
     pose = view.T_world_camera.inverse()
     uv = film_position(view, pose.points(eyes), pose.points(mirror))
-    return FilmCloud(uv[lit], np.where(free, watts, 0.0)[lit])
+    return FilmCloud(uv[lit], np.where(free, watts, 0.0)[lit], points[lit])
 
 
 def _unobstructed(room: RoomGeometry, legs: tuple[tuple[Array, Array], ...], lit: BoolArray) -> BoolArray:

@@ -137,7 +137,7 @@ def test_accuracy_flux_against_traced_rays() -> None:
         view = formed(form).at(0.4)
         gain = view.rig.camera.detector.laser_electrons_per_joule(spot.wavelength_nm)[0]
         total = float(spot_layer(view, spot, ()).total_electrons_per_s[0])
-        _, watts = trace_spot(view, spot, (), spot_truth(view, spot, ()), 15)
+        watts = trace_spot(view, spot, (), spot_truth(view, spot, ()), 15).watts
         assert total == pytest.approx(watts * gain, rel=3e-4)
         sphere = float(spot_layer(default_rig().at(0.4), spot, ()).total_electrons_per_s[0])
         checked += abs(total / sphere - 1.0) > 5e-3

@@ -102,6 +102,7 @@ def places(shape: str, count: int) -> tuple[Place, ...]:
             layer.dv_electrons_per_s_px / layer.total_electrons_per_s[0],
             layer.centroid_uv_px - corner,
             layer.total_electrons_per_s / layer.total_electrons_per_s[0],
+            layer.place_m,
         )
         found.append(Place(moved, uv - corner, spot_blur(rig, uv, D, BEAM)))
         if len(found) == count:

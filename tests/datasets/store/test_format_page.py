@@ -19,6 +19,7 @@ PAGE = (Path(schema.__file__).resolve().parents[1] / "FORMAT.md").read_text(enco
 MODELS = (
     schema.ManifestRow,
     schema.SpotRow,
+    schema.LightRow,
     schema.CertificateRow,
     schema.NoiseRow,
     schema.DatasetInfo,
