@@ -44,8 +44,7 @@ class SpotTruth:
     peak_e : float
         Largest expected electrons of a pixel, room included.
     snr : float
-        Flux over its standard deviation at the bound of this image, after all processing. The position counts as known,
-        the room's levels do not.
+        Signal to noise of the light in this image, after all processing, place and room known (`limits.spot_snr`).
     saturated : bool
         A pixel of the spot is expected above the sensor's saturation.
     bound_px2 : array, shape (2, 2), or None

@@ -8,13 +8,17 @@ edge          the spot's image is nearer than 3 blurs to the mirror's outline or
 confused      the answer is within `match_px` of another light, or its 4 x 4 pixels (two Bayer cells) are brighter than
               the spot's: in the image as it is, or less the laser-off image. A lamp that the laser-off image would have
               ruled out is still what the method was confused by
-below_noise   flux below 5 standard deviations. The largest of 1280 x 720 Gaussian numbers is 4.9 deviations on
-              average: a fainter spot cannot be told from noise (A. Rose, J. Opt. Soc. Am. 38, 196, 1948, has 5 for
-              the eye)
+below_noise   signal to noise (`limits.spot_snr`) below 5. The largest of 1280 x 720 Gaussian numbers is 4.9
+              deviations on average: a fainter spot cannot be told from noise (A. Rose, J. Opt. Soc. Am. 38, 196,
+              1948, has 5 for the eye)
 compression   the raw pixels are good enough (bound below 1 px along each axis), but the spot is lost in the 8-bit
               image: in every colour the mean of its 3 x 3 pixels is less than one code, or less than 3 standard
               errors, above the median of the ring 4 to 8 px around. The error is that of 9 pixels with the ring's
               deviation (1.4826 MAD)
+
+The image itself is the cause only where a fit that knows where to look does no better: where such a fit reaches its
+bound (`fit_at_truth`), `mirror_edge`, `image_edge`, `saturated`, `below_noise` and `compression` do not hold, and the
+method's own fault shows.
 
 A crash on an image without a spot counts as `occluded`; failures of the method are counted apart, `count_failures`.
 """
@@ -31,7 +35,8 @@ import numpy as np
 import polars as pl
 
 from phibench.estimator.benchmark.answer_errors import Rules
-from phibench.estimator.interface import FAILURES, Pair
+from phibench.estimator.benchmark.fit_at_truth import Reference, fit_at_truth, reaches_bound
+from phibench.estimator.interface import FAILURES, Answer, Pair
 from phibench.estimator.pair_set import PairSet, PairTruth, SpotTruth
 from phibench.estimator.spots.camera_codes import rgb_codes
 from phibench.estimator.spots.image_planes import PROCESSED
@@ -63,6 +68,7 @@ class Case:
     failure: str
     draw: Callable[[int], Pair]
     rules: Rules
+    fit: Callable[[Pair, PairTruth], Answer | None] = fit_at_truth
 
     @property
     def spot(self) -> SpotTruth:
@@ -78,6 +84,12 @@ class Case:
     def pair(self) -> Pair:
         """Images."""
         return self.draw(self.truth.number)
+
+    @cached_property
+    def allows_a_fit(self) -> bool:
+        """Whether a fit that knows where to look reaches its bound in this image."""
+        answer = self.fit(self.pair, self.truth)
+        return reaches_bound(answer, self.position, self.spot, self.rules.match_px)
 
     def region(self, uv_px: Array, before: int, after: int, less_off: bool = False) -> Array:
         """Codes of the pixels from `before` to `after` around one, inclusive, shape (h, w, planes).
@@ -97,10 +109,14 @@ class Case:
 
 def cause_of(case: Case) -> str:
     """The cause: the name of the first rule that holds."""
-    return next((name for name, holds in _RULES.items() if holds(case)), case.failure or "method")
+    return next((name for name in _RULES if _is_cause(case, name)), case.failure or "method")
 
 
-def with_causes(records: pl.DataFrame, pairs: PairSet, rules: Rules) -> pl.DataFrame:
+def _is_cause(case: Case, name: str) -> bool:
+    return _RULES[name](case) and not (name in _OF_THE_IMAGE and case.spot.visible and case.allows_a_fit)
+
+
+def with_causes(records: pl.DataFrame, pairs: PairSet, rules: Rules, fit: Reference = fit_at_truth) -> pl.DataFrame:
     """Records with `kind`, `cause` and, of false detections, `taken_for`; null where the spot was detected.
 
     Parameters
@@ -109,13 +125,15 @@ def with_causes(records: pl.DataFrame, pairs: PairSet, rules: Rules) -> pl.DataF
     pairs : PairSet
         Images are asked for only where a rule looks at them, those of a pair twice at most: give `CachedPairs`.
     rules : Rules
+    fit : Reference
+        Fit that knows where to look.
     """
     columns: dict[str, list[str | None]] = {"kind": [], "cause": [], "taken_for": []}
     for row in records.iter_rows(named=True):
         if row["detected"]:
             values: tuple[str | None, ...] = (None, None, None)
         else:
-            case, kind = _case(row, pairs, rules), _kind(row)
+            case, kind = _case(row, pairs, rules, fit), _kind(row)
             values = kind, cause_of(case), taken_for(case) if kind == "false" else None
         for name, value in zip(columns, values, strict=True):
             columns[name].append(value)
@@ -135,9 +153,9 @@ def count_failures(records: pl.DataFrame) -> dict[str, int]:
     return {name: numbers[name] for name in FAILURES}
 
 
-def _case(row: dict[str, Any], pairs: PairSet, rules: Rules) -> Case:
+def _case(row: dict[str, Any], pairs: PairSet, rules: Rules, fit: Reference) -> Case:
     answer = None if row["u_px"] is None else np.array([row["u_px"], row["v_px"]])
-    return Case(row["image"], pairs.truth(row["number"]), answer, row["failure"], pairs.pair, rules)
+    return Case(row["image"], pairs.truth(row["number"]), answer, row["failure"], pairs.pair, rules, fit)
 
 
 def _kind(row: dict[str, Any]) -> str:
@@ -207,13 +225,14 @@ _RULES: dict[str, Callable[[Case], bool]] = {
     "below_noise": _below_noise,
     "compression": _compression,
 }
+_OF_THE_IMAGE = ("mirror_edge", "image_edge", "saturated", "below_noise", "compression")
 CAUSES: dict[str, str] = {
     "occluded": "spot not visible: an object in the way, or the wall that carries it faces away",
     "mirror_edge": "spot not reflected, or cut off at the mirror's outline",
     "image_edge": "spot outside the image, or cut off at its edge",
-    "saturated": "a pixel of the spot is expected above saturation: its shape is lost",
+    "saturated": "a pixel of the spot is expected above saturation, and no fit at its place reaches the bound",
     "confused": "the answer is another light, or a region brighter than the spot",
-    "below_noise": "flux of the spot below 5 standard deviations",
+    "below_noise": "signal to noise of the spot below 5",
     "compression": "spot good enough in the raw pixels, lost in the 8-bit image",
     "error": "the method raised an exception",
     "timeout": "the method took longer than --seconds",
@@ -221,7 +240,7 @@ CAUSES: dict[str, str] = {
     "memory": "the method needed more than --memory-mb",
     "invalid": "the method's answer breaks the rules of the interface",
     "mutated": "the method wrote into its input",
-    "method": "none of these: the light was there",
+    "method": "none of these: the light was there, or a fit at its place reaches the bound",
 }
 """Causes in the order in which they are tried, with their definitions."""
 

@@ -32,8 +32,8 @@ from phibench.estimator.interface import Pair
 from phibench.estimator.limits.off_frame_bound import FrameCounts, on_off_limit, processed_on_off_limit
 from phibench.estimator.limits.position_bound import SpotLimit, spot_limit
 from phibench.estimator.limits.processed_bound import chain_limit
+from phibench.estimator.limits.spot_snr import processed_snr, raw_snr
 from phibench.estimator.pair_set import Distraction, PairSet, PairTruth, SpotTruth, truth_folders
-from phibench.estimator.spots.fisher import covariance_bound
 from phibench.estimator.spots.gaussian_spot import SpotBlur
 from phibench.estimator.spots.image_planes import PROCESSED
 from phibench.estimator.spots.spot_prediction import spot_blur
@@ -44,15 +44,15 @@ from phibench.scenes.rig import Rig
 TASK_VERSION = 6
 """Version of the task: what a method is given, what it must answer and what is counted. A change of any raises it.
 
-6: every preset exposes by itself, unless the recipe's `[frames]` says otherwise.
-6: positions, phi and D refer to the centre of the light, no longer to the beam's axis.
+6: every preset exposes by itself, unless the recipe's `[frames]` says otherwise; positions, phi and D refer to the
+   centre of the light, no longer to the beam's axis; signal to noise is one definition for all presets.
 5: spots may be hidden in one image, and a D of such a pair is false.
 4: a missed pair counts as the best constant depth would; a sealed set shows each sample once.
 """
 
 
 _OF_THE_SPOT = 0.01  # of its brightest pixel: dimmer pixels are not the spot's
-_POSITION = 2  # unknowns of a position, the first ones of a Fisher matrix
+_FLUX = 2  # place of the flux among the unknowns of a Fisher matrix
 
 
 LEAST_BOX_PX = 16
@@ -313,18 +313,23 @@ def spot_bounds(
     card = card_of(raw)
     region = expected_of_light(side.light, raw, rig.camera) if visible else None
     raw_limit = None if region is None else _raw_limit(region, card, pattern_known, frames)
-    limit, electrons, unit = raw_limit, spot_electrons(rates_per_s, side), 1.0
+    limit, electrons, snr = raw_limit, spot_electrons(rates_per_s, side), 0.0
     if region is not None and sensor.output in PROCESSED:
         blur = spot_blur(rig, uv_px, depth_m, beam)
-        limit, unit = (
-            _processed_limit(region, card_of(sensor), rig, uv_px, blur, electrons, pattern_known, frames),
-            electrons,
-        )
+
+        def limit_of_part(part: float) -> SpotLimit:
+            light = part * electrons
+            return _processed_limit(region, card_of(sensor), rig, uv_px, blur, light, pattern_known, frames)
+
+        limit = limit_of_part(1.0)
+        snr = processed_snr(lambda part: _information(limit_of_part(part), electrons), _information(limit, electrons))
+    elif region is not None:
+        snr = raw_snr(region, card, frames, pattern_known)
     peak_e = 0.0 if region is None else _peak_e(region)
     return SpotBounds(
         electrons=electrons,
         peak_e=peak_e,
-        snr=0.0 if limit is None else _snr(limit, unit),
+        snr=snr,
         saturated=peak_e > card.saturation_e,
         bound_px2=_bound(limit),
         raw_bound_px2=_bound(raw_limit),
@@ -376,10 +381,9 @@ def _peak_e(region: ExpectedRegion) -> float:
     return float(region.mean_e[region.spot_e >= _OF_THE_SPOT * region.spot_e.max()].max())
 
 
-def _snr(limit: SpotLimit, flux: float) -> float:
-    """Flux, in the unit of the limit, over its deviation at the limit: position known, background unknown."""
-    variance = covariance_bound(limit.fisher[_POSITION:, _POSITION:], keep=1)[0, 0]
-    return float(flux / np.sqrt(variance)) if variance > 0.0 else 0.0
+def _information(limit: SpotLimit, flux_e: float) -> float:
+    """Information of an image about a spot's relative flux, place and room known."""
+    return float(flux_e**2 * limit.fisher[_FLUX, _FLUX])
 
 
 # -- with a calibration ------------------------------------------------------------------------------------------------

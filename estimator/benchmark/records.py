@@ -58,7 +58,7 @@ COLUMNS: dict[str, str] = {
     "stroke_m": "h",
     "azimuth_rad": "azimuth of the mirror's normal",
     "electrons": "expected electrons of the spot",
-    "snr": "flux over its standard deviation, position known",
+    "snr": "signal to noise of the light, place and room known (docs/limits.md)",
     "saturated": "a pixel of the spot is expected above saturation",
     "visible": "whether the chief ray reaches the sensor",
     "unseen_because": "why not; none if visible",

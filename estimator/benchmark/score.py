@@ -40,6 +40,7 @@ from phibench.estimator.benchmark.document import (
     document_of,
     write_score,
 )
+from phibench.estimator.benchmark.fit_at_truth import KeptFits
 from phibench.estimator.benchmark.records import in_order, missed_relative, record_table, with_missed
 from phibench.estimator.benchmark.report import time_section, write_report
 from phibench.estimator.benchmark.worst_images import worst, worst_of, worst_records
@@ -126,9 +127,10 @@ def score_methods(
         answered += len(answers)
         if stages is not None:
             stages["bounds"] = stages.get("bounds", 0.0) + held.truth_seconds
+        fits = KeptFits()
         for part, outcomes in zip(parts, zip(*answers, strict=True), strict=True):
             with _timed("statistics", stages):
-                part.append(examine(held, outcomes, rules, part[-1].leading if part else None))
+                part.append(examine(held, outcomes, rules, part[-1].leading if part else None, fits))
     with _timed("statistics", stages):
         return [
             _scored(method, pairs, part, rules, seed, limits or {}) for method, part in zip(methods, parts, strict=True)
@@ -167,11 +169,28 @@ def score_outcomes(
     return _scored(method, pairs, parts, rules, seed, limits or {})
 
 
-def examine(pairs: PairSet, outcomes: Sequence[Outcome], rules: Rules, before: pl.DataFrame | None = None) -> Examined:
-    """Join outcomes with truth and images; `before` is `Examined.leading` of the pairs before."""
+def examine(
+    pairs: PairSet,
+    outcomes: Sequence[Outcome],
+    rules: Rules,
+    before: pl.DataFrame | None = None,
+    fits: KeptFits | None = None,
+) -> Examined:
+    """Join outcomes with truth and images.
+
+    Parameters
+    ----------
+    pairs : PairSet
+    outcomes : of some of the pairs
+    rules : Rules
+    before : optional
+        `Examined.leading` of the pairs before.
+    fits : KeptFits, optional
+        Fits at the truth of the same pairs, which methods share.
+    """
     truths = [pairs.truth(outcome.number) for outcome in outcomes]
     table = record_table(truths, outcomes, rules)
-    table = with_causes(table, pairs, rules)
+    table = with_causes(table, pairs, rules, fits or KeptFits())
     return Examined(table, worst(table, pairs, before=before), worst_records(table, before=before))
 
 

@@ -23,6 +23,7 @@ from phibench.estimator.geometry.mirror_image import image_of
 from phibench.estimator.geometry.phi import phi_incidence, phi_normal, phi_ray
 from phibench.estimator.interface import Box, Pair
 from phibench.estimator.limits.position_bound import spot_limit
+from phibench.estimator.limits.spot_snr import raw_snr
 from phibench.estimator.methods.locate import around, clipped
 from phibench.estimator.pair_set import PairTruth, SpotTruth
 from phibench.estimator.sandbox.resolve import MethodError
@@ -311,7 +312,7 @@ def _spot_truth(camera: EasyCamera, scene: EasyScene, spot: EasySpot) -> SpotTru
         "none",
         float(region.spot_e.sum()),
         peak,
-        float(region.spot_e.sum() / np.sqrt(region.mean_e[region.spot_e > 0.01 * region.spot_e.max()].sum())),
+        raw_snr(region, card),
         peak > card.saturation_e,
         bound if card.output == "raw" else None,
         bound,
