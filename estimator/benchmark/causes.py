@@ -35,8 +35,8 @@ import numpy as np
 import polars as pl
 
 from phibench.estimator.benchmark.answer_errors import Rules
-from phibench.estimator.benchmark.fit_at_truth import Reference, fit_at_truth, reaches_bound
 from phibench.estimator.interface import FAILURES, Answer, Pair
+from phibench.estimator.methods.fit_at_truth import Reference, fit_at_truth, reaches_bound
 from phibench.estimator.pair_set import PairSet, PairTruth, SpotTruth
 from phibench.estimator.spots.camera_codes import rgb_codes
 from phibench.estimator.spots.image_planes import PROCESSED
@@ -87,7 +87,7 @@ class Case:
 
     @cached_property
     def allows_a_fit(self) -> bool:
-        """Whether a fit that knows where to look reaches its bound in this image."""
+        """True if a fit that knows where to look reaches its bound in this image."""
         answer = self.fit(self.pair, self.truth)
         return reaches_bound(answer, self.position, self.spot, self.rules.match_px)
 

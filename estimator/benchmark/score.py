@@ -40,7 +40,6 @@ from phibench.estimator.benchmark.document import (
     document_of,
     write_score,
 )
-from phibench.estimator.benchmark.fit_at_truth import KeptFits
 from phibench.estimator.benchmark.records import in_order, missed_relative, record_table, with_missed
 from phibench.estimator.benchmark.report import time_section, write_report
 from phibench.estimator.benchmark.worst_images import worst, worst_of, worst_records
@@ -49,6 +48,7 @@ from phibench.estimator.captures.imported_set import ImportedSet, imported_pairs
 from phibench.estimator.captures.spot_shape import with_shape
 from phibench.estimator.interface import Box, Method, Outcome
 from phibench.estimator.limits.off_frame_bound import FrameCounts
+from phibench.estimator.methods.fit_at_truth import KeptFits
 from phibench.estimator.methods.registry import METHODS, BuiltIn
 from phibench.estimator.pair_set import CachedPairs, PairSet, truth_folders
 from phibench.estimator.sandbox.pairs_ahead import PairsAhead

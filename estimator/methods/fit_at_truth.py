@@ -17,14 +17,13 @@ from phibench.estimator.methods.chain_fit import chain_fit
 from phibench.estimator.methods.raw_likelihood import raw_likelihood
 from phibench.estimator.pair_set import PairTruth, SpotTruth
 from phibench.estimator.spots.image_planes import PROCESSED
-from phibench.scenes.rig import POSITIONS
 
 _BOX_PX = 24
 _SIGMAS = 4.0  # of the bound: a fit at the bound is further off in 3e-4 of the cases
 
 
 class Reference(Protocol):
-    """What answers a pair as a fit at the truth does."""
+    """Function that answers a pair as a fit at the truth does."""
 
     def __call__(self, pair: Pair, truth: PairTruth) -> Answer | None:
         """Answer; None where there is none."""
@@ -32,13 +31,7 @@ class Reference(Protocol):
 
 def fit_at_truth(pair: Pair, truth: PairTruth) -> Answer:
     """Answer of the built-in fit, which is shown boxes about the true places."""
-    spots = {p: getattr(truth, p) for p in POSITIONS}
-    boxes = {
-        f"box_{p}": _box_about(spot, pair.images[p])
-        for p, spot in spots.items()
-        if spot.visible and np.isfinite(spot.uv_px).all()
-    }
-    shown = replace(pair, **boxes)
+    shown = replace(pair, box_down=_box_about(truth.down, pair.down), box_up=_box_about(truth.up, pair.up))
     return chain_fit(shown) if pair.card.output in PROCESSED else raw_likelihood(shown)
 
 
@@ -68,7 +61,9 @@ def reaches_bound(answer: Answer | None, position: str, spot: SpotTruth, match_p
     return reach <= match_px and float(np.linalg.norm(np.subtract(found.uv_px, spot.uv_px))) <= reach
 
 
-def _box_about(spot: SpotTruth, image: Image) -> Box:
+def _box_about(spot: SpotTruth, image: Image) -> Box | None:
+    if not (spot.visible and np.isfinite(spot.uv_px).all()):
+        return None
     height, width = image.shape[:2]
     u0, v0 = (round(x) - _BOX_PX // 2 for x in spot.uv_px)
     left, top = max(min(u0, width - _BOX_PX), 0), max(min(v0, height - _BOX_PX), 0)
