@@ -15,7 +15,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from phibench.datasets.rooms.mesh_files import MeshPart, read_mesh
+from phibench.datasets.rooms.mesh_files import read_mesh
+from phibench.datasets.rooms.mesh_parts import MeshPart
 from phibench.datasets.rooms.room_files import RoomError
 from phibench.scenes.frames import Array, Vector
 from phibench.scenes.room import chassis

@@ -20,7 +20,7 @@ from PIL import Image
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from phibench.datasets.rooms.mesh_files import MeshPart, Paint, Picture
+from phibench.datasets.rooms.mesh_parts import MeshPart, Paint, Picture
 from phibench.datasets.rooms.mesh_placement import (
     MIRROR_TOP_M,
     MeshSettings,

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from phibench.datasets.rooms.mesh_files import MeshPart
+from phibench.datasets.rooms.mesh_parts import MeshPart
 from phibench.datasets.rooms.mesh_placement import EXTENT_M, corners_of, placed_parts
 from phibench.datasets.rooms.mesh_room import MOST_VALUES, mesh_shape
 from phibench.datasets.rooms.panorama_files import Light, read_panorama

@@ -16,7 +16,7 @@ from functools import cache, lru_cache
 from importlib import metadata
 from pathlib import Path
 
-PACKAGES = ("phibench", "numpy", "scipy", "mitsuba", "drjit", "OpenEXR", "pydantic", "polars", "pillow", "trimesh")
+PACKAGES = ("phibench", "numpy", "scipy", "mitsuba", "drjit", "OpenEXR", "pydantic", "polars", "pillow")
 _FOLDERS = ("scenes", "render", "datasets")
 
 

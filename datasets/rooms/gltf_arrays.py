@@ -1,0 +1,195 @@
+"""Arrays of a glTF file: chunks of a .glb, buffers, views, accessors with strides, sparse entries and whole numbers.
+
+glTF 2.0, sections 3.6 and 4 (Khronos Group, 2021; ISO/IEC 12113:2022). Every number of the document is looked at before
+it is used: the file is a stranger's.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phibench.datasets.input_files import InputFile
+from phibench.datasets.rooms.mesh_parts import MOST_TRIANGLES, Companions, damaged
+from phibench.scenes.frames import Array
+from phibench.scenes.validation import printable_line
+
+_KINDS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+MOST_ENTRIES = 3 * MOST_TRIANGLES
+
+
+class GltfDocument:
+    """Document of a glTF file and the bytes behind it.
+
+    Parameters
+    ----------
+    file : InputFile
+    companions : Companions
+
+    Raises
+    ------
+    RoomError
+        If it is damaged.
+    """
+
+    def __init__(self, file: InputFile, companions: Companions) -> None:
+        self.file, self.companions = file, companions
+        data, self._binary = file.read(), b""
+        if data[:4] == b"glTF":
+            text, self._binary = self._chunks(data)
+            self.tree = file.json(text)
+        else:
+            self.tree = file.json(data)
+        version = self.table(self.tree, "asset").get("version", "2.0")
+        if not str(version).startswith("2."):
+            raise file.fault(f"is glTF {printable_line(str(version), 10)}: 2.0 is read")
+        self._buffers: dict[int, bytes] = {}
+
+    def _chunks(self, data: bytes) -> tuple[bytes, bytes]:
+        """Text and binary chunk of a .glb file."""
+        found: dict[bytes, bytes] = {}
+        at = 12
+        while at + 8 <= len(data):
+            length, kind = int.from_bytes(data[at : at + 4], "little"), data[at + 4 : at + 8]
+            if at + 8 + length > len(data):
+                raise self.file.fault("is damaged: it ends within a chunk")
+            found.setdefault(kind, data[at + 8 : at + 8 + length])
+            at += 8 + length
+        if b"JSON" not in found:
+            raise self.file.fault("is damaged: it has no JSON chunk")
+        return found[b"JSON"], found.get(b"BIN\0", b"")
+
+    # Values of the document.
+
+    def rows(self, key: str) -> list[dict[str, Any]]:
+        """List of tables at the root."""
+        found = self.tree.get(key, [])
+        if not isinstance(found, list) or not all(isinstance(one, dict) for one in found):
+            raise self.file.fault(f"is damaged: '{key}' is not a list of tables")
+        return found
+
+    def row(self, key: str, number: Any) -> dict[str, Any]:
+        """Table by its number in a list at the root."""
+        rows = self.rows(key)
+        if isinstance(number, bool) or not isinstance(number, int) or not 0 <= number < len(rows):
+            raise self.file.fault(
+                f"is damaged: it names number {number!s:.20} of its {key}, of which it has {len(rows)}"
+            )
+        return rows[number]
+
+    def table(self, owner: dict[str, Any], key: str) -> dict[str, Any]:
+        """Table within a table; an empty one where there is none."""
+        found = owner.get(key, {})
+        if not isinstance(found, dict):
+            raise self.file.fault(f"is damaged: '{key}' is not a table")
+        return found
+
+    def numbers(self, owner: dict[str, Any], key: str, default: tuple[float, ...]) -> tuple[float, ...]:
+        """Numbers of a list of fixed length."""
+        found = owner.get(key, list(default))
+        is_plain = isinstance(found, list) and len(found) == len(default)
+        if not is_plain or not all(isinstance(x, (int, float)) and not isinstance(x, bool) for x in found):
+            raise self.file.fault(f"is damaged: '{key}' is not {len(default)} numbers")
+        return tuple(float(x) for x in found)
+
+    def whole(self, owner: dict[str, Any], key: str, default: int | None = None, most: int = 2**40) -> int:
+        """Whole number from 0 up."""
+        found = owner.get(key, default)
+        if isinstance(found, bool) or not isinstance(found, int) or not 0 <= found <= most:
+            raise self.file.fault(f"is damaged: '{key}' is {found!s:.20}, not a whole number from 0 to {most}")
+        return found
+
+    # Bytes and arrays.
+
+    def view(self, number: Any) -> tuple[bytes, int]:
+        """Bytes of a buffer view, and its stride, 0 where it states none."""
+        view = self.row("bufferViews", number)
+        if "EXT_meshopt_compression" in self.table(view, "extensions"):
+            raise self.file.fault("has arrays compressed by meshopt: `gltf-transform cp IN.glb OUT.glb` unpacks them")
+        data = self._buffer(self.whole(view, "buffer"))
+        start, length = self.whole(view, "byteOffset", 0), self.whole(view, "byteLength")
+        if start + length > len(data):
+            raise damaged(self.file)
+        return data[start : start + length], self.whole(view, "byteStride", 0, 252)
+
+    def _buffer(self, number: int) -> bytes:
+        if number not in self._buffers:
+            buffer = self.row("buffers", number)
+            uri = buffer.get("uri")
+            data = self._binary if uri is None and number == 0 else self.of_uri(uri)
+            length = self.whole(buffer, "byteLength")
+            if length > len(data):
+                raise damaged(self.file)
+            self._buffers[number] = data[:length]
+        return self._buffers[number]
+
+    def of_uri(self, uri: Any) -> bytes:
+        """Bytes that a URI names: in itself, or a file."""
+        if not isinstance(uri, str):
+            raise damaged(self.file)
+        if not uri.startswith("data:"):
+            return self.companions.named(uri).read()
+        head, comma, text = uri.partition(",")
+        if not comma or not head.endswith(";base64"):
+            raise damaged(self.file)
+        try:
+            return base64.b64decode(text, validate=True)
+        except (binascii.Error, ValueError) as error:
+            raise damaged(self.file) from error
+
+    def array(self, number: Any, width: int | tuple[int, ...]) -> Array:
+        """Entries of an accessor, shape (count, width), as floats; normalised whole numbers span 0 or -1 to 1."""
+        found, accessor = self.raw_array(number, width), self.row("accessors", number)
+        values = found.astype(float)
+        if accessor.get("normalized") and found.dtype.kind in "iu":
+            values = np.maximum(values / np.iinfo(found.dtype).max, -1.0)
+        return values
+
+    def raw_array(self, number: Any, width: int | tuple[int, ...]) -> NDArray[Any]:
+        """Entries of an accessor as they are stored, shape (count, width)."""
+        accessor = self.row("accessors", number)
+        count = accessor.get("count", 0)
+        if isinstance(count, bool) or not isinstance(count, int) or not 0 <= count <= MOST_ENTRIES:
+            raise self.file.fault(f"has an array of {count!s:.20} entries: at most {MOST_ENTRIES} are read")
+        wide, kind = _WIDTHS.get(accessor.get("type", "")), _KINDS.get(accessor.get("componentType", 0))
+        if wide is None or kind is None or wide not in ((width,) if isinstance(width, int) else width):
+            raise self.file.fault(f"is damaged: accessor {number} has a type that its use does not allow")
+        values = np.zeros((count, wide), kind)
+        if "bufferView" in accessor:
+            data, stride = self.view(accessor["bufferView"])
+            values = self._strided(data, self.whole(accessor, "byteOffset", 0), stride, (count, wide), kind)
+        if "sparse" in accessor:
+            values = self._with_sparse(self.table(accessor, "sparse"), values)
+        return values
+
+    def _strided(self, data: bytes, start: int, stride: int, shape: tuple[int, int], kind: str) -> NDArray[Any]:
+        size = np.dtype(kind).itemsize * shape[1]
+        step = stride or size
+        if shape[0] and (step < size or start + step * (shape[0] - 1) + size > len(data)):
+            raise damaged(self.file)
+        if not shape[0]:
+            return np.zeros(shape, kind)
+        return np.ndarray(shape, kind, data, start, (step, np.dtype(kind).itemsize)).copy()
+
+    def _with_sparse(self, sparse: dict[str, Any], values: NDArray[Any]) -> NDArray[Any]:
+        count = self.whole(sparse, "count", None, len(values))
+        places, entries = self.table(sparse, "indices"), self.table(sparse, "values")
+        kind = _KINDS.get(places.get("componentType", 0))
+        if kind is None or kind[1] != "u":
+            raise damaged(self.file)
+        index = self._strided(*self._sparse_view(places), 0, (count, 1), kind)[:, 0].astype(np.int64)
+        new = self._strided(*self._sparse_view(entries), 0, (count, values.shape[1]), values.dtype.str)
+        if count and (index.max() >= len(values) or (np.diff(index) <= 0).any()):
+            raise damaged(self.file)
+        values = values.copy()
+        values[index] = new
+        return values
+
+    def _sparse_view(self, owner: dict[str, Any]) -> tuple[bytes, int]:
+        data, _ = self.view(owner.get("bufferView"))
+        return data, self.whole(owner, "byteOffset", 0)

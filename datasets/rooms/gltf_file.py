@@ -1,0 +1,385 @@
+"""glTF files (.glb, .gltf): nodes, meshes and materials of the scene that the file shows.
+
+glTF 2.0 (Khronos Group, 2021; ISO/IEC 12113:2022). Lists, strips and fans of triangles are read; points and lines have
+no surface. Base colours, emission and their pictures are read, each by its own coordinates. Metal, gloss, relief and
+transparency are not kept. Skins, instances and compressed arrays are refused by name.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phibench.datasets.errors import DatasetError
+from phibench.datasets.input_files import InputFile
+from phibench.datasets.rooms.gltf_arrays import GltfDocument
+from phibench.datasets.rooms.mesh_parts import (
+    BLACK,
+    BRIGHTEST,
+    WHITE,
+    Companions,
+    MeshPart,
+    Paint,
+    Picture,
+    check_count,
+    is_no_picture,
+    leaves_picture,
+    mirrored_repeat,
+    three_numbers,
+)
+from phibench.scenes.frames import Array, Vector
+from phibench.scenes.validation import printable_line
+
+_READ_EXTENSIONS = (
+    "KHR_texture_transform",
+    "KHR_lights_punctual",
+    "KHR_mesh_quantization",
+    "EXT_texture_webp",
+    "KHR_materials_",
+)
+_CONVERTERS = {
+    "KHR_draco_mesh_compression": "`gltf-transform cp IN.glb OUT.glb` unpacks it",
+    "EXT_meshopt_compression": "`gltf-transform cp IN.glb OUT.glb` unpacks it",
+    "KHR_texture_basisu": "`ktx extract` of KTX-Software makes PNG of its pictures",
+}
+_GLOSSY = "KHR_materials_pbrSpecularGlossiness"
+_DEPTH = 100  # of nodes in nodes
+_LIST, _STRIP, _FAN = 4, 5, 6
+_WITHOUT_SURFACE = (0, 1, 2, 3)
+_REPEAT, _MIRRORED, _CLAMPED = 10497, 33648, 33071
+
+
+@dataclass(frozen=True)
+class _Texture:
+    """Use of a picture by a material."""
+
+    index: Any
+    uv_set: int
+    transform: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class _Material:
+    name: str = ""
+    colour: Vector = WHITE
+    picture: _Texture | None = None
+    light: Vector = BLACK
+    light_picture: _Texture | None = None
+    two_sided: bool = False
+
+
+def gltf_parts(file: InputFile, companions: Companions) -> list[MeshPart]:
+    """Parts of a glTF file, one for each primitive of a node.
+
+    Raises
+    ------
+    RoomError
+        If it is damaged, has what is not read, or names a file that is not there.
+    """
+    return _Reader(GltfDocument(file, companions)).parts()
+
+
+class _Reader:
+    """Parts of a document."""
+
+    def __init__(self, document: GltfDocument) -> None:
+        self.document, self.file = document, document.file
+        self._refuse_unread()
+        self.materials = [self._material(row) for row in document.rows("materials")]
+        self._pictures: dict[int, Picture] = {}
+        self._seen: set[int] = set()
+        self._count = 0
+
+    def parts(self) -> list[MeshPart]:
+        """All triangles of the scene."""
+        found: list[MeshPart] = []
+        waiting = [(number, np.eye(4), 1) for number in self._roots()]
+        while waiting:
+            number, outer, depth = waiting.pop(0)
+            node = self.document.row("nodes", number)
+            if number in self._seen or depth > _DEPTH:
+                raise self.file.fault("is damaged: its nodes are no trees")
+            self._seen.add(number)
+            transform = outer @ self._transform(node)
+            if "mesh" in node:
+                found += self._of_node(number, node, transform)
+            waiting += [(child, transform, depth + 1) for child in node.get("children", [])]
+        check_count(self.file, self._count)
+        return found
+
+    def _roots(self) -> list[Any]:
+        """Nodes of the scene that is shown; of a file without scenes all that are no node's children."""
+        document = self.document
+        scenes = document.rows("scenes")
+        if scenes:
+            return list(document.row("scenes", document.tree.get("scene", 0)).get("nodes", []))
+        rows = document.rows("nodes")
+        children = {child for node in rows for child in node.get("children", [])}
+        return [number for number in range(len(rows)) if number not in children]
+
+    def _refuse_unread(self) -> None:
+        names = [str(name) for name in self.document.tree.get("extensionsRequired", [])]
+        for name in names:
+            if not name.startswith(_READ_EXTENSIONS):
+                how = f": {_CONVERTERS[name]}" if name in _CONVERTERS else ""
+                raise self.file.fault(f"needs the glTF extension {printable_line(name, 60)}, which is not read{how}")
+
+    # Places.
+
+    def _transform(self, node: dict[str, Any]) -> Array:
+        document = self.document
+        if "matrix" in node:
+            matrix = np.array(document.numbers(node, "matrix", (0.0,) * 16)).reshape(4, 4).T
+        else:
+            x, y, z, w = document.numbers(node, "rotation", (0.0, 0.0, 0.0, 1.0))
+            length = math.sqrt(x * x + y * y + z * z + w * w)
+            if not 0.5 < length < 2.0:
+                raise self._misplaced(node)
+            x, y, z, w = (c / length for c in (x, y, z, w))
+            matrix = np.eye(4)
+            matrix[:3, :3] = [
+                [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+                [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+                [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+            ]
+            matrix[:3, :3] *= document.numbers(node, "scale", (1.0, 1.0, 1.0))
+            matrix[:3, 3] = document.numbers(node, "translation", (0.0, 0.0, 0.0))
+        if not np.isfinite(matrix).all() or not np.array_equal(matrix[3], [0.0, 0.0, 0.0, 1.0]):
+            raise self._misplaced(node)
+        return matrix
+
+    def _misplaced(self, node: dict[str, Any]) -> DatasetError:
+        shown = printable_line(str(node.get("name", "")), 60)
+        return self.file.fault(f"has a node '{shown}' whose place is not finite, or no place")
+
+    # Triangles.
+
+    def _of_node(self, number: int, node: dict[str, Any], transform: Array) -> list[MeshPart]:
+        mesh = self.document.row("meshes", node["mesh"])
+        label = str(node.get("name") or mesh.get("name") or f"node {number}")
+        shown = printable_line(label, 60)
+        if "skin" in node:
+            raise self.file.fault(f"has a node '{shown}' that a skeleton bends (a skin): apply it before the export")
+        if "EXT_mesh_gpu_instancing" in self.document.table(node, "extensions"):
+            raise self.file.fault(f"has copies of '{shown}' as instances (EXT_mesh_gpu_instancing): make them nodes")
+        weights = node.get("weights", mesh.get("weights", []))
+        primitives = mesh.get("primitives", [])
+        if not isinstance(primitives, list) or not all(isinstance(one, dict) for one in primitives):
+            raise self.file.fault("is damaged: 'primitives' is not a list of tables")
+        parts = (self._of_primitive(label, one, transform, weights) for one in primitives)
+        return [part for part in parts if part is not None]
+
+    def _of_primitive(self, label: str, primitive: dict[str, Any], transform: Array, weights: Any) -> MeshPart | None:
+        document, shown = self.document, printable_line(label, 60)
+        mode = primitive.get("mode", _LIST)
+        if mode in _WITHOUT_SURFACE:
+            return None
+        if mode not in (_LIST, _STRIP, _FAN):
+            raise self.file.fault(f"has a primitive of mode {mode!s:.20} in '{shown}', which glTF does not know")
+        if "KHR_draco_mesh_compression" in document.table(primitive, "extensions"):
+            how = _CONVERTERS["KHR_draco_mesh_compression"]
+            raise self.file.fault(
+                f"has '{shown}' compressed by Draco (KHR_draco_mesh_compression), which is not read: {how}"
+            )
+        attributes = document.table(primitive, "attributes")
+        if "POSITION" not in attributes:
+            return None  # the definition: such a primitive is not drawn
+        points = self._morphed(primitive, document.array(attributes["POSITION"], 3), weights)
+        triangles = self._triangles(primitive, mode, len(points))
+        if not len(triangles):
+            return None
+        self._count += len(triangles)
+        check_count(self.file, self._count)
+        if np.linalg.det(transform[:3, :3]) < 0.0:
+            triangles = triangles[:, ::-1]  # a mirrored node turns its triangles around
+        material = self._material_of(primitive)
+        paint, light = self._paints(label, attributes, triangles, material, len(points))
+        name = f"{label}/{material.name}" if material is not None and material.name else label
+        placed = points @ transform[:3, :3].T + transform[:3, 3]
+        return MeshPart(name, placed, triangles, paint, light, material is not None and material.two_sided)
+
+    def _triangles(self, primitive: dict[str, Any], mode: int, count: int) -> NDArray[np.int64]:
+        if "indices" in primitive:
+            stored = self.document.raw_array(primitive["indices"], 1)
+            if stored.dtype.kind != "u":
+                raise self.file.fault("is damaged: indices are whole numbers without sign")
+            index = stored[:, 0].astype(np.int64)
+        else:
+            index = np.arange(count)
+        if len(index) and index.max() >= count:
+            raise self.file.fault("has triangles with vertices that are not there")
+        if mode == _LIST:
+            if len(index) % 3:
+                raise self.file.fault(f"is damaged: {len(index)} corners make no whole number of triangles")
+            return index.reshape(-1, 3)
+        if len(index) < 3:
+            return np.zeros((0, 3), np.int64)
+        if mode == _FAN:
+            return np.stack([index[1:-1], index[2:], np.full(len(index) - 2, index[0])], axis=1)
+        three = np.stack([index[:-2], index[1:-1], index[2:]], axis=1)
+        three[1::2] = three[1::2][:, [0, 2, 1]]
+        return three
+
+    def _morphed(self, primitive: dict[str, Any], points: Array, weights: Any) -> Array:
+        targets = primitive.get("targets", [])
+        if not isinstance(weights, list) or not isinstance(targets, list):
+            raise self.file.fault("is damaged: weights and targets are lists")
+        for weight, target in zip(weights, targets, strict=False):
+            if weight and isinstance(target, dict) and "POSITION" in target:
+                points = points + float(weight) * self.document.array(target["POSITION"], 3)
+        return points
+
+    # Materials.
+
+    def _material_of(self, primitive: dict[str, Any]) -> _Material | None:
+        if "material" not in primitive:
+            return None
+        self.document.row("materials", primitive["material"])
+        return self.materials[primitive["material"]]
+
+    def _material(self, row: dict[str, Any]) -> _Material:
+        document = self.document
+        extensions = document.table(row, "extensions")
+        base, factor, texture = document.table(row, "pbrMetallicRoughness"), "baseColorFactor", "baseColorTexture"
+        if _GLOSSY in extensions:
+            base, factor, texture = document.table(extensions, _GLOSSY), "diffuseFactor", "diffuseTexture"
+        strength = document.table(extensions, "KHR_materials_emissive_strength").get("emissiveStrength", 1.0)
+        light = tuple(x * float(strength) for x in document.numbers(row, "emissiveFactor", BLACK))
+        colour = three_numbers(document.numbers(base, factor, (1.0, 1.0, 1.0, 1.0))[:3])
+        if not colour or not three_numbers(light):
+            shown = printable_line(str(row.get("name", "")), 60)
+            raise self.file.fault(
+                f"has a material '{shown}' with a colour or emission that is not three numbers from 0 up"
+            )
+        return _Material(
+            str(row.get("name", "")),
+            tuple(min(x, 1.0) for x in colour),
+            self._texture(base, texture),
+            tuple(min(x, BRIGHTEST) for x in light),
+            self._texture(row, "emissiveTexture"),
+            bool(row.get("doubleSided", False)),
+        )
+
+    def _texture(self, owner: dict[str, Any], key: str) -> _Texture | None:
+        if not owner.get(key):
+            return None
+        stated = self.document.table(owner, key)
+        transform = self.document.table(self.document.table(stated, "extensions"), "KHR_texture_transform")
+        uv_set = self.document.whole(transform if "texCoord" in transform else stated, "texCoord", 0, 100)
+        return _Texture(stated.get("index"), uv_set, transform)
+
+    def _paints(
+        self,
+        label: str,
+        attributes: dict[str, Any],
+        triangles: NDArray[np.int64],
+        material: _Material | None,
+        count: int,
+    ) -> tuple[Paint | None, Paint | None]:
+        colours = self._vertex_colours(attributes, count)
+        if material is None:
+            # without a material the definition takes a white one; a file that states no colour gets the plain one
+            return (None if colours is None else Paint(face_colours=colours[triangles].mean(axis=1))), None
+        paint = self._paint(label, material, material.colour, material.picture, attributes, triangles)
+        if colours is not None:
+            paint = self._tinted(label, paint, colours, triangles)
+        if max(material.light) <= 0.0:
+            return paint, None
+        return paint, self._paint(label, material, material.light, material.light_picture, attributes, triangles)
+
+    def _tinted(self, label: str, paint: Paint, colours: Array, triangles: NDArray[np.int64]) -> Paint:
+        """Vertex colours multiply the material's."""
+        if paint.picture is None:
+            return Paint(face_colours=colours[triangles].mean(axis=1) * np.array(paint.colour))
+        used = colours[triangles].reshape(-1, 3)
+        if np.ptp(used, axis=0).max() > 0.5 / 255.0:
+            shown = printable_line(label, 60)
+            raise self.file.fault(f"has '{shown}' with vertex colours that tint a picture: put them into the picture")
+        return replace(paint, colour=tuple(float(a * b) for a, b in zip(paint.colour, used.mean(axis=0), strict=True)))
+
+    def _vertex_colours(self, attributes: dict[str, Any], count: int) -> Array | None:
+        """Linear colours of vertices, shape (N, 3)."""
+        if "COLOR_0" not in attributes:
+            return None
+        stored = self.document.raw_array(attributes["COLOR_0"], (3, 4))
+        scale = float(np.iinfo(stored.dtype).max) if stored.dtype.kind in "iu" else 1.0
+        colours = stored[:, :3].astype(float) / scale
+        if len(colours) != count or not np.isfinite(colours).all() or colours.min(initial=0.0) < 0.0:
+            raise self.file.fault("is damaged: colours of vertices are not one for each, from 0 up")
+        return np.minimum(colours, 1.0)
+
+    def _paint(
+        self,
+        label: str,
+        material: _Material,
+        colour: Vector,
+        texture: _Texture | None,
+        attributes: dict[str, Any],
+        triangles: NDArray[np.int64],
+    ) -> Paint:
+        if texture is None:
+            return Paint(colour)
+        name = f"TEXCOORD_{texture.uv_set}"
+        if name not in attributes:
+            shown = printable_line(f"{label}/{material.name}", 60)
+            raise self.file.fault(f"has no texture coordinates {name} in '{shown}', which its picture needs")
+        uv = self._moved(self.document.array(attributes[name], 2), texture.transform)
+        if triangles.max() >= len(uv):
+            raise self.file.fault("is damaged: texture coordinates are not one for each vertex")
+        corners = uv[triangles]
+        row = self.document.row("textures", texture.index)
+        picture, corners = self._repeated(row, self._picture(material, row), corners, label)
+        return Paint(colour, picture, np.stack([corners[..., 0], 1.0 - corners[..., 1]], axis=-1))
+
+    def _moved(self, uv: Array, stated: dict[str, Any]) -> Array:
+        """Coordinates after KHR_texture_transform: scale, then turn, then shift."""
+        if not stated:
+            return uv
+        scale = np.array(self.document.numbers(stated, "scale", (1.0, 1.0)))
+        shift = np.array(self.document.numbers(stated, "offset", (0.0, 0.0)))
+        angle = float(stated.get("rotation", 0.0))
+        c, s = math.cos(angle), math.sin(angle)
+        return uv * scale @ np.array([[c, -s], [s, c]]) + shift
+
+    def _repeated(self, texture: dict[str, Any], picture: Picture, uv: Array, label: str) -> tuple[Picture, Array]:
+        """Picture and coordinates such that it repeats as the sampler says; v counts downwards."""
+        sampler = self.document.row("samplers", texture["sampler"]) if "sampler" in texture else {}
+        modes = [sampler.get(key, _REPEAT) for key in ("wrapS", "wrapT")]
+        if any(mode == _CLAMPED and leaves_picture(uv, axis) for axis, mode in enumerate(modes)):
+            shown = printable_line(label, 60)
+            raise self.file.fault(
+                f"has a picture in '{shown}' that ends at its edges (CLAMP_TO_EDGE) beside it: repeat it"
+            )
+        axes = [axis for axis, mode in enumerate(modes) if mode == _MIRRORED and leaves_picture(uv, axis)]
+        flipped, moved = mirrored_repeat(picture[::-1], uv, axes)
+        return flipped[::-1], moved
+
+    def _picture(self, material: _Material, texture: dict[str, Any]) -> Picture:
+        extensions = self.document.table(texture, "extensions")
+        source = self.document.table(extensions, "EXT_texture_webp").get("source", texture.get("source"))
+        if source is None and "KHR_texture_basisu" in extensions:
+            how = _CONVERTERS["KHR_texture_basisu"]
+            raise self.file.fault(f"has pictures as KTX2 (KHR_texture_basisu), which is not read: {how}")
+        image = self.document.row("images", source)
+        number = int(source or 0)
+        if number not in self._pictures:
+            self._pictures[number] = self._decoded(material, image)
+        return self._pictures[number]
+
+    def _decoded(self, material: _Material, image: dict[str, Any]) -> Picture:
+        companions, uri = self.document.companions, image.get("uri")
+        if "bufferView" not in image and isinstance(uri, str) and not uri.startswith("data:"):
+            return companions.picture(uri)
+        inside = "bufferView" in image
+        data = self.document.view(image["bufferView"])[0] if inside else self.document.of_uri(uri)
+        try:
+            return companions.pixels(self.file, data)
+        except DatasetError as error:
+            if not is_no_picture(error):
+                raise
+            shown = printable_line(material.name, 60)
+            raise self.file.fault(f"has a material '{shown}' whose texture is missing or damaged") from error

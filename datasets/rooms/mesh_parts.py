@@ -1,0 +1,243 @@
+"""Parts of a mesh file: triangles with one material, its colours and pictures, and what readers of all formats share.
+
+Colours are linear. Texture coordinates have (0, 0) at a picture's lower left corner and (1, 1) at its upper right one;
+beyond them the picture repeats.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import urllib.parse
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phibench.datasets.errors import DatasetError
+from phibench.datasets.input_files import InputFile
+from phibench.datasets.rooms.room_files import RoomError
+from phibench.scenes.frames import Array, Vector
+from phibench.scenes.validation import printable_line
+
+MOST_TRIANGLES = 1_000_000
+REMEDY = "export it again as one .glb file with its textures inside"
+DAMAGED = "is damaged: it ends early, or its numbers do not go together"
+PICTURES = ("PNG", "JPEG", "BMP", "TGA", "TIFF", "WEBP")
+BLACK: Vector = (0.0, 0.0, 0.0)
+WHITE: Vector = (1.0, 1.0, 1.0)
+BRIGHTEST = 1e6
+"""Of an emission, in units of the file."""
+_GREY_16 = ("I", "I;16", "I;16L", "I;16B")
+_OF_8_BITS = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBX")
+_OUTSIDE = 1e-5  # by which coordinates may leave a picture that does not repeat
+
+Picture = NDArray[np.uint8]
+
+
+@dataclass(frozen=True, eq=False)
+class Paint:
+    """Colour of a part.
+
+    Attributes
+    ----------
+    colour : 3 floats, linear; times the picture, where there is one
+    picture : uint8 array, shape (H, W, 3), sRGB, upper row first, or None
+    uv : array, shape (M, 3, 2), or None
+        Place of each triangle's corners on the picture, (0, 0) its lower left corner, (1, 1) its upper right one.
+    face_colours : array, shape (M, 3), linear, or None
+    """
+
+    colour: Vector = WHITE
+    picture: Picture | None = None
+    uv: Array | None = None
+    face_colours: Array | None = None
+
+    def of(self, chosen: NDArray[np.bool_]) -> Paint:
+        """Paint of some of the triangles."""
+        uv = None if self.uv is None else self.uv[chosen]
+        return replace(self, uv=uv, face_colours=None if self.face_colours is None else self.face_colours[chosen])
+
+
+@dataclass(frozen=True, eq=False)
+class MeshPart:
+    """Triangles of one node with one material.
+
+    Attributes
+    ----------
+    name : str, unique in its file
+    vertices : array, shape (N, 3), in units and axes of the file
+    triangles : int array, shape (M, 3)
+    paint : Paint, or None where the file states no colour
+    light : Paint, what the material emits, or None
+    two_sided : bool, as the material says
+    """
+
+    name: str
+    vertices: Array
+    triangles: NDArray[np.int64]
+    paint: Paint | None
+    light: Paint | None = None
+    two_sided: bool = False
+
+    def of(self, chosen: NDArray[np.bool_], name: str) -> MeshPart:
+        """Part of some of the triangles, under another name."""
+        paint, light = (None if paint is None else paint.of(chosen) for paint in (self.paint, self.light))
+        return replace(self, name=name, triangles=self.triangles[chosen], paint=paint, light=light)
+
+
+class Companions:
+    """Files that a mesh names, below its folder, and the pictures in them, each decoded once.
+
+    Parameters
+    ----------
+    file : InputFile
+        The mesh.
+    one_file : bool
+        Refuse every other file.
+    """
+
+    def __init__(self, file: InputFile, one_file: bool) -> None:
+        self.file, self.one_file = file, one_file
+        self._pictures: dict[str, Picture] = {}
+
+    def is_there(self, name: str) -> bool:
+        """Tell whether a name is that of a file below the folder."""
+        path = (self.file.path.parent / _plain(name)).resolve()
+        return path.is_relative_to(self.file.path.parent.resolve()) and path.is_file()
+
+    def named(self, name: str) -> InputFile:
+        """File of a name.
+
+        Raises
+        ------
+        RoomError
+            If it is missing or not below the folder, or the mesh must be one file.
+        """
+        plain = _plain(name)
+        shown = f"names the file '{printable_line(plain)}'"
+        if self.one_file:
+            raise self.file.fault(f"{shown}, and here a mesh must be one file")
+        folder = self.file.path.parent.resolve()
+        path = (folder / plain).resolve()
+        if not path.is_relative_to(folder):
+            raise self.file.fault(f"{shown}, which is not in its folder")
+        if not path.is_file():
+            raise self.file.fault(f"{shown}, which is missing")
+        return InputFile(path, REMEDY, RoomError)
+
+    def picture(self, name: str) -> Picture:
+        """Pixels of a picture that has a file of its own."""
+        found = self.named(name)
+        return self.pixels(found, found.read())
+
+    def pixels(self, owner: InputFile, data: bytes) -> Picture:
+        """Pixels of an encoded picture, 8 bits, sRGB; 16 bits of grey are scaled.
+
+        Raises
+        ------
+        RoomError
+            If it is none, or has colours that are not red, green and blue or grey of 8 or 16 bits.
+        """
+        digest = hashlib.sha256(data).hexdigest()
+        if digest not in self._pictures:
+            self._pictures[digest] = _pixels(owner, data)
+        return self._pictures[digest]
+
+
+def _plain(name: str) -> str:
+    return urllib.parse.unquote(name.strip()).replace("\\", "/")
+
+
+def _pixels(owner: InputFile, data: bytes) -> Picture:
+    image = owner.picture(PICTURES, data)
+    if image.mode in _GREY_16:
+        grey = np.asarray(image, float)
+        if image.format not in ("PNG", "TIFF") or grey.min() < 0.0 or grey.max() > 65535.0:
+            raise owner.fault("has a picture of more than 16 bits: save it with 8 bits a colour")
+        return np.repeat(np.rint(grey / 257.0).astype(np.uint8)[..., None], 3, axis=2)
+    if image.mode not in _OF_8_BITS:
+        raise owner.fault(
+            f"has a picture with colours of the kind {image.mode}: save it as red, green and blue of 8 bits"
+        )
+    return np.asarray(image.convert("RGBA").convert("RGB") if image.mode in ("P", "PA", "LA") else image.convert("RGB"))
+
+
+def is_no_picture(error: DatasetError) -> bool:
+    """Tell whether `InputFile.picture` found none, or a damaged one."""
+    return "not a picture" in str(error) or "damaged picture" in str(error)
+
+
+def three_numbers(words: Any) -> Vector:
+    """Three finite numbers from 0 up; none where they are others."""
+    try:
+        values = tuple(float(word) for word in words)
+    except (TypeError, ValueError):
+        return ()
+    return values if len(values) == 3 and all(math.isfinite(value) and value >= 0.0 for value in values) else ()
+
+
+def mirrored_repeat(picture: Picture, uv: Array, axes: Iterable[int]) -> tuple[Picture, Array]:
+    """Picture that repeats as one that is mirrored at its edges does along axes 0 (u) or 1 (v), and its coordinates."""
+    uv = uv.copy()
+    for axis in axes:
+        picture = (
+            np.concatenate([picture, picture[:, ::-1]], axis=1)
+            if axis == 0
+            else np.concatenate([picture[::-1], picture], axis=0)
+        )
+        uv[..., axis] *= 0.5
+    return picture, uv
+
+
+def leaves_picture(uv: Array, axis: int) -> bool:
+    """Tell whether coordinates along an axis leave the picture, so that a clamped one would not repeat."""
+    return bool(uv.size) and bool(uv[..., axis].min() < -_OUTSIDE or uv[..., axis].max() > 1.0 + _OUTSIDE)
+
+
+def check_count(file: InputFile, count: int) -> None:
+    """Refuse a file with too many triangles, or none.
+
+    Raises
+    ------
+    RoomError
+    """
+    if not 0 < count <= MOST_TRIANGLES:
+        raise file.fault(f"has {count} triangles: 1 to {MOST_TRIANGLES} are read")
+
+
+def check_part(file: InputFile, part: MeshPart) -> None:
+    """Refuse numbers that are none, or that do not go together.
+
+    Raises
+    ------
+    RoomError
+    """
+    if part.vertices.ndim != 2 or part.vertices.shape[1] != 3:
+        raise file.fault(f"has vertices that are not three numbers each, in the part '{part.name}'")
+    if part.triangles.min() < 0 or part.triangles.max() >= len(part.vertices):
+        raise file.fault(f"has triangles with vertices that are not there, in the part '{part.name}'")
+    if not np.isfinite(part.vertices).all():
+        raise file.fault(f"has vertices that are not finite numbers, in the part '{part.name}'")
+    for paint in (part.paint, part.light):
+        uv = None if paint is None else paint.uv
+        if uv is not None and (uv.shape != (len(part.triangles), 3, 2) or not np.isfinite(uv).all()):
+            raise file.fault(f"has texture coordinates that are not pairs of finite numbers, in '{part.name}'")
+
+
+def named_parts(parts: Iterable[MeshPart]) -> tuple[MeshPart, ...]:
+    """Parts in the order of their names, which are made printable and unique."""
+    used: dict[str, int] = {}
+    named = []
+    for part in sorted(parts, key=lambda part: part.name):
+        plain = printable_line(part.name, 80) or "part"
+        used[plain] = used.get(plain, 0) + 1
+        named.append(replace(part, name=plain if used[plain] == 1 else f"{plain} ({used[plain]})"))
+    return tuple(named)
+
+
+def damaged(file: InputFile) -> DatasetError:
+    """Fault of a file whose numbers contradict each other."""
+    return file.fault(DAMAGED)

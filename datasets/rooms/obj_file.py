@@ -1,0 +1,319 @@
+"""OBJ files and their MTL materials, by the definition of Wavefront (appendix B1 of the Advanced Visualizer, 1995).
+
+Relative indices count back from the vertices read so far. Faces of any number of corners become triangles. Curves and
+free-form surfaces are refused by name; points and lines have no surface. A part is an object with one material.
+Material colours and vertex colours are sRGB. A picture replaces `Kd`: most programs write both and mean the picture.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from phibench.datasets.input_files import InputFile
+from phibench.datasets.rooms.mesh_parts import (
+    BRIGHTEST,
+    MOST_TRIANGLES,
+    WHITE,
+    Companions,
+    MeshPart,
+    Paint,
+    check_count,
+    damaged,
+    leaves_picture,
+    three_numbers,
+)
+from phibench.datasets.rooms.polygons import triangulated
+from phibench.render.sensor.srgb import srgb_decoded
+from phibench.scenes.frames import Array, Vector, as_vector
+from phibench.scenes.validation import printable_line
+
+_FREE_FORM = ("curv", "curv2", "surf", "cstype", "bmat", "deg", "step", "parm", "trim", "hole", "scrv", "sp", "con")
+_SCRIPTS = ("call", "csh")
+_MOST_CORNERS = 10_000
+_OPTIONS = {
+    **dict.fromkeys(("-blendu", "-blendv", "-clamp", "-cc", "-imfchan", "-texres", "-boost", "-bm", "-type"), 1),
+    "-mm": 2,
+}
+"""Options of a picture and how many words follow; -s, -o and -t take one to three numbers."""
+
+
+@dataclass(frozen=True)
+class _Map:
+    """Picture of a material: u' = scale u + offset."""
+
+    name: str
+    scale: tuple[float, float] = (1.0, 1.0)
+    offset: tuple[float, float] = (0.0, 0.0)
+    clamped: bool = False
+
+
+@dataclass(frozen=True)
+class _Material:
+    name: str
+    diffuse: Vector = ()
+    emission: Vector = ()
+    picture: _Map | None = None
+    light_picture: _Map | None = None
+
+
+@dataclass
+class _Group:
+    """Faces of an object with one material: numbers of vertices and of texture coordinates, -1 where there is none."""
+
+    corners: list[tuple[int, ...]] = field(default_factory=list)
+    places: list[tuple[int, ...]] = field(default_factory=list)
+
+
+class _Reader:
+    """State while the lines are read."""
+
+    def __init__(self, file: InputFile) -> None:
+        self.file = file
+        self.vertices: list[tuple[float, ...]] = []
+        self.colours: list[tuple[float, ...]] = []
+        self.places: list[tuple[float, float]] = []
+        self.libraries: list[str] = []
+        self.groups: dict[tuple[str, str], _Group] = {}
+        self.label, self.material, self.triangles = "", "", 0
+
+    def line(self, words: list[str]) -> None:
+        """Take one line."""
+        key, values = words[0], words[1:]
+        if key == "v":
+            self._vertex(values)
+        elif key == "vt":
+            self.places.append((float(values[0]), float(values[1]) if len(values) > 1 else 0.0))
+        elif key in ("f", "fo"):
+            self._face(values)
+        elif key in ("o", "g"):
+            self.label = " ".join(values) if key == "o" or not self._has_objects else self.label
+            self._has_objects = self._has_objects or key == "o"
+        elif key == "usemtl":
+            self.material = " ".join(values)
+        elif key == "mtllib":
+            self.libraries.append(" ".join(values))
+        elif key in _FREE_FORM:
+            raise self.file.fault(f"has free-form curves or surfaces (`{key}`), which are not read: export triangles")
+        elif key in _SCRIPTS:
+            raise self.file.fault(f"calls other files (`{key}`), which is not done")
+
+    _has_objects = False
+
+    def _vertex(self, values: list[str]) -> None:
+        numbers = tuple(float(word) for word in values)
+        if len(numbers) not in (3, 4, 6, 7):
+            raise self.file.fault(f"has a vertex of {len(numbers)} numbers: 3, 4, 6 or 7 are read")
+        self.vertices.append(numbers[:3])
+        if len(numbers) > 4:
+            self.colours.append(numbers[-3:])
+
+    def _face(self, values: list[str]) -> None:
+        if not 3 <= len(values) <= _MOST_CORNERS:
+            if len(values) > 2:
+                raise self.file.fault(f"has a face of {len(values)} corners: at most {_MOST_CORNERS} are read")
+            return  # a point or a line has no surface
+        pairs = [word.split("/") for word in values]
+        corners = tuple(self._number(pair[0], len(self.vertices), "vertex") for pair in pairs)
+        has_places = all(len(pair) > 1 and pair[1] for pair in pairs)
+        places = tuple(self._number(p[1], len(self.places), "texture coordinate") if has_places else -1 for p in pairs)
+        self.triangles += len(values) - 2
+        if self.triangles > MOST_TRIANGLES:
+            check_count(self.file, self.triangles)
+        group = self.groups.setdefault((self.label, self.material), _Group())
+        group.corners.append(corners)
+        group.places.append(places)
+
+    def _number(self, word: str, count: int, what: str) -> int:
+        """Number from 0 of an index; a negative one counts back from the last that was read."""
+        number = int(word)
+        index = number - 1 if number > 0 else count + number
+        # a positive one may name what comes later in the file; `obj_parts` looks at these
+        if number == 0 or index < 0:
+            raise self.file.fault(f"has a face with the {what} {number}, of {count} so far")
+        return index
+
+
+def obj_parts(file: InputFile, companions: Companions) -> list[MeshPart]:
+    """Parts of an OBJ file, one for each object and material.
+
+    Raises
+    ------
+    RoomError
+        If it is damaged, has what is not read, or names a file or a material that is not there.
+    """
+    reader = _Reader(file)
+    for line in _lines(file.read()):
+        words = line.split()
+        if words:
+            reader.line(words)
+    materials = _materials(file, companions, reader.libraries)
+    check_count(file, reader.triangles)
+    points = np.array(reader.vertices, float).reshape(-1, 3)
+    places = np.array(reader.places, float).reshape(-1, 2)
+    tints = np.array(reader.colours, float).reshape(-1, 3)
+    colours = tints if len(tints) == len(points) else None
+    if len(tints) and colours is None:
+        raise file.fault(f"has {len(points)} vertices and colours of {len(tints)} of them: give all a colour, or none")
+    parts = []
+    for (label, name), group in reader.groups.items():
+        material = materials.get(name)
+        if material is None and name and reader.libraries:
+            raise file.fault(f"uses the material '{printable_line(name, 60)}', which none of its libraries has")
+        title = "_".join(filter(None, (label, name))) or file.path.stem
+        parts.append(_part(file, companions, title, group, points, places, colours, material))
+    return parts
+
+
+def _lines(data: bytes) -> Iterator[str]:
+    """Lines without comments; one that ends in a backslash goes on."""
+    text = data.decode("utf-8", errors="replace").replace("\r\n", "\n").replace("\r", "\n").replace("\\\n", " ")
+    return (line.partition("#")[0] for line in text.split("\n"))
+
+
+def _part(
+    file: InputFile,
+    companions: Companions,
+    title: str,
+    group: _Group,
+    points: Array,
+    places: Array,
+    colours: Array | None,
+    material: _Material | None,
+) -> MeshPart:
+    corners, uv_corners = [], []
+    for polygon, place in zip(group.corners, group.places, strict=True):
+        if max(polygon) >= len(points) or max(place) >= len(places):
+            raise file.fault("has faces with vertices or texture coordinates that are not there")
+        pieces = np.array([[0, 1, 2]]) if len(polygon) == 3 else triangulated(points[list(polygon)])
+        corners.append(np.array(polygon, np.int64)[pieces])
+        uv_corners.append(np.array(place, np.int64)[pieces])
+    triangles, numbers = np.concatenate(corners), np.concatenate(uv_corners)
+    uv = places[numbers] if len(places) and numbers.min() >= 0 else None
+    paint = light = None
+    if material is not None:
+        paint = _paint(file, companions, material, uv)
+        light = _light(file, companions, material, uv)
+    if paint is None and colours is not None:
+        if not (np.isfinite(colours).all() and colours.min() >= 0.0 and colours.max() <= 1.0):
+            raise file.fault("has vertex colours outside 0 to 1")
+        paint = Paint(face_colours=srgb_decoded(colours)[triangles].mean(axis=1))
+    return MeshPart(title, points, triangles, paint, light)
+
+
+def _paint(file: InputFile, companions: Companions, material: _Material, uv: Array | None) -> Paint | None:
+    if material.picture is not None:
+        return _pictured(file, companions, material, material.picture, WHITE, uv)
+    if not material.diffuse:
+        return None
+    return Paint(as_vector(srgb_decoded(np.clip(np.array(material.diffuse), 0.0, 1.0))))
+
+
+def _light(file: InputFile, companions: Companions, material: _Material, uv: Array | None) -> Paint | None:
+    colour = tuple(min(x, BRIGHTEST) for x in material.emission)
+    if material.light_picture is not None and (not colour or max(colour) > 0.0):
+        return _pictured(file, companions, material, material.light_picture, colour or WHITE, uv)
+    return Paint(colour) if colour and max(colour) > 0.0 else None
+
+
+def _pictured(
+    file: InputFile, companions: Companions, material: _Material, found: _Map, colour: Vector, uv: Array | None
+) -> Paint:
+    picture = companions.picture(found.name)
+    if uv is None:
+        shown = printable_line(material.name, 60)
+        raise file.fault(f"has faces of the material '{shown}', which has a picture, without texture coordinates")
+    moved = uv * np.array(found.scale) + np.array(found.offset)
+    if found.clamped and any(leaves_picture(moved, axis) for axis in (0, 1)):
+        raise file.fault(f"has a picture that ends at its edges (-clamp on) in '{printable_line(material.name, 60)}'")
+    return Paint(colour, picture, moved)
+
+
+# Materials.
+
+
+def _materials(file: InputFile, companions: Companions, libraries: list[str]) -> dict[str, _Material]:
+    found: dict[str, _Material] = {}
+    for line in libraries:
+        # one name with blanks, or several names
+        names = [line] if companions.is_there(line) or " " not in line else line.split()
+        for name in names:
+            library = companions.named(name)
+            for material in _library(library):
+                found.setdefault(material.name, material)
+    return found
+
+
+def _library(file: InputFile) -> list[_Material]:
+    found: list[_Material] = []
+    for line in _lines(file.read()):
+        words = line.split()
+        if not words:
+            continue
+        key, values = words[0], words[1:]
+        if key == "newmtl":
+            found.append(_Material(" ".join(values)))
+        elif found:
+            found[-1] = _with_line(file, found[-1], key.lower(), values)
+    return found
+
+
+def _with_line(file: InputFile, material: _Material, key: str, values: list[str]) -> _Material:
+    if key in ("kd", "ke"):
+        colour = _colour(file, material.name, key, values)
+        return replace(material, diffuse=colour) if key == "kd" else replace(material, emission=colour)
+    if key in ("map_kd", "map_ke"):
+        found = _map(file, material.name, key, values)
+        return replace(material, picture=found) if key == "map_kd" else replace(material, light_picture=found)
+    return material  # gloss, transparency and relief are not kept
+
+
+def _colour(file: InputFile, name: str, key: str, values: list[str]) -> Vector:
+    if values[:1] in (["spectral"], ["xyz"]):
+        raise file.fault(f"states {key} of '{printable_line(name, 60)}' as {values[0]}: write red, green and blue")
+    words = values * 3 if len(values) == 1 else values  # one number is for all three
+    colour = three_numbers(words[:3])
+    if not colour:
+        raise file.fault(f"has a {key} of '{printable_line(name, 60)}' that is not three numbers from 0 up")
+    return colour
+
+
+def _map(file: InputFile, name: str, key: str, values: list[str]) -> _Map:
+    """Picture with its options, which stand before its name."""
+    where = f"{key} of '{printable_line(name, 60)}'"
+    found, k = _Map(""), 0
+    while k < len(values) and values[k].startswith("-"):
+        option = values[k]
+        if option in ("-s", "-o", "-t"):
+            numbers = _leading_numbers(values[k + 1 : k + 4])
+            k += 1 + len(numbers)
+            if option == "-t" and any(numbers):
+                raise file.fault(f"has turbulence in {where}, which is not read")
+            default = 1.0 if option == "-s" else 0.0
+            u, v, *_ = (*numbers, default, default)
+            found = replace(found, scale=(u, v)) if option == "-s" else found
+            found = replace(found, offset=(u, v)) if option == "-o" else found
+            continue
+        if option not in _OPTIONS:
+            raise file.fault(f"has the option {printable_line(option, 20)} in {where}, which is not read")
+        words = values[k + 1 : k + 1 + _OPTIONS[option]]
+        if option == "-mm" and [float(word) for word in words] != [0.0, 1.0]:
+            raise file.fault(f"changes the values of a picture (-mm) in {where}: put it into the picture")
+        if option == "-clamp":
+            found = replace(found, clamped=words == ["on"])
+        k += 1 + _OPTIONS[option]
+    if k >= len(values):
+        raise damaged(file)
+    return replace(found, name=" ".join(values[k:]))
+
+
+def _leading_numbers(words: list[str]) -> list[float]:
+    found: list[float] = []
+    for word in words:
+        try:
+            found.append(float(word))
+        except ValueError:
+            break
+    return found
