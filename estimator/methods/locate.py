@@ -1,17 +1,4 @@
-"""Search for a spot: mirror mask, laser light, boxes around detections, search regions, and its distance.
-
-A method that is written from scratch needs the first half only:
-
->>> import numpy as np
->>> from phibench.estimator.interface import Answer, Pair, Spot
->>> from phibench.estimator.methods.locate import laser_light, mirror_mask
->>> def extract(pair: Pair) -> Answer:
-...     spots = []
-...     for position in ("down", "up"):
-...         light = np.where(mirror_mask(pair), laser_light(pair, position), 0.0)
-...         v, u = np.unravel_index(np.argmax(light), light.shape)
-...         spots.append(Spot((float(u), float(v))))
-...     return Answer(*spots)
+"""Search for a spot by the built-in methods: shared work, boxes around detections, search regions, and its distance.
 
 Integer (u, v) are pixel centres, u along the columns, v along the rows.
 """
@@ -30,8 +17,9 @@ from scipy.ndimage import gaussian_filter
 from phibench.estimator.geometry.status import Status, describe
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.estimator.interface import Answer, Box, Image, Method, Pair, Spot
+from phibench.estimator.methods.pair_light import SIGMA_OF_MAD
 from phibench.estimator.spots.camera_codes import rgb_codes
-from phibench.estimator.spots.detect import Detection, PairDetection, detect, outline_mask
+from phibench.estimator.spots.detect import Detection, PairDetection, detect
 from phibench.estimator.spots.gaussian_spot import SpotBlur
 from phibench.estimator.spots.image_planes import demosaiced, kind_of, linear_planes, redness
 from phibench.estimator.spots.simple_spots import SpotPositions
@@ -42,36 +30,7 @@ SIDE_PX = 15  # of a window: holds 99.9 % of a spot with a blur of up to 2 px, a
 _DETECTED_SIDE_PX = 21  # of a box around a detection: room for a fit's surroundings
 LEAST_PX = 5  # side of a box below which there is nothing to measure
 CORE_PX, AROUND_PX = 0.9, 3.0  # of the two Gaussians of a spot's likeness
-_SIGMA_OF_MAD = 1.4826  # standard deviation of a normal law over its median absolute deviation
 _BEAM_RANGE_M = (0.3, 20.0)  # distances at which a beam's size is taken into account
-
-
-# -- whole images ----------------------------------------------------------------------------------------------------
-
-
-def mirror_mask(pair: Pair) -> BoolArray:
-    """Pixels inside the mirror's outline, shape (H, W), of either image: camera and mirror move together.
-
-    Outside of it there is the room itself, in which a lamp may be redder than the spot.
-    """
-    height, width = pair.down.shape[:2]
-    return outline_mask(pair.rig, Box(0, 0, width, height))
-
-
-def laser_light(pair: Pair, position: str) -> Array:
-    """Red light that the laser adds to an image, shape (H, W), in linear units of full scale 1.
-
-    With a laser-off frame it is on - off of the red plane. Without one it is the redness R - max(G, B), or, of pixels
-    without colour filters, the image itself.
-
-    Parameters
-    ----------
-    pair : Pair
-    position : "down" or "up"
-    """
-    off = pair.images.get(f"{position}_off")
-    on = linear_planes(pair.images[position], pair.card)
-    return redness(on) if off is None else np.asarray(on[0] - linear_planes(off, pair.card)[0])
 
 
 # -- work that methods share -----------------------------------------------------------------------------------------
@@ -241,7 +200,7 @@ def red_peak(red: Array, inside: BoolArray | None = None, least_sigmas: float = 
         return None
     masked = np.where(allowed, likeness, -np.inf)
     v, u = np.unravel_index(int(np.argmax(masked)), masked.shape)
-    scatter = _SIGMA_OF_MAD * float(np.median(np.abs(likeness[allowed])))
+    scatter = SIGMA_OF_MAD * float(np.median(np.abs(likeness[allowed])))
     if not masked[v, u] > max(least_sigmas * scatter, 0.0):
         return None
     return float(u), float(v)

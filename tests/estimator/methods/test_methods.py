@@ -14,7 +14,8 @@ import pytest
 
 from phibench.datasets.frames.sensor_card import SensorCard, sensor_card
 from phibench.estimator.interface import Answer, Box, Pair, Spot
-from phibench.estimator.methods.locate import around, clipped, each_spot, laser_light, locate, mirror_mask, red_peak
+from phibench.estimator.methods.locate import around, clipped, each_spot, locate, red_peak
+from phibench.estimator.methods.pair_light import laser_light, mirror_mask
 from phibench.estimator.methods.registry import KNOWN, METHODS, BuiltIn
 from phibench.estimator.methods.simple import at_the_red_peak
 from phibench.estimator.sandbox.easy_pairs import EasyPairs
@@ -106,7 +107,7 @@ def test_accuracy_of_the_built_in_methods(preset: str, name: str) -> None:
 @pytest.mark.parametrize("laser_off", [True, False])
 @pytest.mark.parametrize("preset", ["bayer-raw", "mono-raw", "srgb8"])
 def test_laser_light_in_the_mirror_is_brightest_at_the_spot(preset: str, laser_off: bool) -> None:
-    """The five lines of `locate`'s docstring, two pixels: a mosaic's neighbours share a spot."""
+    """The lines of `pair_light`'s docstring, two pixels: a mosaic's neighbours share a spot."""
     pair, truth = easy(preset, 0, laser_off), EasyPairs(preset).truth(0)
     mask = mirror_mask(pair)
     assert mask.shape == pair.down.shape[:2]

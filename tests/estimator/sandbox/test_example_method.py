@@ -11,13 +11,12 @@ import pytest
 from phibench.datasets.read import open_finished
 from phibench.estimator.benchmark.answer_errors import MATCH_PX
 from phibench.estimator.benchmark.dataset_pairs import dataset_pairs
-from phibench.estimator.interface import Pair
-from phibench.estimator.methods.simple import detected_spots
+from phibench.estimator.interface import Answer, Pair
 from phibench.estimator.sandbox import example_method
 from phibench.estimator.sandbox.example_method import extract
 
 
-@pytest.mark.parametrize("preset", ["mono-raw", "bayer-raw", "srgb8", "mjpeg"])
+@pytest.mark.parametrize("preset", ["mono-raw", "bayer-raw", "srgb8", "yuyv", "mjpeg"])
 def test_the_example_finds_the_spots_of_a_rendered_room(smoke_dataset: Path, preset: str) -> None:
     """The recipe `smoke` has the room of `paper`, its lamps and two of its distances: at 1.975 m and at 3.18 m.
 
@@ -37,11 +36,20 @@ def test_the_example_finds_the_spots_of_a_rendered_room(smoke_dataset: Path, pre
 
 def test_the_example_answers_without_laser_off_frames_and_without_a_spot(easy: Pair) -> None:
     without = replace(easy, down_off=None, up_off=None)
-    assert extract(without) == detected_spots(without)
+    # with one frame there is the room's slope below the spot: a tenth of a pixel between the two
+    for one, other in zip(both(extract(without)), both(extract(easy)), strict=True):
+        assert np.hypot(*np.subtract(one, other)) < 0.5
     assert easy.down_off is not None
     dark = replace(easy, down=easy.down_off)
     assert extract(dark).down.uv_px is None
     assert extract(dark).up == extract(easy).up
+
+
+def both(answer: Answer) -> list[tuple[float, float]]:
+    """Positions of both images."""
+    assert answer.down.uv_px is not None
+    assert answer.up.uv_px is not None
+    return [answer.down.uv_px, answer.up.uv_px]
 
 
 @pytest.fixture(scope="module")
