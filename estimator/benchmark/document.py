@@ -27,7 +27,7 @@ from phibench.estimator.benchmark.intervals import Estimate
 from phibench.estimator.benchmark.metrics import METRICS, Measured
 from phibench.estimator.benchmark.pair_bounds import excesses
 from phibench.estimator.benchmark.records import COLUMN_TYPES
-from phibench.estimator.benchmark.strata import Stratum, count_pairs, measured, strata
+from phibench.estimator.benchmark.strata import Stratum, count_pairs, light_shift, measured, strata
 from phibench.scenes.validation import printable_line
 
 KIND: Literal["phibench score"] = "phibench score"
@@ -159,6 +159,13 @@ def frame_numbers(records: pl.DataFrame) -> dict[str, Spread | None]:
     return {name: Spread.of(pairs[name]) for name in FRAME_COLUMNS}
 
 
+def light_distances(records: pl.DataFrame) -> dict[str, Spread | None]:
+    """Distances of the light from the beam's axis: in visible images, pixels; of D, metres."""
+    seen = records.filter("visible").select(shift=light_shift())["shift"]
+    pairs = records.filter((pl.col("image") == "down") & pl.col("pair_visible"))
+    return {"shift_px": Spread.of(seen), "depth_m": Spread.of((pairs["depth_m"] - pairs["axis_depth_m"]).abs())}
+
+
 class EncodedPicture(Document):
     """Part of a frame as a picture: (u, v) lies at ((u - first_u + 0.5) / step, ...) from its upper left corner."""
 
@@ -213,6 +220,7 @@ class ScoreDocument(Document):
     samples: int
     draws: int = Field(description="draws of the noise of a sample and preset, at most")
     frames: dict[str, Spread | None] = Field(description="how they were taken; null where nobody knows")
+    light: dict[str, Spread | None] = Field(description="how far the light lies from the beam's axis")
     seed: int
     rules: dict[str, float]
     limits: dict[str, Any]
@@ -265,6 +273,7 @@ def document_of(
         samples=table["sample_id"].n_unique(),
         draws=table["draw"].n_unique(),
         frames=frame_numbers(table),
+        light=light_distances(table),
         seed=seed,
         rules={name: float(value) for name, value in asdict(rules).items()},
         limits=dict(limits),

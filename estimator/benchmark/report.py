@@ -37,6 +37,7 @@ from phibench.estimator.benchmark.score_tables import (
     false_line,
     frames_line,
     head,
+    light_line,
     rank_key,
     rank_words,
     shown_parts,
@@ -54,6 +55,7 @@ _STRATA = (
     "efficiency_px",
     "efficiency_pair_px",
     "pull_deviation",
+    "beyond_5_sigma",
 )
 _LEAST_FOUND = 0.5
 """Share of found spots below which a method is said to fail."""
@@ -206,6 +208,7 @@ def report_html(
         applies=applies,
         head=head,
         frames_line=frames_line,
+        light_line=light_line,
         parts=shown_parts,
         ranked_by=rank_words(by),
         definitions=CAUSES,

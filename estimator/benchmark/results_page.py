@@ -37,6 +37,7 @@ from phibench.estimator.benchmark.score_tables import (
     cell_parts,
     differences_json,
     frames_line,
+    light_line,
     markdown,
     ranked,
     shown_parts,
@@ -45,7 +46,7 @@ from phibench.estimator.benchmark.score_tables import (
 AGAINST = "chain_fit"
 _BOARD = ("rank_phi_rad", "rank_depth", "detection_rate", "false_rate")
 _ERRORS = ("median_px", "rms_px", "median_depth_relative", "rms_depth_relative")
-_CLAIMS = ("efficiency_px", "efficiency_pair_px", "pull_deviation", "coverage_depth")
+_CLAIMS = ("efficiency_px", "efficiency_pair_px", "pull_deviation", "beyond_5_sigma", "coverage_depth")
 _DIFFERENCES = ("rank_phi_rad", "rank_depth", "detection_rate", "median_px", "rms_px")
 _STRATA = ("spot", "signal", "depth", "stroke", "hint", "quality")
 _SHOWN = 4
@@ -62,6 +63,7 @@ _HEADS = {
     "efficiency_px": "efficiency",
     "efficiency_pair_px": "efficiency, pair",
     "pull_deviation": "pull",
+    "beyond_5_sigma": "beyond 5 sigma",
     "coverage_depth": "coverage of D",
 }
 
@@ -168,7 +170,7 @@ def _board(part: Part, title: str, names: Sequence[str]) -> Grid:
     for one in part.scores:
         cells = (" ".join(shown_parts(m, one.metrics[m])) if applies(m, one.method.sees) else "" for m in names)
         rows.append((f"{one.method.name}{FLAGGED if one.flags else ''}", *(_cut(cell) for cell in cells)))
-    note = frames_line(part.scores[0])
+    note = " ".join(filter(None, (frames_line(part.scores[0]), light_line(part.scores[0]))))
     return Grid(title, ("method", *map(_head, names)), tuple(rows), "l" + "r" * len(names), note)
 
 
@@ -233,6 +235,7 @@ A blank: the metric is not that method's. A dash: nothing to compute it from.
 | Ranking | rms errors with missed spots and false detections counted, the best rank of {quantity} first; found, false |
 | Errors of found spots and depths | each method over what it has found itself: who finds less has easier spots |
 | Efficiency and claims | rms at the bound over rms; deviation of pulls, 1 is right; coverage of D, 95 is right |
+| the same: beyond 5 sigma | share of all claims that are off by more than 5 claimed sigma; pulls leave out what is off by 3 px |
 | Method minus | paired differences on the same samples; two stars: shown by an exact test, Holm over 16 metrics |
 | Found; median error | strata, of the best methods and of the one that is compared with |
 | Images without a right position | counts by kind, and their most frequent causes |

@@ -44,6 +44,7 @@ HEADS = {
     "efficiency_px": "efficiency",
     "efficiency_pair_px": "efficiency, pair",
     "pull_deviation": "pull",
+    "beyond_5_sigma": "beyond 5 sigma",
 }
 """Metrics of a ranking with their heads; a narrow table has the first `NARROW` of them."""
 NARROW = 8
@@ -119,7 +120,7 @@ def leaderboard(documents: Sequence[ScoreDocument], by: str = "phi", wide: bool 
     interval = f" {100 * first.rules['confidence']:g} % intervals over samples below the values." if wide else ""
     title = f"{_pairs_in_words(first)}, {rank_words(by)}"
     flagged = _FLAG_NOTE if any(document.flags for document in documents) else ""
-    note = " ".join(filter(None, (frames_line(first), interval.strip(), flagged)))
+    note = " ".join(filter(None, (frames_line(first), light_line(first), interval.strip(), flagged)))
     return Grid(title, ("method", *map(head, names)), tuple(rows), "L" + "r" * len(names), note)
 
 
@@ -132,7 +133,13 @@ def score_table(document: ScoreDocument, by: str = "phi") -> Grid:
         order = [name for name in order if document.metrics[name].value is not None]
     rows = ((METRICS[name].text, METRICS[name].shown[1], *_parts(name, document.metrics[name])) for name in order)
     interval = f"{100 * document.rules['confidence']:g} % interval"
-    return Grid(title, ("metric", "unit", "value", interval), tuple(rows), "LlrL", frames_line(document))
+    return Grid(
+        title,
+        ("metric", "unit", "value", interval),
+        tuple(rows),
+        "LlrL",
+        " ".join(filter(None, (frames_line(document), light_line(document)))),
+    )
 
 
 def strata_table(document: ScoreDocument, wide: bool = False) -> Grid:
@@ -192,6 +199,18 @@ def frames_line(document: ScoreDocument) -> str:
     words = [f"{shown[name][0]} {spread.text(*shown[name][1:])}" for name, spread in there.items()]
     draws = f"{document.draws} draw{'s' * (document.draws != 1)} of the noise"
     return f"Frames: {', '.join([*words, draws])}." if "exposure_s" in there else ""
+
+
+def light_line(document: ScoreDocument) -> str:
+    """Sentence on how far the light, to which a score refers, lies from the beam's axis; "" where nobody knows."""
+    shift, depth = (document.light.get(name) for name in ("shift_px", "depth_m"))
+    if shift is None:
+        return ""
+    of_depth = "" if depth is None else f"; D of the two differs by {1e3 * depth.median:.2g} mm, {1e3 * depth.high:.2g}"
+    return (
+        f"Scores refer to the centre of the light: {1e3 * shift.median:.2g} mpx from the beam's axis (median), "
+        f"{1e3 * shift.high:.2g} mpx at worst{of_depth}{' mm at worst' * (depth is not None)}."
+    )
 
 
 # -- lines beside the tables ---------------------------------------------------------------------------------------
@@ -263,7 +282,7 @@ def depth_line(document: ScoreDocument) -> str:
 # -- comparisons ---------------------------------------------------------------------------------------------------
 
 
-_BETTER = {"no difference shown": "not shown", "too few samples": ""}
+_BETTER = {"no difference shown": "not shown", "too few samples": "not shown"}
 
 
 def comparison(differences: Sequence[Difference], first: str, second: str, wide: bool = False) -> Grid:

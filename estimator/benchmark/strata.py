@@ -23,6 +23,7 @@ _EDGES: dict[str, tuple[str, tuple[float, ...], str]] = {
     "stroke": ("stroke_m", (0.0, 0.3, 0.6, 0.9, math.inf), "m"),
     "signal": ("electrons", (0.0, 300.0, 1e3, 3e3, 1e4, 3e4, math.inf), "e-"),
     "sigmas": ("snr", (0.0, 3.0, 5.0, 10.0, 30.0, math.inf), "sigma"),
+    "shift": ("shift_px", (0.0, 0.001, 0.01, 0.04, math.inf), "px"),
     "azimuth": ("azimuth_deg", tuple(float(x) for x in range(-180, 181, 45)), "deg"),
 }
 CLEAR_SIGMAS = 10.0
@@ -30,8 +31,9 @@ CLEAR_SIGMAS = 10.0
 _VALUES = {
     **{"hint": "hint", "image": "image", "bayer": "bayer", "quality": "jpeg_quality", "preset": "preset"},
     "spot": "shown",
+    "saturation": "full",
 }
-_OF_IMAGES = ("sigmas", "image", "bayer", "spot")
+_OF_IMAGES = ("sigmas", "shift", "image", "bayer", "spot", "saturation")
 _IMAGE_METRICS = tuple(name for name, metric in METRICS.items() if metric.family not in OF_PAIRS)
 STRATA = ("all", *_EDGES, *_VALUES)
 
@@ -68,7 +70,14 @@ def strata(records: pl.DataFrame) -> Iterator[Stratum]:
     shown = (
         pl.when(~pl.col("visible")).then(pl.lit("not visible")).otherwise(clear.otherwise(pl.lit("visible, fainter")))
     )
-    table = prepared(records).with_columns(azimuth_deg=pl.col("azimuth_rad").degrees(), hint=hint, shown=shown)
+    full = pl.when(~pl.col("visible")).then(None).when(pl.col("saturated")).then(pl.lit("saturated"))
+    table = prepared(records).with_columns(
+        azimuth_deg=pl.col("azimuth_rad").degrees(),
+        hint=hint,
+        shown=shown,
+        full=full.otherwise(pl.lit("not saturated")),
+        shift_px=light_shift(),
+    )
     yield Stratum("all", "all", None, None, None, table, table)
     for by in _EDGES:
         yield from _by_edges(by, table)
@@ -78,6 +87,12 @@ def strata(records: pl.DataFrame) -> Iterator[Stratum]:
             if len(part) == len(table):
                 continue  # the whole again
             yield Stratum(by, str(value), None, None, None, part, None if by in _OF_IMAGES else part)
+
+
+def light_shift() -> pl.Expr:
+    """Distance of the light's centre from the image of the beam's axis, px; null where one is not known."""
+    du, dv = (pl.col(f"{x}_true_px") - pl.col(f"{x}_axis_px") for x in "uv")
+    return (du**2 + dv**2).sqrt()
 
 
 def measured(stratum: Stratum, rules: Rules, *stream: Name) -> dict[str, Measured]:

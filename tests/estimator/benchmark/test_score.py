@@ -77,7 +77,7 @@ def test_strata_part_the_whole(mine):
     for stratum in (mine.document.whole, *mine.document.strata):
         by.setdefault(stratum.by, []).append(stratum)
     # one preset, no hints, all visible, and one class of signal to noise: these strata are the whole again
-    assert set(by) == set(STRATA) - {"preset", "hint", "sigmas", "spot"}
+    assert set(by) == set(STRATA) - {"preset", "hint", "sigmas", "shift", "spot", "saturation"}
     whole = by["all"][0].metrics["rms_px"].value
     for name in ("depth", "stroke", "signal", "azimuth", "image", "bayer", "quality"):
         assert sum(stratum.images for stratum in by[name]) == 80, name
