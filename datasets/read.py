@@ -38,6 +38,7 @@ from phibench.datasets.store.documents import (
 )
 from phibench.datasets.store.layers import SpotWindow, read_ambient, read_ambient_variance, read_spot, read_truth
 from phibench.datasets.store.schema import INFO, RIGS, ROOMS, DatasetInfo, ManifestRow, SpotRow
+from phibench.datasets.store.short_form import ShortForm
 from phibench.datasets.store.stored_rooms import Rooms, read_rooms
 from phibench.scenes.laser import Beam, LaserSpot
 from phibench.scenes.rig import POSITIONS, Rig, View
@@ -48,8 +49,8 @@ if TYPE_CHECKING:
     from polars import DataFrame
 
 
-@dataclass(frozen=True)
-class Dataset:
+@dataclass(frozen=True, repr=False)
+class Dataset(ShortForm):
     """An opened data set: iterate over its samples, take one by id or place, or a part of them as a slice.
 
     Attributes
@@ -217,8 +218,8 @@ def _ends(names: Sequence[str]) -> str:
     return ", ".join(names) if len(names) < 3 else f"{names[0]}, ..., {names[-1]}"
 
 
-@dataclass(frozen=True)
-class Sample:
+@dataclass(frozen=True, repr=False)
+class Sample(ShortForm):
     """Sample: pair of images (down, up) of one spot. `position` is "down" or "up" everywhere."""
 
     dataset: Dataset = field(repr=False)

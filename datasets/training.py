@@ -27,6 +27,7 @@ from phibench.datasets.frames.source import FrameSource
 from phibench.datasets.read import Dataset, Sample, open_finished
 from phibench.datasets.recipe.tables import FramesTable
 from phibench.datasets.store.layers import SpotWindow
+from phibench.datasets.store.short_form import ShortForm
 from phibench.render.sensor.camera_chain import Chain, auto_exposed
 from phibench.render.sensor.light import Light, Region
 from phibench.render.sensor.noise_tiles import NoiseStream
@@ -41,7 +42,7 @@ _MARGIN_PX = 32  # of a crop: what demosaicing, denoising and the units beside i
 _OPENED_SOURCES = 8
 
 
-class PairDataset:
+class PairDataset(ShortForm):
     """Pairs of frames of a data set, one draw per epoch.
 
     Item k is a dict: "down" and "up", the images as `Frame.image`; "sample_id"; "depth_m" and "stroke_m"; for both
@@ -76,6 +77,15 @@ class PairDataset:
         names = [row.sample_id for row in dataset.rows] if samples is None else list(samples)
         self.sample_ids = tuple(dataset[name].row.sample_id for name in names)
         self.laser_off, self.epoch = laser_off, 0
+
+    def _shown(self) -> dict[str, Any]:
+        return {
+            "folder": self.folder,
+            "pairs": f"{len(self)}, one draw per epoch",
+            "preset": self.options.preset,
+            "laser off": self.laser_off,
+            "epoch": self.epoch,
+        }
 
     def set_epoch(self, epoch: int) -> None:
         """Choose the draw of all items; call it before a loader starts its workers."""

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phibench.datasets.frames.sensor_card import SensorCard
+from phibench.datasets.store.short_form import ShortForm
 from phibench.scenes.laser import Beam
 from phibench.scenes.rig import Rig
 
@@ -43,8 +44,8 @@ class Box:
         return slice(self.v0_px, self.v0_px + self.height_px), slice(self.u0_px, self.u0_px + self.width_px)
 
 
-@dataclass(frozen=True)
-class Pair:
+@dataclass(frozen=True, repr=False)
+class Pair(ShortForm):
     """Pair of images (down, up) of one spot in one noise realisation, as a camera and a user deliver it.
 
     Attributes
@@ -89,6 +90,23 @@ class Pair:
     beam: Beam | None = None
     frames: Mapping[str, Image] | None = field(default=None, repr=False)
 
+    def _title(self) -> str:
+        return f"Pair {self.number}"
+
+    def _shown(self) -> dict[str, Any]:
+        image = self.down
+        boxes = [f"{box.width_px} x {box.height_px} px" for box in (self.box_down, self.box_up) if box is not None]
+        camera = self.rig.camera
+        return {
+            "images": f"{', '.join(self.images)}: {' x '.join(map(str, image.shape))} {image.dtype}",
+            "frames": ", ".join(f"{self.count(name)} of {name}" for name in self.images),
+            "output": f"{self.card.output} of '{self.card.name}', exposure {1e3 * self.card.exposure_s:.4g} ms",
+            "camera": f"{camera.width_px} x {camera.height_px} px, fx {camera.fx_px:g} px",
+            "stroke h": f"{self.stroke_m:g} m",
+            "boxes": ", ".join(boxes) or "none",
+            "calibration": "none" if self.calibration_covariance is None else "with its covariance",
+        }
+
     @classmethod
     def of_frames(cls, number: int, frames: Mapping[str, Sequence[Image]], **others: Any) -> Pair:
         """Pair of the frames of each image; of one frame each, images are these very frames."""
@@ -122,7 +140,7 @@ def _read_only(image: Image) -> Image:
 
 
 @dataclass(frozen=True)
-class Spot:
+class Spot(ShortForm):
     """Answer for one image.
 
     Parameters
@@ -132,7 +150,7 @@ class Spot:
     covariance_px2 : 2 x 2 or None
         Covariance of (u, v), if the method claims one.
     phi_rad : float or None
-        Angle in the sense `phi_convention`; None leaves it to `estimator.phi`.
+        Angle in the sense `phi_convention`; None leaves it to `estimator.geometry.phi`.
     phi_convention : "ray", "normal", "incidence" or "outline"
     status : str
         "ok", or in a few words why there is no position.
@@ -151,7 +169,7 @@ class Spot:
 
 
 @dataclass(frozen=True)
-class Answer:
+class Answer(ShortForm):
     """Answer for a pair; the depth is computed from the positions unless the method gives one itself.
 
     Parameters

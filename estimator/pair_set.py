@@ -12,6 +12,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Protocol
 
+from phibench.datasets.store.short_form import ShortForm
 from phibench.estimator.interface import Pair
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import Rig
@@ -71,8 +72,8 @@ class SpotTruth:
     axis_px: tuple[float, float] = (math.nan, math.nan)
 
 
-@dataclass(frozen=True)
-class PairTruth:
+@dataclass(frozen=True, repr=False)
+class PairTruth(ShortForm):
     """Exact answer for one pair, with what a score sorts by.
 
     Attributes
@@ -123,6 +124,19 @@ class PairTruth:
     lamp_level: float | None = None
     depth_sigma_m: float = 0.0
     axis_depth_m: float = math.nan
+
+    def _title(self) -> str:
+        return f"Truth of pair {self.number}: '{self.sample_id}', draw {self.draw}, {self.preset}"
+
+    def _shown(self) -> dict[str, Any]:
+        spots = {"down": self.down, "up": self.up}
+        places = {
+            name: f"({one.uv_px[0]:.3f}, {one.uv_px[1]:.3f}) px, phi_ray {one.phi_rad.get('ray', math.nan):.6f} rad"
+            if one.visible
+            else f"not visible: {one.cause}"
+            for name, one in spots.items()
+        }
+        return {"depth D": f"{self.depth_m:.4f} m", "stroke h": f"{self.stroke_m:.4f} m", **places}
 
 
 class Pairs(Protocol):

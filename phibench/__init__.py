@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from phibench.datasets.training import PairDataset
     from phibench.estimator.benchmark.score import score
+    from phibench.estimator.geometry.phi import phi
     from phibench.estimator.geometry.triangulate import depth_exact
     from phibench.estimator.interface import Answer, Pair, Spot
     from phibench.estimator.paper.sensitivity_table import make
@@ -37,6 +38,7 @@ __all__ = [
     "find_spot",
     "make",
     "open_dataset",
+    "phi",
     "score",
 ]
 
@@ -50,6 +52,7 @@ _HOMES = {
     "find_spot": "phibench.estimator.spots.simple_spots",
     "make": "phibench.estimator.paper.sensitivity_table",
     "open_dataset": "phibench.estimator.scored_dataset",
+    "phi": "phibench.estimator.geometry.phi",
     "score": "phibench.estimator.benchmark.score",
 }
 

@@ -1,6 +1,7 @@
 """The public interface: what `import phibench` gives, at which price, and the old names of one version."""
 
 import ast
+import html
 import inspect
 import re
 import subprocess
@@ -17,6 +18,8 @@ from phibench.datasets.errors import DatasetError
 from phibench.estimator import interface
 from phibench.estimator.sandbox.resolve import MethodError
 from phibench.estimator.sandbox.runner import asked_here
+from phibench.scenes.rig import Rig
+from phibench.scenes.validation import SceneError
 
 ROOT = Path(__file__).resolve().parent.parent
 Python = Callable[..., subprocess.CompletedProcess[str]]
@@ -39,7 +42,7 @@ def test_the_public_names_are_there() -> None:
     assert {name: getattr(phibench, name) for name in ("Pair", "Answer", "Spot")} == {
         name: getattr(interface, name) for name in ("Pair", "Answer", "Spot")
     }
-    assert len(set(phibench.__all__) - {"__version__"}) == 10
+    assert len(set(phibench.__all__) - {"__version__"}) == 11
     assert set(phibench.__all__) <= set(dir(phibench))
     assert all(callable(getattr(phibench, name)) for name in phibench.__all__ if name != "__version__")
     with pytest.raises(AttributeError, match="no attribute 'open'; it has Answer"):
@@ -57,7 +60,7 @@ def test_type_checkers_and_editors_see_the_same_names() -> None:
 
 
 def test_the_page_names_every_public_name_and_no_other() -> None:
-    page = (ROOT / "docs" / "python.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "python.md").read_text(encoding="utf-8").split("\n## ")[0]
     rows = re.findall(r"^\| `(\w+)` \|", page, re.M)
     assert sorted(rows) == sorted(phibench.__all__)
 
@@ -107,6 +110,71 @@ def test_the_old_names_of_a_sample_work_and_warn(tiny_dataset: Path) -> None:
     with pytest.warns(DeprecationWarning, match=r"Sample\.frames is now Sample\.camera_frames"):
         frames = sample.frames("bayer-raw", 2, exposure=0.01)
     assert np.array_equal(frames.up, sample.camera_frames("bayer-raw", 2, exposure=0.01).up)
+
+
+def test_phi_is_that_of_the_rendered_truth(tiny_dataset: Path) -> None:
+    """The renderer traces rays; the estimator solves the reflection. The file has float32: half of its step is 6e-8."""
+    sample = phibench.open_dataset(tiny_dataset)[0]
+    truth = sample.truth("up")
+    v, u = np.nonzero(truth["object_id"] >= 0)
+    assert len(u) > 100
+    pixels = np.stack([u, v], axis=-1)
+    for name in ("ray", "normal", "incidence"):
+        found = phibench.phi(sample.view("up"), pixels, name)
+        assert np.abs(found - truth[f"phi_{name}_rad"][v, u]).max() < 6.1e-8
+    assert np.array_equal(phibench.phi(sample.rig, pixels[:5]), phibench.phi(sample.rig.at(0.0), pixels[:5]))
+    assert phibench.phi(sample.rig, pixels[0]).shape == ()
+    assert np.isnan(phibench.phi(sample.rig, (-1e4, 0.0)))
+
+
+@pytest.mark.parametrize(
+    ("uv", "convention", "reason"),
+    [
+        ((1.0, 2.0), "rays", "no convention 'rays' of phi; .*ray"),
+        (3.0, "ray", r"uv_px: must be numbers of shape \(..., 2\)"),
+        ((1.0, 2.0, 3.0), "ray", "uv_px"),
+        ("middle", "ray", "uv_px"),
+    ],
+)
+def test_phi_refuses_in_one_sentence(uv: object, convention: str, reason: str) -> None:
+    with pytest.raises(SceneError, match=reason):
+        phibench.phi(Rig(), uv, convention)
+
+
+def test_every_result_is_shown_by_a_short_table(tiny_dataset: Path) -> None:
+    """At the end of a cell: at most 25 lines of 120 characters, as text and in a notebook."""
+    dataset = phibench.open_dataset(tiny_dataset)
+    sample = dataset[0]
+    spots = [phibench.find_spot(sample.expected_image(place)) for place in ("down", "up")]
+    many = [np.tile(spot.uv_px, (1000, 1)) for spot in spots]
+    easy, answer = phibench.EasyPairs(count=2), phibench.Answer(phibench.Spot((1.0, 2.0)), phibench.Spot.missing("no"))
+    results = [
+        dataset,
+        dataset[:1],
+        sample,
+        sample.spot("down"),
+        sample.camera_frames("mono-raw"),
+        *spots,
+        phibench.depth_exact(sample.rig, sample.row.stroke_m, spots[0].uv_px, spots[1].uv_px),
+        phibench.depth_exact(sample.rig, sample.row.stroke_m, *many),
+        easy,
+        easy.pair(0),
+        easy.truth(0),
+        dataset.pairs("mono-raw"),
+        phibench.PairDataset(tiny_dataset, "mono-raw"),
+        answer,
+        answer.down,
+        phibench.score(easy_set := dataset[:1], "red_centroid", "mono-raw", draws=1),
+    ]
+    assert len(easy_set) == 1
+    for result in results:
+        lines = repr(result).splitlines()
+        assert len(lines) <= 25, type(result)
+        assert max(map(len, lines)) <= (260 if result is answer else 120), type(result)
+        assert result._repr_html_() == f"<pre>{html.escape(repr(result))}</pre>"
+    assert "red_centroid: 1 pairs mono-raw" in repr(results[-1])
+    assert "rms error" in repr(results[-1])
+    assert repr(results[6 - 1]).splitlines()[1] == f"  position  ({spots[0].uv_px[0]:.6g}, {spots[0].uv_px[1]:.6g}) px"
 
 
 def test_a_function_and_its_file_get_the_same_score(bench_dataset: Path, tmp_path: Path) -> None:

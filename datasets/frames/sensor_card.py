@@ -11,7 +11,7 @@ from phibench.render.sensor.settings import Sensor, sensor
 
 @dataclass(frozen=True)
 class SensorCard:
-    """Numbers of one sensor, as `render.sensor.Sensor` defines them.
+    """Numbers of one sensor, as `render.sensor.settings.Sensor` defines them.
 
     Attributes
     ----------

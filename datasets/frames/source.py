@@ -20,6 +20,7 @@ from phibench.datasets.frames.distractors import Distractor
 from phibench.datasets.frames.request import FrameRequest, in_one_sentence, whole_number
 from phibench.datasets.store.layers import SpotWindow
 from phibench.datasets.store.schema import ManifestRow, SpotRow
+from phibench.datasets.store.short_form import ShortForm
 from phibench.render.sensor.camera_chain import Chain, auto_exposed
 from phibench.render.sensor.light import Light, Region
 from phibench.render.sensor.noise_tiles import frame_stream
@@ -66,8 +67,8 @@ class Frame:
         return self.position if self.laser else f"{self.position}_off"
 
 
-@dataclass(frozen=True)
-class Frames:
+@dataclass(frozen=True, repr=False)
+class Frames(ShortForm):
     """Frames of one pair of images (down, up) in one noise realisation; images as `Frame.image`.
 
     Attributes
@@ -77,6 +78,9 @@ class Frames:
     """
 
     by_name: Mapping[str, Frame]
+
+    def _shown(self) -> dict[str, Any]:
+        return {name: frame.image for name, frame in self.by_name.items()}
 
     @classmethod
     def of(cls, frames: list[Frame]) -> Frames:

@@ -28,6 +28,7 @@ from numpy.typing import ArrayLike, NDArray
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.input_files import PICTURE_PIXELS, InputFile, quiet_terminal
 from phibench.datasets.store.files import require_file, write_atomic
+from phibench.datasets.store.short_form import ShortForm
 from phibench.scenes.camera import FILTERS, LARGEST_SIDE_PX
 from phibench.scenes.frames import Array
 from phibench.scenes.validation import printable_line
@@ -207,8 +208,8 @@ SPOT_STACKS = {"electrons_per_s": "", "du_electrons_per_s_px": "du.", "dv_electr
 SPOT_PLANES = tuple(prefix + name for prefix in SPOT_STACKS.values() for name in FILTERS)
 
 
-@dataclass(frozen=True)
-class SpotWindow:
+@dataclass(frozen=True, repr=False)
+class SpotWindow(ShortForm):
     """A spot layer: images of one spot on a small window.
 
     Attributes
@@ -226,6 +227,9 @@ class SpotWindow:
     electrons_per_s: Array
     du_electrons_per_s_px: Array
     dv_electrons_per_s_px: Array
+
+    def _shown(self) -> dict[str, Any]:
+        return {"first pixel": (self.u0_px, self.v0_px), "electrons/s": self.electrons_per_s}
 
     @classmethod
     def empty(cls) -> SpotWindow:

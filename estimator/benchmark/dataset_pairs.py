@@ -25,6 +25,7 @@ from phibench.datasets.read import Dataset, Sample, open_dataset
 from phibench.datasets.store import schema
 from phibench.datasets.store.files import sha256
 from phibench.datasets.store.provenance import provenance
+from phibench.datasets.store.short_form import ShortForm
 from phibench.estimator.calibration.file import Calibration, CalibrationError
 from phibench.estimator.draw_pairs import DrawnPairs
 from phibench.estimator.geometry.rig_parameters import stroke_of
@@ -59,7 +60,7 @@ LEAST_BOX_PX = 16
 """Side of the smallest box, as in a recipe."""
 
 
-class DatasetPairs(DrawnPairs):
+class DatasetPairs(DrawnPairs, ShortForm):
     """Pairs of a data set by number, with their truth; the layers of the last sample are kept.
 
     Parameters
@@ -85,6 +86,13 @@ class DatasetPairs(DrawnPairs):
     ) -> None:
         super().__init__(dataset, pair_draws)
         self._boxes_px, self._sensor, self._count_frames = boxes_px, sensor, count_frames
+
+    def _shown(self) -> dict[str, Any]:
+        return {
+            "data set": self.dataset.folder,
+            "pairs": len(self),
+            "presets": ", ".join(dict.fromkeys(one.preset for one in self.pair_draws)),
+        }
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle without rows and layers: another process opens the data set itself."""

@@ -24,6 +24,7 @@ from phibench.datasets.frames.sensor_file import read_sensor_file
 from phibench.datasets.progress import Steps, progress_console
 from phibench.datasets.read import Dataset, open_finished
 from phibench.datasets.store.files import require_writable
+from phibench.datasets.store.short_form import ShortForm
 from phibench.estimator.benchmark.answer_errors import Rules
 from phibench.estimator.benchmark.causes import with_causes
 from phibench.estimator.benchmark.dataset_pairs import (
@@ -42,6 +43,7 @@ from phibench.estimator.benchmark.document import (
 )
 from phibench.estimator.benchmark.records import in_order, missed_relative, record_table, with_missed
 from phibench.estimator.benchmark.report import time_section, write_report
+from phibench.estimator.benchmark.score_tables import score_table, text_of
 from phibench.estimator.benchmark.worst_images import worst, worst_of, worst_records
 from phibench.estimator.calibration.file import read_calibration
 from phibench.estimator.captures.imported_set import ImportedSet, imported_pairs, is_imported, open_imported
@@ -61,13 +63,19 @@ AT_ONCE = 16
 """Pairs that are examined together; twice as many are in memory. One of MJPEG frames, on and off, takes 11 MB."""
 
 
-@dataclass(frozen=True)
-class Scored:
-    """A score, the records that it was computed from, and what the method printed where it first failed."""
+@dataclass(frozen=True, repr=False)
+class Scored(ShortForm):
+    """A score, the records that it was computed from, and what the method printed where it first failed.
+
+    Its `repr` is the table that `phibench score` prints first.
+    """
 
     document: ScoreDocument
     records: pl.DataFrame
     output: str = ""
+
+    def __repr__(self) -> str:
+        return text_of(score_table(self.document))
 
 
 @dataclass(frozen=True)

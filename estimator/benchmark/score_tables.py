@@ -398,6 +398,14 @@ def show_grid(console: Console, grid: Grid) -> None:
     console.print()
 
 
+def text_of(grid: Grid) -> str:
+    """Table as a terminal of 80 columns shows it."""
+    console = Console(file=io.StringIO(), width=80, markup=False, emoji=False, color_system=None)
+    show_grid(console, grid)
+    shown = console.file.getvalue()  # type: ignore[attr-defined]
+    return "\n".join(line.rstrip() for line in shown.rstrip().split("\n"))
+
+
 def markdown(grid: Grid) -> str:
     """Table in Markdown, a line of text before it."""
     marks = ["--:" if kind == "r" else ":--" for kind in grid.columns]

@@ -167,7 +167,7 @@ def alignment(
 
     Parameters
     ----------
-    image, rig, card : see `outline.find_outline`
+    image, rig, card : see `outline.outline.find_outline`
     tilt_sigma_rad : float
         How well the camera is known to be vertical, each axis.
     principal_point_sigma_px : float

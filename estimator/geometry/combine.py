@@ -114,8 +114,8 @@ def joint_bound(
     """Bound of both positions and of D when the epipolar constraint is used; NaN where there is none.
 
     The covariances are bounds of (u, v) with flux and background unknown; these are the images' own, so that the
-    information of both about (u, v, 1 / D) adds. No part is above the bound of `limits.depth_limit` and of the single
-    images, which takes the four coordinates for four unknowns.
+    information of both about (u, v, 1 / D) adds. No part is above the bound of `limits.position_bound.depth_limit` and
+    of the single images, which takes the four coordinates for four unknowns.
     """
     q = 1.0 / np.asarray(depth_m, float)
     G = up_image(rig, stroke_m, uv_down_px, q).jacobian

@@ -14,12 +14,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from phibench.estimator.geometry.reflection import ON_AXIS_SINE, reflect, reflect_jacobian
 from phibench.estimator.geometry.status import Status, StatusArray, flag, keep
 from phibench.scenes.frames import Array
 from phibench.scenes.revolved_mirror import RevolvedMirror
 from phibench.scenes.rig import Rig, View
+from phibench.scenes.validation import SceneError, nearest
 
 Convention = Callable[[View, Array], Array]
 
@@ -38,6 +40,37 @@ class PhiEstimate:
     phi_rad: Array
     variance_rad2: Array
     status: StatusArray
+
+
+def phi(rig: Rig | View, uv_px: ArrayLike, convention: str = "ray") -> Array:
+    """Angle phi of pixels, radians: `phibench.phi`.
+
+    Parameters
+    ----------
+    rig : Rig or View
+        A rig stands for its down position; `rig.at(stroke_m)` and `sample.view("up")` are views.
+    uv_px : shape (..., 2), pixels
+    convention : "ray", "normal", "incidence" or "outline"
+
+    Returns
+    -------
+    array, shape (...)
+        NaN where the pixel's ray misses the mirror.
+
+    Raises
+    ------
+    SceneError
+        If the pixels are no pairs of numbers, or there is no such convention.
+    """
+    if convention not in CONVENTIONS:
+        raise SceneError(f"no convention '{convention}' of phi; {nearest(convention, CONVENTIONS)}")
+    try:
+        uv = np.asarray(uv_px, float)
+    except (TypeError, ValueError):
+        uv = np.empty(0)
+    if uv.ndim == 0 or uv.shape[-1] != 2:
+        raise SceneError("uv_px: must be numbers of shape (..., 2), the pixel's u and v; give (640.0, 120.0)")
+    return np.asarray(CONVENTIONS[convention](rig.at(0.0) if isinstance(rig, Rig) else rig, uv))
 
 
 def phi_ray(view: View, uv_px: Array) -> Array:
@@ -132,14 +165,14 @@ def estimate_phi(convention: str, view: View, uv_px: Array, covariance_px2: Arra
     PhiEstimate
         variance = g C g^T with g = dphi/d(u, v), differentiated analytically.
     """
-    phi = CONVENTIONS[convention](view, uv_px)
+    angle = CONVENTIONS[convention](view, uv_px)
     status = _outline_status(view, uv_px) if convention == "outline" else reflect(view, uv_px).status
     if covariance_px2 is None:
-        return PhiEstimate(phi, np.full(phi.shape, np.nan), status)
+        return PhiEstimate(angle, np.full(angle.shape, np.nan), status)
     with np.errstate(all="ignore"):
         g = GRADIENTS[convention](view, uv_px)
         variance = np.einsum("...i,...ij,...j->...", g, covariance_px2, g)
-    return PhiEstimate(phi, keep(variance, status), status)
+    return PhiEstimate(angle, keep(variance, status), status)
 
 
 def _outline_status(view: View, uv_px: Array) -> StatusArray:

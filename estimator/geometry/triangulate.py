@@ -9,10 +9,12 @@ all arguments broadcast together. `least_squares_depth` takes the same rays and 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from phibench.datasets.store.short_form import ShortForm, short
 from phibench.estimator.geometry.paper_depth import PARALLEL_SINE
 from phibench.estimator.geometry.reflection import room_rays, room_rays_jacobian
 from phibench.estimator.geometry.status import (
@@ -32,8 +34,8 @@ from phibench.scenes.validation import SceneError
 _ALIGNED_M = 1e-9  # camera, sphere centre and stroke axis count as vertical within this
 
 
-@dataclass(frozen=True)
-class PointEstimate(DepthEstimate):
+@dataclass(frozen=True, repr=False)
+class PointEstimate(ShortForm, DepthEstimate):
     """A depth with the point it belongs to.
 
     Parameters
@@ -44,6 +46,19 @@ class PointEstimate(DepthEstimate):
 
     point_world_m: Array
     gap_m: Array
+
+    def _shown(self) -> dict[str, Any]:
+        states, counts = np.unique(self.status, return_counts=True)
+        return {
+            "depth D": f"{short(np.asarray(self.depth_m))} m",
+            "sigma of D": f"{short(np.asarray(self.sigma_m))} m",
+            "point": f"{short(np.asarray(self.point_world_m))} m",
+            "gap": f"{short(np.asarray(self.gap_m))} m",
+            "status": ", ".join(
+                f"{Status(one).name}{f' {n}' if self.status.size > 1 else ''}"
+                for one, n in zip(states.tolist(), counts.tolist(), strict=True)
+            ),
+        }
 
 
 @dataclass(frozen=True)

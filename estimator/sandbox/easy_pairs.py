@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from phibench.datasets.exposures.expected import ExpectedRegion
 from phibench.datasets.frames.sensor_card import SensorCard, sensor_card
+from phibench.datasets.store.short_form import ShortForm
 from phibench.estimator.geometry.mirror_image import image_of
 from phibench.estimator.geometry.phi import phi_incidence, phi_normal, phi_ray
 from phibench.estimator.interface import Box, Pair
@@ -203,8 +204,8 @@ BOX_PX = 64
 _SPAN_PX = 20  # by which a box may be off the spot
 
 
-@dataclass(frozen=True)
-class EasyPairs:
+@dataclass(frozen=True, repr=False)
+class EasyPairs(ShortForm):
     """Easy pairs by number; a `PairSet`.
 
     Parameters
@@ -231,6 +232,14 @@ class EasyPairs:
     def __post_init__(self) -> None:
         if self.preset not in KINDS:
             raise MethodError(f"no easy pairs for preset '{self.preset}': {nearest(self.preset, KINDS)}")
+
+    def _shown(self) -> dict[str, Any]:
+        return {
+            "pairs": self.count,
+            "preset": self.preset,
+            "laser off": "with frames" if self.laser_off else "none",
+            "boxes": "with boxes" if self.hinted else "none",
+        }
 
     def __len__(self) -> int:
         """Return the number of pairs."""

@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import gaussian_laplace
 from scipy.optimize import least_squares
 
+from phibench.datasets.store.short_form import ShortForm, short
 from phibench.estimator.geometry.status import Status, StatusArray, flag, keep
 from phibench.scenes.frames import Array, BoolArray
 
@@ -190,8 +191,8 @@ MAX_WIDTH_PX = 201
 Region = tuple[int, int, int, int]  # u0, v0, u1, v1: first column and row, last column and row + 1
 
 
-@dataclass(frozen=True)
-class SpotPosition:
+@dataclass(frozen=True, repr=False)
+class SpotPosition(ShortForm):
     """Position of a spot in a noise-free frame.
 
     Parameters
@@ -206,6 +207,15 @@ class SpotPosition:
     flux: float
     window: Region
     status: Status
+
+    def _shown(self) -> dict[str, Any]:
+        u0, v0, u1, v1 = self.window
+        return {
+            "position": f"{short(self.uv_px)} px",
+            "flux": self.flux,
+            "window": f"{u1 - u0} x {v1 - v0} px from ({u0}, {v0})",
+            "status": self.status.name,
+        }
 
 
 def find_spot(on: Array, off: Array | None = None, region: Region | None = None) -> SpotPosition:

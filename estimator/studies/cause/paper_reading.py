@@ -87,7 +87,7 @@ class Reader:
     Parameters
     ----------
     convention : "ray", "normal", "incidence" or "outline"
-        What is taken for phi (`estimator.phi`).
+        What is taken for phi (`estimator.geometry.phi`).
     equation : 4 or 5
         Equation of the paper that gives D.
     centred : bool
