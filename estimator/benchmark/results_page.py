@@ -235,7 +235,7 @@ A blank: the metric is not that method's. A dash: nothing to compute it from.
 | Ranking | rms errors with missed spots and false detections counted, the best rank of {quantity} first; found, false |
 | Errors of found spots and depths | each method over what it has found itself: who finds less has easier spots |
 | Efficiency and claims | rms at the bound over rms; deviation of pulls, 1 is right; coverage of D, 95 is right |
-| the same: beyond 5 sigma | share of all claims that are off by more than 5 claimed sigma; pulls leave out what is off by 3 px |
+| the same: beyond 5 sigma | share of claims off by more than 5 sigma, 0 is right; pulls leave out errors of 3 px |
 | Method minus | paired differences on the same samples; two stars: shown by an exact test, Holm over 16 metrics |
 | Found; median error | strata, of the best methods and of the one that is compared with |
 | Images without a right position | counts by kind, and their most frequent causes |
