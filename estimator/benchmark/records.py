@@ -84,6 +84,9 @@ COLUMNS: dict[str, str] = {
     "phi_rad": "the method's, else estimator.geometry.phi of its pixel through the nominal rig",
     "phi_true_rad": "truth in that convention; outline: estimator.geometry.phi of the true pixel through the true rig",
     "phi_error_rad": "phi_rad - phi_true_rad, in units of phi_ray: times d phi_ray / d phi along the gradient",
+    "claimed_uu_px2": "claimed variance of u",
+    "claimed_uv_px2": "claimed covariance of u and v",
+    "claimed_vv_px2": "claimed variance of v",
     "pull_u": "first component of L^-1 e, C = L L^T the claimed covariance",
     "pull_v": "second component",
     "mahalanobis2": "e^T C^-1 e",
@@ -242,7 +245,8 @@ def _image_columns(
     near = error.distance_px <= rules.match_px  # False for NaN
     detected = visible & np.where(known, near, given)
     false = given & ~detected
-    pull = whitened(np.stack([error.du_px, error.dv_px], -1), usable_covariance(_claimed(answers)))
+    claimed = usable_covariance(_claimed(answers))
+    pull = whitened(np.stack([error.du_px, error.dv_px], -1), claimed)
     bound, raw = (_bounds(spots, name) for name in ("bound_px2", "raw_bound_px2"))
     return {
         "image": [position] * len(spots),
@@ -270,6 +274,9 @@ def _image_columns(
         "false_detection": false,
         "counted_px": np.where(visible & known, np.where(detected, error.distance_px, rules.match_px), np.nan),
         **phi,
+        "claimed_uu_px2": claimed[:, 0, 0],
+        "claimed_uv_px2": claimed[:, 0, 1],
+        "claimed_vv_px2": claimed[:, 1, 1],
         "pull_u": pull[:, 0],
         "pull_v": pull[:, 1],
         "mahalanobis2": np.sum(pull**2, axis=-1),
