@@ -56,6 +56,8 @@ class SensorCard:
         Of "yuyv", BT.601: Y' on 0 to 255, or on 16 to 235.
     chroma_taps : 3 floats
         Of "yuyv": weights of columns 2k - 1, 2k and 2k + 1 in chroma sample k.
+    mosaic_phase : (du, dv)
+        Red of a processed image lies where u + du and v + dv are even: a sensor that is read out mirrored has 1 for 0.
     """
 
     name: str
@@ -87,6 +89,7 @@ class SensorCard:
     denoise_threshold_codes: float | None = None
     ycbcr_range: Literal["full", "limited"] = "full"
     chroma_taps: tuple[float, float, float] = (0.25, 0.5, 0.25)
+    mosaic_phase: tuple[int, int] = (0, 0)
 
     @property
     def saturation_e(self) -> float:
@@ -118,4 +121,4 @@ def sensor_card(preset: str = "bayer-raw", **changes: Any) -> SensorCard:
 
 def card_of(s: Sensor) -> SensorCard:
     """Card of a sensor."""
-    return SensorCard(**{name: getattr(s, name) for name in SensorCard.__dataclass_fields__})
+    return SensorCard(**{name: getattr(s, name) for name in SensorCard.__dataclass_fields__ if name != "mosaic_phase"})

@@ -21,6 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from phibench.datasets.errors import DatasetError
+from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.datasets.frames.sensor_file import SensorFile, read_sensor_file
 from phibench.estimator.calibration.bundle import calibrate
 from phibench.estimator.calibration.file import Calibration, read_calibration
@@ -29,6 +30,7 @@ from phibench.estimator.captures.pair_photos import (
     LEAST_STROKE_M,
     MOST_STROKE_M,
     PairPhotos,
+    PositionPhotos,
     contradiction,
     frames_note,
     moved_between,
@@ -36,7 +38,7 @@ from phibench.estimator.captures.pair_photos import (
     nothing_found,
     pair_of_photos,
 )
-from phibench.estimator.captures.picture_files import SensorChoice, require_colour, sensor_choice
+from phibench.estimator.captures.picture_files import Photo, SensorChoice, require_colour, sensor_choice
 from phibench.estimator.captures.rig_file import MeasuredRig, read_rig_file, require_camera_size
 from phibench.estimator.captures.spot_shape import (
     OUTLINE_SIGMA_PX,
@@ -49,6 +51,7 @@ from phibench.estimator.captures.spot_shape import (
     seen_through,
     spot_images,
 )
+from phibench.estimator.captures.tested_chain import ChainTest, chain_test
 from phibench.estimator.geometry.least_squares_depth import GeneralDepth, depth_general
 from phibench.estimator.geometry.rig_parameters import PARAMETERS, prior_sigmas, stroke_of
 from phibench.estimator.geometry.status import Status, describe
@@ -193,36 +196,132 @@ def measure(photos: PairPhotos, stroke_m: float, setting: Setting) -> Measuremen
     for photo in photos.all:
         require_colour(photo)
         require_camera_size(setting.known.rig, photo.size_px, str(photo.path))
-    chosen = sensor_choice(photos.down.on[0], setting.sensor)
-    for photo in photos.all:
         sensor_choice(photo, setting.sensor)
-    pair = pair_of_photos(photos, stroke_m, setting.known, chosen.card)
+    test = chain_test(
+        photos,
+        lambda photo: sensor_choice(photo, setting.sensor).card,
+        lambda group, card: pair_of_photos(group, stroke_m, setting.known, card),
+    )
+    if photos.down.on[0].kind == "raw" and (corner := next(iter(test.phases))) != (0, 0):
+        return _shifted(measure(*_without(corner, photos, stroke_m, setting)), corner, photos, setting, test.note)
+    return _measured(test, stroke_m, setting)
+
+
+def _measured(test: ChainTest, stroke_m: float, setting: Setting) -> Measurement:
+    """Measurement with the phases of a test, which are in sigma where they are several."""
+    photos, chosen = test.photos, sensor_choice(test.photos.down.on[0], setting.sensor)
+    parts, faults = [], []
+    for phase, chance in test.phases.items():
+        try:
+            parts.append((_fitted(photos, stroke_m, setting, replace(chosen.card, mosaic_phase=phase)), chance))
+        except DatasetError as error:
+            faults.append(error)
+    if not parts:
+        raise faults[0]
+    found = parts[0][0]
+    down, up = (_mixed([(one.spots[name], chance) for one, chance in parts], test.added_px) for name in POSITIONS)
+    depth = depth_general(
+        found.rig,
+        found.stroke_m,
+        down.uv_px,
+        up.uv_px,
+        down.covariance_px2,
+        up.covariance_px2,
+        found.covariance,
+        setting.stroke_sigma_m,
+    )
+    if int(depth.status) != Status.OK:
+        raise contradiction(found.pair, photos, describe(int(depth.status)))
+    tests = _doubt(depth), _torn(down, "down"), _torn(up, "up"), *_moved(found.pair, photos), _foreign(test)
+    notes = (chosen.note, test.note, *found.notes, frames_note(photos), *tests)
+    told = tuple(text for text in notes if text)
+    nominal = setting.known.rig
+    return Measurement(depth, down, up, found.rig, found.stroke_m, found.outlines, nominal, found.pair, chosen, told)
+
+
+@dataclass(frozen=True)
+class _Fitted:
+    """Spots and rig under one chain: both positions, covariance of `PARAMETERS`, and sentences."""
+
+    pair: Pair
+    spots: dict[str, SeenSpot]
+    rig: Rig
+    covariance: Array
+    stroke_m: float
+    outlines: tuple[Outline, ...]
+    notes: tuple[str, ...]
+
+
+def _fitted(photos: PairPhotos, stroke_m: float, setting: Setting, card: SensorCard) -> _Fitted:
+    pair = pair_of_photos(photos, stroke_m, setting.known, card)
     outlines, missing = _outlines(pair, setting.calibration is not None)
     rig, covariance, values, note = _corrected(setting, outlines, missing)
     stroke = float(stroke_of(np.array(stroke_m), values))
     seen = replace(pair, rig=with_blur_of(rig, outlines), stroke_m=stroke)
     images = seen_images(seen)
     shape = _shape(setting, seen, images, outlines)
-    ready = replace(pair, rig=shape.rig(rig), stroke_m=stroke)
-    spots = seen_spots(_answer(ready, photos))
-    down, up = (widened_by_shape(spots[name], images.get(name), shape) for name in POSITIONS)
     rig = shape.rig(rig)
-    depth = depth_general(
-        rig,
-        stroke,
-        down.uv_px,
-        up.uv_px,
-        down.covariance_px2,
-        up.covariance_px2,
-        covariance,
-        setting.stroke_sigma_m,
-    )
-    if int(depth.status) != Status.OK:
-        raise contradiction(ready, photos, describe(int(depth.status)))
-    frames = frames_note(photos)
-    tests = _doubt(depth), _torn(down, "down"), _torn(up, "up"), *_moved(pair, photos)
-    notes = tuple(text for text in (chosen.note, note, _shape_note(shape, setting), frames, *tests) if text)
-    return Measurement(depth, down, up, rig, stroke, outlines, setting.known.rig, ready, chosen, notes)
+    ready = replace(pair, rig=rig, stroke_m=stroke)
+    spots = seen_spots(_answer(ready, photos))
+    wide = {name: widened_by_shape(spots[name], images.get(name), shape) for name in POSITIONS}
+    return _Fitted(ready, wide, rig, covariance, stroke, outlines, (note, _shape_note(shape, setting)))
+
+
+def _mixed(parts: Sequence[tuple[SeenSpot, float]], added_px: float) -> SeenSpot:
+    """Spot of several hypotheses: mean and covariance of their mixture, and what the chain adds."""
+    weight = np.array([chance for _, chance in parts])
+    weight /= weight.sum()
+    places = np.array([spot.uv_px for spot, _ in parts])
+    mean = weight @ places
+    within = np.einsum("k,kij->ij", weight, np.array([spot.covariance_px2 for spot, _ in parts]))
+    between = np.einsum("k,ki,kj->ij", weight, places - mean, places - mean)
+    return SeenSpot(mean, within + between + added_px**2 * np.eye(2), parts[0][0].unlike)
+
+
+def _without(
+    corner: tuple[int, int], photos: PairPhotos, stroke_m: float, setting: Setting
+) -> tuple[PairPhotos, float, Setting]:
+    """Pictures of DN and setting without the first columns and rows, so that red comes first."""
+    du, dv = corner
+
+    def of(group: Sequence[Photo]) -> tuple[Photo, ...]:
+        return tuple(replace(photo, pixels=_cut(photo.pixels, du, dv)) for photo in group)
+
+    down, up = (PositionPhotos(of(one.on), of(one.off)) for one in (photos.down, photos.up))
+    known = replace(setting.known, rig=_rig_at(setting.known.rig, -du, -dv))
+    held = setting.calibration
+    held = None if held is None else replace(held, rig=_rig_at(held.rig, -du, -dv))
+    return PairPhotos(down, up), stroke_m, replace(setting, known=known, calibration=held)
+
+
+def _cut(pixels: Image, du: int, dv: int) -> Image:
+    """Pixels without the first `du` columns and `dv` rows, and without as many at the end as keep the size even."""
+    part = pixels[dv : pixels.shape[0] - dv, du : pixels.shape[1] - du].copy()
+    part.flags.writeable = False
+    return part
+
+
+def _rig_at(rig: Rig, du: int, dv: int) -> Rig:
+    """Rig whose picture begins `du` columns and `dv` rows further out, and ends as much."""
+    camera = rig.camera
+    width, height = camera.width_px + 2 * du, camera.height_px + 2 * dv
+    place = {"cx_px": camera.cx_px + du, "cy_px": camera.cy_px + dv}
+    return replace(rig, camera=replace(camera, width_px=width, height_px=height, **place))
+
+
+def _shifted(
+    found: Measurement, corner: tuple[int, int], photos: PairPhotos, setting: Setting, note: str
+) -> Measurement:
+    """Measurement of cut pictures in the pixels of the whole ones."""
+    down, up = (replace(spot, uv_px=spot.uv_px + np.array(corner)) for spot in (found.down, found.up))
+    rig = _rig_at(found.rig, *corner)
+    pair = replace(pair_of_photos(photos, found.stroke_m, setting.known, found.pair.card), rig=rig)
+    notes = (found.notes[0], note, *found.notes[1:])
+    return replace(found, down=down, up=up, rig=rig, nominal=setting.known.rig, pair=pair, notes=notes)
+
+
+def _foreign(test: ChainTest) -> str:
+    return f"{_DOUBTFUL_SPOTS}s went through another chain than the file's: {test.doubt}" if test.doubt else ""
 
 
 # -- rig -------------------------------------------------------------------------------------------------------------

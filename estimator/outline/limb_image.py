@@ -166,7 +166,8 @@ def _luma(image: NDArray[Any], card: SensorCard) -> Plane:
         values, level = linear @ weights, np.median(linear.reshape(-1, 3), axis=0) * weights
     # shares of the filters in the luma of this picture; three equal ones would be as good, the room is nearly grey
     share = level / level.sum() if level.sum() > 0.0 else np.array(JPEG_LUMA)
-    taps = [_merged(_luma_taps(parity, share, card)) for parity in range(4)]
+    du, dv = card.mosaic_phase
+    taps = [_merged(_luma_taps(2 * ((k // 2 + dv) % 2) + (k + du) % 2, share, card)) for k in range(4)]
     return Plane(values, ~clipped, (taps[0], taps[1], taps[2], taps[3]))
 
 

@@ -95,7 +95,12 @@ def _noise(linear: Array, units: Units, card: SensorCard, rng: np.random.Generat
     """Noise of demosaiced linear light, shape (T, h, w, 3), for the light (T, h + 2, w + 2, 3) of units and border."""
     gain = np.asarray(card.white_balance) / full_scale_e(card)
     colour = np.broadcast_to(np.arange(3), linear.shape)
-    own = colour == (units.v % 2 + units.u % 2)[..., None] if card.mosaic == "bayer" else np.ones(linear.shape, bool)
+    du, dv = card.mosaic_phase
+    own = (
+        colour == ((units.v + dv) % 2 + (units.u + du) % 2)[..., None]
+        if card.mosaic == "bayer"
+        else np.ones(linear.shape, bool)
+    )
     electrons = np.clip(linear, 0.0, None) / gain
     variance = card.read_noise_e**2 + card.dsnu_e**2 + (card.prnu * electrons) ** 2 + 1.0 / (12.0 * card.dn_per_e**2)
     if card.shot_noise:

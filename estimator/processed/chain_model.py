@@ -124,7 +124,7 @@ class Codes:
         return Codes(self.mean[index], self.by_mean[index], self.regression[index], self.excess[index], smoothing)
 
 
-@lru_cache(maxsize=8)
+@lru_cache(maxsize=16)
 def chain_model(card: SensorCard, noise: PixelNoise) -> ChainModel:
     """Model of a processed output, on `window_px` pixels; kept, because it is the same for all spots.
 
@@ -161,7 +161,7 @@ class _Way:
     rounding: Array
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=8)
 def _way(card: SensorCard) -> _Way:
     """Way of a camera's make; arrays are read only. Nothing here depends on the numbers in `BESIDE_CURVE`."""
     h, w = window_px(card)
@@ -171,7 +171,7 @@ def _way(card: SensorCard) -> _Way:
     output = _output((h, w), card, whole)
     grown = output.margin + mixed
     margin, outer = grown + 1, (h + 2 * grown, w + 2 * grown)
-    filters = bayer_filters(np.array([[margin % 2, margin % 2]]), (outer[0] + 2, outer[1] + 2))[0]
+    filters = bayer_filters(_corner(margin, card.mosaic_phase), (outer[0] + 2, outer[1] + 2))[0]
     sharp, smooth = neighbours(outer, card)
     T = ((smooth @ sharp).T @ output.transform.T).toarray()
     sparing = edge_sparing(sharp, outer, card)
@@ -291,7 +291,7 @@ def _apply(matrix: sparse.csr_array, values: Array) -> Array:
 def _linear(card: SensorCard, outer: tuple[int, int], margin: int) -> sparse.csr_array:
     """Demosaicing by the mean of a colour's pixels among the nearest 3 x 3, or the own one; gains; matrix."""
     h, w = outer
-    planes = sparse.vstack([_interpolation(h, w, margin, colour) for colour in range(3)]).tocsr()
+    planes = sparse.vstack([_interpolation(h, w, margin, colour, card.mosaic_phase) for colour in range(3)]).tocsr()
     mix = np.asarray(card.colour_matrix) * np.asarray(card.white_balance) / full_scale_e(card)
     return sparse.csr_array(sparse.kron(sparse.csr_array(mix), sparse.eye_array(h * w)) @ planes)
 
@@ -307,10 +307,15 @@ def _kinds(filters: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.concatenate([row.ravel() for row in rows])
 
 
-@lru_cache(maxsize=16)
-def _interpolation(h: int, w: int, margin: int, colour: int) -> sparse.csr_array:
+def _corner(margin: int, phase: tuple[int, int]) -> NDArray[np.int64]:
+    """Place in the mosaic of the first raw pixel around a window, shape (1, 2): the window's own first is even."""
+    return (margin + np.array([phase])) % 2
+
+
+@lru_cache(maxsize=32)
+def _interpolation(h: int, w: int, margin: int, colour: int, phase: tuple[int, int]) -> sparse.csr_array:
     """One plane, shape (h w, (h + 2)(w + 2))."""
-    filters = bayer_filters(np.array([[margin % 2, margin % 2]]), (h + 2, w + 2))[0]
+    filters = bayer_filters(_corner(margin, phase), (h + 2, w + 2))[0]
     rows, columns, values = [], [], []
     for v in range(1, h + 1):
         for u in range(1, w + 1):

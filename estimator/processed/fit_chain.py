@@ -97,13 +97,14 @@ def code_data(
     extra_e2: float = 0.0,
 ) -> SpotData:
     """Likelihood of each pixel's own code, of one frame and for cards of `own_codes`; the rest as `fit_srgb`."""
-    filters = bayer_filters(origin, planes.shape[1:3])
+    filters = bayer_filters(origin + card.mosaic_phase, planes.shape[1:3])
     noise = unrounded(card, pattern_known)
     noise = PixelNoise(noise.gaussian_e2 + extra_e2, noise.prnu)
     table = code_table(card)
     codes = np.take_along_axis(planes, filters[..., None], axis=3)[..., 0]
     law = code_law(codes, filters, card, noise, table)
-    return spot_data(spot_regions(table.middle_e[filters, codes], origin), law, blur, model)
+    regions = spot_regions(table.middle_e[filters, codes], origin, phase=card.mosaic_phase)
+    return spot_data(regions, law, blur, model)
 
 
 def fit_yuyv(
@@ -279,12 +280,13 @@ def first_fit(
     """
     if response is None:
         raise ValueError("the fit through the chain needs the response of the filters: SpotModel(response=...)")
-    filters = bayer_filters(origin, images.shape[2:4])
+    filters = bayer_filters(origin + card.mosaic_phase, images.shape[2:4])
     x, extra = undone_mean(images, origin, card)
     x = x - (0.0 if background is None else background.mean_e)
     rough, spread = _ROUGH_CODES2 * 12.0 * extra, unrounded(card)
     x, rough, corner = _cut(x, rough, filters, response)
-    fit = fit_law(spot_regions(x, origin + corner), GaussLaw(spread, rough), blur, SpotModel(response))
+    regions = spot_regions(x, origin + corner, phase=card.mosaic_phase)
+    fit = fit_law(regions, GaussLaw(spread, rough), blur, SpotModel(response))
     middle = np.array([x.shape[2] - 1.0, x.shape[1] - 1.0]) / 2.0
     good = fit.status == Status.OK
     uv = np.where(good[:, None], fit.uv_px - origin, middle + corner)
@@ -356,7 +358,7 @@ def undone(images: NDArray[Any], origin: NDArray[np.int64], card: SensorCard) ->
         Image pixel (u, v) of the first column and row.
     card : SensorCard
     """
-    filters = bayer_filters(origin, images.shape[1:3])
+    filters = bayer_filters(origin + card.mosaic_phase, images.shape[1:3])
     rgb = np.stack([rgb_codes(image, card, corner) for image, corner in zip(images, origin, strict=True)])
     code = np.clip(_unsharpened(np.asarray(rgb, float), card.sharpen_amount) / 255.0, 0.0, 1.0)
     linear = light_of(code, card)

@@ -118,27 +118,32 @@ class SpotRegions:
     origin_px : shape (n, 2), image pixel (u, v) of the first column and row
     used : shape (n, h, w), bool
     finite : shape (n,), bool; whether all readings are
+    phase : (du, dv)
+        Red lies where u + du and v + dv are even.
     """
 
     x_e: Array
     origin_px: NDArray[np.int64]
     used: BoolArray
     finite: BoolArray
+    phase: tuple[int, int] = (0, 0)
 
     def __len__(self) -> int:
         return len(self.x_e)
 
     def rows(self, index: NDArray[np.int64]) -> SpotRegions:
         """Some of the regions."""
-        return SpotRegions(self.x_e[index], self.origin_px[index], self.used[index], self.finite[index])
+        return SpotRegions(self.x_e[index], self.origin_px[index], self.used[index], self.finite[index], self.phase)
 
     @property
     def filters(self) -> NDArray[np.int64]:
         """Filter of each pixel of a mosaic, shape (n, h, w)."""
-        return bayer_filters(self.origin_px, (self.x_e.shape[1], self.x_e.shape[2]))
+        return bayer_filters(self.origin_px + self.phase, (self.x_e.shape[1], self.x_e.shape[2]))
 
 
-def spot_regions(x_e: ArrayLike, origin_px: ArrayLike, used: ArrayLike = True) -> SpotRegions:
+def spot_regions(
+    x_e: ArrayLike, origin_px: ArrayLike, used: ArrayLike = True, phase: tuple[int, int] = (0, 0)
+) -> SpotRegions:
     """Regions of some readings; what is not finite is left out.
 
     Parameters
@@ -148,6 +153,8 @@ def spot_regions(x_e: ArrayLike, origin_px: ArrayLike, used: ArrayLike = True) -
         Image pixel (u, v) of the first column and row: where the mosaic's red pixels are.
     used : bool, shape (n, h, w) or one that broadcasts to it
         Pixels that are not left out, such as those below saturation.
+    phase : (du, dv)
+        Of the mosaic: red lies where u + du and v + dv are even.
 
     Raises
     ------
@@ -159,9 +166,8 @@ def spot_regions(x_e: ArrayLike, origin_px: ArrayLike, used: ArrayLike = True) -
         raise ValueError(f"regions have the shape {x.shape}: (n, h, w) of 3 x 3 pixels or more is needed")
     finite = np.isfinite(x)
     origin = np.broadcast_to(np.asarray(origin_px, np.int64), (len(x), 2))
-    return SpotRegions(
-        np.where(finite, x, 0.0), origin, finite & np.asarray(used, bool), np.asarray(finite.all(axis=(1, 2)))
-    )
+    whole = np.asarray(finite.all(axis=(1, 2)))
+    return SpotRegions(np.where(finite, x, 0.0), origin, finite & np.asarray(used, bool), whole, phase)
 
 
 class PixelLaw(Protocol):
