@@ -305,8 +305,8 @@ def _rig_at(rig: Rig, du: int, dv: int) -> Rig:
     """Rig whose picture begins `du` columns and `dv` rows further out, and ends as much."""
     camera = rig.camera
     width, height = camera.width_px + 2 * du, camera.height_px + 2 * dv
-    place = {"cx_px": camera.cx_px + du, "cy_px": camera.cy_px + dv}
-    return replace(rig, camera=replace(camera, width_px=width, height_px=height, **place))
+    cx, cy = camera.cx_px + du, camera.cy_px + dv
+    return replace(rig, camera=replace(camera, width_px=width, height_px=height, cx_px=cx, cy_px=cy))
 
 
 def _shifted(
