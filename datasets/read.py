@@ -8,6 +8,7 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -43,7 +44,7 @@ from phibench.datasets.store.stored_rooms import Rooms, read_rooms
 from phibench.scenes.laser import Beam, LaserSpot
 from phibench.scenes.rig import POSITIONS, Rig, View
 from phibench.scenes.room import Room
-from phibench.scenes.validation import nearest
+from phibench.scenes.validation import nearest, printable_line
 
 if TYPE_CHECKING:
     from polars import DataFrame
@@ -153,17 +154,17 @@ class Dataset(ShortForm):
         if isinstance(key, slice):
             return replace(self, rows=self.rows[key])
         if isinstance(key, str):
-            return self._of_id(key)
+            return self.chosen([key])[0]
         try:
             return self.samples[key]
         except IndexError:
             raise IndexError(f"sample {key}: {self.folder} has {len(self)}, numbered from 0") from None
 
-    def _of_id(self, sample_id: str) -> Sample:
-        found = next((sample for sample in self.samples if sample.row.sample_id == sample_id), None)
-        if found is None:
-            raise DatasetError(f"no sample '{sample_id}'; {nearest(sample_id, [row.sample_id for row in self.rows])}")
-        return found
+    def chosen(self, names: Sequence[str]) -> tuple[Sample, ...]:
+        """Samples of ids or numbers as people write them, each once; see `place_of`."""
+        ids = [row.sample_id for row in self.rows]
+        places = dict.fromkeys(place_of(name, ids, self.folder) for name in names)
+        return tuple(self.samples[place] for place in places)
 
     def to_polars(self) -> DataFrame:
         """Truth of all samples as a polars table, one row each: columns as in `manifest.parquet` (see FORMAT.md)."""
@@ -203,6 +204,25 @@ class Dataset(ShortForm):
             return "-"
         camera = self.rigs[self.rows[0].rig].camera
         return f"{camera.width_px} x {camera.height_px} px"
+
+
+def place_of(name: str, ids: Sequence[str], folder: Path) -> int:
+    """Place of a sample of an id, or of a number counted from 0; an id goes first.
+
+    Raises
+    ------
+    DatasetError
+        If there is none.
+    """
+    if name in ids:
+        return ids.index(name)
+    if not ids:
+        raise DatasetError(f"{folder} has no samples")
+    if re.fullmatch(r"[0-9]{1,9}", name):
+        if int(name) < len(ids):
+            return int(name)
+        raise DatasetError(f"sample {name}: {folder} has {len(ids)}, numbered from 0 to {len(ids) - 1}")
+    raise DatasetError(f"no sample '{printable_line(name, 80)}'; {nearest(name, ids)}")
 
 
 def _count(number: int, noun: str) -> str:

@@ -60,15 +60,7 @@ def sample_of(dataset: Dataset, name: str | None) -> Sample:
     DatasetError
         If there is none.
     """
-    if not len(dataset):
-        raise DatasetError(f"{dataset.folder} has no samples to show")
-    if name is None or not name.isdecimal():
-        return dataset[0 if name is None else name]
-    if int(name) >= len(dataset):
-        raise DatasetError(
-            f"--sample {name}: {dataset.folder} has {len(dataset)}, numbered from 0 to {len(dataset) - 1}"
-        )
-    return dataset[int(name)]
+    return dataset.chosen(["0" if name is None else name])[0]
 
 
 def write_sample_page(sample: Sample, path: str | Path) -> Path:

@@ -109,7 +109,7 @@ def draw_frames(
         What they do not give is the recipe's `[frames]` of each sample.
     draws : draws 0 to draws - 1 of every image
     out : folder to write; by default beside the data set, `<folder>-frames`
-    samples : ids; all by default
+    samples : ids or numbers; all by default
     laser_off : also draw every image without the spot
     workers : processes; by default one per core
     console : where progress goes; by default the standard error
@@ -253,7 +253,7 @@ def _jobs(
 ) -> tuple[list[SampleJob], list[str]]:
     """One job per sample; a region needs a place of the spot in both images."""
     jobs, notes = [], []
-    for sample in dataset if samples is None else [dataset[name] for name in dict.fromkeys(samples)]:
+    for sample in dataset if samples is None else dataset.chosen(samples):
         size = sample.rig.camera.height_px, sample.rig.camera.width_px
         hidden = [p for p in POSITIONS if not has_place(sample.truth_row(p), size)]
         if isinstance(options.region, int) and hidden:

@@ -86,7 +86,7 @@ def calibrate_dataset(
     folder : Path
         Data set; its nominal rig is corrected.
     out : Path
-    samples : ids; the first of the data set by default
+    samples : ids or numbers; the first of the data set by default
     preset : str
         "layers" for the noise-free layers, or a preset of the sensor whose frames are drawn, with the laser on and off.
     spots : bool
@@ -106,7 +106,7 @@ def calibrate_dataset(
     """
     require_writable(out)
     dataset, ruler = open_dataset(folder), ruler or Ruler()
-    chosen = [dataset[name] for name in samples] or [dataset.samples[0]]
+    chosen = dataset.chosen(samples or ["0"])
     rig = _one_rig(chosen)
     if preset == LAYERS:
         images = [Photograph(s.ambient(p)) for s, p in one_per_pose(chosen)]

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from phibench.datasets.errors import DatasetError
+from phibench.datasets.read import place_of
 from phibench.datasets.store.files import require_writable
 from phibench.estimator.calibration.bundle import Bundle, KnownSpot, calibrate
 from phibench.estimator.calibration.from_dataset import DatasetCalibration, Photograph, write_bundle
@@ -34,7 +35,6 @@ from phibench.estimator.outline.outline import find_outline
 from phibench.estimator.outline.outline_result import Outline
 from phibench.estimator.spots.image_planes import ImageError
 from phibench.scenes.rig import POSITIONS, Rig
-from phibench.scenes.validation import nearest
 
 _NEAR = 0.15  # of D, by which a spot may be off and still be the laser's, for blur and filters
 _FAR_SIGMAS = 4.0  # of D, or of the gap of the rays, from what outline and ruler allow: another light was taken
@@ -53,7 +53,7 @@ def calibrate_imported(
     ----------
     folder : Path
     out : Path
-    samples : ids; by default the first, with `spots` all that have a measured D
+    samples : ids or numbers; by default the first, with `spots` all that have a measured D
     spots : bool
         Also use the spots, at the distances of the tape. A sample is left out where no spot is found, or where what is
         found contradicts the tape or itself by more than outline and ruler allow.
@@ -107,9 +107,8 @@ def calibrate_imported(
 
 def _rows(imported: ImportedSet, samples: Sequence[str], spots: bool) -> list[ImportedRow]:
     ids = list(dict.fromkeys(row.sample_id for row in imported.rows))
-    if strange := [name for name in samples if name not in ids]:
-        raise DatasetError(f"{imported.folder} has no sample '{strange[0]}'; {nearest(strange[0], ids)}")
-    wanted = set(samples or (ids if spots else ids[:1]))
+    chosen = {ids[place_of(name, ids, imported.folder)] for name in samples}
+    wanted = chosen or set(ids if spots else ids[:1])
     rows = [row for row in imported.rows if row.sample_id in wanted and not (spots and row.depth_m is None)]
     if not rows:
         raise DatasetError(f"no sample of {imported.folder} has a measured D: put depth_m into pairs.csv")

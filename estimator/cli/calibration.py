@@ -39,7 +39,7 @@ def calibrate(
     out
         JSON file to write.
     sample
-        Ids of samples; the first one by default.
+        Samples: numbers, counted from 0, or ids; the first one by default.
     preset
         Preset of the frames to draw: "mjpeg", "srgb8", "bayer-raw" or "mono-raw"; "layers" is noise-free.
     spots

@@ -227,7 +227,7 @@ def frames(
     out
         Folder to write; by default beside the data set, with "-frames" added to its name.
     sample
-        Ids of samples; all by default.
+        Samples: numbers, counted from 0, or ids; all by default.
     laser_off
         Also every image without the spot.
     exposure
@@ -436,7 +436,7 @@ def panorama(
     out
         PNG file to write.
     sample
-        Id of a sample; the first one by default.
+        Sample: its number, counted from 0, or its id; the first one by default.
     position
         Which of its two views.
     by
@@ -452,7 +452,6 @@ def panorama(
     distance_m
         Of the scene from the mirror's centre; by default far away.
     """
-    from phibench.datasets.errors import DatasetError
     from phibench.datasets.read import open_finished
     from phibench.datasets.store.files import require_writable
     from phibench.datasets.store.pictures import save_png
@@ -461,9 +460,7 @@ def panorama(
 
     grid = Grid(width, *(math.radians(each) for each in elevation_deg))
     dataset = open_finished(directory)
-    if not dataset.samples:
-        raise DatasetError(f"{directory} has no samples to unroll")
-    chosen = dataset.samples[0] if sample is None else dataset[sample]
+    (chosen,) = dataset.chosen(["0" if sample is None else sample])
     require_writable(out)
     distance = FAR_M if distance_m is None else distance_m
     result = unroll(chosen, position, grid, by, distance, _picture(chosen, position, preset, image))

@@ -1,7 +1,7 @@
 """Options that mean the same in every command, and the old spellings of commands and options.
 
-`--method` is repeated, `--sample` names one sample by its id, `--samples` is a count, `--out` is the file or folder to
-write. Wherever a method runs, `Limits` are its options.
+`--method` is repeated, `--sample` names one sample by its number or id, `--samples` is a count, `--out` is the file or
+folder to write. Wherever a method runs, `Limits` are its options.
 """
 
 from __future__ import annotations
@@ -129,7 +129,7 @@ OLD_OPTIONS = {
     ("score", "--seed"): "--bootstrap-seed",
     ("compare", "--seed"): "--bootstrap-seed",
     ("bench", "--methods"): "--method, once for each method",
-    ("dataset frames", "--samples"): "--sample, once for each id",
+    ("dataset frames", "--samples"): "--sample, once for each",
 }
 """New spelling of every option that had another one, by command and option."""
 
