@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 import phibench
 from phibench.datasets.errors import DatasetError
@@ -84,7 +85,22 @@ def test_the_version_is_that_of_the_checkout(python: Python) -> None:
     said = python("from phibench.estimator.cli.main import main; main(['--version'])").stdout.strip()
     assert re.fullmatch(rf"phibench {project['version']}( \(commit [0-9a-f]{{10}}(, changed since)?\))?", said)
     assert ("commit" in said) == (ROOT / ".git").exists()
-    assert f"version: {project['version']}\n" in (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+
+
+def test_the_citation_is_that_of_this_version() -> None:
+    """CITATION.cff and README's BibTeX have the version of the project, the date of its changes, and one title."""
+    version = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"]
+    changes = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    dates = re.findall(rf"^## \[{re.escape(version)}\] - (\d{{4}}-\d\d-\d\d)$", changes, re.M)
+    card = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    cited = (card["title"], str(card["version"]), str(card["date-released"]))
+    assert cited[1:] == (version, dates[0])
+    (entry,) = re.findall(
+        r"^@software\{phibench,\n(.*?)^\}$", (ROOT / "README.md").read_text(encoding="utf-8"), re.M | re.S
+    )
+    fields = dict(re.findall(r"(\w+) = \{(.*)\},?$", entry, re.M))
+    assert (fields["title"], fields["version"], fields["date"]) == cited
+    assert fields["year"] == cited[2][:4]
 
 
 def test_the_module_is_the_command_line(tmp_path: Path) -> None:
