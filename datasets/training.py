@@ -97,13 +97,13 @@ class PairDataset(ShortForm):
     def __getitem__(self, index: int) -> Item:
         source = _source(self.folder, self.sample_ids[_place(index, len(self))], _Hashed(self.options))
         row = _opened(self.folder)[source.names[2]].row
-        item: Item = {"sample_id": row.sample_id, "depth_m": row.depth_m, "stroke_m": row.stroke_m}
+        item: Item = {"sample_id": row.sample_id, "depth_m": row.centre_depth_m, "stroke_m": row.stroke_m}
         for position in POSITIONS:
             frame, truth = source.frame(position, self.epoch), row.position(position)
             item[position] = frame.image
             if self.laser_off:
                 item[f"{position}_off"] = source.frame(position, self.epoch, laser=False).image
-            item |= {f"{position}_{name}": getattr(truth, name) for name in _TRUTH}
+            item |= {f"{position}_{name}": truth.at_centre(name) for name in _TRUTH}
             item |= {f"{position}_u0_px": frame.region.u0_px, f"{position}_v0_px": frame.region.v0_px}
         return item
 
@@ -336,7 +336,7 @@ def _sides_of(sample: Sample, settings: CropSettings) -> Iterator[_Side]:
     seen = {p: truth for p, truth in truths.items() if truth.visible and truth.spot_file is not None}
     coarse = sample.ambient("down")[:, ::_STEP_PX, ::_STEP_PX].copy() if seen else np.empty((3, 0, 0), np.float32)
     for position, truth in seen.items():
-        ambient, middle = sample.ambient(position), np.array([truth.u_px, truth.v_px])
+        ambient, middle = sample.ambient(position), np.array([truth.centre.u_px, truth.centre.v_px])
         u0, v0 = (max(int(x) - reach, 0) for x in middle)
         yield _Side(
             sample.row.sample_id,

@@ -108,7 +108,7 @@ INDEX = "frames.jsonl"
 INDEX_TABLE = "frames.parquet"
 REQUEST = "request.json"
 TRUTH = ("visible", "cause", "u_px", "v_px", "phi_ray_rad", "phi_normal_rad", "phi_incidence_rad", "azimuth_rad")
-"""Fields of a row that are those of the manifest's `down` or `up`."""
+"""Fields of a row as in the manifest's `down` or `up`, places and angles of its `light`."""
 _IMAGES = (".exr", ".jpg", ".png")
 
 
@@ -135,14 +135,14 @@ class FrameRow(Document):
     v0_px: int = described("px", "row of the sensor that is the file's first row")
     width_px: int = described("px", "columns of the file")
     height_px: int = described("px", "rows of the file")
-    depth_m: float = described("m", "D of the spot")
+    depth_m: float = described("m", "D of the spot's light")
     stroke_m: float = described("m", "stroke h of the pair, the true one")
     visible: bool = described(
         "-", "whether the chief ray of the spot reaches the sensor; of the position, laser on or off"
     )
     cause: str = described("-", "why not; 'none' if visible")
-    u_px: Number = described("px", "true image of the spot's centre on the sensor; in the file at u_px - u0_px")
-    v_px: Number = described("px", "true image of the spot's centre on the sensor; in the file at v_px - v0_px")
+    u_px: Number = described("px", "true centre of the spot's light on the sensor; in the file at u_px - u0_px")
+    v_px: Number = described("px", "true centre of the spot's light on the sensor; in the file at v_px - v0_px")
     phi_ray_rad: Number = described("rad", "as in the manifest")
     phi_normal_rad: Number = described("rad", "as in the manifest")
     phi_incidence_rad: Number = described("rad", "as in the manifest")

@@ -151,6 +151,10 @@ class SpotRow(Document):
         angles = {name: getattr(self, name) for name in _ANGLES}
         return LightRow(u_px=self.u_px, v_px=self.v_px, **angles, place_world_m=(math.nan, math.nan, math.nan))
 
+    def at_centre(self, name: str) -> Any:
+        """Value of a field, of places and angles that of `centre`."""
+        return getattr(self.centre if name in LightRow.model_fields else self, name)
+
 
 _ANGLES = ("phi_ray_rad", "phi_normal_rad", "phi_incidence_rad", "azimuth_rad")
 

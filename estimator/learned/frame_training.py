@@ -195,7 +195,7 @@ def _maps_of(cached: CachedSample, draw: PairDraw, dataset: Dataset) -> Iterator
         planes, red = frame_input(on, off, card)
         truth = dataset[draw.sample_id].truth_row(position)
         followers = [one.truths[position] for one in cached.distractors if one.follows_laser]
-        lights = ([truth] if truth.visible else [], [one for one in followers if one.visible])
+        lights = ([truth.centre] if truth.visible else [], [one for one in followers if one.visible])
         places = [[np.array([one.u_px - box.u0_px, one.v_px - box.v0_px]) for one in part] for part in lights]
         heat, counted = targets(planes, *places)
         yield FrameMap(draw.preset, planes.astype(np.float16), red, heat, counted * inside.astype(np.float32))

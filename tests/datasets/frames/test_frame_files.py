@@ -76,9 +76,11 @@ def test_files_are_what_the_api_gives(tiny_dataset: Path, tmp_path: Path, preset
         assert (row.width_px, row.height_px, row.exposure_s) == (320, 180, frame.sensor.exposure_s)
         spot = dataset[row.sample_id].truth_row(row.position)
         for field in TRUTH:
-            np.testing.assert_equal(getattr(row, field), getattr(spot, field))
+            np.testing.assert_equal(getattr(row, field), spot.at_centre(field))
+        if spot.light is not None and spot.visible:
+            assert (row.u_px, row.v_px, row.phi_ray_rad) == (spot.light.u_px, spot.light.v_px, spot.light.phi_ray_rad)
         manifest = dataset[row.sample_id].row
-        assert (row.depth_m, row.stroke_m) == (manifest.depth_m, manifest.stroke_m)
+        assert (row.depth_m, row.stroke_m) == (manifest.light_depth_m, manifest.stroke_m)
         if mode:
             with Image.open(out / name) as picture:
                 assert picture.mode == mode
