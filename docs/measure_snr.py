@@ -1,12 +1,12 @@
 """Signal to noise beside what drawn images show: `measure_snr.py [--scenes 170]`.
 
-Run from the repository root. Scenes are spots over flat rooms of 20 to 3000 electrons a pixel, in random places,
-for each of three presets; all pixels of a spot together collect 3 to 200 times the noise of one pixel. Each is drawn 100 times with the laser on and 100 times with it off,
-every time by another camera. Half of the draws give the mean image of the spot and the variance of every feature, the
-other half the likelihood ratio of a spot at the true place, for Gaussian features of equal noise: the features weighted
-by mean over variance. Its d' is the distance of both means over the mean deviation. Features are raw pixels, each
-pixel's own code, or the coefficients of a JPEG's blocks, those whose mean stands out by 3 standard errors. No model of
-the estimator's enters.
+Run from the repository root. Scenes are spots over flat rooms of 20 to 3000 electrons a pixel, in random places, for
+each of three presets; a spot's pixels together collect 3 to 200 times the noise of one pixel. Each scene is drawn 200
+times with the laser on and 200 times with it off, every time by another camera. Half of the draws give the mean image
+of the spot and the variance of every feature, the other half the likelihood ratio of a spot at the true place, for
+Gaussian features of equal noise: the features weighted by mean over variance. Its d' is the distance of both means over
+the mean deviation. Features are raw pixels, each pixel's own code, or the coefficients of a JPEG's blocks, those whose
+mean stands out by 3 standard errors. No model of the estimator's enters.
 
 Prints per preset the ratio of `limits.spot_snr` to d' (median, 5 and 95 % of scenes with a d' of 2 to 15), the rank
 correlation, and how many scenes one of the two puts below 5 and the other above 7.
