@@ -1,4 +1,4 @@
-"""Check of a method on ten easy pairs: each mistake of convention is named in plain words.
+"""Check of a method on ten easy pairs, three of them without boxes: each mistake is named in plain words.
 
 A mistake of convention moves every spot by a rule. Each rule is tried on the truth, and one that predicts the answers
 is named. Positions have the shape (n, 2, 2): pair, (down, up), (u, v), pixels; NaN where there is none.
@@ -20,6 +20,8 @@ from phibench.estimator.sandbox.runner import Harness
 from phibench.scenes.frames import Array
 
 PAIRS = 10
+WHOLE = 3
+"""Pairs of these, the last ones, that have no boxes: the whole image is searched, and a blue light is in it."""
 _GIVE_UP = 3  # pairs in a row without an answer in time
 
 
@@ -72,7 +74,7 @@ def check_method(
     MethodError
         If the method cannot be found or imported, or there is no such preset.
     """
-    pairs = EasyPairs(preset, count)
+    pairs = EasyPairs(preset, count, whole=min(WHOLE, count // 2))
     done: list[Outcome] = []
     with Harness([reference], limits) as harness:
         for outcome in _until_hopeless(outcome for (outcome,) in harness.outcomes(pairs, range(len(pairs)))):
@@ -85,7 +87,7 @@ def check_method(
 
 def judged(done: Sequence[Outcome], pairs: EasyPairs) -> Check:
     """Faults and notes of outcomes on easy pairs."""
-    faults = [*_failures(done), *_missing(done), *_wrong(done, pairs)]
+    faults = [*_failures(done, pairs), *_missing(done, pairs), *_wrong(done, pairs)]
     printed = tuple((outcome.number, outcome.output) for outcome in done if outcome.output)
     return Check(tuple(faults), tuple(_notes(done, pairs)), printed)
 
@@ -100,14 +102,18 @@ def _until_hopeless(run: Iterator[Outcome]) -> Iterator[Outcome]:
             return
 
 
-def _failures(done: Sequence[Outcome]) -> Iterator[str]:
+def _failures(done: Sequence[Outcome], pairs: EasyPairs) -> Iterator[str]:
     """One sentence per kind of failure, with the message of the first."""
     counts = Counter(outcome.failure for outcome in done if outcome.failure)
+    whole = {outcome.number for outcome in done if pairs.boxes(outcome.number)[0] is None}
     for failure, count in counts.items():
-        first = next(outcome for outcome in done if outcome.failure == failure)
-        yield f"{count} of {len(done)} pairs: {_IN_WORDS[failure]}: {first.message}"
+        failed = [outcome for outcome in done if outcome.failure == failure]
+        boxless = {outcome.number for outcome in failed} == whole and len(whole) < len(done)
+        advice = f"; {_NO_BOXES}" if boxless else ""
+        yield f"{count} of {len(done)} pairs: {_IN_WORDS[failure]}: {failed[0].message}{advice}"
 
 
+_NO_BOXES = "it fails where a pair has no boxes: box_down and box_up are None there, search the whole mirror"
 _IN_WORDS = {
     "error": "the method raised an exception",
     "timeout": "too slow",
@@ -118,13 +124,16 @@ _IN_WORDS = {
 }
 
 
-def _missing(done: Sequence[Outcome]) -> Iterator[str]:
-    """A sentence if most spots of answered pairs are missing: these pairs are easy."""
-    spots = list(_spots(done))
-    missing = [spot.status for _, _, spot in spots if spot.status != OK]
-    if 2 * len(missing) > len(spots):
-        reason, count = Counter(missing).most_common(1)[0]
-        yield f"{len(missing)} of {len(spots)} spots are missing, although all are easy: '{reason}' ({count} times)"
+def _missing(done: Sequence[Outcome], pairs: EasyPairs) -> Iterator[str]:
+    """A sentence if most spots of answered pairs are missing, or of those without boxes: these pairs are easy."""
+    spots = [(number, spot.status) for number, _, spot in _spots(done)]
+    boxless = [(number, status) for number, status in spots if pairs.boxes(number)[0] is None]
+    for asked, where in ((spots, ", although all are easy"), (boxless, " where a pair has no boxes")):
+        missing = [status for _, status in asked if status != OK]
+        if 2 * len(missing) > len(asked):
+            reason, count = Counter(missing).most_common(1)[0]
+            yield f"{len(missing)} of {len(asked)} spots are missing{where}: '{reason}' ({count} times)"
+            return
 
 
 def _wrong(done: Sequence[Outcome], pairs: EasyPairs) -> Iterator[str]:
@@ -134,7 +143,10 @@ def _wrong(done: Sequence[Outcome], pairs: EasyPairs) -> Iterator[str]:
         return
     truths = {outcome.number: pairs.truth(outcome.number) for outcome in answered}
     answer_px, truth_px = _positions(answered), np.array([_true_px(truths[o.number]) for o in answered])
-    fault = position_fault(answer_px, truth_px, _views(pairs, answered))
+    fault = colour_fault(answered, pairs)
+    if not fault:
+        boxed = [pairs.boxes(outcome.number)[0] is not None for outcome in answered]
+        fault = position_fault(answer_px, truth_px, _views(pairs, answered)) or whole_fault(answer_px - truth_px, boxed)
     errors, covariances = _claimed(answered, truths)
     # a covariance says nothing about positions that are wrong by a rule
     yield from filter(None, [fault or covariance_fault(errors, covariances)])
@@ -222,6 +234,7 @@ _OFFSET_SIGMAS = 5.0  # false alarm below 1e-5 for 20 spots, 2 axes
 _HALF_PX = 0.2  # by which a half-pixel offset may miss a half
 _PULL = (0.5, 2.0)  # of 40 numbers: outside by chance 3e-8 (chi squared)
 _LEAST_PULLS = 10
+_LEAST_BLUE = 2  # spots: two answers within 2 px of a blue one are no accident in 4e5 pixels
 
 
 @dataclass(frozen=True)
@@ -271,6 +284,43 @@ def position_fault(answer_px: Array, truth_px: Array, views: Views) -> str:
     return (
         f"the positions are {error:.1f} px from the spot (median); a coarse method comes within 1 px on these pairs: "
         "is something else than the laser spot found?"
+    )
+
+
+def colour_fault(answered: Sequence[Outcome], pairs: EasyPairs) -> str:
+    """Sentence if most answers in images with a blue spot are that spot; "" if not, or if nothing is answered there."""
+    lit = [(outcome, blue) for outcome in answered if (blue := pairs.blue_px(outcome.number)) is not None]
+    if not lit:
+        return ""
+    distance = np.linalg.norm(
+        _positions([outcome for outcome, _ in lit]) - np.array([blue for _, blue in lit]), axis=-1
+    )
+    seen = distance[np.isfinite(distance)]
+    if len(seen) < _LEAST_BLUE or 2 * int((seen <= NEAR_PX).sum()) <= len(seen):
+        return ""
+    return (
+        f"{int((seen <= NEAR_PX).sum())} of {len(seen)} spots are a fainter blue light: red and blue look exchanged; "
+        "images are R, G, B, not B, G, R, and a mosaic has red at even rows and even columns"
+    )
+
+
+def whole_fault(error_px: Array, boxed: Sequence[bool]) -> str:
+    """Sentence if spots are found in boxes and not without them; "" if not.
+
+    Parameters
+    ----------
+    error_px : shape (n, 2, 2)
+    boxed : n flags
+        Whether a pair has boxes.
+    """
+    distance, inside = np.linalg.norm(error_px, axis=-1), np.array(boxed)
+    within, without = distance[inside], distance[~inside]
+    seen, near = without[np.isfinite(without)], within[np.isfinite(within)]
+    if not (len(seen) and len(near)) or np.median(near) > NEAR_PX or 2 * int((seen > NEAR_PX).sum()) <= len(seen):
+        return ""
+    return (
+        f"{int((seen > NEAR_PX).sum())} of {len(seen)} spots are wrong where a pair has no boxes: search inside the "
+        "mirror's outline, `mirror_mask(pair)` in docs/method.md"
     )
 
 

@@ -10,6 +10,7 @@ in every frame. Expected electrons go through noise, converter and a plain proce
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cache, lru_cache
 from typing import Any
@@ -119,24 +120,23 @@ class EasyCamera:
         """(H, W) of an image."""
         return self.camera.height_px, self.camera.width_px
 
-    def expected(self, spot: EasySpot, flux_e: float) -> ExpectedRegion:
-        """Means and derivatives on 41 x 41 pixels around a spot."""
+    def expected(self, spot: EasySpot, flux_e: float, blue: bool = False) -> ExpectedRegion:
+        """Means and derivatives on 41 x 41 pixels around a spot of the laser, or of blue light."""
         box = around(spot.uv_px, self.shape, _WINDOW_PX)
         sigma = np.array([spot.sigma_px])
         across = profile(np.array([spot.uv_px[0] - box.u0_px]), sigma, box.width_px)
         down = profile(np.array([spot.uv_px[1] - box.v0_px]), sigma, box.height_px)
-        filters, response = self._filters(box)
+        filters, response = self._filters(box, blue)
         images = (
             flux_e * response * outer(a, b)[0]
             for a, b in ((down.share, across.share), (down.share, across.by_centre), (down.by_centre, across.share))
         )
         return ExpectedRegion(box.u0_px, box.v0_px, filters, self._room()[box.slices], *images)
 
-    def image(self, spot: EasySpot | None, flux_e: float, stream: tuple[Name, ...]) -> NDArray[Any]:
-        """One frame, the spot left out if it is None; as `Pair` describes the card's output."""
+    def image(self, lights: Sequence[ExpectedRegion], stream: tuple[Name, ...]) -> NDArray[Any]:
+        """One frame of the room and some spots; as `Pair` describes the card's output."""
         mean = self._room().copy()
-        if spot is not None:
-            region = self.expected(spot, flux_e)
+        for region in lights:
             rows, columns = region.spot_e.shape
             mean[region.v0_px : region.v0_px + rows, region.u0_px : region.u0_px + columns] += region.spot_e
         dn = self._digitised(mean, generator("easy pairs", "noise", *stream))
@@ -146,10 +146,10 @@ class EasyCamera:
         """Expected electrons of room and dark current, shape (H, W), read-only."""
         return _room(self.shape, self.card.mosaic == "bayer", self.card.dark_e_per_s * self.card.exposure_s)
 
-    def _filters(self, box: Box) -> tuple[NDArray[np.int64], Array]:
-        """Filter of each pixel of a box and its response to the laser."""
+    def _filters(self, box: Box, blue: bool) -> tuple[NDArray[np.int64], Array]:
+        """Filter of each pixel of a box and its response to the laser, or to light that is as blue as that is red."""
         shape = (box.height_px, box.width_px)
-        response = np.array(self.camera.detector.laser_filter_response)
+        response = np.array(self.camera.detector.laser_filter_response)[:: -1 if blue else 1]
         if self.card.mosaic == "mono":
             return np.zeros(shape, np.int64), np.full(shape, response.sum())
         filters = bayer_filters(np.array([(box.u0_px, box.v0_px)]), shape)[0]
@@ -202,6 +202,7 @@ def _raw(card: SensorCard) -> SensorCard:
 
 BOX_PX = 64
 _SPAN_PX = 20  # by which a box may be off the spot
+_BLUE_SHARE = 0.4  # of the red spot's light: half of it after the white balance, less in luma and in the sum of colours
 
 
 @dataclass(frozen=True, repr=False)
@@ -216,6 +217,9 @@ class EasyPairs(ShortForm):
         Its whole mirror should be in the image.
     laser_off, hinted : bool
         Whether pairs come with frames with the laser off, and with boxes.
+    whole : int
+        So many pairs, the last ones, come without boxes in any case. In a camera with colours they have a fainter blue
+        spot besides, `blue_px`: a method that takes blue for red finds that one.
 
     Raises
     ------
@@ -228,6 +232,7 @@ class EasyPairs(ShortForm):
     rig: Rig = field(default_factory=easy_rig)
     laser_off: bool = True
     hinted: bool = True
+    whole: int = 0
 
     def __post_init__(self) -> None:
         if self.preset not in KINDS:
@@ -250,10 +255,10 @@ class EasyPairs(ShortForm):
         scene, camera = _scene(self.rig, number), self._camera()
         images: dict[str, Any] = {
             f"{name}{'' if on else '_off'}": camera.image(
-                spot if on else None, scene.flux_e, (self.preset, number, name, int(on))
+                self._lights(camera, number, spot) if on else (), (self.preset, number, name, int(on))
             )
             for on in ((True, False) if self.laser_off else (True,))
-            for name, spot in (("down", scene.down), ("up", scene.up))
+            for name, spot in _spots(scene)
         }
         down, up = self.boxes(number)
         stroke, card = scene.stroke_m, camera.card
@@ -261,10 +266,17 @@ class EasyPairs(ShortForm):
 
     def boxes(self, number: int) -> tuple[Box | None, Box | None]:
         """Region hints of a pair."""
-        if not self.hinted:
+        if not self._boxed(number):
             return None, None
         scene = _scene(self.rig, number)
         return self._box(number, "down", scene.down), self._box(number, "up", scene.up)
+
+    def blue_px(self, number: int) -> tuple[tuple[float, float], tuple[float, float]] | None:
+        """Places (u, v) of the blue spots in both images, across the mirror from the red ones; None without them."""
+        if not self._is_whole(number) or self._camera().card.mosaic == "mono":
+            return None
+        scene = _scene(self.rig, number)
+        return self._across(scene.down).uv_px, self._across(scene.up).uv_px
 
     def truth(self, number: int) -> PairTruth:
         """The exact answer."""
@@ -277,7 +289,7 @@ class EasyPairs(ShortForm):
             0,
             self.preset,
             quality,
-            self.hinted,
+            self._boxed(number),
             scene.depth_m,
             scene.stroke_m,
             self.rig,
@@ -289,6 +301,25 @@ class EasyPairs(ShortForm):
     def document(self) -> dict[str, Any]:
         """Provenance."""
         return {"name": "easy pairs", "preset": self.preset, "pairs": self.count, "rig": asdict(self.rig)}
+
+    def _is_whole(self, number: int) -> bool:
+        return self.count - self.whole <= number < self.count
+
+    def _boxed(self, number: int) -> bool:
+        return self.hinted and not self._is_whole(number)
+
+    def _lights(self, camera: EasyCamera, number: int, spot: EasySpot) -> list[ExpectedRegion]:
+        flux = _scene(self.rig, number).flux_e
+        blue = [] if self.blue_px(number) is None else [self._across(spot)]
+        return [
+            camera.expected(spot, flux),
+            *(camera.expected(other, _BLUE_SHARE * flux, blue=True) for other in blue),
+        ]
+
+    def _across(self, spot: EasySpot) -> EasySpot:
+        """A spot on the other side of the mirror's centre."""
+        u, v = 2.0 * self.rig.outline_px().mean(axis=0) - np.array(spot.uv_px)
+        return replace(spot, uv_px=(float(u), float(v)))
 
     def _camera(self) -> EasyCamera:
         return EasyCamera(self.rig.camera, sensor_card(self.preset))

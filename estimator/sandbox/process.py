@@ -175,9 +175,14 @@ _STACK_SECONDS = 0.3  # for a stack to be printed, and for the pipe to end
 _NOT_RESTARTED = ("", "invalid")  # the process is as sound as before
 
 
-def advised(message: str, isolation: Isolation) -> str:
-    """A message with what helps, if the rules of the isolation are what it may be about."""
-    if not isolation.files or "PermissionError" not in message:
+_OUT_OF_REACH = re.compile(r"PermissionError|permission denied|system error number 13\b|errno 13\b", re.IGNORECASE)
+"""Words of Python and of libraries in other languages about a file that cannot be opened."""
+_UNREAD = "can't open/read file"  # printed by OpenCV, which then gives None and raises nothing
+
+
+def advised(message: str, isolation: Isolation, output: str = "") -> str:
+    """A message with what helps, if the rules of the isolation are what it or the printed lines may be about."""
+    if not isolation.files or not (_OUT_OF_REACH.search(message) or _UNREAD in output):
         return message
     return f"{message}; a method reads its own folder and has no network: --allow PATH lets it read more"
 
@@ -254,7 +259,9 @@ class MethodProcess:
         if self._limits.fresh or outcome.failure not in _NOT_RESTARTED:
             self.end()
         message = printable_line(outcome.message, _MESSAGE_LENGTH)
-        return replace(outcome, message=advised(message, self._isolation) if outcome.failure == "error" else message)
+        if outcome.failure == "error":
+            message = advised(message, self._isolation, outcome.output)
+        return replace(outcome, message=message)
 
     def ask_each(self, pair: Pair) -> tuple[Outcome, ...]:
         """Give one pair to the methods, one after the other."""

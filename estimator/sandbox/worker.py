@@ -96,10 +96,33 @@ def place_in(error: BaseException, file: str = "") -> str:
 
 def sentence_of(error: BaseException, file: str = "") -> str:
     """An exception in one sentence, with the method's own line."""
+    what, place = _in_words(error), place_in(error, file)
+    denied = next((one for one in _causes(error) if isinstance(one, PermissionError)), None)
+    because = f", because of {_in_words(denied)}" if denied is not None and denied is not error else ""
+    return f"{what}{because}{f' ({place})' if place else ''}{_on_relative(error) if file else ''}"
+
+
+def _in_words(error: BaseException) -> str:
     text = " ".join(_text_of(error).split())[:_LONGEST_MESSAGE]
-    what = f"{type(error).__name__}: {text}" if text else type(error).__name__
-    place = place_in(error, file)
-    return f"{what} ({place})" if place else what
+    return f"{type(error).__name__}: {text}" if text else type(error).__name__
+
+
+def _on_relative(error: BaseException) -> str:
+    """Advice if a file was looked for in the working folder, which is not where the user is."""
+    lost = next((one for one in _causes(error) if isinstance(one, FileNotFoundError)), None)
+    name = lost.filename if lost is not None else None
+    if not isinstance(name, str) or not name or Path(name).is_absolute():
+        return ""
+    return "; the working folder is a fresh one: a path beside the method is Path(__file__).with_name('...')"
+
+
+def _causes(error: BaseException | None) -> Iterator[BaseException]:
+    """An error, what it was raised because of, and so on."""
+    for _ in range(_MOST_CAUSES):
+        if error is None:
+            return
+        yield error
+        error = error.__cause__ or error.__context__
 
 
 def _text_of(error: BaseException) -> str:
@@ -290,15 +313,12 @@ _NO_MEMORY = re.compile(
 
 def is_out_of_memory(error: BaseException | None) -> bool:
     """Tell an error for want of memory, or one that was raised because of such an error."""
-    for _ in range(_MOST_CAUSES):
-        if error is None:
-            return False
-        if isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno == errno.ENOMEM):
-            return True
-        if lacks_memory(_text_of(error)):
-            return True
-        error = error.__cause__ or error.__context__
-    return False
+    return any(
+        isinstance(one, MemoryError)
+        or (isinstance(one, OSError) and one.errno == errno.ENOMEM)
+        or lacks_memory(_text_of(one))
+        for one in _causes(error)
+    )
 
 
 def lacks_memory(text: str) -> bool:

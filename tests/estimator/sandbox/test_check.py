@@ -16,6 +16,7 @@ from phibench.estimator.cli import main as cli
 from phibench.estimator.geometry.phi import phi_normal, phi_ray
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.estimator.interface import Answer, Method, Outcome, Pair, Spot
+from phibench.estimator.methods.pair_light import mirror_mask
 from phibench.estimator.methods.registry import METHODS
 from phibench.estimator.sandbox.answers import AnswerError, answer_text, checked
 from phibench.estimator.sandbox.check import PAIRS, Check, Views, check_method, covariance_fault, judged, position_fault
@@ -55,7 +56,7 @@ def coarse(pair: Pair) -> Answer:
     return of_the_method("brightest_pixel", pair.number)
 
 
-def tried(method: Method, pairs: list[Pair]) -> Check:
+def tried(method: Method, pairs: list[Pair], of: EasyPairs = SET) -> Check:
     """Judge a method in this process; answers go the way that they go from the method's process."""
     done = []
     for pair in pairs:
@@ -63,7 +64,9 @@ def tried(method: Method, pairs: list[Pair]) -> Check:
             done.append(Outcome(pair.number, checked(answer_text(method(pair))), 0.01))
         except AnswerError as error:
             done.append(Outcome(pair.number, None, 0.01, "invalid", str(error)))
-    return judged(done, SET)
+        except AttributeError as error:
+            done.append(Outcome(pair.number, None, 0.01, "error", str(error)))
+    return judged(done, of)
 
 
 def each(change: Change, method: Method = right) -> Method:
@@ -220,6 +223,82 @@ def test_noise_alone_is_not_taken_for_a_mistake() -> None:
         assert "half a pixel too large" in position_fault(truth + error + 0.5, truth, views)
         seen += 1
     assert seen == 400
+
+
+# -- pairs without boxes, and a blue light -----------------------------------------------------------------------------
+
+WHOLE_SETS = {preset: EasyPairs(preset, 4, whole=3) for preset in ("bayer-raw", "mono-raw", "srgb8", "mjpeg")}
+
+
+def brightest(channel: int | None) -> Method:
+    """Largest on - off in the mirror, of the sum of the colours or of one of R, G, B, the box left alone."""
+
+    def method(pair: Pair) -> Answer:
+        spots = []
+        for name in ("down", "up"):
+            light = pair.images[name].astype(float) - pair.images[f"{name}_off"]
+            if light.ndim == 3:
+                light = light.sum(axis=2) if channel is None else light[..., channel]
+            elif channel is not None:  # the site of a mosaic's colour: red at (0, 0), blue at (1, 1)
+                sites = np.full(light.shape, -np.inf)
+                at = (slice(channel // 2, None, 2), slice(channel // 2, None, 2))
+                sites[at] = light[at]
+                light = sites
+            v, u = np.unravel_index(np.argmax(np.where(mirror_mask(pair), light, -np.inf)), light.shape)
+            spots.append(Spot((float(u), float(v))))
+        return Answer(*spots)
+
+    return method
+
+
+@pytest.mark.parametrize("preset", ["bayer-raw", "srgb8", "mjpeg"])
+def test_blue_taken_for_red_is_told_and_a_grey_picture_is_not(preset: str) -> None:
+    of = WHOLE_SETS[preset]
+    pairs = [of.pair(number) for number in range(len(of))]
+    (fault,) = tried(brightest(2), pairs, of).faults
+    assert fault.startswith("6 of 6 spots are a fainter blue light: red and blue look exchanged")
+    for channel in (0, None):
+        assert tried(brightest(channel), pairs, of).faults == ()
+
+
+def in_boxes(otherwise: Spot | None) -> Method:
+    """The right answer in boxes; elsewhere a given one, or the crash of who reads a box that is not there."""
+
+    def method(pair: Pair) -> Answer:
+        if pair.box_down is None and otherwise is not None:
+            return Answer(otherwise, otherwise)
+        _ = pair.box_down.slices  # type: ignore[union-attr]
+        return METHODS["brightest_pixel"](pair)
+
+    return method
+
+
+def test_a_method_that_needs_boxes_is_told() -> None:
+    of = EasyPairs(count=8, whole=3)
+    pairs = [of.pair(number) for number in range(len(of))]
+    assert [pair.box_down is None for pair in pairs] == [False] * 5 + [True] * 3
+    assert [of.truth(number).hinted for number in range(8)] == [True] * 5 + [False] * 3
+    (crash,) = tried(in_boxes(None), pairs, of).faults
+    assert crash.startswith("3 of 8 pairs: the method raised an exception: 'NoneType' object has no attribute 'slices'")
+    assert "box_down and box_up are None there" in crash
+    (wrong,) = tried(in_boxes(Spot((3.0, 4.0))), pairs, of).faults
+    assert "6 of 6 spots are wrong where a pair has no boxes" in wrong
+    (silent,) = tried(in_boxes(Spot.missing("no box")), pairs, of).faults
+    assert "6 of 6 spots are missing where a pair has no boxes: 'no box'" in silent
+
+
+@pytest.mark.parametrize("preset", WHOLE_SETS)
+@pytest.mark.parametrize("name", ["detect", "brightest_pixel", "red_centroid", "laplacian_blob"])
+def test_sound_methods_pass_without_boxes_and_beside_a_blue_light(preset: str, name: str) -> None:
+    of = WHOLE_SETS[preset]
+    assert tried(METHODS[name], [of.pair(number) for number in range(len(of))], of).faults == ()
+
+
+def test_the_check_has_pairs_without_boxes(tmp_path: Path) -> None:
+    reference = method_file(tmp_path, "return Answer(*[Spot((float(b.u0_px), 1.0)) for b in (pair.box_down,) * 2])")
+    fault = check_method(reference, "mono-raw").faults[0]
+    assert fault.startswith("3 of 10 pairs: the method raised an exception: AttributeError: 'NoneType' object")
+    assert "(my_phi.py, line 6, in <listcomp>)" in fault or "(my_phi.py, line 6, in extract)" in fault
 
 
 # -- through the method's process and the command line ----------------------------------------------------------------

@@ -489,6 +489,39 @@ def test_a_missing_right_is_told_with_what_helps(tmp_path: Path) -> None:
         run_method(late, SmallPairs(1), LIMITS)
 
 
+_WRAPPED = """
+try:
+    open({path!r})
+except OSError as error:
+    raise RuntimeError("no weights") from error
+"""
+
+
+@needs_landlock
+@pytest.mark.parametrize(
+    ("body", "words", "reached"),
+    [
+        (_WRAPPED, "RuntimeError: no weights, because of PermissionError: [Errno 13] Permission denied", False),
+        # as other languages' libraries say it
+        ("raise RuntimeError('Load model from {path} failed:system error number 13')", "system error number 13", False),
+        ("print('imread_({path}): can\\'t open/read file'); None.shape", "has no attribute 'shape'", False),
+        ("raise RuntimeError('system error number 130')", "number 130", True),
+        ("open('beside.txt')", "Path(__file__).with_name('...')", True),
+    ],
+)
+def test_a_file_out_of_reach_is_told_however_a_library_says_it(
+    tmp_path: Path, body: str, words: str, reached: bool
+) -> None:
+    (tmp_path / "method").mkdir()
+    (tmp_path / "weights.txt").write_text("1")
+    text = body.format(path=str(tmp_path / "weights.txt"))
+    (outcome,) = run_method(method_file(tmp_path / "method", text), SmallPairs(1), LIMITS)
+    assert outcome.failure == "error"
+    assert words in outcome.message
+    assert ("--allow PATH" not in outcome.message) == reached
+    assert "my_phi.py, line " in outcome.message
+
+
 def test_limits_go_into_the_record_without_paths(tmp_path: Path) -> None:
     document = RunLimits(fresh=True, allow=(str(tmp_path / "weights"),)).document()
     assert document["fresh"] is True
