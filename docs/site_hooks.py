@@ -1,8 +1,8 @@
 """Hooks of the site: pages that lie elsewhere in the tree, sources that pages link to, and the reference.
 
 A link of a page is relative to the page's place in the repository. Here every file gets a place in the site, and links
-are turned towards it. Formulas become MathML, which browsers draw by themselves. Tutorials are executed, and their
-outputs stand in their pages.
+are turned towards it. Formulas become MathML, which browsers draw by themselves; fonts of Matplotlib travel with the site.
+Tutorials are executed, and their outputs stand in their pages.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+import matplotlib
 import nbformat
 from latex2mathml.converter import convert
 from mkdocs.plugins import event_priority
@@ -73,6 +74,14 @@ REFERENCE = {
         "phibench.estimator.loop.simulator",
     ),
 }
+FONTS = {
+    "mathematics-signs.ttf": "DejaVuSerif.ttf",  # has the table MATH, by which browsers set formulas and stretch signs
+    "mathematics-letters.ttf": "STIXGeneral.ttf",  # has all letters, Greek italics too, and no such table
+    "LICENSE_DEJAVU": "LICENSE_DEJAVU",
+    "LICENSE_STIX": "LICENSE_STIX",
+}
+"""Files of the site's assets and of the fonts that Matplotlib brings; their licences allow copies."""
+
 _LOG = logging.getLogger("mkdocs.hooks.phibench")
 _FORMULA = re.compile(r'<(span|div) class="arithmatex">(.*?)</\1>', re.S)
 _FUNCTION = re.compile(r"(<m[io]>(?:sin|cos|tan|arccos|arcsin)</m[io]>)")
@@ -98,6 +107,9 @@ def on_config(config: Any) -> Any:
 def on_files(files: Files, config: Any) -> Files:
     """Add tutorials, pages of other folders, sources that pages name, and the reference."""
     linked = set()
+    fonts = Path(matplotlib.get_data_path()) / "fonts" / "ttf"
+    for place, name in FONTS.items():
+        files.append(File.generated(config, f"assets/{place}", content=(fonts / name).read_bytes()))
     for name in TUTORIALS:
         for place, content in _tutorial(name).items():
             files.append(File.generated(config, place, content=content))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ast
+import html
 import os
 import re
 import shutil
@@ -11,6 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import matplotlib
 import pytest
 import yaml
 
@@ -64,6 +67,45 @@ def test_every_formula_of_the_pages_is_understood() -> None:
     assert "\\" in convert(r"\unknowable x")
 
 
+def fonts() -> dict[str, str]:
+    """Font files by their names in the site, of the hooks' source: its imports are not all here."""
+    tree = ast.parse((ROOT / "docs" / "site_hooks.py").read_text(encoding="utf-8"))
+    named = (node for node in tree.body if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "FONTS")
+    return dict(ast.literal_eval(next(named).value))
+
+
+def test_a_mathematics_font_travels_with_the_site() -> None:
+    """Every letter of the formulas is in it, also in italics: browsers draw a letter x as U+1D465, and h as U+210E."""
+    from fontTools.ttLib import TTFont
+
+    convert = pytest.importorskip("latex2mathml.converter").convert
+    here = Path(matplotlib.get_data_path()) / "fonts" / "ttf"
+    signs, letters = (TTFont(here / fonts()[f"mathematics-{name}.ttf"]) for name in ("signs", "letters"))
+    assert "MATH" in signs
+    assert {0x20, 0x28, 0x221A, 0x2211} <= set(signs.getBestCmap())
+    assert all((here / name).is_file() for name in fonts().values())
+    style = (ROOT / "docs" / "assets" / "site.css").read_text(encoding="utf-8")
+    assert {name for name in fonts() if name.endswith(".ttf")} == set(re.findall(r'url\("(.*?)"\)', style))
+    pages = [ROOT / "README.md", *(ROOT / "docs").rglob("*.md"), *(ROOT / "datasets").glob("*.md")]
+    formulas = [a or b for page in pages for a, b in FORMULA.findall(CODE.sub("", page.read_text("utf-8")))]
+    drawn = "".join(convert(re.sub(r"\\tag\{\d+\}", "", latex).strip()) for latex in formulas)
+    texts = {html.unescape(text) for text in re.findall(r"<m[ion][^>]*>([^<]+)<", drawn)}
+    wanted = {ord(sign) for text in texts for sign in text} | {italic(text) for text in texts if len(text) == 1}
+    assert len(wanted) > 60
+    assert [f"U+{code:04X}" for code in sorted(wanted - set(letters.getBestCmap()))] == []
+
+
+def italic(letter: str) -> int:
+    """Code point that a browser draws for one letter alone (MathML Core, appendix on italics); Latin and Greek."""
+    code = ord(letter)
+    if letter == "h":
+        return 0x210E
+    for first, last, start in (("A", "Z", 0x1D434), ("a", "z", 0x1D44E), ("Α", "Ω", 0x1D6E2), ("α", "ω", 0x1D6FC)):
+        if ord(first) <= code <= ord(last):
+            return start + code - ord(first)
+    return code
+
+
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     pytest.importorskip("material")
@@ -86,6 +128,7 @@ def test_the_site_loads_nothing_from_the_network(site: Path) -> None:
     formulas = (site / "limits.html").read_text("utf-8")
     assert formulas.count("<math") > 8
     assert "arithmatex" not in formulas
+    assert all((site / "assets" / name).stat().st_size > 1000 for name in fonts())
 
 
 @pytest.mark.study
