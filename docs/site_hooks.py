@@ -1,8 +1,8 @@
 """Hooks of the site: pages that lie elsewhere in the tree, sources that pages link to, and the reference.
 
 A link of a page is relative to the page's place in the repository. Here every file gets a place in the site, and links
-are turned towards it. Formulas become MathML, which browsers draw by themselves; fonts of Matplotlib travel with the site.
-Tutorials are executed, and their outputs stand in their pages.
+are turned towards it. Formulas become MathML, which browsers draw by themselves. Fonts of Matplotlib travel with the
+site. Tutorials are executed, and their outputs stand in their pages.
 """
 
 from __future__ import annotations
