@@ -30,6 +30,8 @@ from phibench.estimator.geometry.least_squares_depth import depth_general
 from phibench.estimator.geometry.rig_parameters import stroke_of
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.estimator.interface import Pair
+from phibench.estimator.methods.fit_place import kept
+from phibench.estimator.methods.locate import SharedPair
 from phibench.estimator.methods.raw_likelihood import with_posteriors
 from phibench.estimator.outline.outline import find_outline
 from phibench.estimator.outline.outline_result import Outline
@@ -159,13 +161,14 @@ def _shape(
 
 def _known(imported: ImportedSet, rows: Sequence[ImportedRow], rig: Rig, shape: SpotShape) -> KnownSpot:
     """Spot of a sample, of all its frames, at the distance of the tape."""
-    pair = replace(_pair(imported, rows), rig=shape.rig(rig))
+    pair = SharedPair.of(replace(_pair(imported, rows), rig=shape.rig(rig)))
     answer = method_for(imported.card)(pair)
     for position in POSITIONS:
         spot = getattr(answer, position)
         if spot.uv_px is None or spot.covariance_px2 is None:
-            raise DatasetError(f"no spot {position}: {spot.status}")
-    found = seen_spots(with_posteriors(pair, answer))
+            why = spot.status if spot.uv_px is None else "a light is there, but no fit of it stays at its place"
+            raise DatasetError(f"no spot {position}: {why}")
+    found = seen_spots(kept(pair, answer, with_posteriors(pair, answer)))
     row = rows[0]
     if row.depth_m is None or row.depth_sigma_m is None:
         raise DatasetError("no measured D")

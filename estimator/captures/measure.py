@@ -56,6 +56,8 @@ from phibench.estimator.geometry.least_squares_depth import GeneralDepth, depth_
 from phibench.estimator.geometry.rig_parameters import PARAMETERS, prior_sigmas, stroke_of
 from phibench.estimator.geometry.status import Status, describe
 from phibench.estimator.interface import Answer, Image, Pair, Spot
+from phibench.estimator.methods.fit_place import kept
+from phibench.estimator.methods.locate import SharedPair
 from phibench.estimator.methods.raw_likelihood import with_posteriors
 from phibench.estimator.outline.limb_image import Measured
 from phibench.estimator.outline.outline import find_outline
@@ -436,10 +438,11 @@ def _shape_note(shape: SpotShape, setting: Setting) -> str:
 
 
 def _answer(pair: Pair, photos: PairPhotos) -> Answer:
+    pair = SharedPair.of(pair)
     answer = method_for(pair.card)(pair)
     if any(spot.uv_px is None or spot.covariance_px2 is None for spot in (answer.down, answer.up)):
         raise nothing_found(pair, photos, answer)
-    return with_posteriors(pair, answer)
+    return kept(pair, answer, with_posteriors(pair, answer))
 
 
 def seen_spots(answer: Answer) -> dict[str, SeenSpot]:

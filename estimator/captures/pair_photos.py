@@ -103,7 +103,8 @@ def nothing_found(pair: Pair, photos: PairPhotos, answer: Answer) -> DatasetErro
         u, v = getattr(answer, unfit).uv_px
         return DatasetError(
             f"a light is seen in the picture {unfit} ({getattr(photos, unfit).on[0].path}) at ({u:.0f}, {v:.0f}) px, "
-            "but it is too faint to be fitted; give more frames, less light of the room or more of the laser"
+            "but no fit of it holds, it is too faint or beside another light; give more frames, less light of the room "
+            "or more of the laser"
         )
     where = " and ".join(f"{p} ({getattr(photos, p).on[0].path})" for p in lacking)
     advice = "" if pair.down_off is not None else "; give pictures with the laser off, too"

@@ -286,7 +286,7 @@ def _of_data(image: SpotImage, data: SpotData, values: Array) -> _Linear | None:
         return _pixels(image, shape, data.regions.filters, known)
 
     model = SpotModel(_response(image.pair, values), known)
-    fit = fit_law(data.regions, data.law, _blur(image, values), model)
+    fit = fit_law(data.regions, data.law, _blur(image, values), model, image.uv_px)
     if fit.status[0] != Status.OK:
         return None
     levels = fit.background_e[0] if known is None else np.zeros(0)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.estimator.geometry.status import Status, describe
 from phibench.estimator.interface import Answer, Box, Pair, Spot
+from phibench.estimator.methods.fit_place import at_detection
 from phibench.estimator.methods.likelihood_maps import SpotLikelihood, of_pixels, of_window
 from phibench.estimator.methods.locate import around as box_at
 from phibench.estimator.methods.locate import (
@@ -78,12 +79,12 @@ def _fitted(pair: Pair) -> Answer:
 
 
 def _spot_or_place(pair: Pair, position: str, found: Detection | None, hint: Box | None, depth_m: float | None) -> Spot:
-    """Fit; or, of a spot that was seen but gives no fit, the place of the matched filter, without covariance."""
-    spot = _spot(pair, position, box_around(found, pair.images[position]) or hint, depth_m)
-    return Spot(found.uv_px) if spot.uv_px is None and found is not None else spot
+    """Fit; or, of a spot that was seen but gives no fit there, the place of the matched filter, without covariance."""
+    near = None if found is None else found.uv_px
+    return at_detection(found, _spot(pair, position, box_around(found, pair.images[position]) or hint, depth_m, near))
 
 
-def _spot(pair: Pair, position: str, box: Box | None, depth_m: float | None) -> Spot:
+def _spot(pair: Pair, position: str, box: Box | None, depth_m: float | None, near: tuple[float, float] | None) -> Spot:
     if box is None:
         return Spot.missing("no spot found")
     shape = pair.images[position].shape
@@ -92,17 +93,17 @@ def _spot(pair: Pair, position: str, box: Box | None, depth_m: float | None) -> 
     on, dark = _parts(pair, position, region)
     background = None if dark is None else _background(dark, None, origin, pair.card)
     lens, model = SpotBlur(pair.rig.camera.blur_sigma_px), SpotModel(_response(pair))
-    start = first_fit(on, origin, pair.card, lens, model.response, background)[0, :2] + origin[0]
+    start = first_fit(on, origin, pair.card, lens, model.response, background, near)[0, :2] + origin[0]
     blur = pair_blur(pair, start, depth_m)
     if pair.card.output == "srgb8":
-        return _answer(_srgb(pair, position, start, blur, model))
+        return _answer(_srgb(pair, position, start, blur, model, near))
     if background is None:
         known = around(start[None], origin, (region.height_px, region.width_px))
         background = _background(on, known, origin, pair.card)
     if pair.card.output == "yuyv":
-        return _answer(fit_yuyv(on, origin, pair.card, blur, model, background))
+        return _answer(fit_yuyv(on, origin, pair.card, blur, model, background, near_px=near))
     size = (shape[1], shape[0])
-    return _answer(fit_jpeg(on, origin, pair.card, blur, model, background, size_px=size))
+    return _answer(fit_jpeg(on, origin, pair.card, blur, model, background, size_px=size, near_px=near))
 
 
 def _region(box: Box, card: SensorCard, shape: tuple[int, ...]) -> Box:
@@ -126,7 +127,14 @@ def _parts(pair: Pair, position: str, box: Box) -> tuple[NDArray[Any], NDArray[A
     return on, dark
 
 
-def _srgb(pair: Pair, position: str, start: Array, blur: SpotBlur, model: SpotModel) -> SpotFit:
+def _srgb(
+    pair: Pair,
+    position: str,
+    start: Array,
+    blur: SpotBlur,
+    model: SpotModel,
+    near: tuple[float, float] | None,
+) -> SpotFit:
     """Fit a square of 17 x 17 pixels about the start."""
     card, square = pair.card, _square(start, pair.images[position])
     origin = np.array([[square.u0_px, square.v0_px]])
@@ -134,7 +142,7 @@ def _srgb(pair: Pair, position: str, start: Array, blur: SpotBlur, model: SpotMo
     own = own_codes(card) and on.shape[1] == 1
 
     if dark is None:
-        flat = fit_srgb(on, origin, card, blur, model)
+        flat = fit_srgb(on, origin, card, blur, model, near_px=near)
         if flat.chi2[0] < _FLAT_CHI2:
             return flat
         known = around(start[None], origin, (2 * _HALF_PX + 1, 2 * _HALF_PX + 1))
@@ -142,7 +150,7 @@ def _srgb(pair: Pair, position: str, start: Array, blur: SpotBlur, model: SpotMo
     else:
         background = _background(dark, None, origin, card, own)
     behind, extra_e2 = replace(model, background_e=background.mean_e), float(np.median(background.variance_e2))
-    return fit_srgb(on, origin, card, blur, behind, extra_e2=extra_e2, background=background)
+    return fit_srgb(on, origin, card, blur, behind, extra_e2=extra_e2, background=background, near_px=near)
 
 
 def _background(

@@ -13,7 +13,8 @@ import numpy as np
 from phibench.estimator.interface import Answer, Box, Method, Pair, Spot
 from phibench.estimator.learned.network_input import frame_input
 from phibench.estimator.learned.networks import CROP, DETECT, Network, heat_peaks, network, refined, shipped
-from phibench.estimator.methods.locate import SearchRegion, each_spot, red_peak
+from phibench.estimator.methods.fit_place import at_detection
+from phibench.estimator.methods.locate import SearchRegion, each_spot
 from phibench.estimator.spots.candidates import Candidates
 from phibench.estimator.spots.detect import Thresholds, choose, mirror_box, outline_mask
 from phibench.estimator.spots.image_planes import kind_of
@@ -26,7 +27,7 @@ def _named(name: str, file: Path | None) -> Network:
 
 
 def learned_crop(file: Path | None = None) -> Method:
-    """Network of a file on the 32 x 32 pixels about the red peak; by default the network that phibench ships.
+    """Network of a file on the 32 x 32 pixels about the spot's place; by default the network that phibench ships.
 
     Examples
     --------
@@ -36,13 +37,15 @@ def learned_crop(file: Path | None = None) -> Method:
     """
 
     def find(region: SearchRegion) -> Spot:
-        peak = red_peak(region.red)
+        peak = region.place
         if peak is None:
             return Spot.missing("no spot")
         u0, v0 = region.origin_px
         pair, name = region.pair, region.position
         place = (peak[0] + u0, peak[1] + v0)
-        return refined(_named(CROP, file), pair.images[name], pair.images.get(f"{name}_off"), pair.card, place)
+        crop = _named(CROP, file)
+        spot = refined(crop, pair.images[name], pair.images.get(f"{name}_off"), pair.card, place)
+        return at_detection(region.found, spot)
 
     return each_spot(find)
 

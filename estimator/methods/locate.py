@@ -5,6 +5,7 @@ Integer (u, v) are pixel centres, u along the columns, v along the rows.
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
@@ -21,7 +22,14 @@ from phibench.estimator.methods.pair_light import SIGMA_OF_MAD
 from phibench.estimator.spots.camera_codes import rgb_codes
 from phibench.estimator.spots.detect import Detection, PairDetection, detect
 from phibench.estimator.spots.gaussian_spot import SpotBlur
-from phibench.estimator.spots.image_planes import demosaiced, kind_of, linear_planes, redness
+from phibench.estimator.spots.image_planes import (
+    demosaiced,
+    full_scale_e,
+    kind_of,
+    linear_planes,
+    redness,
+    variance_e2,
+)
 from phibench.estimator.spots.simple_spots import SpotPositions
 from phibench.estimator.spots.spot_prediction import spot_blur
 from phibench.scenes.frames import Array, BoolArray
@@ -122,7 +130,10 @@ def locate(pair: Pair, hints: bool = False) -> tuple[Box | None, Box | None]:
     ValueError
         If an image does not fit the card's output.
     """
-    found = detected(pair)
+    return _boxes(pair, detected(pair), hints)
+
+
+def _boxes(pair: Pair, found: PairDetection, hints: bool) -> tuple[Box | None, Box | None]:
     own = (pair.box_down, pair.box_up) if hints else trusted_hints(pair, found)
     return box_around(found.down, pair.down) or own[0], box_around(found.up, pair.up) or own[1]
 
@@ -180,7 +191,9 @@ def spot_likeness(red: Array) -> Array:
     return np.asarray(narrow - wide)
 
 
-def red_peak(red: Array, inside: BoolArray | None = None, least_sigmas: float = 0.0) -> tuple[float, float] | None:
+def red_peak(
+    red: Array, inside: BoolArray | None = None, least_sigmas: float = 0.0, variance: Array | None = None
+) -> tuple[float, float] | None:
     """Pixel (u, v) of the largest likeness, in the coordinates of `red`; None if nothing stands out.
 
     Parameters
@@ -191,10 +204,16 @@ def red_peak(red: Array, inside: BoolArray | None = None, least_sigmas: float = 
         Where the spot may be.
     least_sigmas : float
         The peak must exceed the scatter of the likeness so many times (median absolute deviation).
+    variance : shape (h, w), optional
+        Of the redness, pixel by pixel, in any unit: the likeness is then over its standard deviation. Otherwise the
+        noise of a lamp outshines a spot in a dark place.
     """
     if min(red.shape) < 3 or not np.isfinite(red).all():
         return None
     likeness = spot_likeness(red)
+    if variance is not None:
+        # the square of a Gaussian is one of half the variance
+        likeness = likeness / np.sqrt(gaussian_filter(variance, CORE_PX / math.sqrt(2.0), mode="nearest"))
     allowed = np.ones(red.shape, bool) if inside is None else inside
     if not allowed.any():
         return None
@@ -221,12 +240,15 @@ class SearchRegion:
         In the image; from the hint, or from `locate`.
     depth_m : float or None
         Of the spot, where it is known already.
+    found : Detection or None
+        Where `detect` sees the spot; None in a hint in which it sees none.
     """
 
     pair: Pair
     position: str
     box: Box
     depth_m: float | None = None
+    found: Detection | None = None
 
     @property
     def origin_px(self) -> tuple[int, int]:
@@ -268,9 +290,27 @@ class SearchRegion:
         red, off = redness(self.planes), self.off_pixels
         return red if off is None else red - redness(linear_planes(off, self.pair.card, self.origin_px))
 
+    @property
+    def variance(self) -> Array:
+        """Variance of the redness, shape (h, w), but for a factor that is the same everywhere."""
+        card, scale = self.pair.card, full_scale_e(self.pair.card)
+        images = [self.pixels] if self.off_pixels is None else [self.pixels, self.off_pixels]
+        levels = [linear_planes(image, card, self.origin_px).mean(axis=0) * scale for image in images]
+        return np.sum([variance_e2(level, card, len(levels) > 1) for level in levels], axis=0)
+
+    @property
+    def place(self) -> tuple[float, float] | None:
+        """Place (u, v) of the spot in the coordinates of the box; None if nothing stands out.
+
+        It is that of `detect`. In a hint in which it sees none, it is the reddest spot-like place over its noise.
+        """
+        if self.found is None:
+            return red_peak(self.red, variance=self.variance)
+        return self.found.uv_px[0] - self.box.u0_px, self.found.uv_px[1] - self.box.v0_px
+
     def narrowed(self) -> SearchRegion | None:
-        """Region of 15 x 15 pixels around the reddest spot-like place in the box; None if there is none."""
-        return self.window_at(red_peak(self.red))
+        """Region of 15 x 15 pixels around `place`; None if there is none."""
+        return self.window_at(self.place)
 
     def window_at(self, peak: tuple[float, float] | None) -> SearchRegion | None:
         """Region of 15 x 15 pixels around a place (u, v) in the coordinates of the box."""
@@ -285,35 +325,41 @@ class SearchRegion:
 
 def each_spot(find: Callable[[SearchRegion], Spot], hints: bool = False) -> Method:
     """Method that looks at each image by itself, where `locate` sees a spot, or else at its hint if `hints`."""
-    return lambda pair: _both(find, pair, locate(pair, hints), None)
+    return lambda pair: _both(find, pair, detected(pair), hints, None)
 
 
 def each_spot_twice(find: Callable[[SearchRegion], Spot]) -> Method:
     """Method as of `each_spot`, then once more with the distance found, for methods that use the beam's size."""
 
     def method(pair: Pair) -> Answer:
-        boxes = locate(pair)
-        return measured_twice(lambda depth_m: _both(find, pair, boxes, depth_m), pair)
+        found = detected(pair)
+        return measured_twice(lambda depth_m: _both(find, pair, found, False, depth_m), pair)
 
     return method
 
 
 def _both(
-    find: Callable[[SearchRegion], Spot], pair: Pair, boxes: tuple[Box | None, Box | None], depth_m: float | None
+    find: Callable[[SearchRegion], Spot], pair: Pair, found: PairDetection, hints: bool, depth_m: float | None
 ) -> Answer:
-    down, up = (_seen(find, pair, name, box, depth_m) for name, box in zip(("down", "up"), boxes, strict=True))
+    seen = zip(("down", "up"), _boxes(pair, found, hints), (found.down, found.up), strict=True)
+    down, up = (_seen(find, pair, name, box, depth_m, one) for name, box, one in seen)
     return Answer(down, up)
 
 
 def _seen(
-    find: Callable[[SearchRegion], Spot], pair: Pair, position: str, box: Box | None, depth_m: float | None
+    find: Callable[[SearchRegion], Spot],
+    pair: Pair,
+    position: str,
+    box: Box | None,
+    depth_m: float | None,
+    found: Detection | None,
 ) -> Spot:
     if box is None:
         return Spot.missing("nothing spot-like in the mirror")
     inside = clipped(box, pair.images[position].shape)
     if min(inside.width_px, inside.height_px) < LEAST_PX:
         return Spot.missing("the box lies outside the image")
-    return find(SearchRegion(pair, position, inside, depth_m))
+    return find(SearchRegion(pair, position, inside, depth_m, found))
 
 
 def spot_of(found: SpotPositions) -> Spot:

@@ -30,8 +30,16 @@ from phibench.estimator.geometry.joint_posterior import JointPosterior, joint_po
 from phibench.estimator.geometry.status import Status, describe
 from phibench.estimator.interface import Answer, Image, Matrix2, Pair, Spot
 from phibench.estimator.methods.chain_fit import chain_fit, spot_likelihood
+from phibench.estimator.methods.fit_place import at_detection, kept
 from phibench.estimator.methods.likelihood_maps import SpotLikelihood, likelihood_map, of_pixels
-from phibench.estimator.methods.locate import SearchRegion, each_spot_twice, once, pair_blur, seen_depth_m
+from phibench.estimator.methods.locate import (
+    SearchRegion,
+    SharedPair,
+    each_spot_twice,
+    once,
+    pair_blur,
+    seen_depth_m,
+)
 from phibench.estimator.spots.fit_joint import JointFit, fit_joint
 from phibench.estimator.spots.fit_raw import SpotData, SpotFit, fit_law, spot_data
 from phibench.estimator.spots.gaussian_spot import SpotModel
@@ -55,28 +63,31 @@ _MISFIT_SIGMAS = 3.0  # by which the fit's chi2 must exceed 1 before its covaria
 
 
 def raw_maximum_likelihood(region: SearchRegion) -> Spot:
-    """Position and covariance by maximum likelihood on 15 x 15 raw pixels around the red peak."""
+    """Position and covariance by maximum likelihood on 15 x 15 raw pixels about the place of the spot.
+
+    Of a spot that was seen but gives no fit there, it is the place of the matched filter, without covariance; of one
+    with too few pixels that are not full it is nothing.
+    """
     try:
         noise = noise_of(region.pair.card, pattern_known=True)
     except ValueError:
         return Spot.missing("the fit needs shot noise and no row noise")
-    near = region.narrowed()
-    if near is None:
+    place = region.place
+    near = region.window_at(place)
+    if near is None or place is None:
         return Spot.missing("no spot")
-    x = raw_electrons(near.pixels, region.pair.card)[None]
-    flat = _fit(near, x, noise, None)
-    if (
-        near.off_pixels is None
-        and flat.status[0] == Status.OK
-        and flat.chi2[0] < 1.0 + _FLAT_SIGMAS * math.sqrt(2.0 / x.size)
-    ):
-        return _fitted_spot(flat, x.size)
-    structured = _fit(near, x, noise, _background(near, x, noise, flat))
-    return _fitted_spot(structured if structured.status[0] == Status.OK else flat, x.size)
+    x, start = raw_electrons(near.pixels, region.pair.card)[None], np.add(place, region.origin_px)
+    flat = _fit(near, x, noise, None, start)
+    fit, good = flat, flat.status[0] == Status.OK
+    if near.off_pixels is not None or not good or flat.chi2[0] >= 1.0 + _FLAT_SIGMAS * math.sqrt(2.0 / x.size):
+        structured = _fit(near, x, noise, _background(near, x, noise, flat), start)
+        fit = structured if structured.status[0] == Status.OK else flat
+    spot = _fitted_spot(fit, x.size)
+    return spot if fit.status[0] == Status.SATURATED else at_detection(region.found, spot)
 
 
-def _fit(near: SearchRegion, x: Array, noise: PixelNoise, background: Background | None) -> SpotFit:
-    """Fit with a known background, or with a level per filter."""
+def _fit(near: SearchRegion, x: Array, noise: PixelNoise, background: Background | None, start: Array) -> SpotFit:
+    """Fit from a place (u, v) of the image, with a known background or with a level per filter."""
     card, rig = near.pair.card, near.pair.rig
     u0, v0 = near.origin_px
     blur = pair_blur(near.pair, (u0 + near.box.width_px // 2, v0 + near.box.height_px // 2), near.depth_m)
@@ -88,7 +99,8 @@ def _fit(near: SearchRegion, x: Array, noise: PixelNoise, background: Background
         if background is None
         else GaussLaw(noise, background.variance_e2, frames, pattern.prnu, background.mean_e)
     )
-    return fit_law(spot_regions(x, near.origin_px, x < _full_from_e(card, frames)), law, blur, model)
+    regions = spot_regions(x, near.origin_px, x < _full_from_e(card, frames))
+    return fit_law(regions, law, blur, model, start)
 
 
 def _full_from_e(card: SensorCard, frames: int) -> float:
@@ -139,13 +151,18 @@ def raw_likelihood(pair: Pair) -> Answer:
 
 
 def joint_fit(pair: Pair) -> Answer:
-    """Positions and depth of a pair; the separate answers where one image has no spot or the two are not one point."""
-    return joint_of(pair, raw_likelihood(pair) if pair.card.output == "raw" else chain_fit(pair))
+    """Positions and depth of a pair; the separate answers where one image has no spot or the two are not one point.
+
+    Nor are they taken from a spot that left the place where it was seen (`fit_place`).
+    """
+    shared = pair if isinstance(pair, SharedPair) else SharedPair.of(pair)
+    separate = raw_likelihood(shared) if pair.card.output == "raw" else chain_fit(shared)
+    return kept(shared, separate, joint_of(shared, separate))
 
 
 def joint_of(pair: Pair, separate: Answer) -> Answer:
     """Answer for both images together, from that for each by itself: `raw_maximum_likelihood`'s or `chain_fit`'s."""
-    if separate.down.uv_px is None or separate.up.uv_px is None:
+    if separate.down.covariance_px2 is None or separate.up.covariance_px2 is None:
         return separate
     return (_raw if pair.card.output == "raw" else _processed)(pair, separate)
 
@@ -208,8 +225,6 @@ def _raw(pair: Pair, separate: Answer) -> Answer:
 
 
 def _processed(pair: Pair, separate: Answer) -> Answer:
-    if separate.down.covariance_px2 is None or separate.up.covariance_px2 is None:
-        return separate
     depth_m = seen_depth_m(pair, separate)
     found = _posterior(pair, [spot_likelihood(pair, p, getattr(separate, p), depth_m) for p in POSITIONS])
     if found is not None and found.status == Status.OK:

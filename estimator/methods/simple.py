@@ -35,7 +35,7 @@ def in_the_box(name: str) -> Finder:
 
 
 def at_the_red_peak(name: str) -> Finder:
-    """Simple extractor on 15 x 15 pixels around the reddest spot-like place in the box.
+    """Simple extractor on 15 x 15 pixels about the spot's place (`SearchRegion.place`).
 
     Parameters
     ----------
@@ -50,7 +50,7 @@ def at_the_red_peak(name: str) -> Finder:
 
 
 def red_centroid(region: SearchRegion) -> Spot:
-    """Thresholded centroid of the redness on 15 x 15 pixels around its peak; of the signal without colour filters."""
+    """Thresholded centroid of the redness about the spot's place; of the signal without colour filters."""
     near = region.narrowed()
     if near is None:
         return Spot.missing("no spot")
@@ -58,8 +58,8 @@ def red_centroid(region: SearchRegion) -> Spot:
 
 
 def off_difference(region: SearchRegion) -> Spot:
-    """Thresholded centroid of the difference's red plane, on 15 x 15 pixels around its peak."""
-    near = region.window_at(red_peak(_added(region)))
+    """Thresholded centroid of the difference's red plane, on 15 x 15 pixels about the spot's place."""
+    near = region.window_at(red_peak(_added(region)) if region.found is None else region.place)
     if near is None:
         return Spot.missing("no spot in the difference")
     return spot_of(thresholded_centroid(_added(near)[None], near.origin_px))

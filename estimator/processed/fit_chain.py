@@ -37,6 +37,8 @@ from phibench.scenes.frames import Array
 
 _CUT_PX = 15  # side of the square of the first fit
 _MATCHED = (0.0, 0.8, 0.8)  # px, of (image, v, u): a spot in focus has 0.7 px and the pixel, together 0.76 px
+_LEVEL_PX = 2.0  # over which the level is taken that a pixel's noise is reckoned from
+_ASTRAY_PX = 2.0  # from where the spot was seen
 _ROUGH_CODES2 = 4.0  # variance of a decoded code that the first fit reckons with, codes squared
 _UNSHARP_STEPS = 24  # each multiplies the error by amount / (1 + amount): 4e-12 in all at 0.5
 
@@ -50,6 +52,7 @@ def fit_srgb(
     pattern_known: bool = False,
     extra_e2: float = 0.0,
     background: Background | None = None,
+    near_px: ArrayLike | None = None,
 ) -> SpotFit:
     """Fit one spot in each region of processed 8-bit images.
 
@@ -70,6 +73,8 @@ def fit_srgb(
         Variance of the known background's error, electrons squared; frames share it.
     background : Background, optional
         Where all codes are fitted, instead of the model's background and `extra_e2`.
+    near_px
+        As for `fit_law`.
 
     Raises
     ------
@@ -82,9 +87,9 @@ def fit_srgb(
         known, shape = None if model is None else model.background_e, (len(planes), *planes.shape[2:4])
         levels = np.zeros(shape) if known is None else np.broadcast_to(known, shape)
         background = background or Background(levels, np.full(levels.shape, extra_e2))
-        return _fit_windows(planes, origin, card, blur, model, background, pattern_known)
+        return _fit_windows(planes, origin, card, blur, model, background, pattern_known, near_px=near_px)
     data = code_data(planes[:, 0], origin, card, blur, model, pattern_known, extra_e2)
-    return fit_law(data.regions, data.law, blur, model)
+    return fit_law(data.regions, data.law, blur, model, near_px)
 
 
 def code_data(
@@ -115,6 +120,7 @@ def fit_yuyv(
     model: SpotModel | None = None,
     background: Background | None = None,
     pattern_known: bool = False,
+    near_px: ArrayLike | None = None,
 ) -> SpotFit:
     """Fit one spot in each region of Y'CbCr 4:2:2 images, to their codes.
 
@@ -124,7 +130,7 @@ def fit_yuyv(
         13 x 13 pixels or more.
     origin_px : shape (2,) or (n, 2)
         Image pixel (u, v) of the first column and row; it may be odd.
-    card, blur, model, background, pattern_known
+    card, blur, model, background, pattern_known, near_px
         As for `fit_jpeg`.
 
     Raises
@@ -134,7 +140,7 @@ def fit_yuyv(
     """
     planes = _checked(images, card, 2)
     origin = np.broadcast_to(np.asarray(origin_px, np.int64), (len(planes), 2))
-    return _fit_windows(planes, origin, card, blur, model, background, pattern_known)
+    return _fit_windows(planes, origin, card, blur, model, background, pattern_known, near_px=near_px)
 
 
 def fit_jpeg(
@@ -146,6 +152,7 @@ def fit_jpeg(
     background: Background | None = None,
     pattern_known: bool = False,
     size_px: tuple[int, int] = (1280, 720),
+    near_px: ArrayLike | None = None,
 ) -> SpotFit:
     """Fit one spot in each region of decoded MJPEG images.
 
@@ -164,6 +171,8 @@ def fit_jpeg(
     pattern_known : bool
         PRNU and DSNU were calibrated; otherwise they count as noise.
     size_px : (width, height) of the image
+    near_px
+        As for `fit_law`.
 
     Returns
     -------
@@ -178,7 +187,7 @@ def fit_jpeg(
     planes = _checked(images, card)
     origin = np.broadcast_to(np.asarray(origin_px, np.int64), (len(planes), 2))
     _on_grid(origin, planes.shape[2:4], card)
-    return _fit_windows(planes, origin, card, blur, model, background, pattern_known, size_px)
+    return _fit_windows(planes, origin, card, blur, model, background, pattern_known, size_px, near_px)
 
 
 def own_codes(card: SensorCard) -> bool:
@@ -196,6 +205,7 @@ def _fit_windows(
     background: Background | None,
     pattern_known: bool,
     size_px: tuple[int, int] = (0, 0),
+    near_px: ArrayLike | None = None,
 ) -> SpotFit:
     """Fit each image's window of outputs; `size_px` of the whole image matters for JPEG alone."""
     n, model = len(planes), model or SpotModel()
@@ -203,7 +213,7 @@ def _fit_windows(
         return _collected([], origin, np.zeros(0), model.free_width)
     chain, blurs = _chain(card, background, pattern_known), blur.each(n)
     widths = np.asarray(blurs.sigma_px)
-    first = first_fit(planes, origin, card, SpotBlur(widths), model.response, background)
+    first = first_fit(planes, origin, card, SpotBlur(widths), model.response, background, near_px)
     rows = []
     for i in range(n):
         start = first[i] if not model.free_width else np.append(first[i], widths[i])
@@ -258,7 +268,8 @@ def spot_window(
     planes = _checked(image, card, image.shape[-1])
     region, corner = _region(planes[0], origin[0], card, background, 0, size_px)
     one = blur.each(1)
-    start = first_fit(planes, origin, card, SpotBlur(np.asarray(one.sigma_px)), model.response, background)[0]
+    lens = SpotBlur(np.asarray(one.sigma_px))
+    start = first_fit(planes, origin, card, lens, model.response, background, uv_px)[0]
     chain = _chain(card, background, False)
     window, first = region_window(region, chain, uv_px - origin[0] - corner, one, model)
     place = first + corner + origin[0]
@@ -273,39 +284,51 @@ def first_fit(
     blur: SpotBlur,
     response: tuple[float, float, float] | None,
     background: Background | None = None,
+    near_px: ArrayLike | None = None,
 ) -> Array:
     """Start of a fit, shape (n, 6): u, v in the region, flux, levels; a Gaussian fit of each pixel's own colour.
 
-    `images` have the shape (n, f, h, w, c), f frames of each.
+    `images` have the shape (n, f, h, w, c), f frames of each. It begins near `near_px` as `fit_law` does; where it
+    leads farther away than `_ASTRAY_PX`, the start is that place.
     """
     if response is None:
         raise ValueError("the fit through the chain needs the response of the filters: SpotModel(response=...)")
     filters = bayer_filters(origin + card.mosaic_phase, images.shape[2:4])
     x, extra = undone_mean(images, origin, card)
-    x = x - (0.0 if background is None else background.mean_e)
     rough, spread = _ROUGH_CODES2 * 12.0 * extra, unrounded(card)
-    x, rough, corner = _cut(x, rough, filters, response)
+    variance = spread.variance_e2(gaussian_filter(np.maximum(x, 0.0), (0.0, _LEVEL_PX, _LEVEL_PX))) + rough
+    x = x - (0.0 if background is None else background.mean_e)
+    if near_px is None:
+        near = origin + _outstanding(x, variance, filters, response)
+    else:
+        near = np.broadcast_to(np.asarray(near_px, float), (len(x), 2))
+    x, rough, corner = _cut(x, rough, np.rint(near - origin).astype(np.int64))
     regions = spot_regions(x, origin + corner, phase=card.mosaic_phase)
-    fit = fit_law(regions, GaussLaw(spread, rough), blur, SpotModel(response))
-    middle = np.array([x.shape[2] - 1.0, x.shape[1] - 1.0]) / 2.0
-    good = fit.status == Status.OK
-    uv = np.where(good[:, None], fit.uv_px - origin, middle + corner)
+    fit = fit_law(regions, GaussLaw(spread, rough), blur, SpotModel(response), near)
+    good = (fit.status == Status.OK) & (np.linalg.norm(fit.uv_px - near, axis=1) < _ASTRAY_PX)
+    uv = np.where(good[:, None], fit.uv_px, near) - origin
     levels = np.where(good[:, None], fit.background_e, np.median(x, axis=(1, 2))[:, None])
     # the brightest pixel of a spot in focus holds about a quarter of its light
     flux = np.where(good, fit.flux_e, np.maximum(x.reshape(len(x), -1).max(axis=1) * 4.0, 1.0))
     return np.column_stack([uv, flux, levels])
 
 
-def _cut(
-    x: Array, extra: Array, filters: NDArray[np.int64], response: tuple[float, float, float]
-) -> tuple[Array, Array, NDArray[np.int64]]:
-    """Squares about the brightest place: pixels, variances, and the squares' corners (u, v)."""
-    weight = np.asarray(response)[filters]
+def _outstanding(
+    x: Array, variance: Array, filters: NDArray[np.int64], response: tuple[float, float, float]
+) -> NDArray[np.int64]:
+    """Pixel (u, v) of regions, shape (n, 2), at which a spot stands out most from its noise."""
+    seen = np.asarray(response)[filters]
     level = np.stack([np.where(filters == c, np.median(x, axis=(1, 2))[:, None, None], 0.0) for c in range(3)]).sum(0)
-    match = gaussian_filter(weight * (x - level), _MATCHED) / np.sqrt(gaussian_filter(weight**2, _MATCHED))
+    weight = seen / variance
+    match = gaussian_filter(weight * (x - level), _MATCHED) / np.sqrt(gaussian_filter(weight * seen, _MATCHED))
     v, u = np.unravel_index(np.argmax(match.reshape(len(x), -1), axis=1), x.shape[1:])
+    return np.stack([u, v], axis=1)
+
+
+def _cut(x: Array, extra: Array, middle: NDArray[np.int64]) -> tuple[Array, Array, NDArray[np.int64]]:
+    """Squares about pixels (u, v), shape (n, 2): values, variances, and the squares' corners (u, v)."""
     h, w = (min(_CUT_PX, side) for side in x.shape[1:])
-    corner = np.stack([np.clip(u - w // 2, 0, x.shape[2] - w), np.clip(v - h // 2, 0, x.shape[1] - h)], axis=1)
+    corner = np.clip(middle - [w // 2, h // 2], 0, [x.shape[2] - w, x.shape[1] - h])
     parts = [(slice(b, b + h), slice(a, a + w)) for a, b in corner]
     cut_x, cut_extra = (np.stack([values[i][part] for i, part in enumerate(parts)]) for values in (x, extra))
     return cut_x, cut_extra, np.asarray(corner, np.int64)

@@ -21,6 +21,7 @@ from phibench.estimator.spots.gaussian_spot import SpotBlur, SpotModel, SpotPixe
 from phibench.estimator.spots.raw_pixels import GaussLaw, PixelLaw, PixelNoise, SpotRegions, spot_regions
 from phibench.scenes.frames import Array, BoolArray
 
+NEAR_PX = 1.5  # of a detection on interpolated pixels, which are up to a pixel off; lamps and noise lie farther off
 START_PX = 0.6  # half width of the 3 x 3 grid of starts: the minima of a Bayer grid lie about a pixel apart
 LEAST_SNR = 3.0  # flux over its standard deviation below which there is no spot
 DAMPING = (1.0,) * 12 + (0.5,) * 16 + (0.25,) * 24  # of the steps after screening: full ones may go round in circles
@@ -111,7 +112,13 @@ def fit_raw(
     return fit_law(spot_regions(x, origin_px, x < saturation_e), GaussLaw(noise), blur, model)
 
 
-def fit_law(regions: SpotRegions, law: PixelLaw, blur: SpotBlur, model: SpotModel | None = None) -> SpotFit:
+def fit_law(
+    regions: SpotRegions,
+    law: PixelLaw,
+    blur: SpotBlur,
+    model: SpotModel | None = None,
+    near_px: ArrayLike | None = None,
+) -> SpotFit:
     """Fit one spot in each region, for pixels of any law.
 
     Parameters
@@ -123,6 +130,9 @@ def fit_law(regions: SpotRegions, law: PixelLaw, blur: SpotBlur, model: SpotMode
         Of all spots or of each; its sigma is the start of a free width.
     model : SpotModel, optional
         By default the laser behind the filters of a mosaic, an unknown level per filter and a known width.
+    near_px : shape (2,) or (n, 2), optional
+        Place (u, v) in the image, within `NEAR_PX` of which a fit begins: of a detection. By default it begins where
+        light stands out most, wherever in the region.
 
     Returns
     -------
@@ -132,15 +142,16 @@ def fit_law(regions: SpotRegions, law: PixelLaw, blur: SpotBlur, model: SpotMode
     """
     data = spot_data(regions, law, blur, model)
     parts = [np.arange(i, min(i + AT_ONCE, len(data))) for i in range(0, len(data), AT_ONCE)]
-    fits = [_fit(data.rows(part)) for part in parts]
+    near = None if near_px is None else np.broadcast_to(np.asarray(near_px, float), (len(data), 2))
+    fits = [_fit(data.rows(part), None if near is None else near[part]) for part in parts]
     if not fits:
         return _nothing(data.pixels.levels.shape[1])
     return SpotFit(*(np.concatenate([getattr(fit, f.name) for fit in fits]) for f in fields(SpotFit)))
 
 
-def _fit(data: SpotData) -> SpotFit:
+def _fit(data: SpotData, near_px: Array | None) -> SpotFit:
     with np.errstate(all="ignore"):
-        theta = _screened(data, _first_guess(data))
+        theta = _screened(data, _first_guess(data, near_px))
         theta, converged = _polished(data, theta)
         return _result(data, theta, converged)
 
@@ -148,7 +159,7 @@ def _fit(data: SpotData) -> SpotFit:
 # -- start -----------------------------------------------------------------------------------------------------------
 
 
-def _first_guess(data: SpotData) -> Array:
+def _first_guess(data: SpotData, near_px: Array | None) -> Array:
     """Background: median of the border per level. Position and flux: peak of the matched filter on whole pixels."""
     regions, pixels = data.regions, data.pixels
     border = regions.used.copy()
@@ -160,11 +171,20 @@ def _first_guess(data: SpotData) -> Array:
     match = _blurred(np.where(regions.used, above * pixels.response, 0.0), kernel)
     norm = _blurred(np.where(regions.used, pixels.response**2, 0.0), kernel**2) + 1e-12
     gain = np.maximum(match, 0.0) ** 2 / norm
+    if near_px is not None:
+        gain = near_alone(gain, near_px - regions.origin_px)
     v, u = np.unravel_index(np.argmax(gain.reshape(len(gain), -1), axis=1), gain.shape[1:])
     each = np.arange(len(gain))
     flux = np.maximum(match[each, v, u] / norm[each, v, u], 1.0)
     width = [np.asarray(pixels.blur.sigma_px)] if pixels.free_width else []
     return np.column_stack([u, v, flux, b, *width]).astype(float)
+
+
+def near_alone(values: Array, uv_px: Array) -> Array:
+    """Values of images, shape (n, h, w), within `NEAR_PX` of places, shape (n, 2), of them; elsewhere -inf."""
+    v, u = np.indices(values.shape[1:])
+    off = np.maximum(np.abs(u - uv_px[:, 0, None, None]), np.abs(v - uv_px[:, 1, None, None]))
+    return np.where(off <= NEAR_PX, values, -np.inf)
 
 
 def _median(x: Array, mask: BoolArray) -> Array:
