@@ -23,6 +23,12 @@ def own_version() -> str:
         return "0+unknown"
 
 
+def program_version() -> str:
+    """Name and version of the program, "phibench 0.2.0"; of a checkout also the commit and whether it was changed."""
+    state = checkout_state()
+    return f"phibench {own_version()}" + (f" ({state})" if state else "")
+
+
 def checkout_state() -> str:
     """State of the checkout in words, "commit 0123456789, changed since"; "" for an installed package."""
     commit = _git("rev-parse", "--verify", "--quiet", "HEAD")

@@ -1,10 +1,12 @@
 """Score document: one JSON file per run of one method, with its records beside it as Parquet under the same stem.
 
-The document names the SHA-256 of the records. Numbers are in SI units; null stands where there is no number.
+The document names the SHA-256 of the records' file, and that of the results in them, which two equal runs share.
+Numbers are in SI units; null stands where there is no number.
 """
 
 from __future__ import annotations
 
+import hashlib
 import io
 import json
 import math
@@ -21,6 +23,7 @@ from phibench.datasets.input_files import InputFile, Name
 from phibench.datasets.store.files import sha256, write_bytes, write_text
 from phibench.datasets.store.provenance import code_behind, provenance
 from phibench.datasets.store.schema import Document
+from phibench.datasets.version import program_version
 from phibench.estimator.benchmark.answer_errors import Rules
 from phibench.estimator.benchmark.causes import count, count_failures
 from phibench.estimator.benchmark.intervals import Estimate
@@ -82,7 +85,7 @@ class StratumScore(Document):
 
 
 class MethodCard(Document):
-    """Identity of a method: its reference, its place, and the hash of its code (null if it cannot be told)."""
+    """Identity of a method: reference, place, hash of its code (null if it cannot be told), and what it ran with."""
 
     reference: Name
     name: Name = Field(default="", description="by default what follows the last slash of the reference")
@@ -94,6 +97,13 @@ class MethodCard(Document):
     modules: dict[Name, Name] = Field(
         default={}, description="SHA-256 of the files beside the method's that it imports"
     )
+    packages: dict[Name, Name | None] = Field(
+        default={}, description="version of each package that its process loaded; null of a module of no package"
+    )
+    files: dict[Name, Name | None] = Field(
+        default={}, description="SHA-256 of further files opened in its folder and under --allow; null: not hashed"
+    )
+    files_complete: bool = Field(default=False, description="all files that were opened there are known")
     sees: Literal["image", "pair", ""] = Field(
         default="", description="each image by itself, or both as one point; empty if that is not known"
     )
@@ -226,6 +236,7 @@ class ScoreDocument(Document):
     limits: dict[str, Any]
     isolation: Name = Field(default="", description="what the method could reach: `Isolation.sentence`")
     provenance: dict[str, Any]
+    program: Name = Field(default="", description="that scored: version of phibench, commit of a checkout")
     code_sha256: str = Field(description="of everything behind the score")
     missed_relative: float = Field(description="relative error of D as which a missed pair counts")
     flags: list[Flag] = Field(description="what the images cannot tell so well")
@@ -236,6 +247,7 @@ class ScoreDocument(Document):
     worst: list[Worst]
     records: Annotated[str, AfterValidator(_beside)] = Field(description="name of the Parquet file")
     records_sha256: str
+    results_sha256: Name = Field(default="", description="of the records without times and messages: `results_sha256`")
 
     @property
     def whole(self) -> StratumScore:
@@ -278,6 +290,7 @@ def document_of(
         rules={name: float(value) for name, value in asdict(rules).items()},
         limits=dict(limits),
         provenance=dict(provenance()),
+        program=program_version(),
         code_sha256=code_behind(SCORER),
         missed_relative=missed,
         flags=[Flag(**{**asdict(one), "ratio": finite(one.ratio)}) for one in excesses(whole.images)],
@@ -288,7 +301,21 @@ def document_of(
         worst=[],
         records="",
         records_sha256="",
+        results_sha256=results_sha256(table),
     )
+
+
+_NOT_RESULTS = ("seconds", "message")
+"""Columns that may differ between two runs that answer alike; a message can name the line at which time was up."""
+
+
+def results_sha256(records: pl.DataFrame) -> str:
+    """SHA-256 of the records without times and messages: of the JSON of [name, values] of every column, in order.
+
+    Two runs share it if every answer, truth and error is the same to the last bit.
+    """
+    columns = [[name, records[name].to_list()] for name in records.columns if name not in _NOT_RESULTS]
+    return hashlib.sha256(json.dumps(columns, separators=(",", ":")).encode()).hexdigest()
 
 
 def _metric(name: str, value: Measured) -> Metric:

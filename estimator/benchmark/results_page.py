@@ -266,14 +266,14 @@ def _item(note: str) -> str:
 
 
 def _sources(parts: Sequence[Part]) -> Iterator[str]:
-    yield "| preset | data set | pairs | samples | task | hash of the data set | scored by commit |"
+    yield "| preset | data set | pairs | samples | task | hash of the data set | scored by |"
     yield "|---|---|---|---|---|---|---|"
     for part in parts:
         first = part.scores[0]
-        commits = sorted({str(one.provenance.get("commit") or "unknown")[:12] for one in part.scores})
+        programs = sorted({one.program or "not told" for one in part.scores})
         digest = str(first.pair_set.get("dataset_sha256"))[:12]
         cells = (part.title, first.pair_set.get("name"), first.pairs, first.samples, first.pair_set.get("task_version"))
-        yield "| " + " | ".join(map(str, (*cells, digest, ", ".join(commits)))) + " |"
+        yield "| " + " | ".join(map(str, (*cells, digest, ", ".join(programs)))) + " |"
 
 
 def results_html(parts: Sequence[Part], by: str = "phi") -> str:

@@ -54,8 +54,8 @@ from phibench.estimator.methods.fit_at_truth import KeptFits
 from phibench.estimator.methods.registry import METHODS, BuiltIn
 from phibench.estimator.pair_set import CachedPairs, PairSet, truth_folders
 from phibench.estimator.sandbox.pairs_ahead import PairsAhead
-from phibench.estimator.sandbox.resolve import MethodError, RunLimits, resolve
-from phibench.estimator.sandbox.runner import Harness, asked_here, function_name
+from phibench.estimator.sandbox.resolve import MethodError, RunLimits, code_of_function, resolve
+from phibench.estimator.sandbox.runner import Harness, Ran, asked_here, function_name, ran_here
 
 Ask = Callable[[PairSet, Sequence[int]], Iterable[tuple[Outcome, ...]]]
 """Pairs and numbers to the outcomes of every method: `sandbox.runner.Harness.outcomes`."""
@@ -284,9 +284,9 @@ def score(
         if limits is not None or workers != 1:
             raise MethodError("limits and workers are for methods in a process of their own: give FILE.py:FUNCTION")
         with Steps(console, "pairs", len(chosen)) as steps:
-            card = MethodCard.of(function_name(method), kind="function")
+            card = MethodCard.of(function_name(method), kind="function", **code_of_function(method))
             (scored,) = score_methods([card], chosen, asked_here(method), None, seed, None, steps.reach)
-        scored = isolated(scored, "not isolated: a function runs in this process")
+        scored = ran_with(isolated(scored, "not isolated: a function runs in this process"), ran_here())
     return scored if out is None else saved(scored, Path(out))
 
 
@@ -395,8 +395,8 @@ def run_and_score(
         stages.update(harness.stages)
         stages["draw"] -= stages["bounds"]  # made in the same turn: `CachedPairs`
         stages |= {stage: stages[stage] + seconds for stage, seconds in making.items()}
-    told = zip(scored, harness.failed_outputs, harness.isolations, strict=True)
-    return [replace(isolated(one, isolation), output=output) for one, output, isolation in told]
+    told = zip(scored, harness.failed_outputs, harness.isolations, harness.ran, strict=True)
+    return [replace(ran_with(isolated(one, isolation), ran), output=output) for one, output, isolation, ran in told]
 
 
 _WORTH_A_PROCESS = 40  # pairs; a process that makes them starts in 2 s
@@ -419,6 +419,12 @@ def _ahead(pairs: PairSet, workers: int) -> Iterator[tuple[PairSet, dict[str, fl
 def isolated(scored: Scored, isolation: str) -> Scored:
     """The score with how its method was isolated."""
     return replace(scored, document=scored.document.model_copy(update={"isolation": isolation}))
+
+
+def ran_with(scored: Scored, ran: Ran) -> Scored:
+    """The score with packages and files of its method."""
+    card = scored.document.method.model_copy(update=vars(ran))
+    return replace(scored, document=scored.document.model_copy(update={"method": card}))
 
 
 def open_scored(folder: str | Path) -> Dataset | ImportedSet:

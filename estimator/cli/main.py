@@ -38,10 +38,9 @@ from phibench.estimator.cli.studies import paper, study
 
 def _version_line() -> str:
     """Version as `phibench --version` prints it; in a checkout with the commit and with what differs from it."""
-    from phibench.datasets.version import checkout_state, own_version
+    from phibench.datasets.version import program_version
 
-    state = checkout_state()
-    return f"phibench {own_version()}" + (f" ({state})" if state else "")
+    return program_version()
 
 
 app = App(

@@ -31,6 +31,8 @@ from phibench.datasets.store.leftovers import OwnedFolder
 from phibench.estimator.interface import FAILURES, Outcome, Pair
 from phibench.estimator.sandbox.answers import AnswerError, checked
 from phibench.estimator.sandbox.isolation import Access, Isolation
+from phibench.estimator.sandbox.loaded_packages import MOST_NAMES
+from phibench.estimator.sandbox.opened_files import OpenedFiles
 from phibench.estimator.sandbox.readable_files import access_of
 from phibench.estimator.sandbox.resolve import MethodError, Reference, RunLimits
 from phibench.estimator.sandbox.supervisor import HUNG_UP, KILL_SECONDS, processes_in
@@ -215,9 +217,16 @@ class MethodProcess:
         if others and any(one.kind != "built-in" for one in self._references):
             raise MethodError("built-in methods alone share a process: ask methods of your own one by one")
         self.stages: dict[str, float] = {}
+        self.loaded = set[str]()
+        """Names of modules that the process has told of: `loaded_packages.loaded_names`."""
         self._access, self._isolation = access_of(reference, limits, hidden), Isolation(reason="it did not start")
         self._lock, self._closed = threading.Lock(), False
         self._process: _Running | None = None
+
+    @property
+    def reference(self) -> Reference:
+        """The method, or the first of several."""
+        return self._reference
 
     @property
     def isolation(self) -> Isolation:
@@ -248,6 +257,14 @@ class MethodProcess:
         except BaseException:
             self.end()
             raise
+        self.loaded |= process.loaded
+
+    def watch(self) -> OpenedFiles:
+        """Watch over the files that the method may read and that no package holds, from now on."""
+        places = [(f"allow: {Path(name).absolute().name}", Path(name)) for name in self._limits.allow]
+        if self._reference.kind == "file":
+            places.insert(0, ("", Path(self._reference.place).parent))
+        return OpenedFiles(places, [Path(path) for path in self._access.hidden])
 
     def ask(self, pair: Pair, method: int = 0) -> Outcome:
         """Give a method one pair; never raises for what the method does."""
@@ -280,6 +297,8 @@ class MethodProcess:
             return Outcome(pair.number, None, math.nan, "crash", "the run was stopped")
         file = self._reference.place if self._reference.kind == "file" else ""
         outcome = process.ask(pair, self._limits, file, method)
+        if len(self.loaded) < MOST_NAMES:
+            self.loaded |= process.loaded
         if len(self._references) > 1:
             self._add(process.stages, self._references[method].name)
         return outcome
@@ -320,6 +339,7 @@ class _Running:
         ours, theirs = socket.socketpair()
         self._connection, self._memory = Connection(ours), MemoryFile(size)
         self._shares, self._held, self.stages = False, _NO_PAIR, dict[str, float]()
+        self.loaded = frozenset[str]()
         self._owned = OwnedFolder("method")
         self._folder = str(self._owned.path)
         try:
@@ -360,7 +380,8 @@ class _Running:
         try:
             isolation = Isolation(**json.loads(self._connection.receive(limits.start_seconds)))
             self._connection.send(json.dumps(order).encode(), limits.start_seconds)
-            fault = self._reply(nonce, end).get("fault")
+            reply = self._reply(nonce, end)
+            fault = reply.get("fault")
         except TimeoutError:
             place = self._place(reference.place)
             raise MethodError(
@@ -372,6 +393,7 @@ class _Running:
             raise MethodError(f"method '{reference.name}' cannot be imported: {why}") from None
         if fault != "":
             raise MethodError(advised(printable_line(str(fault), _MESSAGE_LENGTH), isolation))
+        self.loaded = _names(reply)
         return isolation
 
     def is_ready(self, size: int) -> bool:
@@ -394,6 +416,7 @@ class _Running:
         except TransportError:
             return self._dead(pair, limits, file, before)
         seconds = time.monotonic() - start
+        self.loaded = _names(reply) or self.loaded
         if self._shares:  # built-in methods tell the truth; of others nothing but the answer counts
             seconds += reply["reused_seconds"]
             self.stages = {**reply["stages"], "": reply["own_seconds"]}
@@ -467,6 +490,13 @@ class _Running:
     def _last_line(self) -> str:
         lines = self._output.text().strip().splitlines()
         return f"; its last words: {lines[-1]}" if lines else ""
+
+
+def _names(reply: dict[str, Any]) -> frozenset[str]:
+    """Modules that a reply tells of; empty if it tells of none, or not in the form of names."""
+    told = reply.get("loaded")
+    names = told[:MOST_NAMES] if isinstance(told, list) else []
+    return frozenset(name for name in names if isinstance(name, str) and name == printable_line(name))
 
 
 def outcome_of(pair: Pair, reply: dict[str, Any], seconds: float) -> Outcome:

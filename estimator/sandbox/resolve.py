@@ -11,6 +11,8 @@ is computed is not among them.
 from __future__ import annotations
 
 import ast
+import hashlib
+import inspect
 import math
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
@@ -21,6 +23,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from phibench.datasets.input_files import MIB, InputFile
 from phibench.datasets.store.files import sha256
 from phibench.datasets.store.provenance import code_behind
+from phibench.estimator.sandbox.loaded_packages import package_sha256
 from phibench.scenes.validation import close_names, printable_line
 
 if TYPE_CHECKING:
@@ -45,7 +48,7 @@ class Reference:
     function : str
         Function in the file; "" otherwise.
     sha256 : str or None
-        Of the file, or of the code behind the built-in methods; None for packages.
+        Of the file, of the code behind the built-in methods, or of a package's files: `package_sha256`.
     version : str or None
         Distribution and version of a package.
     modules : tuple of (path, SHA-256)
@@ -73,12 +76,15 @@ class Reference:
         """From its fields as JSON has them."""
         return cls(**{**fields, "modules": tuple((name, hashed) for name, hashed in fields["modules"])})
 
+    def files(self) -> list[Path]:
+        """The method's file and the modules beside it; none of a method that is no file."""
+        path = Path(self.place)
+        return [path, *(path.parent / name for name, _ in self.modules)] if self.kind == "file" else []
+
     def changed(self) -> str:
         """Name of the first file of the method that is not as it was when it was looked up; "" if all are."""
-        if self.kind != "file":
-            return ""
-        path = Path(self.place)
-        files = [(path, self.sha256), *((path.parent / name, hashed) for name, hashed in self.modules)]
+        hashes = (self.sha256, *(hashed for _, hashed in self.modules))
+        files = zip(self.files(), hashes, strict=False)
         return next((file.name for file, hashed in files if not file.is_file() or sha256(file) != hashed), "")
 
 
@@ -106,7 +112,8 @@ def resolve(reference: str) -> Reference:
         raise MethodError(f"method '{reference}' is registered by {' and by '.join(map(_owner, found))}: remove one")
     if not found:
         raise MethodError(_unknown(reference, list(KNOWN)))
-    return Reference(reference, "package", found[0].value, version=_owner(found[0]))
+    hashed = package_sha256(found[0].dist, found[0].module)
+    return Reference(reference, "package", found[0].value, sha256=hashed, version=_owner(found[0]))
 
 
 def installed() -> tuple[EntryPoint, ...]:
@@ -139,6 +146,24 @@ def _of_file(reference: str) -> Reference:
     hashed, modules = sha256(path), tuple((name, sha256(path.parent / name)) for name in modules_beside(path))
     # names of files may hold bytes that are no text, and what a terminal obeys
     return Reference(f"{printable_line(path.stem)}:{function}", "file", str(path), function, hashed, modules=modules)
+
+
+def code_of_function(function: Any) -> dict[str, Any]:
+    """Hashes of a function's file and of the modules beside it, as `Reference` has them; of a cell that of its source.
+
+    The values are None and empty where Python cannot tell the source.
+    """
+    code = function if inspect.isroutine(function) else type(function)
+    try:
+        path = Path(inspect.getsourcefile(code) or "")
+        if path.is_file():
+            return {
+                "sha256": sha256(path),
+                "modules": {name: sha256(path.parent / name) for name in modules_beside(path)},
+            }
+        return {"sha256": hashlib.sha256(inspect.getsource(code).encode()).hexdigest()}
+    except (OSError, TypeError):
+        return {"sha256": None}
 
 
 def modules_beside(path: Path) -> list[str]:

@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import TypeVar
@@ -20,11 +21,31 @@ from typing import TypeVar
 from phibench.estimator.interface import Method, Outcome, Pair
 from phibench.estimator.pair_set import PairSet, truth_folders
 from phibench.estimator.sandbox.isolation import Isolation
+from phibench.estimator.sandbox.loaded_packages import loaded_names, packages_of
 from phibench.estimator.sandbox.process import MethodProcess, outcome_of
 from phibench.estimator.sandbox.resolve import MethodError, Reference, RunLimits, resolve
 from phibench.estimator.sandbox.worker import reply_of, require_method
 
 T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Ran:
+    """What a method's process ran with.
+
+    Attributes
+    ----------
+    packages : dict of str to str or None
+        Version of every package that it has loaded, the interface's own among them: `loaded_packages.packages_of`.
+    files : dict of str to str or None
+        SHA-256 of other files that were opened where it may read: `opened_files.OpenedFiles`.
+    files_complete : bool
+        Every file is known that was opened there.
+    """
+
+    packages: dict[str, str | None]
+    files: dict[str, str | None]
+    files_complete: bool
 
 
 class Harness:
@@ -97,6 +118,12 @@ class Harness:
     def isolations(self) -> list[str]:
         """Isolation of each method in a sentence; after entering."""
         told = self._in_order([[pool.isolation.sentence()] * len(at) for pool, at in self._pooled()])
+        return list(told)
+
+    @property
+    def ran(self) -> list[Ran]:
+        """What each method ran with, so far; those of one process together have the same packages."""
+        told = self._in_order([[pool.ran] * len(at) for pool, at in self._pooled()])
         return list(told)
 
     @property
@@ -208,9 +235,17 @@ class _MethodPool:
         self._processes, self._free = processes, queue.SimpleQueue[MethodProcess]()
         for process in processes:
             self._free.put(process)
+        self._opened = processes[0].watch()
 
     def start(self) -> None:
         self._processes[0].start()
+
+    @property
+    def ran(self) -> Ran:
+        names = set[str]().union(*(process.loaded for process in self._processes))
+        reference = self._processes[0].reference
+        files = self._opened.hashes(reference.files())
+        return Ran(packages_of(names), files, self._opened.complete)
 
     @property
     def isolation(self) -> Isolation:
@@ -226,11 +261,13 @@ class _MethodPool:
         try:
             return process.ask_each(pair)
         finally:
+            self._opened.look()
             self._free.put(process)
 
     def close(self) -> None:
         for process in self._processes:
             process.close()
+        self._opened.close()
 
 
 def run_method(
@@ -281,3 +318,8 @@ def asked_here(method: Method) -> Callable[[PairSet, Sequence[int]], Iterator[tu
 def function_name(method: Method) -> str:
     """Name under which a function is scored."""
     return str(getattr(method, "__name__", type(method).__name__))
+
+
+def ran_here() -> Ran:
+    """What a function in this process runs with; files that it opened before are not known."""
+    return Ran(packages_of(loaded_names()), {}, False)

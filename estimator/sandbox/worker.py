@@ -32,6 +32,7 @@ from typing import TYPE_CHECKING, Any
 
 from phibench.estimator.interface import Answer, Method
 from phibench.estimator.sandbox.answers import answer_text, to_bytes
+from phibench.estimator.sandbox.loaded_packages import loaded_names
 from phibench.estimator.sandbox.resolve import MethodError, Reference, RunLimits
 from phibench.estimator.sandbox.transport import Connection, ReceivedPair, SharedPages, TransportError, unpack
 from phibench.scenes.validation import close_names
@@ -231,14 +232,17 @@ def main(line: int, reader: int, isolation: dict[str, Any]) -> None:
     file = references[0].place if references[0].kind == "file" else ""
     limits = RunLimits(memory_mb=order["memory_mb"])
     limit_bytes = size_bytes() + int(1e6 * limits.memory_mb)
-    connection.send(to_bytes({"nonce": nonce, "fault": ""}))
+    folder = str(Path(file).parent) if file else ""
+    connection.send(to_bytes({"nonce": nonce, "fault": "", "loaded": loaded_names(folder)}))
     held = None
     with suppress(TransportError):
         while True:
             received = unpack(connection.receive(), pages, held)
             if len(methods) > 1:  # one method's pair is not kept: it would count against its limit
                 held = received = _shared(received)
-            _answer(connection, received, lambda one: _reply(methods[one.method], one, limits, limit_bytes, file))
+            _answer(
+                connection, received, lambda one: _reply(methods[one.method], one, limits, limit_bytes, file), folder
+            )
 
 
 def _shared(received: ReceivedPair) -> ReceivedPair:
@@ -249,14 +253,24 @@ def _shared(received: ReceivedPair) -> ReceivedPair:
     return received if isinstance(pair, SharedPair) else replace(received, pair=SharedPair.of(pair))
 
 
-def _answer(connection: Connection, received: ReceivedPair, reply: Callable[[ReceivedPair], dict[str, Any]]) -> None:
-    """Answer one pair, in the process that was asked alone."""
+def _answer(
+    connection: Connection, received: ReceivedPair, reply: Callable[[ReceivedPair], dict[str, Any]], folder: str
+) -> None:
+    """Answer one pair, in the process that was asked alone; with the modules, where it has imported further ones."""
     asked = {"number": received.pair.number, "nonce": received.nonce}
-    process = os.getpid()
-    answer = to_bytes({**reply(received), **asked})
+    process, before = os.getpid(), _count_modules()
+    fields = {**reply(received), **asked}
+    answer = to_bytes(fields if _count_modules() == before else {**fields, "loaded": loaded_names(folder)})
     if os.getpid() != process:  # a copy that the method has forked and let return: one answer is enough
         os._exit(0)
     connection.send(answer)
+
+
+def _count_modules() -> int:
+    try:
+        return len(sys.modules)
+    except TypeError:  # a method may put anything in its place
+        return 0
 
 
 def _reply(method: Method, received: ReceivedPair, limits: RunLimits, limit_bytes: int, file: str) -> dict[str, Any]:

@@ -23,7 +23,7 @@ from phibench.datasets.store import schema
 from phibench.datasets.store.files import sha256
 from phibench.estimator.benchmark.answer_errors import Rules
 from phibench.estimator.benchmark.dataset_pairs import TASK_VERSION, DatasetPairs, dataset_pairs
-from phibench.estimator.benchmark.document import ScoreDocument, document_of, read_records, read_score
+from phibench.estimator.benchmark.document import ScoreDocument, document_of, read_records, read_score, results_sha256
 from phibench.estimator.benchmark.records import COLUMN_TYPES, missed_relative, record_table, with_missed
 from phibench.estimator.interface import Outcome
 
@@ -125,7 +125,7 @@ def _of_document(document: ScoreDocument) -> Iterator[str]:
         yield f"seed is {document.seed}: intervals of results are of the bootstrap seed 0"
     if document.isolation.startswith("not isolated"):
         yield f"the method was {document.isolation}: score it as FILE.py:FUNCTION on a machine that isolates it"
-    if not document.method.sha256 and document.method.kind != "package":
+    if not document.method.sha256:
         yield "method.sha256 is missing: nobody can tell which code was scored"
 
 
@@ -249,6 +249,8 @@ def _of_statistics(document: ScoreDocument, table: pl.DataFrame) -> Iterator[str
     missed = missed_relative(plain, rules)
     counted = with_missed(plain, missed)
     yield from _differences(table, counted, ("depth_counted", "rank_depth2"), "what a missed pair costs")
+    if document.results_sha256 != results_sha256(table):
+        yield "results_sha256 is not that of the records: hand in both files of one run"
     again = document_of(document.method, document.pair_set, counted, rules, document.seed, document.limits, missed)
     for name in ("missed_relative", "metrics", "strata", "causes", "failures", "flags"):
         given, right = (one.model_dump(mode="json")[name] for one in (document, again))

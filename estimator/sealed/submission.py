@@ -33,7 +33,7 @@ from phibench.estimator.interface import FAILURES, Box, Image, Outcome, Pair, Sp
 from phibench.estimator.pair_set import PairTruth, truth_folders
 from phibench.estimator.sandbox.answers import AnswerError, checked
 from phibench.estimator.sandbox.resolve import Reference, RunLimits, resolve
-from phibench.estimator.sandbox.runner import Harness
+from phibench.estimator.sandbox.runner import Harness, Ran
 from phibench.estimator.sealed.sealed_set import (
     CHECKSUMS,
     FRAMES,
@@ -284,7 +284,7 @@ def submit(
     found = resolve(method)
     with Harness([found], limits, workers, truth_folders(pairs)) as harness:
         outcomes = [outcome for (outcome,) in harness.outcomes(pairs, range(len(pairs)))]
-        document = submission(pairs.seal, found, outcomes, harness.isolations[0])
+        document = submission(pairs.seal, found, outcomes, harness.isolations[0], harness.ran[0])
     check_complete(document, pairs.seal, "the run")
     write_text(out, json.dumps(document.model_dump(mode="json"), indent=1, allow_nan=False) + "\n")
     spots = [spot for o in outcomes if o.answer is not None for spot in (o.answer.down, o.answer.up)]
@@ -296,13 +296,15 @@ def submit(
     return Submitted(out, len(outcomes), answered, positions, silence, pairs.note)
 
 
-def submission(seal: Seal, method: Reference, outcomes: Sequence[Outcome], isolation: str = "") -> Submission:
+def submission(
+    seal: Seal, method: Reference, outcomes: Sequence[Outcome], isolation: str = "", ran: Ran | None = None
+) -> Submission:
     """Document of a method's outcomes on a sealed set, by number."""
     return Submission(
         format=FORMAT,
         seal=seal.id,
         task_version=seal.task_version,
-        method=MethodCard.of(method.name, **method.document()),
+        method=MethodCard.of(method.name, **method.document(), **({} if ran is None else vars(ran))),
         isolation=isolation,
         provenance=provenance(),
         answers=tuple(_line(outcome) for outcome in sorted(outcomes, key=lambda outcome: outcome.number)),

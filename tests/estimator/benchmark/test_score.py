@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import hashlib
 import io
 import json
 import math
@@ -14,10 +15,18 @@ import pytest
 from helpers.bench_cases import Cases, cases, change, constant, outcomes, sampler, shifted, silent, truth_itself
 from PIL import Image
 
+import phibench
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.frames.sensor_file import SensorFile, write_sensor_file
 from phibench.estimator.benchmark.answer_errors import Rules
-from phibench.estimator.benchmark.document import MethodCard, ScoreDocument, read_records, read_score, write_score
+from phibench.estimator.benchmark.document import (
+    MethodCard,
+    ScoreDocument,
+    read_records,
+    read_score,
+    results_sha256,
+    write_score,
+)
 from phibench.estimator.benchmark.metrics import METRICS
 from phibench.estimator.benchmark.score import score_methods, score_outcomes
 from phibench.estimator.benchmark.score_tables import leaderboard, number, ranked
@@ -51,6 +60,17 @@ def test_a_score_says_where_it_comes_from(mine):
     assert set(d.metrics) == set(METRICS)
     assert (d.metrics["rms_px"].unit, d.metrics["rms_px"].better) == ("px", "lower")
     assert "all" not in {stratum.by for stratum in d.strata}
+
+
+def test_results_have_a_hash_that_times_do_not_change(mine):
+    """The same as by the standard library, from the records as Python has them."""
+    changed = mine.records.with_columns(seconds=pl.col("seconds") + 1.0, message=pl.lit("late"))
+    rows = mine.records.drop("seconds", "message").to_dict(as_series=False)
+    text = json.dumps([[name, values] for name, values in rows.items()], separators=(",", ":"))
+    assert mine.document.results_sha256 == hashlib.sha256(text.encode()).hexdigest() == results_sha256(changed)
+    other = mine.records.with_columns(u_px=pl.col("u_px") * (1.0 + 2e-16))
+    assert results_sha256(other) != mine.document.results_sha256
+    assert mine.document.program.startswith(f"phibench {phibench.__version__}")
 
 
 def test_a_score_and_its_records_are_read_back(mine, tmp_path):
