@@ -35,8 +35,10 @@ from phibench.datasets.store.provenance import provenance
 from phibench.datasets.store.schema import CHECKSUMS, Document
 from phibench.estimator.captures.measure import Setting, read_setting
 from phibench.estimator.captures.pair_list import ListedPair, photos_of, read_pair_list
-from phibench.estimator.captures.picture_files import Photo, require_colour, sensor_choice
+from phibench.estimator.captures.pair_photos import PairPhotos, pair_of_photos
+from phibench.estimator.captures.picture_files import Photo, SensorChoice, require_colour, sensor_choice
 from phibench.estimator.captures.rig_file import require_camera_size
+from phibench.estimator.captures.tested_chain import PATTERNS, ChainTest, chain_test
 from phibench.estimator.interface import Image, Pair
 from phibench.estimator.pair_set import PairTruth, SpotTruth
 from phibench.scenes.laser import Beam
@@ -125,9 +127,11 @@ def _there(path: Path) -> Path | None:
 def _import(folder: Path, listed: Sequence[ListedPair], setting: Setting, work: Path, out: Path) -> Imported:
     rows: list[ImportedRow] = []
     first: Photo | None = None
+    test: ChainTest | None = None
     for row in listed:
         photos = photos_of(folder, row, setting)
         first = first or photos.down.on[0]
+        test = test or _test_of(photos, row, setting)
         for photo in photos.all:
             require_colour(photo)
             require_camera_size(setting.known.rig, photo.size_px, str(photo.path))
@@ -151,9 +155,9 @@ def _import(folder: Path, listed: Sequence[ListedPair], setting: Setting, work: 
                     depth_sigma_m=row.depth_sigma_m,
                 )
             )
-    if first is None:
+    if test is None:
         raise DatasetError(f"{folder} holds no pair")
-    chosen = sensor_choice(first, setting.sensor)
+    chosen = _chosen(test, setting)
     info = ImportedInfo(
         name=out.name[:64] or "imported",
         pairs=len(rows),
@@ -173,6 +177,35 @@ def _import(folder: Path, listed: Sequence[ListedPair], setting: Setting, work: 
         out.rmdir()
     work.replace(out)
     return Imported(out, len(rows), sum(row.depth_m is not None for row in rows), chosen.note)
+
+
+def _test_of(photos: PairPhotos, row: ListedPair, setting: Setting) -> ChainTest:
+    """Chain of a set, by its first pair."""
+    return chain_test(
+        photos,
+        lambda photo: sensor_choice(photo, setting.sensor).card,
+        lambda group, card: pair_of_photos(group, row.stroke_m, setting.known, card),
+    )
+
+
+def _chosen(test: ChainTest, setting: Setting) -> SensorChoice:
+    """Sensor of a set, with what the pictures say of its chain.
+
+    Raises
+    ------
+    DatasetError
+        If its DN do not begin with red: fits of DN take RGGB.
+    """
+    first, phase = test.photos.down.on[0], next(iter(test.phases))
+    if first.kind == "raw" and phase != (0, 0):
+        raise DatasetError(
+            f"{first.path} begins with {PATTERNS[phase]}: a set of DN begins with red; cut {phase[0]} columns and "
+            f"{phase[1]} rows off at the left and top of all pictures, and as many at the other side, and change "
+            "width_px, height_px, cx_px and cy_px of the rig file"
+        )
+    found = sensor_choice(first, setting.sensor)
+    note = "; ".join(text for text in (found.note, test.note, test.doubt) if text)
+    return replace(found, card=replace(found.card, mosaic_phase=phase), note=note)
 
 
 def _require_like(first: Photo, photo: Photo) -> None:

@@ -215,7 +215,10 @@ def _measured(test: ChainTest, stroke_m: float, setting: Setting) -> Measurement
     parts, faults = [], []
     for phase, chance in test.phases.items():
         try:
-            parts.append((_fitted(photos, stroke_m, setting, replace(chosen.card, mosaic_phase=phase)), chance))
+            card = replace(chosen.card, mosaic_phase=phase)
+            # the outline hardly knows of the phase: that of the first is every other's
+            seen = parts[0][0].limb if parts else None
+            parts.append((_fitted(photos, stroke_m, setting, card, seen), chance))
         except DatasetError as error:
             faults.append(error)
     if not parts:
@@ -238,7 +241,11 @@ def _measured(test: ChainTest, stroke_m: float, setting: Setting) -> Measurement
     notes = (chosen.note, test.note, *found.notes, frames_note(photos), *tests)
     told = tuple(text for text in notes if text)
     nominal = setting.known.rig
-    return Measurement(depth, down, up, found.rig, found.stroke_m, found.outlines, nominal, found.pair, chosen, told)
+    return Measurement(depth, down, up, found.rig, found.stroke_m, found.limb[0], nominal, found.pair, chosen, told)
+
+
+_Limb = tuple[tuple[Outline, ...], str]
+"""Outlines, and why there are none."""
 
 
 @dataclass(frozen=True)
@@ -250,13 +257,16 @@ class _Fitted:
     rig: Rig
     covariance: Array
     stroke_m: float
-    outlines: tuple[Outline, ...]
+    limb: _Limb
     notes: tuple[str, ...]
 
 
-def _fitted(photos: PairPhotos, stroke_m: float, setting: Setting, card: SensorCard) -> _Fitted:
+def _fitted(
+    photos: PairPhotos, stroke_m: float, setting: Setting, card: SensorCard, limb: _Limb | None = None
+) -> _Fitted:
+    """Fit both spots; outlines are looked for, or are those of `limb`, with why there are none."""
     pair = pair_of_photos(photos, stroke_m, setting.known, card)
-    outlines, missing = _outlines(pair, setting.calibration is not None)
+    outlines, missing = limb = limb or _outlines(pair, setting.calibration is not None)
     rig, covariance, values, note = _corrected(setting, outlines, missing)
     stroke = float(stroke_of(np.array(stroke_m), values))
     seen = replace(pair, rig=with_blur_of(rig, outlines), stroke_m=stroke)
@@ -266,7 +276,7 @@ def _fitted(photos: PairPhotos, stroke_m: float, setting: Setting, card: SensorC
     ready = replace(pair, rig=rig, stroke_m=stroke)
     spots = seen_spots(_answer(ready, photos))
     wide = {name: widened_by_shape(spots[name], images.get(name), shape) for name in POSITIONS}
-    return _Fitted(ready, wide, rig, covariance, stroke, outlines, (note, _shape_note(shape, setting)))
+    return _Fitted(ready, wide, rig, covariance, stroke, limb, (note, _shape_note(shape, setting)))
 
 
 def _mixed(parts: Sequence[tuple[SeenSpot, float]], added_px: float) -> SeenSpot:

@@ -13,6 +13,7 @@ from PIL import Image
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.frames.sensor_card import sensor_card
 from phibench.datasets.read import Sample, open_dataset
+from phibench.estimator.captures.imported_set import ImportedSet, import_pairs, open_imported
 from phibench.estimator.captures.measure import Measurement, measure, read_setting
 from phibench.estimator.captures.pair_photos import PairPhotos, PositionPhotos
 from phibench.estimator.captures.picture_files import read_photo
@@ -148,3 +149,27 @@ def test_a_sensor_without_filters_is_told(case: Case, tmp_path: Path) -> None:
         grey[name] = np.rint(np.kron(mean, np.ones((2, 2)))).astype(np.uint16)
     with pytest.raises(DatasetError, match="no colour filters"):
         case.measured(grey, tmp_path)
+
+
+def test_an_imported_set_has_the_chain_that_its_pictures_show(case: Case, tmp_path: Path) -> None:
+    """A turned PNG keeps its phase, a PNG of a JPEG the JPEG's tables; turned DN are told what to cut off."""
+
+    def imported(preset: str, turn: object, name: str) -> ImportedSet:
+        folder = tmp_path / name
+        folder.mkdir()
+        for image in NAMES:
+            Image.fromarray(np.ascontiguousarray(case.pixels(preset, image)[turn])).save(folder / f"{image}.png")
+        (folder / "rig.toml").write_bytes((case.folder / preset / "rig.toml").read_bytes())
+        columns = ",".join(f"{image}.png" for image in NAMES)
+        text = f"name,{','.join(NAMES)},stroke_m\na,{columns},{case.sample.row.stroke_m}\n"
+        (folder / "pairs.csv").write_text(text)
+        return open_imported(import_pairs(folder, tmp_path / f"{name}-set").folder)
+
+    for phase in ((0, 0), (1, 0), (1, 1)):
+        found = imported("srgb8", TURNS.get(phase, ...), f"turned{phase[0]}{phase[1]}")
+        assert (found.card.output, found.card.mosaic_phase) == ("srgb8", phase)
+    found = imported("mjpeg", ..., "decoded")
+    assert (found.card.output, found.card.jpeg_quality, found.card.jpeg_subsampling) == ("mjpeg", 76, "4:2:2")
+    assert found.pair(found.rows[0]).down.shape == (180, 320, 3)
+    with pytest.raises(DatasetError, match=r"begins with GRBG: .* cut 1 columns and 0 rows"):
+        imported("bayer-raw", TURNS[1, 0], "dn")
