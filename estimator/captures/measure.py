@@ -212,7 +212,8 @@ def measure(photos: PairPhotos, stroke_m: float, setting: Setting) -> Measuremen
 def _measured(test: ChainTest, stroke_m: float, setting: Setting) -> Measurement:
     """Measurement with the phases of a test, which are in sigma where they are several."""
     photos, chosen = test.photos, sensor_choice(test.photos.down.on[0], setting.sensor)
-    parts, faults = [], []
+    parts: list[tuple[_Fitted, float]] = []
+    faults: list[DatasetError] = []
     for phase, chance in test.phases.items():
         try:
             card = replace(chosen.card, mosaic_phase=phase)
