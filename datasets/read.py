@@ -57,14 +57,17 @@ class Dataset(ShortForm):
     Attributes
     ----------
     folder : Path
+        Where it lies.
     info : DatasetInfo
+        Content of `dataset.json`.
     rigs : Rigs
         By id: `dataset.rigs[row.rig]`; a sample's own is `sample.rig`.
     rooms : Rooms
         By id: `dataset.rooms[row.room]`; a sample's own is `sample.room`.
     rows : tuple of ManifestRow
         Exact numbers of the samples, in the order of the manifest.
-    samples : tuple of Sample, in the same order
+    samples : tuple of Sample
+        In the same order.
     """
 
     folder: Path
@@ -333,10 +336,12 @@ class Sample(ShortForm):
         Parameters
         ----------
         preset : "ideal", "mono-raw", "bayer-raw", "srgb8", "yuyv" or "mjpeg"
-        draw : int, 0 or above
+            Where the camera's chain ends.
+        draw : int
+            Number of the noise realisation, 0 or above.
         laser_off : bool
             Also `frames.down_off` and `frames.up_off`.
-        **options
+        **options : Any
             In place of the recipe's: exposure (seconds, "auto", or None for the preset's time), lamp_level,
             laser_level, carriage_speed_m_s, region, camera_seed, and any number of the preset, such as
             ``jpeg_quality=60``.

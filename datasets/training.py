@@ -51,9 +51,14 @@ class PairDataset(ShortForm):
 
     Parameters
     ----------
-    folder : folder of a finished data set
-    preset, options : as `Sample.frame_source`
-    samples : ids; all by default
+    folder : str or Path
+        Of a finished data set.
+    preset : str
+        As for `Sample.frame_source`.
+    **options : Any
+        As for `Sample.frame_source`.
+    samples : sequence of str, optional
+        Their ids; all by default.
     laser_off : bool
         Also "down_off" and "up_off".
 
@@ -166,6 +171,7 @@ class Crop:
     card : SensorCard
         Numbers of the sensor, with the exposure that was chosen.
     sample_id, position, preset : str
+        Where the crop comes from, and where the camera's chain ends.
     laser_level : float
         Factor of the spot's light.
     """
@@ -193,14 +199,18 @@ class SpotCrops:
 
     Parameters
     ----------
-    folders : folders of finished data sets
+    folders : sequence of paths
+        Of finished data sets.
     options : sequence of FrameOptions
         One of them is drawn for every crop; what they do not give is the recipe's `[frames]` of the spot's sample.
     length : int
         Crops in an epoch.
     seed : int
+        Names the draws.
     settings : CropSettings
-    samples : ids; all by default
+        Size, spread and levels.
+    samples : sequence of str, optional
+        Their ids; all by default.
     laser_off : bool
         Also the crop with the laser off.
 

@@ -152,6 +152,7 @@ class Spot(ShortForm):
     phi_rad : float or None
         Angle in the sense `phi_convention`; None leaves it to `estimator.geometry.phi`.
     phi_convention : "ray", "normal", "incidence" or "outline"
+        Sense of `phi_rad`.
     status : str
         "ok", or in a few words why there is no position.
     """
@@ -175,6 +176,7 @@ class Answer(ShortForm):
     Parameters
     ----------
     down, up : Spot
+        Answers for the two images.
     depth_m, sigma_depth_m : float or None
         The standard deviation is that of the pixels' noise: what a calibration adds, the score adds.
     interval_depth_m : (low, high) or None
@@ -209,6 +211,7 @@ class Outcome:
     seconds : float
         Wall-clock time inside the method; NaN where it did not come back.
     failure : "" or one of `FAILURES`
+        Reason why there is no answer; empty if there is one.
     message : str
         One sentence about the failure, with the method's own line where there is one.
     output : str

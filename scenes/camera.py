@@ -89,6 +89,7 @@ class Camera:
     width_px, height_px : int
         Image size; pixel centres are integers, the image spans [-0.5, W - 0.5].
     pixel_pitch_um : float
+        Distance of pixel centres.
     fx_px, fy_px, cx_px, cy_px : float
         OpenCV camera matrix, pixels.
     k1, k2, k3, p1, p2 : float

@@ -30,7 +30,9 @@ class LaserSpot:
     albedo : float in [0, 1] or None
         Diffuse albedo at the laser's wavelength; None, with a beam only, is each surface's own, its coat included.
     power_w, wavelength_nm : float
+        Of the beam.
     profile : "gaussian" or "uniform"
+        Irradiance across the spot.
     diameter_m : float
         Diameter of the disc ("uniform") or 1/e^2 diameter = 4 sigma ("gaussian", ISO 11146's D4sigma); across the
         beam where there is one.
@@ -130,7 +132,9 @@ class Beam:
     Parameters
     ----------
     diameter_base_m : float
+        Diameter at the laser.
     diameter_growth_m_per_m : float
+        Growth of the diameter with the distance.
     """
 
     diameter_base_m: float = 3e-3

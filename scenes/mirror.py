@@ -112,8 +112,11 @@ class Level:
     Attributes
     ----------
     value_m : array, shape (...)
+        Value of the level function; 0 on the surface.
     gradient : array, shape (..., 3)
+        Its derivatives by the point.
     hessian_per_m : array, shape (..., 3, 3)
+        Its second derivatives.
     """
 
     value_m: Array
@@ -411,11 +414,13 @@ class SphereMirror(MetalSurface):
     Parameters
     ----------
     radius_m : float
+        R.
     roughness_alpha : float
         Beckmann roughness (rms slope x sqrt 2); 0 is an ideal mirror, 0.005 blurs by about 1 px.
     form : Form or None
         Deviations from the sphere; None is a perfect one, and so is a `Form` whose numbers are all 0.
     metal : "steel", "aluminium" or "gold"
+        Gives the reflectance.
     reflectance_table : ReflectanceTable or None
         Measured reflectance instead of the metal's.
     """

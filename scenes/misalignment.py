@@ -104,6 +104,7 @@ class RigParameter:
     study : float
         Magnitude that a study takes unless told otherwise: what is left after careful mounting.
     meaning : str
+        What it is, in words.
     step : float
         For differences, about the size of a real error; NaN for a parameter that no calibration fits.
     prior_sigma : float

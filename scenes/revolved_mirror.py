@@ -71,6 +71,7 @@ class Sag:
     Attributes
     ----------
     z_m : array
+        Sag, along the axis.
     slope_per_m : array
         dz / ds.
     bend_per_m3 : array
@@ -105,6 +106,7 @@ class Profile:
     conic : float
         k, the conic constant.
     rim_radius_m : float
+        Where the mirror ends, from the axis.
     even_terms : floats
         a_2, a_3, ... in m^-3, m^-5, ...
 
@@ -407,9 +409,11 @@ class RevolvedMirror(MetalSurface):
     Parameters
     ----------
     profile : Profile
+        Curve that is revolved.
     roughness_alpha : float
         Beckmann roughness; 0 is an ideal mirror.
     metal : "steel", "aluminium" or "gold"
+        Gives the reflectance.
     reflectance_table : ReflectanceTable or None
         Measured reflectance instead of the metal's.
     form : Form or None

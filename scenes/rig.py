@@ -36,9 +36,13 @@ def limb_points(eye_m: Array, across: Array, radius_m: float, form: Form) -> Arr
     Parameters
     ----------
     eye_m : array, shape (3,)
+        Camera centre, metres, sphere's frame.
     across : array, shape (N, 3)
         Unit vectors at right angles to the eye's direction.
-    radius_m, form
+    radius_m : float
+        Radius of the perfect sphere.
+    form : Form
+        Deviation from it.
     """
     distance = float(np.linalg.norm(eye_m))
     axis = eye_m / distance
@@ -96,7 +100,10 @@ class Rig:
 
     Parameters
     ----------
-    camera, mirror
+    camera : Camera
+        Intrinsics, lens and detector.
+    mirror : Mirror
+        Shape and metal.
     T_world_camera : Pose
         Camera pose at the down position.
     T_camera_sphere : Pose

@@ -40,6 +40,7 @@ class ExportRequest:
     Parameters
     ----------
     form : "parquet", "webdataset" or "frames"
+        Container of the pairs.
     frames : FrameOptions
         What they do not give is the recipe's `[frames]` of each sample.
     draws : int
@@ -139,8 +140,10 @@ def pair_table(rows: Sequence[ManifestRow], drawn: Sequence[tuple[str, Mapping[s
 
     Parameters
     ----------
-    rows : rows of the manifest
-    drawn : (sample id, what is added: "key", "split", "draw", ...) of each row of the table, all with the same names
+    rows : sequence of ManifestRow
+        Of the manifest.
+    drawn : sequence of pairs
+        Sample id and what is added ("key", "split", "draw", ...) of each row of the table, all with the same names.
     """
     import polars
 

@@ -69,8 +69,11 @@ class FilmFrame:
     jpeg : bytes or None
         The file that the camera sends; None for a window and for other outputs than "mjpeg".
     frame, draw : int
+        Number of the frame in its film, and of the noise realisation.
     sensor : Sensor
+        With the film's exposure.
     region : Region
+        Part of the image.
     """
 
     image: NDArray[Any] = field(repr=False)
@@ -88,9 +91,11 @@ class Film:
     Attributes
     ----------
     folder : FilmFolder
+        Where it lies.
     plan : FilmPlan
         Scene, nominal scene, encoder.
     info : FilmInfo
+        Content of its document.
     """
 
     folder: FilmFolder
@@ -191,6 +196,7 @@ class Film:
         Parameters
         ----------
         number, draw : int
+            Of the frame, and of the noise realisation.
         preset : str
             Of the sensor.
         camera_seed : int
@@ -199,7 +205,7 @@ class Film:
             False switches the laser off, whatever the code says.
         side_px : int, optional
             Side of the window, at most that of the film; the film's own by default.
-        **changes
+        **changes : Any
             Numbers of the preset.
 
         Raises

@@ -45,8 +45,11 @@ class Frame:
     jpeg : bytes or None
         The file that the camera sends; None for a region and for other outputs than "mjpeg".
     position : "down" or "up"
+        Stroke position.
     laser : bool
+        The spot is in the image.
     draw : int
+        Number of the noise realisation.
     sensor : Sensor
         With the exposure and the gain that were used.
     region : Region
@@ -192,8 +195,11 @@ class FrameSource:
     Attributes
     ----------
     request : FrameRequest
-    names : (data set, seed, sample id)
-    sides : mapping of "down" and "up" to Side
+        Sensor, levels and region that were asked for.
+    names : tuple of str, int, str
+        Data set, seed and sample id, which name the noise.
+    sides : mapping of str to Side
+        For "down" and "up".
     """
 
     request: FrameRequest

@@ -51,6 +51,7 @@ class SeenFilm:
     Attributes
     ----------
     frames : FilmFrames
+        Frames that a user of the camera has.
     positions : FilmPositions
         Of each frame with the laser on, by itself.
     offsets_m : array, shape (N,)
@@ -296,6 +297,7 @@ def tracked_positions(
     encoder_m : shape (frames,)
         Readings at the frames' times.
     encoder_sigma_m : float
+        Standard deviation of the stroke's encoder.
 
     Raises
     ------

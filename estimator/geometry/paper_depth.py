@@ -62,14 +62,19 @@ def depth_paper(
 
     Parameters
     ----------
-    phi1_rad, phi2_rad : shape (...), at the down and the up position
-    stroke_m : shape (...), h
-    radius_m : float, R
-    covariance_rad2 : shape (..., 2, 2), covariance of (phi1, phi2), optional; see `covariance_of`
+    phi1_rad, phi2_rad : array, shape (...)
+        At the down and the up position.
+    stroke_m : array, shape (...)
+        Stroke h.
+    radius_m : float
+        R.
+    covariance_rad2 : array, shape (..., 2, 2)
+        Covariance of (phi1, phi2), optional; see `covariance_of`.
 
     Returns
     -------
     DepthEstimate
+        D with its standard deviation to first order, and a status.
     """
     phi1, phi2, h = _inputs(phi1_rad, phi2_rad, stroke_m)
     R = radius_m

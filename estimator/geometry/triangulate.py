@@ -40,8 +40,10 @@ class PointEstimate(ShortForm, DepthEstimate):
 
     Parameters
     ----------
-    point_world_m : shape (..., 3), midpoint of the common perpendicular of the two rays
-    gap_m : shape (...), length of that perpendicular: by how much the rays miss each other
+    point_world_m : array, shape (..., 3)
+        Midpoint of the common perpendicular of the two rays.
+    gap_m : array, shape (...)
+        Length of that perpendicular: by how much the rays miss each other.
     """
 
     point_world_m: Array
@@ -67,10 +69,14 @@ class Meeting:
 
     Parameters
     ----------
-    depth_m : shape (...), D
-    gap_m : shape (...), signed length of the perpendicular
-    point_world_m : shape (..., 3)
-    status : shape (...), of the rays and of their meeting
+    depth_m : array, shape (...)
+        D.
+    gap_m : array, shape (...)
+        Signed length of the perpendicular.
+    point_world_m : array, shape (..., 3)
+        The midpoint.
+    status : array, shape (...)
+        Of the rays and of their meeting.
     """
 
     depth_m: Array
@@ -125,9 +131,12 @@ def depth_exact(
     ----------
     rig : Rig
         The nominal rig, one for both images: a motion between them (`rig.motion`) is not used.
-    stroke_m : shape (...), h
-    uv_down_px, uv_up_px : shape (..., 2), pixels
-    covariance_down_px2, covariance_up_px2 : shape (..., 2, 2), of (u, v), independent of each other, both or none
+    stroke_m : array, shape (...)
+        Stroke h.
+    uv_down_px, uv_up_px : array, shape (..., 2)
+        Pixels.
+    covariance_down_px2, covariance_up_px2 : array, shape (..., 2, 2)
+        Of (u, v), independent of each other, both or none.
 
     Returns
     -------

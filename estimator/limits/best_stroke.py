@@ -57,6 +57,7 @@ class BestStroke:
     Attributes
     ----------
     depth_m : float
+        D that was asked for.
     stroke_m : float
         NaN where no stroke can be taken.
     sigma_m, sigma_spot_m, sigma_calibration_m, sigma_stroke_m, sigma_higher_order_m : float
@@ -66,6 +67,7 @@ class BestStroke:
         What keeps the stroke from being better: "shortest stroke", "longest stroke", or the cause beside it, such as
         "ceiling"; empty at a minimum of the error. Where no stroke can be taken, all causes.
     curve : StrokeCurve
+        Error of D by the stroke.
     """
 
     depth_m: float
@@ -109,10 +111,12 @@ def best_stroke(
         default what a rig put together by hand is good for (`PRIOR_SIGMA`).
     stroke_sigma_m : float
         Error of the single stroke, besides what the parameters say of all strokes.
-    strokes_m : (shortest, longest)
+    strokes_m : tuple of float
+        Shortest and longest stroke.
     around : Surroundings
         Heights and azimuths of the spots, room height, robot, distance from edges.
     laser : Laser
+        Spot and its light.
     card : SensorCard
         Sensor and exposure; preset "mjpeg" if not given.
     spot : SpotSigma
@@ -122,6 +126,7 @@ def best_stroke(
     Returns
     -------
     BestStroke
+        Best stroke with its error, and what limits it.
 
     Raises
     ------
@@ -181,6 +186,7 @@ def spot_bound(rig: Rig, card: SensorCard, room_e_per_s: tuple[float, float, flo
     rig : Rig
         Its blur half way out in the mirror's image.
     card : SensorCard
+        Sensor whose noise counts.
     room_e_per_s : 3 floats
         The wall's electrons per second and pixel behind R, G, B.
     """

@@ -59,9 +59,13 @@ def raw_information(
 
     Parameters
     ----------
-    mean_e : array of any shape, electrons
+    mean_e : array of any shape
+        Expected electrons.
     card : SensorCard
-    model, pattern_known
+        Sensor whose noise counts.
+    model : str
+        As for `spot_limit`.
+    pattern_known : bool
         As for `spot_limit`.
 
     Raises
@@ -97,8 +101,10 @@ def censored_share(mean_e: Array, variance_e2: Array, saturation_e: float) -> Ar
 
     Parameters
     ----------
-    mean_e : array of any shape, electrons
-    variance_e2 : shape of `mean_e`
+    mean_e : array of any shape
+        Expected electrons.
+    variance_e2 : array
+        Of the noise; shape of `mean_e`.
     saturation_e : float
         W, `SensorCard.saturation_e`.
     """
@@ -114,7 +120,8 @@ def exact_information(mean_e: Array, gaussian_e2: float) -> Array:
 
     Parameters
     ----------
-    mean_e : array of any shape, 0 or above, electrons
+    mean_e : array of any shape
+        Expected electrons, 0 or above.
     gaussian_e2 : float
         Variance of the Gaussian part, electrons squared.
     """
@@ -192,8 +199,10 @@ class SpotLimit:
 
     Attributes
     ----------
-    covariance_px2 : shape (2, 2), of (u, v); NaN where the pixels cannot tell
-    fisher : shape (k, k), by u, v, relative flux, background levels in electrons, as far as they are unknown
+    covariance_px2 : array, shape (2, 2)
+        Of (u, v); NaN where the pixels cannot tell.
+    fisher : array, shape (k, k)
+        By u, v, relative flux, background levels in electrons, as far as they are unknown.
     """
 
     covariance_px2: Array
@@ -211,14 +220,16 @@ class DepthLimit:
 
     Attributes
     ----------
-    depth_m : shape (...)
+    depth_m : array, shape (...)
+        D.
     sigma_spot_m : shape (...)
         From the pixels' noise: sqrt(g^T F^-1 g).
     sigma_calibration_m : shape (...)
         From what is not known of the rig: sqrt(g_c^T Sigma_c g_c).
     gradient : shape (..., p)
         g_c, dD by each of `rig_parameters.RIG_PARAMETERS`, metres per its unit.
-    status : shape (...), values of `Status`
+    status : array, shape (...)
+        Values of `Status`.
     """
 
     depth_m: Array
@@ -245,7 +256,9 @@ def spot_limit(
     Parameters
     ----------
     region : ExpectedRegion
+        Expected electrons of the pixels about the spot, with derivatives.
     card : SensorCard
+        Sensor whose noise counts.
     unknown : "position", "flux" or "flux+background"
         What is unknown: the position alone, the flux too, or the background levels too.
     model : "approximate", "exact" or "quantised"
@@ -294,8 +307,14 @@ def depth_limit(
 
     Parameters
     ----------
-    rig, stroke_m, uv_down_px, uv_up_px, covariance_down_px2, covariance_up_px2
-        As for `triangulate.depth_exact`; the covariances are bounds of (u, v).
+    rig : Rig
+        The nominal rig.
+    stroke_m : array, shape (...)
+        Stroke h.
+    uv_down_px, uv_up_px : array, shape (..., 2)
+        Pixels.
+    covariance_down_px2, covariance_up_px2 : array, shape (..., 2, 2)
+        Bounds of (u, v).
     covariance_rig : shape (p, p)
         Of the calibration's parameters, see `rig_parameters.rig_covariance`.
     """

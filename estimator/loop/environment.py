@@ -63,7 +63,8 @@ class ApproachTarget(gymnasium.Env[dict[str, Any], dict[str, Any]]):
     ----------
     setup : Setup, optional
         Vehicle, rig, sensor, rooms and task.
-    **task : numbers of `Task`, in place of the setup's
+    **task : Any
+        Numbers of `Task`, in place of the setup's.
 
     Attributes
     ----------

@@ -49,6 +49,7 @@ class Action(NamedTuple):
     drive_m_per_s, turn_rad_per_s : float
         By the vehicle's nominal slip and skid factor.
     flipper_rad_per_s, stroke_m_per_s : float
+        Rates of the flipper and of the stroke.
     exposure : int
         Index of `sensing.EXPOSURES_S`.
     code : int
@@ -72,6 +73,7 @@ class Observation(NamedTuple):
     Attributes
     ----------
     step : int
+        Number of the step.
     left_m, right_m : float
         Ways of the tracks by their encoders.
     flipper_rad, pitch_rad, roll_rad, stroke_m : float
@@ -112,7 +114,9 @@ class Task:
     distances_m : 2 floats
         Between which targets are drawn, from the stroke axis at the start.
     stand_off_m, reach_m, depth_share : float
+        Where the robot is to stop, how far from it is still there, and how far a stated D may be off, as a share.
     step_s, longest_s : float
+        Length of a step and of an episode.
     stroke_m : float
         Longest stroke; the carriage starts down.
     stroke_speed_m_per_s, turn_rad_per_s : float
@@ -172,6 +176,7 @@ class Setup:
     Parameters
     ----------
     vehicle : Vehicle
+        Robot that drives.
     rig : Rig
         The nominal one, which policies know.
     misalignment : Misalignment
@@ -182,6 +187,7 @@ class Setup:
     preset : str
         Sensor whose bound is the noise, or whose pixels are drawn.
     task : Task
+        What it is to do.
     arenas : tuple of Arena
         Rooms, of which each episode draws one; without any each episode has a plain room of its own.
     fidelity : "exact", "windows" or "frames"
@@ -234,6 +240,7 @@ class Simulator:
     Parameters
     ----------
     setup : Setup
+        Room, robot, rig and task.
     reads : bool
         Measure the spots in pixels; False leaves that to the policy, and `Observation.spots` empty.
 

@@ -77,6 +77,7 @@ class Chain:
         Parameters
         ----------
         light : Light
+            Expected electrons per second.
         stream : NoiseStream
             Name it after all that makes the frame: data set, seed, sample, position, laser on or off, draw.
         region : Region, optional

@@ -1,0 +1,74 @@
+"""Docstrings of the site's reference: every entry says what it is, and a group has one type."""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+SECTIONS = ("Parameters", "Attributes", "Returns", "Raises")
+Documented = ast.ClassDef | ast.FunctionDef
+
+
+def reference() -> list[Path]:
+    """Modules of the site's reference, of the hooks' source: its imports are not all here."""
+    tree = ast.parse((ROOT / "docs" / "site_hooks.py").read_text(encoding="utf-8"))
+    named = (node for node in tree.body if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "REFERENCE")
+    modules = [module for group in ast.literal_eval(next(named).value).values() for module in group]
+    return [ROOT / f"{module.removeprefix('phibench.').replace('.', '/')}.py" for module in modules]
+
+
+def public(tree: ast.AST) -> Iterator[Documented]:
+    for node in ast.iter_child_nodes(tree):
+        if isinstance(node, Documented) and not node.name.startswith("_"):
+            yield node
+            yield from public(node)
+
+
+def annotations(node: Documented) -> dict[str, str]:
+    """Types by the names of a function's arguments, or of a class's fields, properties and arguments."""
+    if isinstance(node, ast.FunctionDef):
+        every = [*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]
+        return {one.arg: ast.unparse(one.annotation) for one in every if one.annotation is not None}
+    found = {}
+    for part in node.body:
+        if isinstance(part, ast.AnnAssign) and isinstance(part.target, ast.Name):
+            found[part.target.id] = ast.unparse(part.annotation)
+        if isinstance(part, ast.FunctionDef) and part.name == "__init__":
+            found |= annotations(part)
+        elif isinstance(part, ast.FunctionDef) and part.returns is not None:
+            found[part.name] = ast.unparse(part.returns)
+    return found
+
+
+def entries(text: str) -> Iterator[tuple[str, str, str]]:
+    """Section, first line and description of every entry of a docstring."""
+    parts = re.split(r"^([A-Z]\w+)\n-{3,}\n", text, flags=re.M)
+    for section, body in zip(parts[1::2], parts[2::2], strict=True):
+        if section in SECTIONS:
+            for entry in re.split(r"\n(?=\S)", body.strip("\n")):
+                head, _, said = entry.partition("\n")
+                yield section, head, said.strip()
+
+
+def faults(file: Path) -> Iterator[str]:
+    for node in public(ast.parse(file.read_text(encoding="utf-8"))):
+        types = annotations(node)
+        for section, head, said in entries(ast.get_docstring(node) or ""):
+            where = f"{file.relative_to(ROOT)}: {node.name}: {head}"
+            if not said:
+                yield f"{where}: says nothing"
+            names = [name.strip() for name in head.split(" : ")[0].split(",")]
+            if section in ("Parameters", "Attributes"):
+                if " : " not in head:
+                    yield f"{where}: has no type"
+                if len({types[name] for name in names if name in types}) > 1:
+                    yield f"{where}: has several types"
+
+
+def test_every_entry_says_what_it_is_and_a_group_has_one_type() -> None:
+    files = reference()
+    assert len(files) > 20
+    assert [fault for file in files for fault in faults(file)] == []
