@@ -28,7 +28,7 @@ install = $(1)/python -m pip install --quiet --disable-pip-version-check --const
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .PHONY: help setup dataset bench studies studies-full lint clean
-.PHONY: docs dist test test-base test-slow proof test-all attack mutants benchmark
+.PHONY: docs dist test test-base test-wheel test-slow proof test-all attack mutants benchmark
 
 help:
 	@echo "make setup      make .venv with everything in it, and make sure of LLVM"
@@ -38,6 +38,7 @@ help:
 	@echo "make studies-full  the same in full (hours), published to docs/studies"
 	@echo "make test       the tests, without the slow ones"
 	@echo "make test-base  the tests of scoring and geometry without Mitsuba, with any PYTHON=python3.13"
+	@echo "make test-wheel  the wheel alone fetches, verifies and scores a released set of rooms of three kinds"
 	@echo "make test-slow  the slow tests"
 	@echo "make proof      the slow tests of accuracy, but those of many minutes"
 	@echo "make test-all   all tests"
@@ -104,6 +105,10 @@ test-base:
 	$(or $(PYTHON),python3) -m venv --clear $(BASE)
 	@$(call install,$(BASE)/bin,--editable '.[test]')
 	$(BASE)/bin/python -m pytest $(BASE_TESTS)
+
+# The wheel alone in a clean environment: it fetches a released set of three kinds of rooms, verifies and scores it.
+test-wheel: $(READY)
+	$(BIN)/python -m pytest --slow tests/test_distribution.py
 
 test-slow: $(READY)
 	$(BIN)/python -m pytest --slow --study -m "slow or study"

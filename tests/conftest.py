@@ -179,6 +179,12 @@ def bench_dataset(shared: SharedFolder) -> Path:
 
 
 @pytest.fixture(scope="session")
+def kinds_dataset(shared: SharedFolder) -> Path:
+    """Data set of `tests/tiny_kinds.toml`: a generated room, a panorama and a mesh. Read only."""
+    return rendered(shared, "kinds", ROOT / "tests" / "tiny_kinds.toml")
+
+
+@pytest.fixture(scope="session")
 def method(tmp_path_factory: pytest.TempPathFactory) -> str:
     """Reference of a method in a file: the brightest pixel; it fails on pair 1."""
     from helpers.sealed_sets import METHOD

@@ -1,21 +1,30 @@
 """What is handed out: source distribution, wheel, container, conda recipe, workflow, and the Pythons that they name."""
 
+import json
 import os
 import re
 import shutil
 import subprocess
 import sys
 import tarfile
+import threading
 import tomllib
 import venv
 import zipfile
 from collections.abc import Iterator
+from contextlib import contextmanager
 from fnmatch import fnmatch
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
+from helpers.small_release import ask, part_of
+
+from phibench.datasets.release.release_make import release
+from phibench.estimator.sealed.sealed_set import seal
 
 ROOT = Path(__file__).resolve().parent.parent
 FOLDERS = ("phibench", "scenes", "render", "datasets", "estimator")
@@ -83,7 +92,7 @@ def test_the_workflow_runs_targets_that_exist_on_every_python() -> None:
     runs = [step["run"] for job in jobs.values() for step in job["steps"] if "run" in step]
     targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.M))
     named = {match[1] for run in runs for match in re.finditer(r"^make ([a-z-]+)", run)}
-    assert {"docs", "dist", "test-base"} <= named
+    assert {"docs", "dist", "test-base", "test-wheel"} <= named
     assert named - targets == set()
     assert "bash .ci/run" in runs
     classifiers = [line.rpartition(" :: ")[2] for line in project()["project"]["classifiers"]]
@@ -101,19 +110,38 @@ def test_the_container_copies_and_makes_what_is_there() -> None:
     assert [word for word in copied if not (ROOT / word).exists()] == []
 
 
-@pytest.mark.slow
-def test_a_wheel_scores_in_a_clean_environment(bench_dataset: Path, tmp_path: Path) -> None:
-    """Source distribution, wheel from it, an environment without Mitsuba, a method written, checked and scored."""
-
-    def run(*command: object, cwd: Path = tmp_path) -> str:
-        words = [str(word) for word in command]
-        child = subprocess.run(words, cwd=cwd, env=own, capture_output=True, text=True, timeout=900, check=False)
-        assert child.returncode == 0, child.stdout + child.stderr
-        return child.stdout
-
+def run(*command: object, cwd: Path) -> str:
+    """Output of a command that must succeed, without the checkout on its path."""
     own = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
-    run(sys.executable, "-m", "build", "--outdir", tmp_path / "dist", ROOT)
-    wheel, source = (next((tmp_path / "dist").glob(f"*.{end}")) for end in ("whl", "tar.gz"))
+    words = [str(word) for word in command]
+    child = subprocess.run(words, cwd=cwd, env=own, capture_output=True, text=True, timeout=900, check=False)
+    assert child.returncode == 0, child.stdout + child.stderr
+    return child.stdout
+
+
+@pytest.fixture(scope="module")
+def distributions(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of the source distribution and of the wheel that is built from it."""
+    folder = tmp_path_factory.mktemp("distributions")
+    run(sys.executable, "-m", "build", "--outdir", folder, ROOT, cwd=folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def clean(distributions: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of the programs of an environment that has the wheel alone, with what it asks for."""
+    folder = tmp_path_factory.mktemp("clean")
+    venv.create(folder, with_pip=True)
+    wheel = next(distributions.glob("*.whl"))
+    run(folder / "bin/pip", "install", "--quiet", "--constraint", ROOT / "constraints.txt", wheel, cwd=folder)
+    code = "import importlib.util as u; print([name for name in ('mitsuba', 'drjit') if u.find_spec(name)])"
+    assert run(folder / "bin/python", "-c", code, cwd=folder) == "[]\n"
+    return folder / "bin"
+
+
+@pytest.mark.slow
+def test_distributions_hold_what_they_should(distributions: Path) -> None:
+    wheel, source = (next(distributions.glob(f"*.{end}")) for end in ("whl", "tar.gz"))
     inside = {name for name in zipfile.ZipFile(wheel).namelist() if ".dist-info/" not in name}
     assert inside == {place(file) for file in shipped()}
     with tarfile.open(source) as archive:
@@ -121,17 +149,52 @@ def test_a_wheel_scores_in_a_clean_environment(bench_dataset: Path, tmp_path: Pa
     needed = {"Makefile", "constraints.txt", "tests/conftest.py", "docs/install.md", ".ci/run", "CITATION.cff"}
     assert needed | {file.as_posix() for file in shipped()} <= there
 
-    venv.create(tmp_path / "clean", with_pip=True)
-    run(tmp_path / "clean/bin/pip", "install", "--quiet", "--constraint", ROOT / "constraints.txt", wheel)
-    phibench, elsewhere = tmp_path / "clean/bin/phibench", tmp_path / "elsewhere"
+
+@pytest.mark.slow
+def test_a_wheel_scores_in_a_clean_environment(clean: Path, bench_dataset: Path, tmp_path: Path) -> None:
+    """A method written, checked and scored without Mitsuba; the score names the wheel's version."""
+    phibench, elsewhere = clean / "phibench", tmp_path / "elsewhere"
     elsewhere.mkdir()
     shutil.copytree(bench_dataset, tmp_path / "data")
-    assert run(phibench, "--version", cwd=elsewhere) == f"phibench {project()['project']['version']}\n"
-    code = "import importlib.util as u; print(u.find_spec('mitsuba'))"
-    assert run(tmp_path / "clean/bin/python", "-c", code, cwd=elsewhere) == "None\n"
+    version = f"phibench {project()['project']['version']}"
+    assert run(phibench, "--version", cwd=elsewhere) == f"{version}\n"
     run(phibench, "method", "new", "my_phi.py", cwd=elsewhere)
     assert "nothing wrong" in run(phibench, "method", "check", "my_phi.py:extract", cwd=elsewhere)
     method = ("--method", "my_phi.py:extract", "--preset", "mono-raw", "--draws", "1")
     run(phibench, "score", tmp_path / "data", *method, "--out", "mine.json", cwd=elsewhere)
-    assert (elsewhere / "mine.json").is_file()
     assert (elsewhere / "mine.parquet").is_file()
+    score = json.loads((elsewhere / "mine.json").read_text(encoding="utf-8"))
+    assert score["program"] == version
+    assert score["method"]["packages"]["phibench"] == score["provenance"]["packages"]["phibench"] == version.split()[1]
+
+
+@pytest.mark.slow
+def test_a_wheel_fetches_verifies_and_scores_rooms_of_three_kinds(
+    clean: Path, kinds_dataset: Path, tmp_path: Path
+) -> None:
+    """From a release on the loopback: a generated room, a panorama and a mesh, read without the renderer."""
+    made = release(ask(tmp_path, [part_of("kinds", "tiny_kinds.toml", "pairs")], use=[kinds_dataset]), seal)
+    assert list(made.manifest.parts) == ["phibench-v4-kinds"]
+    phibench = clean / "phibench"
+    with loopback(tmp_path / "public") as address:
+        run(phibench, "fetch", "kinds", "--from", address, "--out", "set", cwd=tmp_path)
+    rooms = [json.loads(line) for line in (tmp_path / "set" / "rooms.jsonl").read_text().splitlines()]
+    assert {room["source"]["kind"] for room in rooms} == {"generated", "panorama", "mesh"}
+    run(phibench, "dataset", "verify", "set", cwd=tmp_path)
+    run(phibench, "score", "set", "--method", "detect", "--preset", "bayer-raw", "--out", "mine.json", cwd=tmp_path)
+    score = json.loads((tmp_path / "mine.json").read_text(encoding="utf-8"))
+    assert (score["pairs"], sum(score["failures"].values())) == (3, 0)
+
+
+@contextmanager
+def loopback(folder: Path) -> Iterator[str]:
+    """Serve a folder on the loopback; its address."""
+    handler = partial(SimpleHTTPRequestHandler, directory=str(folder))
+    with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02})
+        thread.start()
+        try:
+            yield f"http://127.0.0.1:{server.server_address[1]}/"
+        finally:
+            server.shutdown()
+            thread.join()

@@ -31,7 +31,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Ran:
-    """What a method's process ran with.
+    """Packages and files with which a method's process ran.
 
     Attributes
     ----------
@@ -122,7 +122,7 @@ class Harness:
 
     @property
     def ran(self) -> list[Ran]:
-        """What each method ran with, so far; those of one process together have the same packages."""
+        """Packages and files of each method, so far; those of one process together have the same packages."""
         told = self._in_order([[pool.ran] * len(at) for pool, at in self._pooled()])
         return list(told)
 
@@ -321,5 +321,5 @@ def function_name(method: Method) -> str:
 
 
 def ran_here() -> Ran:
-    """What a function in this process runs with; files that it opened before are not known."""
+    """Packages of a function in this process; files that it opened before are not known."""
     return Ran(packages_of(loaded_names()), {}, False)

@@ -27,9 +27,9 @@ TEXT = KINDS.read_text(encoding="utf-8")
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Data set of three rooms, rendered once (20 CPU-s) for all tests here. Read only: copy it to change it."""
-    return make_inline(KINDS, tmp_path_factory.mktemp("kinds") / "out")
+def made(kinds_dataset: Path) -> Path:
+    """Data set of three rooms, rendered once (20 CPU-s). Read only: copy it to change it."""
+    return kinds_dataset
 
 
 @pytest.fixture
