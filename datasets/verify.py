@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
@@ -215,6 +216,7 @@ def _content_faults(dataset: Dataset, bad: set[str], truth_layers: bool, console
         for sample in sorted(dataset, key=lambda one: one.row.room):  # a room takes longer to build than to look at
             for position in POSITIONS:
                 faults += _guarded(_spot_faults(sample, position, answer, bad))
+            faults += _depth_faults(sample)
             steps.advance()
         for info in dataset.rooms.infos.values():
             if info.lit and schema.light_map_file(info.room) not in bad:
@@ -241,6 +243,19 @@ def _spot_faults(
         yield from _guarded(_spot_layer_faults(sample, position, row, answer))
         if row.view_ambient_file not in bad:
             yield from _guarded(_noise_faults(sample, position, row, answer))
+
+
+def _depth_faults(sample: Sample) -> Iterator[str]:
+    """D of the light is that of its places, by Pythagoras."""
+    row = sample.row
+    places = [one.light.place_world_m for one in (row.down, row.up) if one.visible and one.light is not None]
+    if not places:
+        return
+    x, y, _ = (math.fsum(values) / len(places) for values in zip(*places, strict=True))
+    centre = sample.rig.at(0.0).sphere_centre_m
+    expected = math.hypot(x - centre[0], y - centre[1])
+    if not same_number(row.light_depth_m, expected, 1e-9, 1e-9):
+        yield f"{row.sample_id}: light_depth_m is {row.light_depth_m}, the places give {expected}"
 
 
 def _expected(answer: SpotAnswer) -> list[tuple[str, Any]]:

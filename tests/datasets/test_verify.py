@@ -267,6 +267,28 @@ def test_a_truth_that_the_parameters_do_not_give_is_found(copy: Path) -> None:
     assert fault.startswith("seen-near-h0.500 up: u_px is")
 
 
+@pytest.mark.parametrize("field", ["v_px", "phi_normal_rad", "place_world_m"])
+def test_a_light_that_the_parameters_do_not_give_is_found(copy: Path, field: str) -> None:
+    rows = read_manifest(copy)
+    light = rows[0].up.light
+    assert light is not None
+    value = getattr(light, field)
+    moved = (*value[:2], value[2] + 1e-6) if isinstance(value, tuple) else value + 1e-7
+    up = rows[0].up.model_copy(update={"light": light.model_copy(update={field: moved})})
+    write_manifest(copy, [rows[0].model_copy(update={"up": up}), *rows[1:]])
+    sign(copy)
+    [fault] = check(copy).faults
+    assert fault.startswith("seen-near-h0.500 up: light is")
+
+
+def test_a_depth_of_the_light_that_the_places_do_not_give_is_found(copy: Path) -> None:
+    rows = read_manifest(copy)
+    write_manifest(copy, [rows[0].model_copy(update={"light_depth_m": rows[0].light_depth_m + 1e-6}), *rows[1:]])
+    sign(copy)
+    [fault] = check(copy).faults
+    assert fault.startswith("seen-near-h0.500: light_depth_m is")
+
+
 def test_a_changed_rig_is_found(copy: Path) -> None:
     rig = json.loads((copy / schema.RIGS).read_text())
     rig["resolved"]["mirror"]["radius_m"] += 1e-6
