@@ -34,7 +34,7 @@ class BlockSums:
     temporal : sum of the pixels' variances from frame to frame, DN^2
     spatial : sum of squares of the pixels' means after shading is removed, DN^2
     frames : number of frames
-    full : share of values at the last code
+    full, zero : shares of values at the last code and at 0
     flicker_dn2 : variance of the mean of all frames, of the scatter of the frames' means
     """
 
@@ -44,6 +44,7 @@ class BlockSums:
     spatial: Array
     frames: int
     full: float
+    zero: float
     flicker_dn2: float
 
     def jackknife(self) -> BlockSums:
@@ -53,7 +54,7 @@ class BlockSums:
             return np.concatenate([[x.sum()], x.sum() - x])
 
         pixels, mean, temporal, spatial = (totals(x) for x in (self.pixels, self.mean, self.temporal, self.spatial))
-        return BlockSums(pixels, mean, temporal, spatial, self.frames, self.full, self.flicker_dn2)
+        return BlockSums(pixels, mean, temporal, spatial, self.frames, self.full, self.zero, self.flicker_dn2)
 
     @property
     def mean_dn(self) -> Array:
@@ -89,8 +90,9 @@ def block_sums(frames: NDArray[Any], top_dn: int) -> BlockSums:
     spatial = rough[inner] ** 2 / (1.0 - 1.0 / _BOX**2)
     pixels, mean, noise = (_by_blocks(x[inner]) for x in (np.ones_like(pixel_mean), pixel_mean, temporal))
     full = sum(int((frame >= top_dn).sum()) for frame in frames) / frames.size
+    zero = sum(int((frame <= 0).sum()) for frame in frames) / frames.size
     flicker = float(levels.var(ddof=1)) / n
-    return BlockSums(pixels, mean, noise, _by_blocks(spatial), n, full, flicker)
+    return BlockSums(pixels, mean, noise, _by_blocks(spatial), n, full, zero, flicker)
 
 
 def _by_blocks(values: Array) -> Array:

@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtr
 
 from phibench.estimator.sensor_fit.block_sums import (
     BlockSums,
@@ -33,6 +34,7 @@ from phibench.scenes.frames import Array
 
 _MARGIN_SIGMAS = 6.0  # a level is used if so many deviations of its noise lie below saturation
 _HIDDEN_DN = 0.15  # noise below it leaves too few codes to be told from rounding
+_CUT = 1e-3  # of dark values at the converter's lower end: below, their variance lacks less than 1 %
 _FAINT = 0.02  # of the range: below, a level's noise over its signal says nothing
 _BY_GAIN = ("gain_dn_per_e", "dark_e_per_s", "read_noise_e", "row_noise_e", "dsnu_e", "full_well_e")
 _SHAPE = "16 pixels or more of each filter along both sides are needed"
@@ -295,6 +297,11 @@ class _Fit:
         return np.asarray(slope)
 
     def _noise(self, gain: Array, dark_rate: Array) -> None:
+        if self._cut_share() > _CUT:
+            reason = "dark frames are cut at code 0; raise the camera's offset (brightness)"
+            self.reasons |= {"read_noise_e": reason, "dsnu_e": reason, "row_noise_e": reason}
+            self.findings["dark"] = f"{reason}; the black level and all that is counted from it are too high by it"
+            return
         if self.dark_dn2[0] < _HIDDEN_DN**2:
             reason = f"below {_HIDDEN_DN} DN: rounding hides it; take dark frames at a higher gain"
             self.reasons |= {"read_noise_e": reason, "dsnu_e": reason, "row_noise_e": reason}
@@ -315,6 +322,13 @@ class _Fit:
             self.values["dsnu_e"] = np.sqrt(np.maximum(pattern, 0.0))
         else:
             self.reasons["dsnu_e"] = "lost in temporal noise and rounding: take more dark frames, at a higher gain"
+
+    def _cut_share(self) -> float:
+        """Share of the dark values below -0.5 DN, which a converter turns into 0; 1 where most values are 0."""
+        if self.dark.zero > 0.5:
+            return 1.0
+        spread = np.sqrt(max(float(self.dark_dn2[0] + self.offset_dn2[0]), 1e-6))
+        return float(ndtr((-0.5 - float(self.black[0])) / spread))
 
     def _prnu(self, used: list[_Level], response: Response) -> None:
         shown = np.stack([self._signal(one) for one in used])

@@ -102,6 +102,15 @@ def test_a_dark_level_that_jitters_is_frame_noise(tmp_path: Path, black: float, 
     assert not found.tables.findings
 
 
+@pytest.mark.parametrize(("black", "is_cut"), [(-0.4, True), (0.0, True), (0.4, True), (2.0, False), (6.0, False)])
+def test_dark_frames_that_are_cut_are_said_to_be(tmp_path: Path, black: float, is_cut: bool) -> None:
+    """Noise of 0.5 DN: 42, 16, 4 and 0.0 % of the values lie below -0.5 DN."""
+    camera = BentCamera(0.02, 25.0, black, bits=8)
+    tables = fit_sensor(write_transfer(tmp_path / "c", camera, 2, SHARES, frames=4)).file.tables
+    assert ("cut at code 0" in tables.findings.get("dark", "")) == is_cut
+    assert ("read_noise_e" in tables.not_determined) == is_cut
+
+
 def test_dark_frames_that_drift_are_not_called_auto_exposure(tmp_path: Path) -> None:
     folder = write_transfer(tmp_path / "c", TWELVE_BITS, 1, (0.5,), frames=2)
     write_stack(tmp_path / "more", BentCamera(0.1, 30.0, 60.0).frames(0.0, 1, np.random.default_rng(1)))
