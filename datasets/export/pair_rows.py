@@ -74,7 +74,7 @@ class ExportRequest:
             shares = f"validation = {self.validation:g}, test = {self.test:g}"
             raise DatasetError(f"{shares}: give shares from 0 on, below 1 together")
         if self.frames.sensor().output == "electrons":
-            raise DatasetError("preset 'ideal' has no image file that others read: give another preset")
+            raise DatasetError(f"preset '{self.frames.preset}' has no image file that others read: give another preset")
 
     @property
     def images(self) -> tuple[tuple[str, str, bool], ...]:

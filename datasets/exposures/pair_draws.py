@@ -111,17 +111,18 @@ def _of_sample(
     sample: Sample, frames: FramesTable, presets: tuple[str, ...], draws: int, sensor: SensorFile | None
 ) -> Iterator[PairDraw]:
     lights = present(sample.stream_names, sample.dataset.recipe.distractors)
-    requests = {preset: sample.frame_request(_options(preset, sensor)) for preset in presets}
+    requests = {preset: _request(sample, preset, sensor) for preset in presets}
     boxes = _boxes(sample, frames)
     for draw in range(draws):
         for preset, request in requests.items():
             yield PairDraw(0, sample.row.sample_id, preset, draw, request, frames.laser_off, boxes, lights)
 
 
-def _options(preset: str, sensor: SensorFile | None) -> FrameOptions:
-    if preset == "ideal":
-        raise DatasetError("preset 'ideal' ends before the pixels: take bayer-raw, mono-raw, srgb8, yuyv or mjpeg")
-    return FrameOptions(preset, {} if sensor is None else dict(sensor.numbers))
+def _request(sample: Sample, preset: str, sensor: SensorFile | None) -> FrameRequest:
+    request = sample.frame_request(FrameOptions(preset, {} if sensor is None else dict(sensor.numbers)))
+    if request.sensor().output == "electrons":
+        raise DatasetError(f"preset '{preset}' ends before the pixels: take bayer-raw, mono-raw, srgb8, yuyv or mjpeg")
+    return request
 
 
 def _boxes(sample: Sample, frames: FramesTable) -> tuple[Region, Region] | None:

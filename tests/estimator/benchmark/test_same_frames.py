@@ -9,12 +9,15 @@ import pytest
 from PIL import Image
 
 import phibench
+from phibench.datasets.errors import DatasetError
 from phibench.datasets.export.export_make import export
 from phibench.datasets.export.pair_rows import ExportRequest, pair_key
 from phibench.datasets.exposures.draw import draw_frames
 from phibench.datasets.frames.frame_files import read_index
 from phibench.datasets.frames.request import FrameOptions
+from phibench.datasets.recipe.load import parse_recipe, recipe_text
 from phibench.datasets.training import CropSettings, PairDataset, SpotCrops
+from phibench.render.sensor import settings
 
 DRAW = 1
 NAMES = ("down", "up", "down_off", "up_off")
@@ -93,3 +96,30 @@ def test_a_pair_is_found_by_what_a_score_says_of_it(bench_dataset: Path) -> None
         pairs.number_of("nothing")
     with pytest.raises(phibench.datasets.errors.DatasetError, match="give one"):
         pairs.number_of(truth.sample_id)
+
+
+def test_a_preset_added_to_the_table_works_or_is_refused(
+    tiny_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One that ends at raw pixels works as the shipped ones; one that ends before pixels is told by its name."""
+    table = tmp_path / "presets.toml"
+    more = '[presets.dim-raw]\noutput = "raw"\nread_noise_e = 8.0\n\n[presets.dim-light]\noutput = "electrons"\n'
+    table.write_text(f"{settings.PRESETS_FILE.read_text()}\n{more}")
+    monkeypatch.setattr(settings, "PRESETS_FILE", table)
+    test_six_ways_give_the_same_bytes(tiny_dataset, tmp_path, "dim-raw")
+    scored = phibench.score(
+        tiny_dataset,
+        lambda pair: phibench.Answer(phibench.Spot.missing("-"), phibench.Spot.missing("-")),
+        "dim-raw",
+        pairs=1,
+    )
+    assert scored.records["preset"].unique().to_list() == ["dim-raw"]
+    with pytest.raises(DatasetError, match="preset 'dim-light' ends before the pixels"):
+        phibench.open_dataset(tiny_dataset).pairs("dim-light")
+    with pytest.raises(DatasetError, match="preset 'dim-light' has no image file"):
+        ExportRequest("frames", FrameOptions("dim-light"))
+    with pytest.raises(ValueError, match="no easy pairs for preset 'dim-raw'"):
+        phibench.EasyPairs("dim-raw")
+    text = f'{recipe_text("paper")}\n[frames]\npresets = ["dim-raw"]\n'
+    with pytest.raises(DatasetError, match=r"frames\.presets\[0\]: 'dim-raw' is not allowed; give one of"):
+        parse_recipe(text)
