@@ -19,6 +19,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 from phibench.datasets.errors import DatasetError
 from phibench.estimator.film.film_positions import FilmPositions
+from phibench.estimator.geometry.depth_interval import depth_interval
 from phibench.estimator.geometry.mirror_image import image_of
 from phibench.estimator.geometry.rig_parameters import PARAMETERS, STROKE_PARAMETERS
 from phibench.estimator.geometry.triangulate import depth_exact
@@ -67,6 +68,11 @@ class FilmDepth:
     frames: int
     by_rig_m: Array
     places_px: Array
+
+    @property
+    def interval_m(self) -> tuple[float, float]:
+        """Ends in metres between which D lies with 95 %: `depth_interval`."""
+        return depth_interval(self.depth_m, self.sigma_m)
 
 
 def film_depth(

@@ -36,6 +36,7 @@ from phibench.estimator.film.film_estimates import EqualLight, bundle_depth, equ
 from phibench.estimator.film.film_frames import film_frames, lit_frames
 from phibench.estimator.film.film_positions import FilmPositions, joined
 from phibench.estimator.film.processed_film import processed_positions
+from phibench.estimator.geometry.depth_interval import depth_pull
 from phibench.estimator.interface import Image, Pair
 from phibench.estimator.paper.experiment_tables import Procedure, calibrate_rig
 from phibench.scenes.frames import Array
@@ -312,15 +313,20 @@ def processed_stroke(
 
 
 def summary(rows: pl.DataFrame) -> pl.DataFrame:
-    """Per way: films, rms of the relative error, its prediction, pull, share within 95 %, gain of the film."""
+    """Per way: films, rms of the relative error, its prediction, pull, share within 95 %, gain of the film.
+
+    Pulls are those of `depth_pull`.
+    """
     relative, claim = pl.col("error_m") / pl.col("depth_m"), pl.col("sigma_m") / pl.col("depth_m")
     good = rows.filter(pl.col("error_m").is_finite() & pl.col("sigma_m").is_finite())
+    true, error, sigma = (good[name].to_numpy() for name in ("depth_m", "error_m", "sigma_m"))
+    good = good.with_columns(pl.Series("pull", depth_pull(true + error, sigma, true)))
     return good.group_by("way", maintain_order=True).agg(
         pl.len().alias("films"),
         (relative**2).mean().sqrt().alias("rms"),
         (claim**2).mean().sqrt().alias("predicted"),
-        (pl.col("error_m").abs() <= WITHIN * pl.col("sigma_m")).mean().alias("within_95"),
-        ((pl.col("error_m") / pl.col("sigma_m")) ** 2).mean().sqrt().alias("pull"),
+        (pl.col("pull").abs() <= WITHIN).mean().alias("within_95"),
+        (pl.col("pull") ** 2).mean().sqrt(),
         ((pl.col("film_pixels_m") / pl.col("depth_m")) ** 2).mean().sqrt().alias("pixels"),
         # median over films: one of a short stroke has as much say as one of a long one
         ((pl.col("two_ends_pixels_m") / pl.col("film_pixels_m")) ** 2).median().alias("gain"),
@@ -335,6 +341,8 @@ def closure_interval(rows: pl.DataFrame, common_end: bool = False) -> tuple[floa
     far as it comes from the pattern or from what rounding hides of a room. The truth lies between.
     """
     good = rows.filter(pl.col("error_m").is_finite() & pl.col("sigma_m").is_finite())
+    true, error, sigma = (good[name].to_numpy() for name in ("depth_m", "error_m", "sigma_m"))
+    good = good.with_columns(pl.Series("pull", depth_pull(true + error, sigma, true)))
     D, sigma = good["depth_m"].to_numpy(), good["sigma_m"].to_numpy()
     common = np.array(good["calibration_m"].to_list()).reshape(len(D), -1)
     own = np.sqrt(np.maximum(sigma**2 - np.sum(common**2, axis=1), 0.0)) / D
