@@ -1,7 +1,8 @@
 """Signal to noise beside what drawn images show: `measure_snr.py [--scenes 170] [--presets mjpeg]`.
 
 Run from the repository root. Scenes are spots over flat rooms of 20 to 3000 electrons a pixel, in random places, for
-each of three presets; a spot's pixels together collect 3 to 200 times the noise of one pixel, 20 to 400 for mjpeg. Each scene is drawn 200
+each of three presets; a spot's pixels together collect 3 to 200 times the noise of one pixel, 20 to 400 for
+mjpeg. Each scene is drawn 200
 times with the laser on and 200 times with it off, every time by another camera. Half of the draws give the mean image
 of the spot and the variance of every feature, the other half the likelihood ratio of a spot at the true place, for
 Gaussian features of equal noise: the features weighted by mean over variance. Its d' is the distance of both means over
