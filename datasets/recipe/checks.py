@@ -87,7 +87,7 @@ def semantic_faults(raw: Raw) -> list[Fault]:
 def warnings(recipe: Recipe) -> list[str]:
     """Warnings of what is legal but probably not meant."""
     result = []
-    if not build_true_rig(recipe).fits_image():
+    if not (_draws_outline(recipe) or build_true_rig(recipe).fits_image()):
         result.append("rig: the mirror's outline does not fit the image; spots near its rim may fall outside")
     used = _used_targets(recipe)
     unused = [target.name for target in recipe.targets if target.name not in used]
@@ -95,6 +95,14 @@ def warnings(recipe: Recipe) -> list[str]:
         what = "experiment uses" if recipe.random is None else "sample of [random] uses"
         result.append(f"targets: {', '.join(unused)} stand in the room but no {what} their spots")
     return result
+
+
+_OF_THE_OUTLINE = ("z_c_m", "radius_m", "pixel_pitch_um", "fx_px", "fy_px", "cx_px", "cy_px", "mirror")
+
+
+def _draws_outline(recipe: Recipe) -> bool:
+    """Tell whether samples draw what makes the outline large or moves it: then no sample has the rig of `[rig]`."""
+    return recipe.random is not None and any(getattr(recipe.random.rig, key) is not None for key in _OF_THE_OUTLINE)
 
 
 def _used_targets(recipe: Recipe) -> set[str]:

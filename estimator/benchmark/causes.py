@@ -33,6 +33,7 @@ from typing import Any
 
 import numpy as np
 import polars as pl
+from scipy.ndimage import uniform_filter
 
 from phibench.estimator.benchmark.answer_errors import Rules
 from phibench.estimator.interface import FAILURES, Answer, Pair
@@ -52,6 +53,8 @@ LEAST_CONTRAST = 3.0
 _RING = (4, 8)  # px from the spot: 4 px are 5 blurs of the default rig, so that no light of the spot is in it
 _CLIPPED = 0.95  # of the largest code: the mean of 4 x 4 pixels in a lamp's reflection
 _LAMP_TO_SPOT = 3.0
+_AROUND_PX = 12  # from a false position, to what on - off has there otherwise
+_PEAK_SIGMAS = 2.2
 KINDS: dict[str, str] = {"missed": "no answer", "false": "false", "unseen": "rightly none"}
 """Kinds with their names in tables. The records' column `missed` holds for "false" at a visible spot, too."""
 _PIXEL_SIGMA2 = 1.0 / 12.0  # px^2: the integration over a pixel widens the optical blur by the variance of a unit box
@@ -248,16 +251,26 @@ CAUSES: dict[str, str] = {
 TAKEN_FOR: dict[str, tuple[str, str]] = {
     "lamp": (
         "a lamp or its reflection in the mirror",
-        "mask the mirror's outer ring, subtract the laser-off image, or use --boxes 64",
+        "subtract a laser-off image, mask lamps (lamp_mask in docs/method.md), or use --boxes 64",
+    ),
+    "lamp_noise": (
+        "noise of a lamp or its reflection in on - off",
+        "divide by the noise, mask lamps (lamp_mask in docs/method.md), or use --boxes 64",
     ),
     "light": ("another light of the scene", "tell it by the laser-off image and its size, or use --boxes 64"),
-    "region": ("a region that is brighter than the spot", "subtract the laser-off image, or use --boxes 64"),
+    "region": ("a region that is brighter than the spot", "subtract a laser-off image, or use --boxes 64"),
+    "region_noise": (
+        "noise of a bright region in on - off",
+        "divide by the noise, mask bright regions (lamp_mask in docs/method.md), or use --boxes 64",
+    ),
     "nothing": (
         "false, on nothing brighter than the spot",
         "phibench method check tells mistakes of convention, --boxes 64 narrows the search",
     ),
 }
 """Kinds of places that false detections lie on, in words, with advice."""
+NOISE = "_noise"
+"""End of the kinds whose places are peaks of on - off: those of methods that subtract."""
 
 
 def taken_for(case: Case) -> str:
@@ -268,8 +281,33 @@ def taken_for(case: Case) -> str:
         return "light"
     spot = _level(case, np.array(case.spot.uv_px), False) if case.spot.visible else np.inf
     if _is_lamp(case, case.answer_px, spot):
-        return "lamp"
-    return "region" if _level(case, case.answer_px, False) > spot else "nothing"
+        kind = "lamp"
+    elif _level(case, case.answer_px, False) > spot:
+        kind = "region"
+    else:
+        return "nothing"
+    return f"{kind}{NOISE}" if _is_peak_of_difference(case, case.answer_px) else kind
+
+
+def _is_peak_of_difference(case: Case, uv_px: Array) -> bool:
+    """Tell whether on - off has a peak at a false position: the answer of a method that subtracts.
+
+    The largest mean of 3 x 3 pixels within 2 px is compared with those of the ring 6 to 12 px around. Of methods that
+    look at on alone it exceeds 2.2 deviations at less than half of the positions, of methods that subtract at most.
+    """
+    if getattr(case.pair, f"{case.position}_off") is None:
+        return False
+    difference = case.region(uv_px, _AROUND_PX, _AROUND_PX, less_off=True).sum(axis=-1)
+    if difference.shape != (2 * _AROUND_PX + 1,) * 2:
+        return False
+    means = uniform_filter(difference, 3)
+    rows, columns = np.abs(np.indices(means.shape) - _AROUND_PX)
+    distance = np.maximum(rows, columns)
+    ring = means[distance >= _AROUND_PX // 2]
+    level = np.median(ring)
+    scatter = 1.4826 * np.median(np.abs(ring - level))  # deviation of a normal law
+    # codes are whole numbers: the mean of nine has a tenth of a code where the noise is less
+    return bool(means[distance <= 2].max() - level >= _PEAK_SIGMAS * max(scatter, 0.1))
 
 
 def _is_lamp(case: Case, uv_px: Array, spot_level: float) -> bool:

@@ -10,7 +10,7 @@ two methods of the same law, any metric at all is called different in at most 1 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -130,6 +130,30 @@ def refuse_different(first: ScoreDocument, second: ScoreDocument, first_name: st
                     f"{first_name} and {second_name} have different {what}: {key} is {_short(a.get(key))} and "
                     f"{_short(b.get(key))}; score both methods on the same pairs"
                 )
+
+
+def note_on_size(differences: Sequence[Difference], rules: Mapping[str, float], samples: int) -> str:
+    """What would give a verdict, if no metric can have one; empty if some can.
+
+    Parameters
+    ----------
+    differences : of `compare`
+    rules : of the scores
+    samples : that both scores have
+    """
+    if any(item.better != "too few samples" for item in differences):
+        return ""
+    least = int(rules["least_compared"])
+    if samples >= least:
+        return (
+            f"Too few samples for a verdict: every metric counts fewer than {least} of the {samples} that both have. "
+            "The methods find too few spots together: score them on easier pairs, or with --boxes 64."
+        )
+    return (
+        f"Too few samples for a verdict: both have {samples}, {least} are the least, and more draws of a sample do "
+        f"not count. Score both on a data set of {least} samples or more: `samples` of [random] in a recipe, or "
+        "bench-dev."
+    )
 
 
 def note_on_code(first: ScoreDocument, second: ScoreDocument) -> str:

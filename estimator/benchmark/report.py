@@ -40,6 +40,7 @@ from phibench.estimator.benchmark.score_tables import (
     light_line,
     rank_key,
     rank_words,
+    refused,
     shown_parts,
 )
 
@@ -232,7 +233,10 @@ def _groups(scores: Sequence[tuple[ScoreDocument, pl.DataFrame]]) -> list[list[t
 def _ranking(
     number: int, group: list[tuple[ScoreDocument, pl.DataFrame]], every: Sequence[ScoreDocument], by: str
 ) -> Ranking:
-    order = sorted(group, key=lambda item: rank_key(item[0], by))
+    refusals = {document.method.name: why for document, table in group if (why := refused(table))}
+    left_out = [f"{name} is not compared: it {why}." for name, why in refusals.items()]
+    compared = [item for item in group if item[0].method.name not in refusals] or group
+    order = sorted(compared, key=lambda item: rank_key(item[0], by))
     names = _distinct([document.method.name for document, _ in order])
     scores = {name: document for name, (document, _) in zip(names, order, strict=True)}
     tables = {name: table for name, (_, table) in zip(names, order, strict=True)}
@@ -244,7 +248,7 @@ def _ranking(
     frames, frame_of = _frames(number, scores)
     return Ranking(
         title=title,
-        verdict=verdict(scores, by),
+        verdict=" ".join([verdict(scores, by), *left_out]),
         pair_set=pair_set,
         scores=scores,
         keys=keys(names),
@@ -279,7 +283,7 @@ def verdict(scores: Mapping[str, ScoreDocument], by: str) -> str:
     missing = {name: kind["missed"] + kind["false"] for name, kind in first.causes.items()}
     cause = max(missing, key=lambda name: missing[name])
     placed = first.metrics["rms_counted_px"].value is not None  # of real pairs no cause can be told
-    why = f", most of the others are missed for the cause '{cause}'" if missing[cause] and placed else ""
+    why = f", most of the others are missed {_because(cause)}" if missing[cause] and placed else ""
     alone = "is best by" if len(scores) > 1 else "has, by the rank of"
     parts = [f"{best}: {flag.text}." for flag in first.flags]
     parts += [
@@ -293,6 +297,11 @@ def verdict(scores: Mapping[str, ScoreDocument], by: str) -> str:
     if wrong:
         parts.append(f"False detections in {100 * FULL_OF_FALSE:g} % of the images or more: {_listed(wrong)}.")
     return " ".join(parts if blind or wrong else [*parts, "No method finds less than half."])
+
+
+def _because(cause: str) -> str:
+    """The most frequent cause in words."""
+    return "by its own fault: the light was there" if cause == "method" else f"for the cause '{cause}'"
 
 
 def _rate(score: ScoreDocument, metric: str) -> float:

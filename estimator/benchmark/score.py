@@ -1,7 +1,7 @@
 """Benchmark of methods on a pair set: run them, compare with the truth, name causes, keep the worst images.
 
 `score_methods` is for methods that are run, `score_outcomes` for answers that are there. `bench` runs every built-in
-method on every preset of a data set that it takes, and writes one report.
+or registered method on every preset of a data set that it takes, and writes one report.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ from phibench.estimator.methods.fit_at_truth import KeptFits
 from phibench.estimator.methods.registry import METHODS, BuiltIn
 from phibench.estimator.pair_set import CachedPairs, PairSet, truth_folders
 from phibench.estimator.sandbox.pairs_ahead import PairsAhead
-from phibench.estimator.sandbox.resolve import MethodError, RunLimits, code_of_function, resolve
+from phibench.estimator.sandbox.resolve import MethodError, RunLimits, code_of_function, installed, resolve
 from phibench.estimator.sandbox.runner import Harness, Ran, asked_here, function_name, ran_here
 
 Ask = Callable[[PairSet, Sequence[int]], Iterable[tuple[Outcome, ...]]]
@@ -320,13 +320,13 @@ def bench(
     calibration: str | Path | None = None,
     limits: RunLimits | None = None,
 ) -> Benched:
-    """Run built-in methods on all presets of a data set and write scores and a report.
+    """Run built-in methods and those of installed packages on all presets of a data set; write scores and a report.
 
     Parameters
     ----------
     folder : finished data set
     out : folder for `<preset>-<method>.json` and `report.html`
-    methods : names of built-in methods; all by default
+    methods : names of methods that are built in or registered by a package; all by default
     workers : pairs that are worked on at a time
     pairs : the first so many of each preset; all by default
     console : where progress goes; by default the standard error
@@ -339,14 +339,16 @@ def bench(
         If the data set will not do, or a method is unknown.
     """
     dataset, out = open_scored(folder), Path(out)
-    console, chosen = console or progress_console(), _chosen(METHODS, methods)
+    console = console or progress_console()
+    chosen = _chosen(list(dict.fromkeys([*METHODS, *(point.name for point in installed())])), methods)
     if out.resolve() == dataset.folder.resolve() or dataset.folder.resolve() in out.resolve().parents:
         raise DatasetError(f"{out} lies inside the data set, whose files are signed; give a folder outside, --out")
     require_writable(out / REPORT)
     scores, notes, times = [], [], dict[str, dict[str, float]]()
     for preset in _presets(dataset):
         taken = wanted_pairs(dataset, preset, pairs=pairs, calibration=calibration)
-        refusals = {name: refusal(METHODS[name], taken) for name in chosen}
+        # what a package's method takes is known to nobody: it is asked, and its answers say so
+        refusals = {name: refusal(METHODS[name], taken) if name in METHODS else "" for name in chosen}
         notes += [f"{name} is left out on {preset}: {why}" for name, why in refusals.items() if why]
         names = [name for name, why in refusals.items() if not why]
         stages: dict[str, float] = {}
@@ -525,8 +527,10 @@ def _presets(dataset: Dataset | ImportedSet) -> tuple[str, ...]:
     return PRESETS if frames is None else frames.presets
 
 
-def _chosen(known: Mapping[str, BuiltIn], wanted: Sequence[str] | None) -> list[str]:
+def _chosen(known: Sequence[str], wanted: Sequence[str] | None) -> list[str]:
     names = list(known) if wanted is None else list(dict.fromkeys(wanted))
     if strange := [name for name in names if name not in known]:
-        raise DatasetError(f"no built-in method '{strange[0]}'; known: {', '.join(known)}")
+        raise DatasetError(
+            f"no method '{strange[0]}' is built in or registered by a package; known: {', '.join(known)}"
+        )
     return names

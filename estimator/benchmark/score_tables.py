@@ -22,11 +22,12 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from phibench.estimator.benchmark.causes import CAUSES, KINDS, TAKEN_FOR
+from phibench.estimator.benchmark.causes import CAUSES, KINDS, NOISE, TAKEN_FOR
 from phibench.estimator.benchmark.compare import Difference
 from phibench.estimator.benchmark.document import ScoreDocument, Value
 from phibench.estimator.benchmark.intervals import Estimate
 from phibench.estimator.benchmark.metrics import METRICS, RANKS, applies
+from phibench.estimator.methods.registry import REFUSED
 
 Form = Literal["terminal", "csv", "markdown", "latex", "json"]
 
@@ -109,6 +110,18 @@ def rank_words(by: str) -> str:
     return f"ranked by {what}, missed spots and false detections counted"
 
 
+def refused(records: pl.DataFrame) -> str:
+    """Reason for which a built-in method took none of the pairs, such as "takes srgb8, not bayer-raw"; "" if it did.
+
+    Parameters
+    ----------
+    records : as of `records.records`
+    """
+    said = set(records.select("failure", "status").rows())
+    ((failure, status),) = said if len(said) == 1 else (("", ""),)
+    return status if not failure and status.startswith(REFUSED) else ""
+
+
 def leaderboard(documents: Sequence[ScoreDocument], by: str = "phi", wide: bool = False) -> Grid:
     """One row per method, the best first; `wide` adds intervals and the last columns."""
     first, names = documents[0], tuple(HEADS)[: None if wide else NARROW]
@@ -173,7 +186,8 @@ def _kind_totals(document: ScoreDocument) -> Iterator[str]:
 
 def _most_frequent(document: ScoreDocument, count: int = 3) -> list[str]:
     wrong = Counter({cause: kinds["missed"] + kinds["false"] for cause, kinds in document.causes.items()})
-    return [f"{cause} {number}" for cause, number in wrong.most_common(count) if number]
+    names = {"method": "the method's own"}  # it stands in a column of methods
+    return [f"{names.get(cause, cause)} {number}" for cause, number in wrong.most_common(count) if number]
 
 
 def _finds(document: ScoreDocument) -> bool:
@@ -227,8 +241,12 @@ def false_line(records: pl.DataFrame) -> str:
     false = answers.filter("false_detection")
     if not len(false) or len(false) < FULL_OF_FALSE * len(answers):
         return ""
-    ((kind, number),) = Counter(false["taken_for"].to_list()).most_common(1)
-    what, advice = TAKEN_FOR[kind]
+    kinds = Counter(false["taken_for"].to_list())
+    ((kind, number),) = Counter(kind.removesuffix(NOISE) for kind in kinds.elements()).most_common(1)
+    # one place may look like either; a method subtracts the laser-off image everywhere or nowhere
+    bright = ("lamp", "region")
+    subtracts = sum(kinds[one + NOISE] for one in bright) > sum(kinds[one] for one in bright)
+    what, advice = TAKEN_FOR[kind + NOISE if kind in bright and subtracts else kind]
     return f"{100 * number / len(answers):.0f} % of the answers are {what}: {advice}"
 
 
@@ -334,16 +352,19 @@ def print_scores(scored: Sequence[HasScore], form: str, by: str, wide: bool, cal
     calibrated : bool
         Say how well the predicted error of D holds.
     """
-    documents = [one.document for one in scored]
+    refusals = {id(one): f"not compared: it {why}" for one in scored if (why := refused(one.records))}
+    every = [one.document for one in scored]
+    documents = [one.document for one in scored if id(one) not in refusals] or every
     board = leaderboard(documents, by, wide)
     if form != "terminal":
         table = {"markdown": markdown, "latex": latex}
         whole = {"csv": scores_csv, "json": scores_json}
-        sys.stdout.write(table[form](board) if form in table else whole[form](documents, by))
+        sys.stdout.write(table[form](board) if form in table else whole[form](every, by))
         return
     console = table_console(wide)
     show_grid(console, board if wide or len(documents) > 1 else score_table(documents[0], by))
     failed = {id(one): line for one in scored if (line := failure_line(one.records))}
+    failed |= refusals
     for one in scored:
         lines = [failed.get(id(one), ""), *(flag.text for flag in one.document.flags), false_line(one.records)]
         for line in filter(None, lines):

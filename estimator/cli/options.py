@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Group, Parameter, Token
 
-from phibench.estimator.cli.completions import built_in_methods, methods, presets
+from phibench.estimator.cli.completions import methods, presets
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -63,8 +63,8 @@ BuiltIn = Annotated[
     Parameter(
         name="--method",
         negative="",
-        completer=built_in_methods,
-        help="A built-in method, as `phibench method list` shows. May be given several times; all by default.",
+        completer=methods,
+        help="A built-in or registered method, as `phibench method list` shows. May be repeated; all by default.",
     ),
 ]
 

@@ -142,7 +142,7 @@ def compare(first: Path, second: Path, *, bootstrap_seed: Whole = 0, output: Out
         Seed of the bootstrap that makes the intervals.
     """
     from phibench.estimator.benchmark.compare import compare as compare_scores
-    from phibench.estimator.benchmark.compare import note_on_code, note_on_pairs
+    from phibench.estimator.benchmark.compare import note_on_code, note_on_pairs, note_on_size
     from phibench.estimator.benchmark.document import read_score
     from phibench.estimator.benchmark.score_tables import print_comparison
 
@@ -152,8 +152,8 @@ def compare(first: Path, second: Path, *, bootstrap_seed: Whole = 0, output: Out
     lines = sys.stdout if form == "terminal" else sys.stderr
     for note in filter(None, (note_on_pairs(a, b, str(first), str(second)), note_on_code(a, b))):
         print(f"note: {note}", file=lines)
-    if all(item.better == "too few samples" for item in differences):
-        print(f"Too few samples for a verdict: {a.rules['least_compared']:g} are the least.", file=lines)
+    if small := note_on_size(differences, a.rules, min(a.samples, b.samples)):
+        print(small, file=lines)
     elif all(item.better in ("no difference shown", "too few samples") for item in differences):
         print("No metric shows a difference: see docs/scoring.md, Paired comparison, for the test.", file=lines)
     return 0
@@ -268,7 +268,7 @@ def bench(
     calibration: Path | None = None,
     limits: Limits = LIMITS,
 ) -> int:
-    """Run the built-in methods on every preset of a data set and write scores and a report.
+    """Run built-in and registered methods on every preset of a data set and write scores and a report.
 
     Parameters
     ----------

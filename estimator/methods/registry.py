@@ -84,6 +84,9 @@ class BuiltIn:
         return Answer(Spot.missing(why), Spot.missing(why)) if why else self.function(pair)
 
 
+REFUSED = ("takes ", "needs ")
+"""Beginnings of `BuiltIn.refusal` where a method that is installed cannot take a pair."""
+
 _ALL = (
     BuiltIn(
         "brightest_pixel",
@@ -169,14 +172,14 @@ _ALL = (
     BuiltIn(
         "photutils_centroid_2dg",
         each_spot(photutils_centroid_2dg),
-        "elliptical Gaussian on the redness, by photutils",
+        "elliptical Gaussian on the red light of on - off, by photutils; on the redness without a laser-off frame",
         "photutils.centroids.centroid_2dg",
         package="photutils",
     ),
     BuiltIn(
         "trackpy_refine",
         each_spot(trackpy_refine, hints=True),
-        "centre of mass of the redness, moved until it is central, by trackpy",
+        "centre of mass of the same light, moved until it is central, by trackpy",
         "J. C. Crocker, D. G. Grier, J. Colloid Interface Sci. 179, 298 (1996); trackpy.refine_com",
         package="trackpy",
     ),

@@ -77,7 +77,7 @@ TRACKPY_DIAMETER_PX = 7
 
 
 def photutils_centroid_2dg(region: SearchRegion) -> Spot:
-    """`photutils.centroids.centroid_2dg` on the redness of 15 x 15 pixels: an elliptical Gaussian by least squares."""
+    """`photutils.centroids.centroid_2dg` on `_laser_in` of 15 x 15 pixels: an elliptical Gaussian by least squares."""
     from photutils.centroids import centroid_2dg
 
     near = region.narrowed()
@@ -88,7 +88,7 @@ def photutils_centroid_2dg(region: SearchRegion) -> Spot:
 
 
 def trackpy_refine(region: SearchRegion) -> Spot:
-    """`trackpy.refine_com` on the redness of 15 x 15 pixels: centroid in a disc of 7 pixels, moved until it is central.
+    """`trackpy.refine_com` on `_laser_in` of 15 x 15 pixels: centroid in a disc of 7 pixels, moved until it is central.
 
     Trackpy's own search wants whole numbers; the start is the red peak.
     """
@@ -104,11 +104,16 @@ def trackpy_refine(region: SearchRegion) -> Spot:
 
 
 def _above(near: SearchRegion) -> Array:
-    """Redness over the median of the window's border; scaled, because a fit's tolerances are absolute."""
-    red = redness(near.planes)
+    """Laser's light over the median of the window's border; scaled, because a fit's tolerances are absolute."""
+    red = _laser_in(near)
     edge = np.concatenate([red[0], red[-1], red[1:-1, 0], red[1:-1, -1]])
     above = red - np.median(edge)
     return np.asarray(above / max(float(above.max()), 1e-12))
+
+
+def _laser_in(near: SearchRegion) -> Array:
+    """Red plane of on - off; the redness where there is no laser-off frame."""
+    return redness(near.planes) if near.off_pixels is None else _added(near)
 
 
 def _spot_in_window(near: SearchRegion, u: float, v: float) -> Spot:

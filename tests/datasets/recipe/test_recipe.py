@@ -171,6 +171,16 @@ def test_a_mirror_beyond_the_image_is_a_warning() -> None:
     assert "does not fit the image" in warning
 
 
+@pytest.mark.parametrize(
+    ("drawn", "count"),
+    [({}, 1), ({"f_number": {"uniform": [2.0, 2.8]}}, 1), ({"z_c_m": {"uniform": [0.26, 0.28]}}, 0)],
+)
+def test_the_outline_of_a_rig_that_no_sample_has_is_no_warning(drawn: dict[str, Any], count: int) -> None:
+    document = changed(rig={"z_c_m": 0.2}, random={"stroke_m": {"uniform": [0.2, 0.4]}, "rig": drawn})
+    document.pop("experiments", None)
+    assert len([text for text in warnings(check_recipe(document)) if "outline" in text]) == count
+
+
 def test_a_board_that_nobody_uses_is_a_warning() -> None:
     [warning] = warnings(check_recipe(changed(targets=[target(), target(name="b", azimuth_deg=90.0)])))
     assert "b stand" in warning

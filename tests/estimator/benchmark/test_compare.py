@@ -10,7 +10,7 @@ from helpers.bench_cases import Cases, cases, outcomes, sampler, scaled, shifted
 
 from phibench.datasets.errors import DatasetError
 from phibench.estimator.benchmark.answer_errors import Rules
-from phibench.estimator.benchmark.compare import COMPARED, compare, compare_records, note_on_code
+from phibench.estimator.benchmark.compare import COMPARED, compare, compare_records, note_on_code, note_on_size
 from phibench.estimator.benchmark.document import MethodCard, read_score, write_score
 from phibench.estimator.benchmark.metrics import METRICS
 from phibench.estimator.benchmark.records import records
@@ -85,6 +85,19 @@ def test_below_thirty_samples_there_is_no_verdict():
         assert found["rms_px"].better == better
         assert found["rms_px"].difference.value == pytest.approx(1.4)
         assert np.isnan(found["rms_px"].chance) == (samples < 30)
+
+
+def test_what_would_give_a_verdict_is_said():
+    rules = {"least_compared": 30.0}
+    small = compare_records(table(shifted(0.1), cases(25)), table(shifted(1.5), cases(25)), RULES, "test")
+    note = note_on_size(small, rules, 25)
+    assert "both have 25, 30 are the least" in note
+    assert "30 samples or more" in note
+    assert "bench-dev" in note
+    enough = compare_records(table(shifted(0.1), cases(30)), table(shifted(1.5), cases(30)), RULES, "test")
+    assert note_on_size(enough, rules, 30) == ""
+    nothing = [replace(item, better="too few samples") for item in enough]
+    assert "--boxes 64" in note_on_size(nothing, rules, 30)
 
 
 def test_a_constant_depth_without_positions_is_never_better():

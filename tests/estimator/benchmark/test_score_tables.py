@@ -14,7 +14,7 @@ from phibench.estimator.benchmark.causes import KINDS
 from phibench.estimator.benchmark.compare import compare_records
 from phibench.estimator.benchmark.document import MethodCard
 from phibench.estimator.benchmark.metrics import METRICS
-from phibench.estimator.benchmark.report import report_html
+from phibench.estimator.benchmark.report import report_html, verdict
 from phibench.estimator.benchmark.score import isolated, score_outcomes
 from phibench.estimator.benchmark.score_tables import (
     HEADS,
@@ -23,8 +23,9 @@ from phibench.estimator.benchmark.score_tables import (
     number,
     print_comparison,
     print_scores,
+    refused,
 )
-from phibench.estimator.interface import Outcome
+from phibench.estimator.interface import Answer, Outcome, Spot
 
 RULES = Rules(resamples=199)
 NAMES = ("gaussian_least_squares", "raw_maximum_likelihood", "a_method_of_my_own.py:extract")
@@ -182,3 +183,34 @@ def test_one_unit_per_quantity():
 )
 def test_three_digits(value, text):
     assert number(value, 3, significant=True) == text
+
+
+def test_a_method_that_takes_none_of_the_pairs_is_not_ranked_and_not_blamed(scored, capsys):
+    """It answers every pair with its refusal: neither last in the table nor a failure in the report's headline."""
+    why = "takes srgb8, yuyv, mjpeg, not bayer-raw"
+
+    def refuses(_):
+        return Answer(Spot.missing(why), Spot.missing(why))
+
+    pairs = cases(20)
+    other = score_outcomes(MethodCard.of("chain_fit", kind="built-in"), pairs, outcomes(pairs, refuses), RULES)
+    assert refused(other.records) == why
+    assert [refused(one.records) for one in scored] == ["", "", ""]
+    print_scores([*scored, other], "terminal", "phi", wide=False)
+    out = " ".join(capsys.readouterr().out.split())
+    assert f"chain_fit: not compared: it {why}" in out
+    assert out.count("chain_fit") == 1
+    html = report_html([(one.document, one.records) for one in (*scored, other)])
+    assert f"chain_fit is not compared: it {why}." in html
+    assert html.count("chain_fit") == 1
+    blamed = next(line for line in html.splitlines() if "Less than half of the spots" in line)
+    assert "chain_fit" not in blamed.partition("is not compared")[0].rpartition("Less than half")[2].partition(".")[0]
+
+
+def test_the_cause_of_the_method_itself_has_words(scored):
+    (one,) = scored[:1]
+    wrong = {cause: dict.fromkeys(KINDS, 0) for cause in one.document.causes}
+    wrong["method"]["missed"] = 3
+    document = one.document.model_copy(update={"causes": wrong})
+    assert "most of the others are missed by its own fault: the light was there" in verdict({"one": document}, "phi")
+    assert cause_table([document, document]).rows[0][-1] == "the method's own 3"
