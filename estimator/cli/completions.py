@@ -69,11 +69,6 @@ def methods(context: CompletionContext) -> Iterator[str]:
     yield from _files(context.incomplete, ".py")
 
 
-def built_in_methods(_: CompletionContext) -> tuple[str, ...]:
-    """Built-in methods."""
-    return BUILT_IN
-
-
 def released(_: CompletionContext) -> tuple[str, ...]:
     """Released data sets, by their last words and by their titles."""
     return *PARTS, *(f"{TITLE}{part}" for part in PARTS)

@@ -5,8 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import polars as pl
 import pytest
 from helpers.bench_cases import RIG, Cases, cases, change, constant, image_of, outcomes, silent, truth_itself
+from scipy.ndimage import maximum_filter, uniform_filter
 
 from phibench.datasets.frames.sensor_card import sensor_card
 from phibench.estimator.benchmark.answer_errors import MATCH_PX, Rules
@@ -14,6 +16,7 @@ from phibench.estimator.benchmark.causes import (
     _RULES,
     CAUSES,
     KINDS,
+    TAKEN_FOR,
     Case,
     cause_of,
     count,
@@ -192,6 +195,43 @@ def test_a_false_detection_lies_on_a_lamp_a_light_a_region_or_nothing():
     other = Distraction("glow", (float(u), float(v)), 100.0)
     assert place((u + 1.0, v), distractions=(other,)) == "light"
     assert place((u, v), visible=False, uv_px=(np.nan, np.nan)) == "nothing"
+
+
+def test_a_peak_of_the_difference_on_a_lamp_is_noise_of_who_subtracts():
+    """A lamp of 248 codes with noise of 3 codes, on and off: peaks of on - off stand out, what on alone shows does not.
+
+    Of 40 x 40 positions the highest 3 x 3 mean lies 3 deviations up on average; the lowest
+    is the one with no peak within 2 px.
+    """
+    rng = np.random.default_rng(4)
+    u, v = (round(x) for x in (UV[0] + 100.0, UV[1]))
+    image, off = image_of(TRUTH.down).astype(float), image_of(TRUTH.down).astype(float)
+    for one in (image, off):
+        one[v - 40 : v + 41, u - 40 : u + 41] = 248.0
+        one[v - 40 : v + 41, u - 40 : u + 41] += 3.0 * rng.standard_normal((81, 81, 3))
+    image, off = (np.clip(np.rint(one), 0, 255).astype(np.uint8) for one in (image, off))
+    means = uniform_filter((image.astype(float) - off).sum(axis=-1), 3)[v - 20 : v + 21, u - 20 : u + 21]
+    highest = np.unravel_index(np.argmax(means), means.shape)
+    lowest = np.unravel_index(np.argmin(maximum_filter(means, 5)), means.shape)
+
+    def kind(at, off_image):
+        asked = pair_of(TRUTH, image, off_image)
+        answer = np.array([u - 20 + at[1], v - 20 + at[0]], float)
+        return taken_for(Case("down", TRUTH, answer, "", lambda _: asked, RULES))
+
+    assert kind(highest, off) == "lamp_noise"
+    assert kind(lowest, off) == "lamp"
+    assert kind(highest, None) == "lamp"  # nothing was subtracted
+    assert "subtract" not in TAKEN_FOR["lamp_noise"][1] + TAKEN_FOR["region_noise"][1]
+
+
+def test_the_line_on_false_answers_takes_a_methods_places_together():
+    """5 lamps, 4 of them noise, and 3 regions of noise: 7 of 8 say that the method subtracts."""
+    kinds = ["lamp", *["lamp_noise"] * 4, *["region_noise"] * 3]
+    table = pl.DataFrame({"u_px": [1.0] * 8, "false_detection": [True] * 8, "taken_for": kinds})
+    assert false_line(table).startswith("62 % of the answers are noise of a lamp")
+    plain = table.with_columns(taken_for=pl.Series([kind.removesuffix("_noise") for kind in kinds]))
+    assert false_line(plain).startswith("62 % of the answers are a lamp or its reflection in the mirror: subtract")
 
 
 def test_a_table_full_of_false_detections_says_what_they_are():

@@ -43,7 +43,7 @@ def test_the_benchmark_runs_what_accepts_each_preset(bench_dataset: Path, tmp_pa
 @pytest.mark.parametrize(
     ("out", "names", "words"),
     [
-        ("out", ["x"], "no built-in method 'x'; known: "),
+        ("out", ["x"], "no method 'x' is built in or registered by a package; known: "),
         ("inside", None, "lies inside the data set"),
     ],
 )
