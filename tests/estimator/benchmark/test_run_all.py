@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import textwrap
 from dataclasses import replace
+from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import pytest
@@ -18,8 +19,9 @@ from phibench.estimator.benchmark.score import bench, score
 from phibench.estimator.methods import locate
 from phibench.estimator.methods.locate import SharedPair
 from phibench.estimator.methods.registry import METHODS
+from phibench.estimator.sandbox import resolve as resolving
 from phibench.estimator.sandbox.process import MethodProcess
-from phibench.estimator.sandbox.resolve import MethodError, RunLimits, resolve
+from phibench.estimator.sandbox.resolve import GROUP, MethodError, RunLimits, resolve
 from phibench.estimator.sandbox.runner import Harness
 from phibench.estimator.spots.detect import detect
 
@@ -38,6 +40,22 @@ def test_the_benchmark_runs_what_accepts_each_preset(bench_dataset: Path, tmp_pa
     one, other = score(bench_dataset, names[0], "bayer-raw", console=quiet()).document, documents[0]
     assert one.metrics["rms_px"] == other.metrics["rms_px"]
     assert one.worst == other.worst
+
+
+def test_registered_methods_run_beside_built_in_ones(
+    bench_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A package's method that is `detect` by another name has its scores, to the last bit."""
+    theirs = EntryPoint("theirs", "phibench.estimator.methods.simple:detected_spots", GROUP)
+    monkeypatch.setattr(resolving, "entry_points", lambda group: [theirs])
+    done = bench(bench_dataset, tmp_path / "out", ["theirs", "detect"], pairs=1, console=quiet())
+    documents = {path.stem: read_score(path) for path in done.scores}
+    presets = {stem.removesuffix("-theirs") for stem in documents if stem.endswith("-theirs")}
+    assert presets == {"bayer-raw", "srgb8", "mjpeg"}
+    for preset in presets:
+        theirs_, ours = documents[f"{preset}-theirs"], documents[f"{preset}-detect"]
+        assert theirs_.method.kind == "package"
+        assert theirs_.metrics["rms_counted_px"].value == ours.metrics["rms_counted_px"].value
 
 
 @pytest.mark.parametrize(

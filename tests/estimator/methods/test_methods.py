@@ -148,6 +148,25 @@ def test_accuracy_of_the_optional_methods(name: str) -> None:
     assert np.median(np.linalg.norm(error, axis=1)) < 0.1
 
 
+@pytest.mark.parametrize("name", ["photutils_centroid_2dg", "trackpy_refine"])
+def test_rows_of_packages_see_the_laser_alone(name: str) -> None:
+    """A bright edge beside the spot, laser on and off: with the laser-off frame it changes nothing.
+
+    The edge is 4 px beside the spot, in the window of both rows. Its own noise is left out: the same frame is on and
+    off, so that on - off is what it was.
+    """
+    pytest.importorskip(KNOWN[name].package)
+    pair, truth = easy("mono-raw", 0), EasyPairs("mono-raw").truth(0)
+    assert pair.down_off is not None
+    edge = np.zeros(pair.down.shape, np.uint16)
+    edge[:, round(truth.down.uv_px[0]) + 4 :] = 200
+    lit = replace(pair, down=pair.down + edge, down_off=pair.down_off + edge)
+    plain, beside = (KNOWN[name](one).down.uv_px for one in (pair, lit))
+    assert plain is not None
+    assert beside is not None
+    assert beside == pytest.approx(plain, abs=1e-6)
+
+
 # -- refusals ---------------------------------------------------------------------------------------------------------
 
 
