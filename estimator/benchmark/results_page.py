@@ -40,6 +40,7 @@ from phibench.estimator.benchmark.score_tables import (
     light_line,
     markdown,
     ranked,
+    refused,
     shown_parts,
 )
 
@@ -127,7 +128,9 @@ def _part(
     seed: int,
 ) -> Part:
     tables = {document.method.name: table for document, table in group}
-    order = ranked([document for document, _ in group], by)
+    refusals = {name: why for name, table in tables.items() if (why := refused(table))}
+    documents = [document for document, _ in group]
+    order = ranked([one for one in documents if one.method.name not in refusals] or documents, by)
     base = next((one for one in order if one.method.name == against), order[0])
     name = base.method.name
     rules = Rules()
@@ -138,6 +141,7 @@ def _part(
     }
     notes = [f"{one.method.name}: {flag.text}" for one in order for flag in one.flags]
     notes += [f"{one.method.name}: {text}" for one in order if (text := note_on_code(base, one))]
+    notes += [f"{name} is not compared: it {why}" for name, why in refusals.items()]
     title = ", ".join(base.pair_set.get("presets", ())) or "pairs"
     if apart := note_on_others(order, every):
         notes, title = [apart, *notes], f"{title}, {base.pairs} pairs"

@@ -69,6 +69,11 @@ def methods(context: CompletionContext) -> Iterator[str]:
     yield from _files(context.incomplete, ".py")
 
 
+def named_methods(_: CompletionContext) -> tuple[str, ...]:
+    """Built-in methods, for commands that take no file; names that packages register are not looked up."""
+    return BUILT_IN
+
+
 def released(_: CompletionContext) -> tuple[str, ...]:
     """Released data sets, by their last words and by their titles."""
     return *PARTS, *(f"{TITLE}{part}" for part in PARTS)

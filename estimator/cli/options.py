@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Group, Parameter, Token
 
-from phibench.estimator.cli.completions import methods, presets
+from phibench.estimator.cli.completions import methods, named_methods, presets
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -63,7 +63,7 @@ BuiltIn = Annotated[
     Parameter(
         name="--method",
         negative="",
-        completer=methods,
+        completer=named_methods,
         help="A built-in or registered method, as `phibench method list` shows. May be repeated; all by default.",
     ),
 ]

@@ -30,6 +30,7 @@ from phibench.estimator.benchmark.report import Section, report_html, time_secti
 from phibench.estimator.benchmark.results_page import read_parts
 from phibench.estimator.benchmark.score import score_outcomes
 from phibench.estimator.cli import main as cli
+from phibench.estimator.interface import Answer, Spot
 
 RULES = Rules(resamples=199)
 
@@ -360,6 +361,20 @@ def test_results_of_nothing_or_of_one_method_twice_are_refused(score_files, tmp_
         read_parts([score_files[0], copy])
     with pytest.raises(DatasetError, match="results of nothing"):
         read_parts([])
+
+
+def test_results_leave_out_who_takes_none_of_the_pairs(tmp_path):
+    """`chain_fit` is what others are compared with by default: on raw pixels the best method stands in."""
+    why = "takes srgb8, yuyv, mjpeg, not bayer-raw"
+    files = []
+    for name, oracle in (("ideal", sampler()), ("chain_fit", lambda _: Answer(Spot.missing(why), Spot.missing(why)))):
+        files.append(tmp_path / f"{name}.json")
+        write_score(files[-1], *scored(name, oracle))
+    (part,) = read_parts(files)
+    assert [one.method.name for one in part.scores] == ["ideal"]
+    assert part.against == "ideal"
+    assert part.differences == {}
+    assert f"chain_fit is not compared: it {why}" in part.notes
 
 
 def test_the_report_says_where_the_time_went():
