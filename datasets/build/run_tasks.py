@@ -36,7 +36,7 @@ from phibench.datasets.store.checksums import checksums_text
 from phibench.datasets.store.croissant import dataset_croissant
 from phibench.datasets.store.documents import manifest_documents, parse_info, read_info, rigs_text, to_table
 from phibench.datasets.store.files import only_run, remove_temporary, sha256, write_bytes
-from phibench.datasets.store.leftovers import TEMPORARY_PREFIX
+from phibench.datasets.store.leftovers import TEMPORARY_PREFIX, folder_for_work
 from phibench.datasets.store.schema import ManifestRow, RoomInfo
 from phibench.scenes.rig import POSITIONS
 
@@ -58,11 +58,12 @@ def claimed(out: Path, name: str | None) -> Iterator[None]:
         With one sentence that says what to do.
     """
     refuse_other(out, name)
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise _not_writable(out, error) from error
-    with only_run(out):
+    with contextlib.ExitStack() as stack:
+        try:
+            stack.enter_context(folder_for_work(out, (schema.DRAWS,)))
+        except OSError as error:
+            raise _not_writable(out, error) from error
+        stack.enter_context(only_run(out))
         refuse_other(out, name)  # again: now nobody else can write
         try:
             write_bytes(out / f"{TEMPORARY_PREFIX}probe", b"").unlink()

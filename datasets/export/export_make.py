@@ -41,6 +41,7 @@ from phibench.datasets.store.files import (
     write_bytes,
     write_text,
 )
+from phibench.datasets.store.leftovers import folder_for_work
 from phibench.datasets.store.provenance import code_behind
 from phibench.datasets.store.schema import Document, described
 from phibench.scenes.rig import POSITIONS
@@ -104,8 +105,7 @@ def export(
     _check_folder(out, Path(folder))
     _versions(request)  # a missing package is said before anything is written
     try:
-        out.mkdir(parents=True, exist_ok=True)
-        with only_run(out):
+        with folder_for_work(out), only_run(out):
             remove_temporary(out)
             return _export(dataset, request, out, count, console)
     except OSError as error:

@@ -40,6 +40,7 @@ from phibench.datasets.read import Dataset, Sample, open_dataset, open_finished
 from phibench.datasets.store import schema
 from phibench.datasets.store.checksums import read_checksums
 from phibench.datasets.store.files import WriteError, only_run, remove_temporary, sha256, working
+from phibench.datasets.store.leftovers import folder_for_work
 from phibench.datasets.store.provenance import code_behind
 from phibench.datasets.store.schema import ManifestRow, row_line
 from phibench.scenes.rig import POSITIONS
@@ -126,8 +127,7 @@ def draw_frames(
     _check_folder(target, Path(folder))
     jobs, notes = _jobs(dataset, target, options, _items(options, draws, laser_off), samples)
     try:
-        target.mkdir(parents=True, exist_ok=True)
-        with only_run(target):
+        with folder_for_work(target), only_run(target):
             remove_temporary(target)
             made, kept = _draw(jobs, dataset, target, options, count, console)
     except OSError as error:

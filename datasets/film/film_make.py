@@ -51,6 +51,7 @@ from phibench.datasets.progress import Steps, progress_console
 from phibench.datasets.recipe.load import find_recipe, parse_recipe, recipe_files, recipe_text
 from phibench.datasets.store.croissant import films_croissant
 from phibench.datasets.store.files import WriteError, only_run, sha256, write_text
+from phibench.datasets.store.leftovers import folder_for_work
 from phibench.datasets.store.provenance import code_behind, code_sha256
 from phibench.datasets.store.schema import CROISSANT
 from phibench.render.film.film_truth import instant_truth
@@ -87,8 +88,7 @@ def make_films(recipe: str | Path, out: str | Path, workers: int | None = None, 
     check_drives(plan, films)
     _refuse_other(out, parsed.dataset.name)
     try:
-        out.mkdir(parents=True, exist_ok=True)
-        with only_run(out):
+        with folder_for_work(out), only_run(out):
             return _make(plan, films, text, out, workers, console)
     except OSError as error:
         told = str(error) if isinstance(error, WriteError) else f"could not write to {out}: {error}"

@@ -25,6 +25,7 @@ from phibench.datasets.progress import Steps, progress_console
 from phibench.datasets.rooms.room_sources import GeneratedRoom
 from phibench.datasets.store.documents import from_json, to_json
 from phibench.datasets.store.files import only_run, write_bytes, write_text
+from phibench.datasets.store.leftovers import folder_for_work
 from phibench.datasets.store.schema import Document, described
 from phibench.render.film.room_image import LitRoom, Placement, quick_spot, room_image
 from phibench.render.optics.room_tracer import blocked_by, own_geometry
@@ -113,8 +114,7 @@ def bake_rooms(
     """
     console, settings = console or progress_console(), settings or BakeSettings()
     try:
-        out.mkdir(parents=True, exist_ok=True)
-        with only_run(out), Steps(console, "rooms", count) as steps:
+        with folder_for_work(out), only_run(out), Steps(console, "rooms", count) as steps:
             infos = []
             for info in parallel_map(partial(_bake, out, settings, stream), range(count), workers):
                 infos.append(info)

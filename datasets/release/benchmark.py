@@ -138,16 +138,23 @@ class ReleasedPart(Document):
     """One data set in `MANIFEST.json`.
 
     `size` and `files` are those of the unpacked data set. `sums_sha256` is the hash of its `SHA256SUMS`, and with it
-    that of every file.
+    that of every file. `recipe_samples` is the number that the frozen recipe draws, null where it draws none.
     """
 
     kind: Kind
     recipe_sha256: Digest
     samples: Annotated[int, Field(ge=0)]
+    recipe_samples: Annotated[int, Field(ge=1)] | None = None
     files: Annotated[int, Field(ge=1)]
     size: Annotated[int, Field(ge=1)]
     sums_sha256: Digest
     archives: Annotated[tuple[Archive, ...], Field(strict=False, min_length=1)]
+
+    @property
+    def count_text(self) -> str:
+        """Number of samples; "3 of 500" where the frozen recipe draws another number."""
+        whole = self.recipe_samples
+        return str(self.samples) if whole in (None, self.samples) else f"{self.samples} of {whole}"
 
     @property
     def download(self) -> int:

@@ -31,7 +31,7 @@ from phibench.datasets.release.benchmark import MANIFEST, Archive, ReleasedPart,
 from phibench.datasets.store import schema
 from phibench.datasets.store.checksums import differing_files, read_checksums
 from phibench.datasets.store.files import WriteError, only_run, sha256, write_text
-from phibench.datasets.store.leftovers import OwnedFolder, remove_tree
+from phibench.datasets.store.leftovers import OwnedFolder, folder_for_work, remove_tree
 from phibench.scenes.validation import nearest, printable_line
 
 if TYPE_CHECKING:
@@ -103,8 +103,7 @@ def fetch(
 
 def _listed(name: str, place: _Source, out: Path, manifest_sha256: str | None) -> tuple[str, ReleasedPart]:
     """Title and entry of a data set in the source's manifest."""
-    out.parent.mkdir(parents=True, exist_ok=True)
-    with OwnedFolder("fetch", out.parent) as folder:
+    with folder_for_work(out.parent), OwnedFolder("fetch", out.parent) as folder:
         path = place.get(MANIFEST, folder, None)
         if manifest_sha256 is not None and sha256(path) != manifest_sha256.lower():
             raise DatasetError(

@@ -32,7 +32,7 @@ from phibench.datasets.film.film_store import INFO as FILM_INFO
 from phibench.datasets.input_files import SETTINGS_BYTES, InputFile
 from phibench.datasets.make import cost, make
 from phibench.datasets.progress import Steps, progress_console
-from phibench.datasets.recipe.load import parse_recipe, recipe_files
+from phibench.datasets.recipe.load import parse_recipe, recipe_files, with_numbers
 from phibench.datasets.release.benchmark import (
     FORMAT,
     MANIFEST,
@@ -59,6 +59,7 @@ from phibench.datasets.store.files import (
     write_atomic,
     write_text,
 )
+from phibench.datasets.store.leftovers import folder_for_work
 from phibench.datasets.store.schema import Document
 
 Seal = Callable[[Path, Path], object]
@@ -138,10 +139,8 @@ def release(request: ReleaseRequest, seal: Seal) -> Released:
     used = _assigned(request)
     out = request.out
     try:
-        for folder in (out, request.work):
-            folder.mkdir(parents=True, exist_ok=True)
-        request.work.chmod(stat.S_IRWXU)  # it holds a secret
-        with only_run(out):
+        with folder_for_work(out), folder_for_work(request.work), only_run(out):
+            request.work.chmod(stat.S_IRWXU)  # it holds a secret
             remove_temporary(out)
             manifest = _claimed(out)
             made = kept = 0
@@ -193,6 +192,11 @@ def _check_folders(request: ReleaseRequest) -> None:
         raise DatasetError(
             f"--out {out} and --work {work}: one lies in the other; {out} is to be published, so part them"
         )
+    for part in request.parts:  # faults of a recipe or a number are said before a folder is made
+        if (samples := request.samples_of(part)) is not None:
+            parse_recipe(
+                with_numbers(part.text(), str(part.recipe), samples, None), str(part.recipe), recipe_files(part.recipe)
+            )
     sealed = [part.name for part in request.parts if part.kind == "sealed"]
     if request.secret_seed is None and sealed:
         raise DatasetError(f"part {sealed[0]} is sealed: give --secret-seed FILE, which is made if it is not there")
@@ -341,6 +345,7 @@ def _packed(request: ReleaseRequest, part: Part, folder: Path, manifest: Manifes
         kind=part.kind,
         recipe_sha256=part.sha256,
         samples=count,
+        recipe_samples=drawn_numbers(part.text())[1],
         files=len(members),
         size=sum((folder / name).stat().st_size for name in members),
         sums_sha256=sha256(folder / schema.CHECKSUMS),
@@ -447,6 +452,6 @@ def _card(title: str, manifest: Manifest) -> str:
     for name, part in sorted(manifest.parts.items()):
         size = megabytes(part.size)
         lines.append(
-            f"| `{name}` | {kinds[part.kind]} | {part.samples} | {part.files} | {size} | {len(part.archives)} |"
+            f"| `{name}` | {kinds[part.kind]} | {part.count_text} | {part.files} | {size} | {len(part.archives)} |"
         )
     return "\n".join([*lines, "", f"Licence: [CC BY 4.0]({LICENSE_URL}).", ""])

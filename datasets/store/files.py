@@ -161,23 +161,36 @@ def _flush_folder(folder: Path) -> None:
 
 
 def require_writable(path: Path) -> None:
-    """Find out before long work whether a file can be written; its folder is made, and cleared of leftovers.
+    """Find out before long work whether a file can be written; nothing is made, and its folder is cleared of leftovers.
+
+    Where the folder is not there yet, the nearest one above it is tried. Writing makes those between.
 
     Raises
     ------
     DatasetError
         If not.
     """
-    if path.is_dir():
-        raise DatasetError(f"{path} cannot be written: it is a folder; give the name of a file")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        remove_leftovers(path.parent)
-        with tempfile.TemporaryFile(dir=path.parent):
+        if path.is_dir():
+            raise DatasetError(f"{path} cannot be written: it is a folder; give the name of a file")
+        folder = _nearest_folder(path.parent)
+        remove_leftovers(folder)
+        with tempfile.TemporaryFile(dir=folder):
             pass
     except OSError as error:
         reason = error.strerror or str(error)
         raise DatasetError(f"{path} cannot be written: {reason}; give another path") from error
+
+
+def _nearest_folder(folder: Path) -> Path:
+    """Folder itself, or the nearest one above it that is there; an `OSError` where a file or a long name bars it."""
+    try:
+        folder.stat()
+    except FileNotFoundError:
+        if folder == folder.parent:
+            raise
+        return _nearest_folder(folder.parent)
+    return folder
 
 
 # Locks: one run at a time in a folder, and none beside the workers of a killed one.

@@ -14,7 +14,7 @@ import shutil
 import stat
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 
 TEMPORARY_PREFIX = ".phibench-tmp-"
@@ -53,6 +53,40 @@ class OwnedFolder:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+@contextlib.contextmanager
+def folder_for_work(path: Path, passing: Collection[str] = ()) -> Iterator[Path]:
+    """Make a folder and those above it; work that ends in an error leaves none of them empty.
+
+    What was there before stays, and so does a folder that holds anything.
+
+    Parameters
+    ----------
+    path : folder
+    passing : names of files that alone are no reason to keep a folder after an error; an interruption keeps them
+
+    Raises
+    ------
+    OSError
+        If it cannot be made.
+    """
+    made = []
+    for folder in (path, *path.parents):  # innermost first
+        if folder.exists():
+            break
+        made.append(folder)
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        yield path
+    except BaseException as error:
+        with contextlib.suppress(OSError):  # the first that is not empty ends it
+            if made and isinstance(error, Exception) and {entry.name for entry in path.iterdir()} <= set(passing):
+                for name in passing:
+                    (path / name).unlink(missing_ok=True)
+            for folder in made:
+                folder.rmdir()
+        raise
 
 
 @contextlib.contextmanager

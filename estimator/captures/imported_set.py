@@ -30,7 +30,7 @@ from phibench.datasets.input_files import SETTINGS_BYTES, FileName, InputFile, N
 from phibench.datasets.store.checksums import checksums_text, read_checksums
 from phibench.datasets.store.documents import from_json, to_json
 from phibench.datasets.store.files import WriteError, read_rows, sha256, write_bytes, write_text
-from phibench.datasets.store.leftovers import OwnedFolder
+from phibench.datasets.store.leftovers import OwnedFolder, folder_for_work
 from phibench.datasets.store.provenance import provenance
 from phibench.datasets.store.schema import CHECKSUMS, Document
 from phibench.estimator.captures.measure import Setting, read_setting
@@ -112,8 +112,7 @@ def import_pairs(folder: Path, out: Path, rig: Path | None = None, sensor: Path 
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise DatasetError(f"{out} exists and is not an empty folder; give a new one, --out")
     try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        with OwnedFolder("import", out.parent) as work:
+        with folder_for_work(out.parent), OwnedFolder("import", out.parent) as work:
             return _import(folder, listed, setting, work, out)
     except OSError as error:
         text = str(error) if isinstance(error, WriteError) else f"could not write to {out}: {error}"

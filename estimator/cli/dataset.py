@@ -377,7 +377,7 @@ def release(
         return 0
     done = release_make.release(request, seal)
     for name, held in sorted(done.manifest.parts.items()):
-        print(f"{name}: {held.samples} samples, {len(held.archives)} archives, {held.download / 1e6:.1f} MB")
+        print(f"{name}: {held.count_text} samples, {len(held.archives)} archives, {held.download / 1e6:.1f} MB")
     print(f"{out}: {done.made} archives written, {done.kept} kept; SHA-256 of MANIFEST.json: {done.digest}")
     return 0
 

@@ -143,7 +143,7 @@ def experiments(
     from phibench.datasets.film.film_read import open_films
     from phibench.datasets.progress import Steps, progress_console
     from phibench.datasets.read import open_finished
-    from phibench.datasets.store.files import require_writable
+    from phibench.datasets.store.files import require_writable, write_atomic
     from phibench.estimator.paper.film_experiments import FilmProcedure, closure_interval, run_film_experiments, summary
 
     if out is not None:
@@ -166,7 +166,7 @@ def experiments(
             f"{row['pull']:6.2f} {row['within_95']:11.1%} {row['gain']:6.2f}"
         )
     if out is not None:
-        rows.write_parquet(out)
+        write_atomic(out, rows.write_parquet)
         print(f"{out}: {len(rows)} rows")
     return 0
 
@@ -323,7 +323,7 @@ def run(
         Parquet file for the rows.
     """
     from phibench.datasets.progress import Steps, progress_console
-    from phibench.datasets.store.files import require_writable
+    from phibench.datasets.store.files import require_writable, write_atomic
     from phibench.estimator.loop.episodes import LOST, PolicyFile, episode_frame, episodes_of, run_foreign
 
     if out is not None:
@@ -341,7 +341,7 @@ def run(
             steps.advance()
     _print(rows)
     if out is not None:
-        episode_frame(rows).write_parquet(out)
+        write_atomic(out, episode_frame(rows).write_parquet)
         print(f"{out}: {len(rows)} rows")
     return 1 if any(row.outcome == LOST for row in rows) else 0
 

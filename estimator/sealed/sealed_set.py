@@ -34,7 +34,7 @@ from phibench.datasets.recipe.tables import Recipe
 from phibench.datasets.store.checksums import checksums_text, read_checksums
 from phibench.datasets.store.documents import to_json
 from phibench.datasets.store.files import WriteError, read_rows, sha256, write_bytes, write_text
-from phibench.datasets.store.leftovers import OwnedFolder
+from phibench.datasets.store.leftovers import OwnedFolder, folder_for_work
 from phibench.datasets.store.schema import Document
 from phibench.estimator.benchmark.dataset_pairs import TASK_VERSION, DatasetPairs, dataset_pairs
 from phibench.estimator.interface import Box, Pair
@@ -177,8 +177,7 @@ def seal(folder: str | Path, public: str | Path, preset: str | None = None, cons
     pairs = single_pairs(dataset_pairs(open_finished(folder), preset))
     _check_folder(public, Path(folder))
     try:
-        public.parent.mkdir(parents=True, exist_ok=True)
-        with OwnedFolder("seal", public.parent) as work:
+        with folder_for_work(public.parent), OwnedFolder("seal", public.parent) as work:
             return _seal(pairs, Path(folder), work, public, console)
     except OSError as error:
         text = str(error) if isinstance(error, WriteError) else f"could not write to {public}: {error}"

@@ -246,6 +246,7 @@ def test_a_scheduler_that_is_not_there(tmp_path: Path, monkeypatch: pytest.Monke
     (tmp_path / "worse.json").write_text("{")
     for name in ("bad.json", "worse.json"):
         assert "no dask scheduler answers at" in refusal(tmp_path / "out", str(tmp_path / name))
+    assert not (tmp_path / "out").exists()
 
 
 def test_workers_that_are_missing_or_do_not_fit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

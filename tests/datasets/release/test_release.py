@@ -18,7 +18,7 @@ from phibench.datasets.plan.plan import make_plan
 from phibench.datasets.recipe.load import parse_recipe, recipe_text, with_numbers
 from phibench.datasets.release import fetch as fetching
 from phibench.datasets.release.benchmark import PARTS, VERSION, Part, content_sha256
-from phibench.datasets.release.release_make import ReleaseRequest, dry_run, release
+from phibench.datasets.release.release_make import ReleaseRequest, _card, dry_run, release
 from phibench.datasets.store.checksums import damaged, differing_files, read_checksums
 from phibench.estimator.cli.main import main
 from phibench.estimator.sealed.sealed_set import seal
@@ -84,6 +84,26 @@ def test_citation_names_this_version() -> None:
 
 
 # Releases.
+
+
+def test_card_says_how_many_of_how_many(made: Made) -> None:
+    """A smaller release says so. The recipe's number is counted here from the frozen text alone."""
+    dev = PARTS[0]
+    assert re.findall(r"^samples = (\d+)$", dev.text(), flags=re.MULTILINE) == ["500"]
+    whole = made.released.manifest.parts["phibench-v4-small"]
+    assert whole.recipe_samples is None  # it draws none
+    for samples, text in ((3, "3 of 500"), (500, "500")):
+        part = whole.model_copy(update={"samples": samples, "recipe_samples": 500})
+        card = _card("phibench-v4", made.released.manifest.model_copy(update={"parts": {dev.title: part}}))
+        row = next(line for line in card.splitlines() if line.startswith(f"| `{dev.title}`"))
+        assert row.split("|")[3].strip() == text
+
+
+def test_refused_release_leaves_nothing(tmp_path: Path) -> None:
+    request = ReleaseRequest(PARTS[:1], tmp_path / "o" / "public", tmp_path / "o" / "work", None, samples=0)
+    with pytest.raises(DatasetError, match=r"random\.samples: 0 is not allowed"):
+        release(request, seal)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_archives_hold_the_data_sets_and_no_secret(made: Made, smallest_dataset: Path, film_windows: Path) -> None:

@@ -19,6 +19,7 @@ from phibench.datasets.store import files, schema
 from phibench.datasets.store.files import (
     only_run,
     remove_temporary,
+    require_writable,
     sha256,
     working,
     write_atomic,
@@ -26,7 +27,7 @@ from phibench.datasets.store.files import (
     write_text,
 )
 from phibench.datasets.store.layers import write_exr
-from phibench.datasets.store.leftovers import TEMPORARY_PREFIX
+from phibench.datasets.store.leftovers import TEMPORARY_PREFIX, folder_for_work
 
 
 def test_bytes_text_and_hash(tmp_path: Path) -> None:
@@ -34,6 +35,32 @@ def test_bytes_text_and_hash(tmp_path: Path) -> None:
     assert path.read_bytes() == b"\xc3\xa9\n"
     assert sha256(write_bytes(path, b"abc")) == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
     assert [p.name for p in path.parent.iterdir()] == ["a.txt"]
+
+
+@pytest.mark.parametrize("stop", [DatasetError("no"), KeyboardInterrupt()])
+def test_refused_work_leaves_no_empty_folder(tmp_path: Path, stop: BaseException) -> None:
+    """Folders that were there stay, and so does one that holds anything; a passing file goes with a refusal alone."""
+    (tmp_path / "old").mkdir()
+    for name in ("new", "old"):
+        with pytest.raises(type(stop)), folder_for_work(tmp_path / name / "a" / "b"):
+            raise stop
+    assert [path.name for path in tmp_path.rglob("*")] == ["old"]
+    for top, names in (("new", ["draws"]), ("full", ["draws", "work"])):
+        with contextlib.suppress(type(stop)), folder_for_work(tmp_path / top / "a" / "b", ("draws",)) as folder:
+            for name in names:
+                (folder / name).touch()
+            raise stop
+    assert (tmp_path / "new").exists() == isinstance(stop, KeyboardInterrupt)
+    assert sorted(path.name for path in (tmp_path / "full" / "a" / "b").iterdir()) == ["draws", "work"]
+
+
+def test_asking_whether_a_file_can_be_written_makes_nothing(tmp_path: Path) -> None:
+    require_writable(tmp_path / "a" / "b" / "c.json")
+    (tmp_path / "file").touch()
+    for bad, reason in (("file/b/c.json", "Not a directory"), (f"{'x' * 300}/c.json", "File name too long")):
+        with pytest.raises(DatasetError, match=f"cannot be written: {reason}"):
+            require_writable(tmp_path / bad)
+    assert [path.name for path in tmp_path.rglob("*")] == ["file"]
 
 
 def test_permissions_are_those_of_an_ordinary_file(tmp_path: Path) -> None:
