@@ -28,6 +28,7 @@ from phibench.datasets.build.scheduler import Executor, Outcome
 from phibench.datasets.build.tasks import Done, Failed, Task, fault_text, perform, worker_name
 from phibench.datasets.build.view_task import start_renderer
 from phibench.datasets.errors import DatasetError
+from phibench.datasets.frames.request import whole_number
 from phibench.datasets.parallel import ONE_THREAD
 from phibench.datasets.store.files import write_text
 from phibench.datasets.store.leftovers import OwnedFolder
@@ -39,6 +40,7 @@ WORKERS_S = 60.0
 LOST_S = 300.0
 DEATH_S = 10.0  # a nanny says at once how its worker died, on a busy machine a little later
 _POLL_S = 0.005
+_LEAST_S = 0.5  # between two looks for a scheduler that is still to start
 _CENSUS_S = 2.0  # counting the workers is a call to the scheduler: not before every task
 # dask lets glibc return memory at once; a view's arrays of 45 MB would then fault every page anew, 1 s a view
 _MEMORY = {"MALLOC_TRIM_THRESHOLD_": 2**31, "MALLOC_MMAP_THRESHOLD_": 2**30, "MALLOC_TOP_PAD_": 2**26}
@@ -190,6 +192,36 @@ def remote_workers(scheduler: str, out: Path) -> Iterator[DaskExecutor]:
                 f"the scheduler at {scheduler} has no workers after {WORKERS_S:g} s; start some"
             ) from None
         yield DaskExecutor(client, out)
+
+
+def wait_for_workers(scheduler: str, seconds: int) -> None:
+    """Wait until a scheduler answers and has a worker; the queue of a cluster may start both late.
+
+    Parameters
+    ----------
+    scheduler : its address, or its scheduler file, which need not be there yet
+    seconds : longest wait
+
+    Raises
+    ------
+    DatasetError
+        With what is missing after that time.
+    """
+    _, distributed = _libraries()
+    until = time.monotonic() + whole_number("--wait-for-workers", seconds, 1)
+    while True:
+        left = until - time.monotonic()
+        try:
+            with _connect(distributed, scheduler) as client:
+                client.wait_for_workers(1, timeout=max(min(left, WORKERS_S), _LEAST_S))
+            return
+        except TimeoutError:
+            missing = f"the scheduler at {scheduler} has no workers; start some"
+        except DatasetError as error:
+            missing = str(error)
+        if left <= _LEAST_S:
+            raise DatasetError(f"after a wait of {seconds} s: {missing}")
+        time.sleep(_LEAST_S)
 
 
 def _connect(distributed: Any, scheduler: str) -> Any:

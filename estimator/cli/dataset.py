@@ -27,6 +27,7 @@ def make(
     out: Path,
     workers: Whole | None = None,
     scheduler: str | None = None,
+    wait_for_workers: Whole | None = None,
     shard: str | None = None,
     samples: Whole | None = None,
     seed: Whole | None = None,
@@ -47,6 +48,8 @@ def make(
         Number of processes; one for each core by default.
     scheduler
         Address or scheduler file of a running dask scheduler, to use its workers instead.
+    wait_for_workers
+        With --scheduler: wait so many seconds at most until its file is there and a worker has come.
     shard
         Part of the recipe for job arrays, such as 1/8; put the parts together with `merge`.
     samples
@@ -64,6 +67,10 @@ def make(
     """
     given: Any = {"shard": shard, "samples": samples, "seed": seed, "replace": replace, "room_files": room_files}
     given["leave_out_refused"] = leave_out_refused
+    if wait_for_workers is not None and scheduler is None:
+        from phibench.datasets.errors import DatasetError
+
+        raise DatasetError("--wait-for-workers is about workers of a scheduler: give --scheduler too")
     if dry_run:
         from phibench.datasets.make import dry_run as dry_run_text
 
@@ -71,6 +78,10 @@ def make(
         return 0
     from phibench.estimator.paper.sensitivity_table import make as make_dataset
 
+    if wait_for_workers is not None and scheduler is not None:
+        from phibench.datasets.build.workers import wait_for_workers as wait
+
+        wait(scheduler, wait_for_workers)
     make_dataset(recipe, out, workers, scheduler=scheduler, **given)
     return 0
 

@@ -1,5 +1,6 @@
 """Real workers: faults and deaths, nobody left behind, and a scheduler of others on the loopback device."""
 
+import concurrent.futures
 import contextlib
 import json
 import logging
@@ -247,6 +248,31 @@ def test_a_scheduler_that_is_not_there(tmp_path: Path, monkeypatch: pytest.Monke
     for name in ("bad.json", "worse.json"):
         assert "no dask scheduler answers at" in refusal(tmp_path / "out", str(tmp_path / name))
     assert not (tmp_path / "out").exists()
+
+
+def test_a_wait_for_a_scheduler_that_starts_late(tmp_path: Path) -> None:
+    """The wait begins before scheduler and worker, and ends when both are there, or in a sentence."""
+    scheduler, worker, _ = commands("loopback", tmp_path)
+    with pytest.raises(DatasetError, match="after a wait of 1 s: there is no scheduler file"):
+        workers.wait_for_workers(scheduler[-1], 1)
+    with concurrent.futures.ThreadPoolExecutor(1) as pool:
+        waiting = pool.submit(workers.wait_for_workers, scheduler[-1], 100)
+        with running(scheduler):
+            with pytest.raises(DatasetError, match=r"after a wait of 1 s: the scheduler at .* has no workers"):
+                workers.wait_for_workers(scheduler[-1], 1)
+            assert not waiting.done()
+            with running(worker):
+                assert waiting.result(timeout=100) is None
+
+
+def test_slurm_jobs_are_ordered_and_ended() -> None:
+    """The array without a scheduler stands first; jobs wait for others, and the last one ends them."""
+    plain, served = re.split(r"^## Slurm: a scheduler and workers$", PAGE, flags=re.MULTILINE)
+    assert "## Slurm: a job array without a scheduler" in plain
+    for part, order in ((plain, ["afterok:$shards"]), (served, ["after:$scheduler"] * 2 + ["afterany:$make"])):
+        assert re.findall(r"--dependency (\S+)", part) == order
+    assert "--wait-for-workers" in served
+    assert "scancel $scheduler $workers" in served
 
 
 def test_workers_that_are_missing_or_do_not_fit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
