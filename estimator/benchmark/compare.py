@@ -133,7 +133,7 @@ def refuse_different(first: ScoreDocument, second: ScoreDocument, first_name: st
 
 
 def note_on_size(differences: Sequence[Difference], rules: Mapping[str, float], samples: int) -> str:
-    """What would give a verdict, if no metric can have one; empty if some can.
+    """Sentence on what would give a verdict, if no metric can have one; empty if some can.
 
     Parameters
     ----------
