@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from scipy import ndimage, optimize
 
 from phibench.estimator.outline.edge_ring import CURVES, PEAKS, TURNS, Circle, EdgeRing, FineRing, LimbRing, log_colours
+from phibench.estimator.outline.limb_circle import limb_circle
 from phibench.estimator.outline.limb_image import block_sums
 from phibench.estimator.spots.image_planes import ImageError
 from phibench.scenes.frames import Array
@@ -43,6 +44,11 @@ _SCALES = (6.0, 3.0, 2.0, 1.5, 1.5, 1.5)  # of the robust weights, in steps
 _SECTORS = 12
 _OVERWHELMING = 2.5
 _SAME_PX, _SAME = 3.0, 0.04  # pixels, and parts of the radius
+_AGREE = 2.0  # standard deviations by which edges and the fall of the light may differ
+_OF_EDGES, _OF_FALL = 0.75, 0.25  # of what the two are apart: error of either where it is the answer
+_MODEL = 0.003  # of the radius: what the model of the fall errs, by one real ball under 40 lights
+_SURE_CONTRAST = 30.0  # of an edge all around, which a smooth fall never is
+_LEAST_GAIN = 0.35  # of the logarithm: by which the fall must describe the light better than the edges
 
 
 @dataclass(frozen=True)
@@ -120,7 +126,37 @@ def find_circle(light: NDArray[Any], radii_px: tuple[float, float] | None = None
     if best is None:
         raise ImageError("no outline of a ball was found: the picture has no edges on a circle")
     best.require_clear()
-    return refined(light, best)
+    found = beside_limb(light, refined(light, best))
+    found.require_clear()
+    return found
+
+
+def beside_limb(light: NDArray[Any], found: BallCircle) -> BallCircle:
+    """The circle by edges, or by the fall of the light where that is another one and describes the light better.
+
+    What the two are apart counts in the covariance.
+    """
+    block = max(1, math.ceil(max(light.shape[:2]) / LONGEST_PX))
+    small = shrunk(light if light.ndim == 2 else light.mean(axis=-1), block)
+    u, v, radius = found.circle_px
+    near = ((u + 0.5) / block - 0.5, (v + 0.5) / block - 0.5, radius / block)
+    limb = limb_circle(small, near, (found.ellipse_px[0] / block, found.ellipse_px[1] / block))
+    if limb is None:
+        return found
+    own = np.array(found.covariance_px2) / block**2
+    floor = (_MODEL * near[2]) ** 2 * np.eye(3)
+    apart = np.array(limb.circle_px) - np.array(near)
+    most = float(np.abs(apart).max())
+    if (np.abs(apart) < _AGREE * np.sqrt(np.diag(own + limb.covariance_px2 + floor / 4.0))).all():
+        shared = (_OF_EDGES * most) ** 2 * np.eye(3)
+        return replace(found, covariance_px2=(own + shared) * block**2)
+    if limb.gain < _LEAST_GAIN:  # the room in the ball is not smooth: its edges are what there is
+        shared = (0.0 if found.contrast >= _SURE_CONTRAST else _OF_FALL * most) ** 2 * np.eye(3)
+        return replace(found, covariance_px2=(own + shared) * block**2)
+    u, v, radius = limb.circle_px
+    whole = ((u + 0.5) * block - 0.5, (v + 0.5) * block - 0.5, radius * block)
+    shared = floor + (_OF_FALL * most) ** 2 * np.eye(3)
+    return replace(found, circle_px=whole, covariance_px2=(limb.covariance_px2 + shared) * block**2)
 
 
 def refined(light: NDArray[Any], found: BallCircle, floor_px: float = _FLOOR_PX) -> BallCircle:

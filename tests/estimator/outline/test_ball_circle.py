@@ -11,7 +11,7 @@ from helpers.ball_photographs import ball_photograph
 from scipy import stats
 
 from phibench.estimator.calibration.align import alignment, verdict
-from phibench.estimator.outline.ball_circle import BallCircle, circles, find_circle
+from phibench.estimator.outline.ball_circle import BallCircle, circles, find_circle, refined
 from phibench.estimator.outline.edge_ring import TURNS, EdgeRing, log_colours
 from phibench.estimator.outline.outline import find_outline
 from phibench.estimator.outline.outline_result import require_near
@@ -59,12 +59,12 @@ def test_the_same_photograph_at_twice_the_size_has_the_same_outline() -> None:
     to that floor.
     """
     photo = ball_photograph(np.random.default_rng([7, 3]))
-    small, double = find_circle(photo.light), np.kron(photo.light, np.ones((2, 2, 1), np.float32))
+    small, double = next(circles(photo.light)), np.kron(photo.light, np.ones((2, 2, 1), np.float32))
     expected = 2.0 * np.array(small.circle_px) + [0.5, 0.5, 0.0]
     again = next(circles(double))
     np.testing.assert_allclose(again.circle_px, expected, atol=1e-6)
     np.testing.assert_allclose(again.sigma_px, 2.0 * small.sigma_px, rtol=1e-6)
-    large = find_circle(double)
+    large = refined(double, again)
     np.testing.assert_allclose(large.circle_px, expected, atol=0.8)
     assert (large.sigma_px < again.sigma_px).all()
 
