@@ -3,7 +3,7 @@
     python docs/measure_limb_contrast.py drawn 40
     python docs/measure_limb_contrast.py FOLDER      # one ball that stands still, under several lights
 
-Drawn balls stand before a wall that is lit in a pool on one side and goes on in the mirror; numbers are drawn at random.
+Drawn balls stand before a wall that is lit in a pool on one side and goes on in the mirror; numbers are random.
 Pulls of photographs are about the median circle of all answers.
 """
 

@@ -104,7 +104,7 @@ def _basis(x: Array, radius_px: float, blur_px: float) -> Array:
 
 
 def _residual(y: Array, basis: Array) -> Array:
-    """What the best coefficients of each sector leave, shape (sectors, n)."""
+    """Light that the best coefficients of each sector leave, shape (sectors, n)."""
     turned = np.swapaxes(basis, -1, -2)
     normal = turned @ basis
     size = np.trace(normal, axis1=-2, axis2=-1)[:, None, None]
