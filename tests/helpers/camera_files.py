@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 from phibench.datasets.frames.frame_files import png_bytes
+from phibench.datasets.frames.request import Exposure
 from phibench.datasets.read import Dataset, Sample
-from phibench.estimator.draw_pairs import pairs_of
+from phibench.estimator.draw_pairs import DrawnPairs, pairs_of
 from phibench.scenes.rig import Rig
 
 NAMES = ("down", "up", "down_off", "up_off")
@@ -22,11 +24,13 @@ def rig_text(rig: Rig) -> str:
 
 
 def write_pictures(
-    dataset: Dataset, sample: Sample, folder: Path, preset: str, draws: int = 1
+    dataset: Dataset, sample: Sample, folder: Path, preset: str, draws: int = 1, exposure: Exposure = "auto"
 ) -> dict[str, list[Path]]:
     """Pictures by name, one for each draw of the noise; and `rig.toml` beside them."""
     folder.mkdir(parents=True, exist_ok=True)
     pairs = pairs_of(dataset, [sample], preset, draws)
+    exposed = (replace(one, request=replace(one.request, exposure=exposure)) for one in pairs.pair_draws)
+    pairs = DrawnPairs(pairs.dataset, tuple(exposed))
     files: dict[str, list[Path]] = {name: [] for name in NAMES}
     for number in range(len(pairs)):
         _, frames = pairs.pair_and_frames(number)

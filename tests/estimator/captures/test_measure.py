@@ -31,7 +31,8 @@ class Case:
         self.sample: Sample = next(s for s in dataset if s.row.down.visible and s.row.up.visible)
         self.folder = out
         self.jpg = write_pictures(dataset, self.sample, out, "mjpeg", 3)
-        self.raw = write_pictures(dataset, self.sample, out, "bayer-raw", 3)
+        # a third of the camera's own exposure: photons rule, and not the responsivity's pattern
+        self.raw = write_pictures(dataset, self.sample, out, "bayer-raw", 3, 1.0 / 60.0)
 
     def arguments(self, files: Files, stroke_m: float | None = None, names: tuple[str, ...] = NAMES) -> list[str]:
         """Command line for the first frames."""
