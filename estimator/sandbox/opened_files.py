@@ -10,6 +10,7 @@ import ctypes
 import os
 import struct
 import sys
+import threading
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -40,6 +41,7 @@ class OpenedFiles:
     def __init__(self, places: Sequence[tuple[str, Path]], hidden: Sequence[Path] = ()) -> None:
         self._hidden, self._found = [path.resolve() for path in hidden], dict[str, Path]()
         self._watched: dict[int, tuple[str, Path]] = {}
+        self._lock = threading.Lock()
         self._handle = self._library().inotify_init1(_FLAGS) if sys.platform == "linux" else -1
         self.complete = self._handle >= 0
         """Every file that was opened is known."""
@@ -63,7 +65,7 @@ class OpenedFiles:
 
     def look(self) -> None:
         """Take up what was opened since the last look: the kernel keeps 16 384 events."""
-        with suppress(BlockingIOError):
+        with self._lock, suppress(BlockingIOError):
             while self._handle >= 0:
                 self._take(os.read(self._handle, _READ_BYTES))
 
@@ -82,9 +84,10 @@ class OpenedFiles:
     def close(self) -> None:
         """Watch no more."""
         self.look()
-        if self._handle >= 0:
-            os.close(self._handle)
-        self._handle = -1
+        with self._lock:  # threads that ask the method look, too
+            if self._handle >= 0:
+                os.close(self._handle)
+            self._handle = -1
 
     def hashes(self, known: Sequence[Path] = ()) -> dict[str, str | None]:
         """SHA-256 of the files that were opened, by name; None of a file that is gone, or beyond 200 files or 16 GiB.

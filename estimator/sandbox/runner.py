@@ -261,8 +261,8 @@ class _MethodPool:
         try:
             return process.ask_each(pair)
         finally:
-            self._opened.look()
             self._free.put(process)
+            self._opened.look()
 
     def close(self) -> None:
         for process in self._processes:
