@@ -264,11 +264,12 @@ def raw_phase(images: Mapping[str, Image]) -> Phase | str | None:
         off = images.get(f"{position}_off")
         if off is None:
             return None
-        told.add(_spot_phase(np.asarray(images[position], float) - np.asarray(off, float)))
+        told.add(_spot_phase(np.asarray(images[position], float), np.asarray(off, float)))
     return told.pop() if len(told) == 1 else None
 
 
-def _spot_phase(light: Array) -> Phase | str | None:
+def _spot_phase(on: Array, off: Array) -> Phase | str | None:
+    light = on - off
     h, w = (size // 2 * 2 for size in light.shape)
     sums = light[:h, :w].reshape(h // 2, 2, w // 2, 2).sum(axis=(1, 3))
     match = gaussian_filter(sums, 1.0) - gaussian_filter(sums, 4.0)
@@ -285,7 +286,9 @@ def _spot_phase(light: Array) -> Phase | str | None:
     first, second, *_, last = sorted(places, key=lambda place: -places[place])
     if places[first] > _RED_RATIO * places[second]:
         return first
-    return "mono" if places[first] < _NO_FILTERS * places[last] else None
+    # pixels at the converter's end are as bright behind any filter
+    cut = np.count_nonzero(on[v0 : v0 + 10, u0 : u0 + 10] == on.max()) > 2
+    return "mono" if places[first] < _NO_FILTERS * places[last] and not cut else None
 
 
 # -- all of it ---------------------------------------------------------------------------------------------------------

@@ -15,7 +15,8 @@ from scipy.ndimage import center_of_mass, gaussian_filter
 from phibench.estimator.interface import Answer, Pair, Spot
 from phibench.estimator.methods.pair_light import lamp_mask, laser_light, mirror_mask, noise_of
 
-HALF_PX = 3  # of the window of the centroid
+HALF_PX = 5  # of the pixels around the brightest one
+WINDOW_SIGMA_PX, ROUNDS = 1.5, 10  # of the Gaussian window of the centroid
 LEAST_SIGMAS = 6.0  # of the noise that a spot must exceed
 
 
@@ -37,6 +38,13 @@ def find(pair: Pair, position: str) -> Spot:
         return Spot.missing("nothing bright enough in the mirror")
     top, left = max(v - HALF_PX, 0), max(u - HALF_PX, 0)
     window = light[top : v + HALF_PX + 1, left : u + HALF_PX + 1]
-    window = window - np.median(window)
-    row, column = center_of_mass(np.maximum(window - 0.1 * window.max(), 0.0))
-    return Spot((float(left + column), float(top + row)))
+    window = np.maximum(window - np.median(window), 0.0)
+    rows, columns = np.mgrid[: window.shape[0], : window.shape[1]]
+    row, column = float(v - top), float(u - left)
+    for _ in range(ROUNDS):  # a window that moves with the centroid does not draw it to the brightest pixel
+        weight = window * np.exp(-0.5 * ((rows - row) ** 2 + (columns - column) ** 2) / WINDOW_SIGMA_PX**2)
+        found_row, found_column = center_of_mass(weight)
+        row, column = row + 2.0 * (found_row - row), column + 2.0 * (found_column - column)
+    if not (0.0 <= row < len(window) and 0.0 <= column < len(window[0])):
+        return Spot.missing("no round spot")
+    return Spot((left + column, top + row))

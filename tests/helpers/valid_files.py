@@ -291,6 +291,7 @@ def sensitivity_kind(folder: Path) -> tuple[bytes, Callable[[Path], object], Non
 FRAME: dict[str, Any] = {
     **{"file": "a-down.png", "sha256": TEXT, "kind": "frame", "values": "sRGB", "dataset": "a", "dataset_seed": 1},
     **{"sample_id": "a", "position": "down", "laser": "on", "draw": 0, "preset": "srgb8", "exposure_s": 0.1},
+    **{"jpeg_quality": None, "laser_level": 1.0, "lamp_level": 1.0},
     **{"analogue_gain": 1.0, "u0_px": 0, "v0_px": 0, "width_px": 4, "height_px": 4, "depth_m": 1.0, "stroke_m": 0.5},
     **{"visible": True, "cause": "none", "u_px": 1.0, "v_px": None, "phi_ray_rad": 0.1, "phi_normal_rad": 0.1},
     **{"phi_incidence_rad": 0.1, "azimuth_rad": 0.1, "sensor": {"a": 1}, "request": {}, "key": TEXT},
