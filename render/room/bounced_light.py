@@ -62,6 +62,7 @@ def _light(surfaces: Surfaces, found: _Found) -> Array:
     import drjit as dr
 
     value = surfaces.light(found.look_up)
+    dr.eval(value)  # its bands together: each would look up all three
     sums = [dr.block_sum(value[k], found.rays) for k in range(3)]
     return np.pi / found.rays * np.stack([np.array(channel, dtype=float) for channel in sums], axis=-1)
 
@@ -140,8 +141,8 @@ def _resampled(old: TexelGrid, new: TexelGrid, values: Array, matrix: Callable[[
     out = np.zeros((new.count, 3))
     for (part, *size), (to, *wanted) in zip(old.grids(), new.grids(), strict=True):
         down, across = (matrix(n, m) for n, m in zip(size, wanted, strict=True))
-        image = np.tensordot(down, values[part].reshape(*size, 3), axes=1)
-        out[to] = np.einsum("ij,rjc->ric", across, image).reshape(-1, 3)
+        image = np.matmul(down, values[part].reshape(size[0], -1)).reshape(wanted[0], size[1], 3)
+        out[to] = np.matmul(across, image).reshape(-1, 3)  # einsum takes 20 times as long
     return out
 
 

@@ -67,7 +67,8 @@ def _band(
     direction = mi.Vector3f(*(mi.Float(aligned(part)) for part in parts))
     ray = mi.Ray3f(mi.Point3f(*map(float, place)), direction)
     t, patch, valid = surfaces.hit(ray)
-    value = surfaces.radiance(patch, ray(t), direction, valid, lamps=True)
-    planes = np.stack([np.array(dr.select(valid, band, 0.0)) for band in (value.x, value.y, value.z)], axis=-1)
+    value = dr.select(valid, surfaces.radiance(patch, ray(t), direction, valid, lamps=True), 0.0)
+    dr.eval(value, valid)  # together: each would trace the rays anew
+    planes = np.stack([np.array(value[k]) for k in range(3)], axis=-1)
     picture = planes.reshape(end - first, _SIDE, 2 * rows, _SIDE, 3).mean(axis=(1, 3))
     return picture.astype(np.float32), float(np.count_nonzero(np.array(valid))) / _SIDE**2

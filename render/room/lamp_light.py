@@ -157,6 +157,7 @@ def _lamp_rays(
     n = len(some)
     zero = (mi.UInt32(0), dr.zeros(mi.Color3f, n), dr.zeros(mi.Float, n), dr.zeros(mi.Float, n))
     _, total, weights, seen = dr.while_loop(zero, lambda i, *_: i < count, body)
+    dr.eval(total, weights, seen)  # together: each would run the loop anew
     value = np.stack([np.array(total[k], dtype=float) for k in range(3)], axis=-1)
     if not is_screen:
         value *= surfaces.table.radiance_w_m2_sr[int(lamp[13])]

