@@ -50,6 +50,7 @@ from phibench.datasets.store.layers import (
 from phibench.datasets.store.schema import LightRow, ManifestRow, PoseInfo, RoomInfo, SpotRow
 from phibench.render.optics.ray_tracer import trace_pixels
 from phibench.render.optics.reflection_point import mirror_points
+from phibench.render.optics.spot_layer import spot_light
 from phibench.render.optics.truth import mirror_angles
 from phibench.render.room.light_map import texel_count
 from phibench.render.room.noise_budget import BUDGETS
@@ -269,8 +270,8 @@ def _light_faults(sample: Sample, position: str, light: LightRow, answer: SpotAn
     The closed form is asked for a point on the ray that leaves the mirror where the light's centre is seen.
     """
     name, view = f"{sample.row.sample_id} {position}", sample.view(position)
-    expected = answer.light(view)
-    if expected is None or not all(_same(getattr(light, field), value) for field, value in expected):
+    expected = spot_light(view, answer.layer)
+    if expected is None or not all(_same(getattr(light, field), value) for field, value in vars(expected).items()):
         yield f"{name}: light is {light}, the parameters give {expected}"
         return
     if answer.certificate is None:

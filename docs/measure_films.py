@@ -40,7 +40,7 @@ class Estimate:
 def estimate(film: Film, camera: int) -> Estimate:
     """Bundle and filter of one camera."""
     frames = film_frames(film, draw=camera, camera_seed=camera)
-    true = float(film.table["depth_m"][0])
+    true = film.light_depth_m
     try:
         seen = seen_film(frames)
         found = bundle_depth(seen)

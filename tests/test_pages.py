@@ -253,6 +253,31 @@ def test_the_examples_of_the_page_run(page, tiny_dataset, tmp_path, monkeypatch)
         exec(example, names)
 
 
+RUNS = re.compile(
+    r"`[^`]*\b(pytest|phibench|make|python|mkdocs|buildah|du|cffconvert|git|\.ci/run)\b"
+    r"|^`(-m |--slow|\w+\.py|docs/\w+\.py|dataset )|^same\b|^the same\b|^\(|\]\("
+)
+
+
+def test_measurements_have_commands():
+    """A figure without a command that repeats it cannot be checked: a command, a note with one, or a link to it."""
+    checked, without = 0, []
+    for page in sorted((ROOT / "docs" / "measurements").glob("*.md")):
+        column = None
+        for line in page.read_text(encoding="utf-8").splitlines():
+            cells = [cell.strip() for cell in line.strip().strip("|").split(" | ")]
+            if not line.startswith("|"):
+                column = None
+            elif column is None:
+                column = cells.index("command") if "command" in cells else -1
+            elif column >= 0 and not cells[0].startswith("---"):
+                checked += 1
+                if not RUNS.search(cells[column]):
+                    without.append(f"{page.name}: {line[:80]}")
+    assert checked > 300
+    assert without == []
+
+
 def test_pages_that_are_excused_exist():
     assert set(PAGES) >= HISTORY
 

@@ -17,10 +17,9 @@ from phibench.datasets.store import schema
 from phibench.datasets.store.layers import SpotWindow, write_spot
 from phibench.datasets.store.schema import CertificateRow, LightRow, ManifestRow, SpotRow
 from phibench.render.optics.certificate import Certificate, certify
-from phibench.render.optics.ray_tracer import trace_pixels
 from phibench.render.optics.room_tracer import room_geometry
-from phibench.render.optics.spot_layer import SpotLayer, spot_layer
-from phibench.render.optics.truth import SpotTruth, depth_m, mirror_angles, spot_truth
+from phibench.render.optics.spot_layer import SpotLayer, spot_layer, spot_light
+from phibench.render.optics.truth import SpotTruth, depth_m, spot_truth
 from phibench.scenes.frames import Array
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.rig import POSITIONS, Rig, Stroke, View
@@ -43,15 +42,6 @@ class SpotAnswer:
         """Energy centroid minus chief ray, pixels (u, v)."""
         u_px, v_px = self.layer.centroid_uv_px
         return float(u_px) - self.truth.u_px, float(v_px) - self.truth.v_px
-
-    def light(self, view: View) -> LightRow | None:
-        """Centre of the light; None where none reaches the lens."""
-        uv = self.layer.centroid_uv_px
-        if not np.isfinite(uv).all():
-            return None
-        rays = trace_pixels(view, uv[None])
-        angles = {name: float(value[0]) for name, value in vars(mirror_angles(rays.normals, rays.directions)).items()}
-        return LightRow(u_px=float(uv[0]), v_px=float(uv[1]), **angles, place_world_m=_triple(self.layer.place_m))
 
 
 def answer_spot(view: View, spot: LaserSpot, room: Room) -> SpotAnswer:
@@ -147,13 +137,13 @@ def light_depth_m(rows: Iterable[SpotRow], sphere_centre_down_m: Array) -> float
 
 
 def _spot_row(pose_id: str, view: View, answer: SpotAnswer, file: str | None) -> SpotRow:
-    certificate = answer.certificate
+    certificate, light = answer.certificate, spot_light(view, answer.layer)
     return SpotRow(
         pose=pose_id,
         offset_m=view.offset_m,
         **asdict(answer.truth),
         coma_shift_px=answer.coma_shift_px,
-        light=answer.light(view),
+        light=None if light is None else LightRow(**vars(light)),
         electrons_per_s=_triple(answer.layer.total_electrons_per_s),
         view_ambient_file=schema.view_file(pose_id, "ambient"),
         view_truth_file=schema.view_file(pose_id, "truth"),

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -57,8 +58,10 @@ from phibench.datasets.store.schema import CROISSANT
 from phibench.render.film.film_truth import instant_truth
 from phibench.render.film.moving_rows import RowsImage, parted_image, rows_image, spot_time_s
 from phibench.render.optics.room_tracer import room_geometry
-from phibench.render.optics.spot_layer import SpotLayer, spot_layer
+from phibench.render.optics.spot_layer import SpotLayer, SpotLight, spot_layer, spot_light
+from phibench.render.optics.truth import depth_m
 from phibench.scenes.frames import Array, as_vector
+from phibench.scenes.motion.film_scene import FilmScene
 from phibench.scenes.room import Room
 
 _UNEVEN = 5e-3  # of the flux: what it changes from frame to frame beside its own course
@@ -177,8 +180,8 @@ def make_film(out: Path, plan: Plan, keys: dict[str, str], film: FilmPlan) -> Fi
     folder.done.unlink(missing_ok=True)
     began = time.process_time()
     times = [spot_time_s(film.scene, frame) for frame in range(film.scene.times.frames)]
-    images = frame_spots(film, room, times)
-    rows = frame_truths(film, room, times, images)
+    images, centres = frame_spots(film, room, times)
+    rows = frame_truths(film, room, times, images, centres)
     _check_seen(film, rows)
     places, error = key_views(film, folder, keys[film.film_id], render, images)
     write_spots(folder.path / "spots.npz", images)
@@ -224,11 +227,11 @@ def light_images(film: FilmPlan, room: Room, number: int) -> tuple[list[RowsImag
     """Another light in every frame, in its colour, and its truth."""
     alone = replace(film, scene=film.scene.of_light(number))
     times = [spot_time_s(alone.scene, frame) for frame in range(alone.scene.times.frames)]
-    images = frame_spots(alone, room, times)
+    images, centres = frame_spots(alone, room, times)
     colour = film.scene.lights[number].colour
     if colour is not None:
         images = [coloured(one, colour) for one in images]
-    return images, frame_truths(alone, room, times, images)
+    return images, frame_truths(alone, room, times, images, centres)
 
 
 def coloured(image: RowsImage, colour: tuple[float, ...]) -> RowsImage:
@@ -238,30 +241,36 @@ def coloured(image: RowsImage, colour: tuple[float, ...]) -> RowsImage:
     return RowsImage(image.u0_px, image.v0_px, *(share * stack[:1] for stack in stacks))
 
 
-def frame_spots(film: FilmPlan, room: Room, times_s: Sequence[float]) -> list[RowsImage]:
-    """Spot in every frame; frames of one pose, in which nothing moves, share their image.
+def frame_spots(film: FilmPlan, room: Room, times_s: Sequence[float]) -> tuple[list[RowsImage], list[SpotLight | None]]:
+    """Spot in every frame, and the centre of its light in the still of each of these times.
+
+    Frames of one pose, in which nothing moves, share their image.
 
     Where a spot goes behind something, or comes out, its flux bends: such frames are put together from parts.
     """
     scene = film.scene
     images: list[RowsImage] = []
+    centres: list[SpotLight | None] = []
     flux: list[float] = []
-    held: tuple[tuple[float, ...], SpotLayer] | None = None
+    held: tuple[tuple[float, ...], SpotLayer, SpotLight | None] | None = None
     for frame, at in enumerate(times_s):
         state = _state(film, at)
         if held is not None and held[0] == state and not _moves(film, frame):
             images.append(images[-1])
             flux.append(flux[-1])
+            centres.append(centres[-1])
             continue
         if held is None or held[0] != state:
             view = scene.view_at(at)
-            held = state, spot_layer(view, scene.spot_at(at), room_geometry(room, view))
+            layer = spot_layer(view, scene.spot_at(at), room_geometry(room, view))
+            held = state, layer, spot_light(view, layer)
         images.append(rows_image(scene, frame, held[1], at))
         flux.append(float(held[1].total_electrons_per_s.sum()))
+        centres.append(held[2])
     for frame in _bends(np.array(flux)):
         if _moves(film, frame):
             images[frame] = parted_image(scene, room, frame)
-    return images
+    return images, centres
 
 
 def _bends(flux: Array) -> list[int]:
@@ -292,7 +301,13 @@ def _moves(film: FilmPlan, frame: int) -> bool:
     return bool(np.ptp(scene.offset_m(ends)) or any(np.ptp(way, axis=0).any() for way in ways))
 
 
-def frame_truths(film: FilmPlan, room: Room, times_s: Sequence[float], images: Sequence[RowsImage]) -> list[FrameTruth]:
+def frame_truths(
+    film: FilmPlan,
+    room: Room,
+    times_s: Sequence[float],
+    images: Sequence[RowsImage],
+    centres: Sequence[SpotLight | None],
+) -> list[FrameTruth]:
     """Truth of every frame."""
     scene = film.scene
     frames = scene.times.frame_s
@@ -308,10 +323,19 @@ def frame_truths(film: FilmPlan, room: Room, times_s: Sequence[float], images: S
             as_vector(tracks[frame]),
             instant_truth(scene, room, float(frames[frame])),
             instant_truth(scene, room, at),
+            centres[frame],
+            _light_depth_m(scene, at, centres[frame]),
             tuple(float(x) for x in images[frame].electrons_per_s.sum(axis=(1, 2))),
         )
         for frame, at in enumerate(times_s)
     ]
+
+
+def _light_depth_m(scene: FilmScene, time_s: float, light: SpotLight | None) -> float:
+    if light is None:
+        return math.nan
+    down = scene.view_of(0.0, np.zeros(3), scene.robot_state(time_s)).sphere_centre_m
+    return float(depth_m(np.array(light.place_world_m), down))
 
 
 def _check_seen(film: FilmPlan, rows: Sequence[FrameTruth]) -> None:

@@ -115,6 +115,11 @@ class Film:
         """Truth, a row per frame: the columns of FORMAT.md."""
         return read_table(self.folder.path / "film.parquet", self.info.frames)
 
+    @property
+    def light_depth_m(self) -> float:
+        """D of the light on the surfaces, of a robot and a target that stand: mean of the frames that see it."""
+        return float(np.nanmean(self.table["row_light_depth_m"].to_numpy()))
+
     @cached_property
     def spots(self) -> list[RowsImage]:
         """Spot in every frame, electrons per second over the exposure."""

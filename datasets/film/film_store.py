@@ -18,7 +18,7 @@ import io
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, TypeVar
@@ -36,13 +36,14 @@ from phibench.datasets.store.layers import read_exr, write_exr
 from phibench.datasets.store.schema import CROISSANT, LOG, Document, described
 from phibench.render.film.film_truth import RATES, InstantTruth
 from phibench.render.film.moving_rows import RowsImage
+from phibench.render.optics.spot_layer import SpotLight
 from phibench.render.sensor.light import Region
 from phibench.scenes.camera import FILTERS
 from phibench.scenes.frames import Array
 
 INFO, RECIPE, CHECKSUMS = "film.json", "recipe.toml", "SHA256SUMS"
 LIGHTS, LIGHT_IMAGES = "lights.parquet", "light{:02d}.npz"
-SCHEMA_VERSION = 3
+SCHEMA_VERSION = 4
 _Model = TypeVar("_Model", bound=Document)
 _AGAIN = "run `phibench film make` again"
 _ARRAYS = {
@@ -252,7 +253,10 @@ def read_spots(path: Path, frames: int) -> list[RowsImage]:
 
 @dataclass(frozen=True)
 class FrameTruth:
-    """Truth of one frame: at its time, and at that of the spot's own row; readings of encoders at the frame's time."""
+    """Truth of one frame: at its time, and at that of the spot's own row; readings of encoders at the frame's time.
+
+    `light` is the centre of the light at the time of the row, None where none reaches the lens; `light_depth_m`, its D.
+    """
 
     frame: int
     encoder_m: float
@@ -260,6 +264,8 @@ class FrameTruth:
     tracks_m: tuple[float, ...]
     at_frame: InstantTruth
     at_row: InstantTruth
+    light: SpotLight | None
+    light_depth_m: float
     electrons_per_s: tuple[float, ...]
 
     def record(self) -> dict[str, Any]:
@@ -272,7 +278,15 @@ class FrameTruth:
             "electrons_per_s": list(self.electrons_per_s),
         }
         both = (("", self.at_frame), ("row_", self.at_row))
-        return head | {prefix + name: value for prefix, one in both for name, value in _columns(one).items()}
+        columns = {prefix + name: value for prefix, one in both for name, value in _columns(one).items()}
+        return head | _light_columns(self.light) | {"row_light_depth_m": self.light_depth_m} | columns
+
+
+def _light_columns(light: SpotLight | None) -> dict[str, Any]:
+    """Columns `row_light_`, with NaN where there is no light."""
+    names = [one.name for one in fields(SpotLight)]
+    values = {name: getattr(light, name, (math.nan,) * 3 if name.endswith("_m") else math.nan) for name in names}
+    return {f"row_light_{name}": list(v) if isinstance(v, tuple) else v for name, v in values.items()}
 
 
 def _columns(one: InstantTruth) -> dict[str, Any]:
@@ -312,7 +326,7 @@ def read_table(path: Path, frames: int) -> polars.DataFrame:
         table = polars.read_parquet(io.BytesIO(InputFile(path, _AGAIN).read()))
     except polars.exceptions.PolarsError as error:
         raise DatasetError(f"{path} is damaged; {_AGAIN}") from error
-    if len(table) != frames or "row_u_px" not in table.columns:
+    if len(table) != frames or "row_light_u_px" not in table.columns:
         raise DatasetError(f"{path} does not hold {frames} frames; {_AGAIN}")
     return table
 

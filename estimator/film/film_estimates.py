@@ -409,7 +409,7 @@ def _found(film: Film, tracker: TargetTracker, name: str) -> FoundRow:
     except SceneError as error:
         return FoundRow(name, str(error))
     table = film.table if name == TARGET else film.lights_table.filter(polars.col("light") == name)
-    truth = np.array([table["row_u_px"][first.locked], table["row_v_px"][first.locked]])
+    truth = np.array([table[f"row_light_{x}_px"][first.locked] for x in "uv"])
     place = first.track.uv_px[first.locked - first.track.first]
     losses = sum(hold.lost >= 0 for hold in tracker.holds if hold.target == name)
     lock_s = (first.locked + 1) / tracker.times.rate_hz

@@ -128,7 +128,7 @@ def _rows(film: Film, bundle: Bundle, procedure: FilmProcedure, camera: int) -> 
         whole = processed_stroke(film, bundle, procedure, camera, seen)
         frames = seen.frames if whole is None else seen.frames + whole.frames - 2
         found.append(("stroke", whole, frames, None))
-    pair, depth_m, parts = film.plan.pair, float(film.table["depth_m"][0]), _independent(bundle.covariance)
+    pair, depth_m, parts = film.plan.pair, film.light_depth_m, _independent(bundle.covariance)
     rows = []
     for way, one, frames, at_light in found:
         estimate, sigma = (nan, nan) if one is None else (one.depth_m, one.sigma_m)

@@ -18,11 +18,12 @@ import numpy as np
 from scipy.special import erf, ndtr
 
 from phibench.render.optics.beam_deposit import Deposit, deposit
-from phibench.render.optics.ray_tracer import MirrorRays, lens_rays, reflect
+from phibench.render.optics.ray_tracer import MirrorRays, lens_rays, reflect, trace_pixels
 from phibench.render.optics.reflection_point import MirrorPoints, mirror_points, onward
 from phibench.render.optics.room_tracer import GeometryLike, RoomGeometry, as_geometry, blocked_by
 from phibench.render.optics.spot_samples import FilmCloud, disc_points, film_position, slices, specular_cloud
-from phibench.scenes.frames import Array
+from phibench.render.optics.truth import mirror_angles
+from phibench.scenes.frames import Array, as_vector
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.random_streams import sobol
 from phibench.scenes.rig import View
@@ -62,6 +63,39 @@ class SpotLayer:
     centroid_uv_px: Array
     total_electrons_per_s: Array
     place_m: Array
+
+
+@dataclass(frozen=True)
+class SpotLight:
+    """Centre of the light of a spot that reaches the image: what a perfect method finds.
+
+    Attributes
+    ----------
+    u_px, v_px : float
+        Centre of the light in the image.
+    phi_ray_rad, phi_normal_rad, phi_incidence_rad, azimuth_rad : float
+        `MirrorAngles` of the ray through (u_px, v_px) and the lens centre.
+    place_world_m : 3 floats
+        Place of the light on the surfaces, weighted by power.
+    """
+
+    u_px: float
+    v_px: float
+    phi_ray_rad: float
+    phi_normal_rad: float
+    phi_incidence_rad: float
+    azimuth_rad: float
+    place_world_m: tuple[float, ...]
+
+
+def spot_light(view: View, layer: SpotLayer) -> SpotLight | None:
+    """Centre of the light of a layer of this view; None where none reaches the lens."""
+    uv = layer.centroid_uv_px
+    if not np.isfinite(uv).all():
+        return None
+    rays = trace_pixels(view, uv[None])
+    angles = {name: float(value[0]) for name, value in vars(mirror_angles(rays.normals, rays.directions)).items()}
+    return SpotLight(float(uv[0]), float(uv[1]), **angles, place_world_m=as_vector(layer.place_m))
 
 
 def spot_layer(view: View, spot: LaserSpot, room: GeometryLike, log2_pairs: int | None = None) -> SpotLayer:

@@ -278,7 +278,7 @@ def _images(rendered: RenderedRoom, scene: FilmScene) -> tuple[list[list[RowsIma
         alone = replace(scene, lights=()) if n == 0 else scene.of_light(n - 1)
         times = [spot_time_s(alone, k) for k in range(alone.times.frames)]
         plan = replace(rendered.plan, scene=alone)
-        own = frame_spots(plan, rendered.room, times)
+        own, _ = frame_spots(plan, rendered.room, times)
         colour = None if n == 0 else scene.lights[n - 1].colour
         if colour is not None:
             own = [coloured(one, colour) for one in own]

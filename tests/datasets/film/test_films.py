@@ -318,3 +318,23 @@ def test_other_folders_are_refused(film_windows: Path, tiny_dataset: Path, tmp_p
         make_films(recipe, film_windows, 1)
     with pytest.raises(DatasetError, match="frames 0 to 9"):
         film_of(film_windows).room(10)
+
+
+def test_the_centre_of_the_light_is_that_of_its_electrons(film_images: Path) -> None:
+    film, whole = film_of(film_images), 0
+    for row in film.table.iter_rows(named=True):
+        # boards are even: light and axis are 0.3 mpx apart (docs/model.md), D by as little
+        light = np.array([row["row_light_u_px"], row["row_light_v_px"]])
+        assert light == pytest.approx([row["row_u_px"], row["row_v_px"]], abs=0.005)
+        assert row["row_light_depth_m"] == pytest.approx(row["depth_m"], rel=1e-4)
+        if row["row_laser_level"] < 1.0:  # lit during a part of the exposure: the mean place is another one
+            continue
+        image = film.spots[row["frame"]]
+        plane = image.electrons_per_s[0].astype(float)
+        v, u = np.mgrid[: plane.shape[0], : plane.shape[1]]
+        centre = np.array([(u * plane).sum(), (v * plane).sum()]) / plane.sum() + image.origin_px
+        # rows see the spot at their own times: 5 px/s x 0.33 ms a row stretch a spot of 2 px by 0.01 px, evenly
+        assert centre == pytest.approx(light, abs=0.01)
+        whole += 1
+    assert whole >= 1
+    assert film.light_depth_m == pytest.approx(film.table["depth_m"][0], rel=1e-4)

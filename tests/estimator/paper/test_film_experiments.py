@@ -66,7 +66,7 @@ def test_a_burst_of_a_cut_out_gives_the_depth(film_with_rests: Path) -> None:
     at = found.depth
     assert at is not None
     # a normal error beyond 5 sigma: 6e-7
-    assert abs(at.depth_m - film.table["depth_m"][0]) < 5.0 * at.sigma_m
+    assert abs(at.depth_m - film.light_depth_m) < 5.0 * at.sigma_m
     assert at.sigma_m < 0.1 * at.depth_m
 
 
@@ -75,7 +75,7 @@ def test_processed_frames_on_the_way_add_to_the_bursts(film_processed: Path) -> 
     """Three cameras: squared pulls of D, and misfits, below their limits of 1e-5; sigma falls, D moves with the rig."""
     film, bundle = film_and_bundle(film_processed)
     wide = replace(bundle, covariance=1e-6 * np.diag([float(name == "stroke_relative") for name in PARAMETERS]))
-    mjpeg, depth_m = FilmProcedure("mjpeg", on=2, off=2, sensor={"jpeg_quality": 85}), film.table["depth_m"][0]
+    mjpeg, depth_m = FilmProcedure("mjpeg", on=2, off=2, sensor={"jpeg_quality": 85}), film.light_depth_m
     pulls, misfits, degrees = [], 0.0, 0
     for camera in range(3):
         ends = bursts(film, bundle, mjpeg, camera)
@@ -104,7 +104,7 @@ def whole_sigma_m(film: Film, bundle: Bundle, procedure: FilmProcedure) -> float
 def test_the_whole_stroke_gives_the_depth(film_with_rests: Path) -> None:
     film, bundle = film_and_bundle(film_with_rests)
     found, light = whole_stroke(film, bundle, FEW, 0)
-    assert abs(found.depth_m - film.table["depth_m"][0]) < 5.0 * found.sigma_m
+    assert abs(found.depth_m - film.light_depth_m) < 5.0 * found.sigma_m
     assert light.film_m == pytest.approx(found.sigma_m, rel=0.05)  # the rig is known: pixels and encoder are all
     assert light.gain > 0.0
 
