@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
+from phibench.datasets.errors import DatasetError
 from phibench.datasets.store.files import write_bytes
 from phibench.datasets.store.schema import SpotRow
 from phibench.render.optics.truth import SpotTruth
@@ -53,7 +54,15 @@ def halved(planes: NDArray[Any]) -> NDArray[Any]:
 
 
 def save_png(path: Path, picture: Picture) -> Path:
-    """Write a picture, shape (H, W, 3), atomically."""
+    """Write a picture, shape (H, W, 3), atomically.
+
+    Raises
+    ------
+    DatasetError
+        If the name does not end in .png.
+    """
+    if path.suffix.lower() != ".png":
+        raise DatasetError(f"{path}: pictures are written as PNG; give a name that ends in .png")
     buffer = io.BytesIO()
     Image.fromarray(picture).save(buffer, format="PNG", compress_level=6)
     return write_bytes(path, buffer.getvalue())

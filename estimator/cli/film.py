@@ -281,7 +281,9 @@ def bake(*, out: Path, rooms: Whole = 5, seed: str = "rooms", workers: Whole | N
         Number of processes; one for each core by default.
     """
     from phibench.datasets.film.moving_camera import bake_rooms
+    from phibench.datasets.frames.request import whole_number
 
+    whole_number("--rooms", rooms, 1)
     print(f"{out}: {bake_rooms(out, rooms, seed, workers=workers)} rooms")
     return 0
 
@@ -322,10 +324,12 @@ def run(
     out
         Parquet file for the rows.
     """
+    from phibench.datasets.frames.request import whole_number
     from phibench.datasets.progress import Steps, progress_console
     from phibench.datasets.store.files import require_writable, write_atomic
     from phibench.estimator.loop.episodes import LOST, PolicyFile, episode_frame, episodes_of, run_foreign
 
+    whole_number("--episodes", episodes, 1)
     if out is not None:
         require_writable(out)
     setup = _setup(rooms, fidelity, calibration, as_built)
@@ -379,10 +383,12 @@ def show_loop(
     episode
         Number of the episode in that stream.
     """
+    from phibench.datasets.frames.request import whole_number
     from phibench.datasets.store.files import require_writable
     from phibench.estimator.loop.episodes import with_own_rig
     from phibench.estimator.studies.loop.drawings import show_episode
 
+    whole_number("--episode", episode)
     require_writable(out)
     setup = with_own_rig(_setup(rooms, fidelity, calibration, as_built), seed, episode)
     print(f"{out}: {show_episode(setup, out, policy, seed, episode)}")

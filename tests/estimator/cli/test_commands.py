@@ -180,3 +180,25 @@ def test_no_page_has_an_old_spelling() -> None:
         for line in file.read_text(encoding="utf-8").splitlines():
             assert not OLD_WORDS.search(line), f"{file}: {line}"
     assert checked > 200
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["loop", "bake", "--rooms", "0", "--out", "rooms"], "--rooms = 0: must be an integer, 1 or above"),
+        (["loop", "run", "--episodes", "0"], "--episodes = 0: must be an integer, 1 or above"),
+        (["loop", "show", "--episode", "-1", "--out", "a.mp4"], "--episode = -1: must be an integer, 0 or above"),
+    ],
+)
+def test_counts_of_the_loop_are_checked(arguments, sentence, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(arguments) == 2
+    assert sentence in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_panorama_is_a_png(tiny_dataset, tmp_path, capsys):
+    out = tmp_path / "unrolled.xyz"
+    assert cli.main(["dataset", "panorama", str(tiny_dataset), "--out", str(out), "--width", "64"]) == 2
+    assert "give a name that ends in .png" in capsys.readouterr().err
+    assert not out.exists()
