@@ -6,6 +6,7 @@ Run from the repository root. FOLDER holds what `phibench bench` wrote: `<preset
 95 % intervals (bootstrap over samples), rms at the bound over rms, and the share of all claims that are off by more
 than 5 claimed sigma, answers beyond 3 px included. Strata: shift between light and axis, saturation, signal to noise,
 distance from the detection, and saturation within each of the others. A stratum of fewer than 30 answers is not shown.
+Above each table: of images in which `detect` is within 1 px, how many the method answers, and how many beyond 3 px.
 """
 
 from __future__ import annotations
@@ -58,6 +59,18 @@ def claims_of(folder: Path, preset: str, method: str) -> pl.DataFrame:
 
 def _records(path: Path) -> pl.DataFrame:
     return read_records(path, read_score(path))
+
+
+def lost_detections(folder: Path, preset: str, method: str) -> str:
+    """What becomes of the spots that `detect` finds within 1 px; empty where it has no score here."""
+    detect = folder / f"{preset}-detect.json"
+    if not detect.is_file():
+        return ""
+    right = _records(detect).filter(pl.col("visible") & (pl.col("distance_px") <= 1.0)).select("number", "image")
+    answers = _records(folder / f"{preset}-{method}.json").join(right, on=("number", "image"), how="semi")
+    off = answers["distance_px"].drop_nulls()
+    worst = f"; farthest {off.max():.2f} px" if len(off) else ""
+    return f"detect within 1 px: {len(right)} images, answers {len(off)}, beyond 3 px {int((off > 3.0).sum())}{worst}"
 
 
 def strata_of(table: pl.DataFrame) -> Iterator[tuple[str, pl.DataFrame]]:
@@ -115,6 +128,7 @@ def main() -> None:
         print(
             f"\n{preset}, {method}: light {shift.median():.2g} px from the axis (median), {shift.max():.2g} at worst\n"
         )
+        print(f"{lost_detections(given.folder, preset, method)}\n")
         print("| stratum | answers | samples | pull, light | pull, axis | bound / rms | beyond 5 sigma |")
         print("|---|---|---|---|---|---|---|")
         for label, part in strata_of(table):
