@@ -12,12 +12,15 @@ STUDIES_ALL := noise misalignment baseline cause isotropy stroke mirror loop
 # Environment without Mitsuba, and what is tested in it.
 BASE := out/base-env
 BASE_TESTS := tests/scenes tests/estimator/geometry tests/estimator/sandbox tests/test_package.py
+# Where proofs are: reading all other test files takes as long as ten of them.
+PROOFS = tests/accuracy $(shell grep -rl --include='test_*.py' 'def test_.*accuracy' tests/[b-z]* | xargs grep -l mark.slow)
 # Which Python makes the environment: `make setup PYTHON=python3.13`. Without it the first that is new enough.
 PYTHON ?=
 # Tests start hundreds of processes. Where compiled modules may not be kept, each compiles the package anew, for a second.
 unexport PYTHONDONTWRITEBYTECODE
-# Test files are shared between two processes; `make test PARALLEL=` runs them one after the other.
-PARALLEL ?= --numprocesses 2 --dist loadfile --no-loadscope-reorder
+# Each of two processes begins with one half of the tests, and takes some of the other's at its end, so that both end
+# together; `make test PARALLEL=` runs them one after the other.
+PARALLEL ?= --numprocesses 2 --dist worksteal
 
 # All extras but those of networks and of the site.
 EVERYTHING := --editable '.[render,cluster,study,film,export,test,check]'
@@ -114,7 +117,7 @@ test-slow: $(READY)
 	$(BIN)/python -m pytest --slow --study -m "slow or study"
 
 proof: $(READY)
-	$(BIN)/python -m pytest $(PARALLEL) --slow -m slow -k accuracy
+	$(BIN)/python -m pytest $(PARALLEL) --slow -m slow -k accuracy $(PROOFS)
 
 test-all: $(READY)
 	$(BIN)/python -m pytest --slow --study

@@ -1,6 +1,7 @@
-"""Workers that do their tasks in the process of the test."""
+"""Workers that do their tasks in the process of the test, each task once."""
 
 from collections import deque
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -40,6 +41,8 @@ def make_inline(recipe: str | Path, out: Path, **options: Any) -> Path:
 class InlineExecutor:
     """Executor of `InlineWorkerPool`."""
 
+    newest_first = False
+
     def __init__(self, out: Path) -> None:
         self._out, self._waiting = out, deque[Any]()
 
@@ -50,7 +53,9 @@ class InlineExecutor:
         self._waiting.append(task)
 
     def next(self) -> Any:
+        from helpers.remembered_tasks import Remembered
+
         from phibench.datasets.build.tasks import perform
 
-        task = self._waiting.popleft()
-        return task, perform(task, self._out)
+        task = self._waiting.pop() if self.newest_first else self._waiting.popleft()
+        return task, perform(replace(task, function=Remembered(task)), self._out)

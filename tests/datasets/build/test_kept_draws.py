@@ -144,7 +144,11 @@ def test_damaged_draws_are_drawn_anew(drawn: Plan, folder: Path, tmp_path: Path,
         signed(path, [key, samples | {"0": samples["0"] | {"normal_world": [0.0, 0.0, 0.0]}}])
     else:
         signed(path, [key, samples | {"99": samples["0"], "-1": samples["0"]}])
-    assert exact(make_plan(recipe, RoomFiles(), None, read_draws(tmp_path, recipe, RoomFiles()))) == exact(drawn)
+    kept = read_draws(tmp_path, recipe, RoomFiles())
+    assert (kept == {}) == (what not in ("tries", "vector", "number"))
+    # without a draw the plan is that of an empty folder: it is drawn once more, for all of these
+    if kept or what == "cut":
+        assert exact(make_plan(recipe, RoomFiles(), None, kept)) == exact(drawn)
 
 
 @pytest.mark.slow

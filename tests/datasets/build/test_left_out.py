@@ -4,6 +4,7 @@ import json
 import shutil
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -64,21 +65,26 @@ def whole(recipe: Path) -> Path:
     return make_inline(recipe, recipe.parent / "whole")
 
 
-def refusing() -> pytest.MonkeyPatch:
-    """Refuse the spot of number 1, and both the down view and the spot of number 3; the caller undoes it.
-
-    The view comes after the spot in a run that is left alone: the spot's cause is the sample's.
-    """
-    patch, plan = pytest.MonkeyPatch(), make_plan(parse_recipe(TEXT))
+@cache
+def refused() -> tuple[Any, str]:
+    """A `certify` that refuses the spots of numbers 1 and 3, the same one for all tests, and the down view of 3."""
+    plan = make_plan(parse_recipe(TEXT))
     spots = [plan.spots[name].position_world_m for name in LEFT_OUT]
-    view = f"view {next(pair for pair in plan.pairs if pair.sample_id == LEFT_OUT[1]).pose_id('down')}"
 
     def certified(view: Any, spot: Any, *rest: Any) -> Any:
         found = certify(view, spot, *rest)
         bad = spot.position_world_m in spots
         return replace(found, chief_difference_px=0.01, passed=False) if bad else found
 
-    do = tasks.perform
+    return certified, f"view {next(pair for pair in plan.pairs if pair.sample_id == LEFT_OUT[1]).pose_id('down')}"
+
+
+def refusing() -> pytest.MonkeyPatch:
+    """Refuse the spot of number 1, and both the down view and the spot of number 3; the caller undoes it.
+
+    The view comes after the spot in a run that is left alone: the spot's cause is the sample's.
+    """
+    patch, (certified, view), do = pytest.MonkeyPatch(), refused(), tasks.perform
 
     def perform(task: Task, *rest: Any) -> Done | Failed:
         return Failed("its room cannot be built", refused=True) if task.name == view else do(task, *rest)
@@ -151,12 +157,7 @@ def test_kills_and_the_order_of_tasks_change_no_byte(
             raise KeyboardInterrupt
         return perform(*arguments)
 
-    def newest(self: Any) -> Any:
-        task = self._waiting.pop()
-        return task, tasks.perform(task, self._out)
-
-    if newest_first:
-        refusals.setattr(inline_workers.InlineExecutor, "next", newest)
+    refusals.setattr(inline_workers.InlineExecutor, "newest_first", newest_first)
     options: Any = {"workers": 1, "console": quiet(), "leave_out_refused": True}
     refusals.setattr(tasks, "perform", killed)
     with pytest.raises(KeyboardInterrupt):
