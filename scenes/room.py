@@ -1,6 +1,6 @@
 """Room and robot: everything that light can hit except the mirror.
 
-The robot is the ESCALADE360 as simple solids. The paper gives its overall dimensions, 0.90 x 0.53 x 0.30 m, and tracks
+The robot is the ESCALADE360 as simple solids. The paper gives its overall dimensions, which the solids have, and tracks
 with flippers after the PackBot; the split into body, tracks and flippers is ours. So are the mast that lifts the sensor
 and the camera's housing, which make the middle of the mirror show a camera on a robot. The holder of the mirror is the
 rig's (`scenes/holder.py`), and is part of every room that the rig looks into.
@@ -23,7 +23,9 @@ from phibench.scenes.validation import SceneError, finite_vector, unit_vector, w
 
 # The robot.
 
-BODY_TOP_M = 0.30
+ROBOT_SIZE_M = (0.90, 0.53, 0.30)
+"""Overall length, width and height without mast, of the paper; flippers at `FLIPPER_RAD`."""
+BODY_TOP_M = ROBOT_SIZE_M[2]
 _HOUSING_M = (0.072, 0.030, 0.032)  # the C310's bar, lying on its back
 _LENS_CLEARANCE_M = 1e-3  # the housing's top stays below the lens centre so that it shades no aperture
 _GREY, _BLACK, _OLIVE = (0.10, 0.10, 0.10), (0.03, 0.03, 0.03), (0.16, 0.17, 0.10)
@@ -32,17 +34,21 @@ _GREY, _BLACK, _OLIVE = (0.10, 0.10, 0.10), (0.03, 0.03, 0.03), (0.16, 0.17, 0.1
 FLIPPER_RAD = math.radians(25.0)
 """Angle at which the flippers are drawn unless a robot turns them; 0 is ahead, up counts."""
 _AXLE_M = np.array([0.23, 0.0, 0.10])  # of the front rollers, about which the flippers turn
+_TRACK_M, _FLIPPER_M = (0.78, 0.11, 0.20), (0.28, 0.05, 0.08)
+_TRACK_Y_M = 0.5 * (ROBOT_SIZE_M[1] - _TRACK_M[1])  # of the middles, half of the gauge
+# of the flippers' middles: the tips' upper corners end the length
+_FLIPPER_X_M = 0.5 * (ROBOT_SIZE_M[0] - _FLIPPER_M[0] * math.cos(FLIPPER_RAD) - _FLIPPER_M[2] * math.sin(FLIPPER_RAD))
 
 
 def chassis(robot: RobotPose | None = None) -> tuple[Cuboid, ...]:
     """Body, two tracks and two flippers, standing on the floor, front towards world +x unless the robot has driven."""
     flipper = rotation_xyz(y_rad=-FLIPPER_RAD)
     parts = (
-        cuboid("robot_body", (-0.05, 0.0, 0.19), (0.66, 0.31, 0.22), _OLIVE),
-        cuboid("robot_track_left", (-0.06, 0.21, 0.10), (0.78, 0.09, 0.20), _BLACK),
-        cuboid("robot_track_right", (-0.06, -0.21, 0.10), (0.78, 0.09, 0.20), _BLACK),
-        cuboid("robot_flipper_left", (0.30, 0.21, 0.18), (0.28, 0.05, 0.08), _GREY, flipper),
-        cuboid("robot_flipper_right", (0.30, -0.21, 0.18), (0.28, 0.05, 0.08), _GREY, flipper),
+        cuboid("robot_body", (-0.05, 0.0, 0.19), (0.66, 0.29, 0.22), _OLIVE),
+        cuboid("robot_track_left", (-0.06, _TRACK_Y_M, 0.10), _TRACK_M, _BLACK),
+        cuboid("robot_track_right", (-0.06, -_TRACK_Y_M, 0.10), _TRACK_M, _BLACK),
+        cuboid("robot_flipper_left", (_FLIPPER_X_M, _TRACK_Y_M, 0.18), _FLIPPER_M, _GREY, flipper),
+        cuboid("robot_flipper_right", (_FLIPPER_X_M, -_TRACK_Y_M, 0.18), _FLIPPER_M, _GREY, flipper),
     )
     if robot is None:
         return parts

@@ -33,7 +33,7 @@ from phibench.estimator.cli.options import DATA, INSTALLATION, METHODS, SENSOR, 
 from phibench.estimator.cli.room import room
 from phibench.estimator.cli.score import bench, compare, report, results, score
 from phibench.estimator.cli.seal import seal, submission
-from phibench.estimator.cli.studies import paper, study
+from phibench.estimator.cli.studies import paper, stroke, study
 
 
 def _version_line() -> str:
@@ -65,6 +65,7 @@ app.command(align, group=SENSOR)
 app.command(measure, group=SENSOR)
 app.command(import_, name="import", group=SENSOR)
 app.command(paper, group=SENSOR)
+app.command(stroke, group=SENSOR)
 
 
 cache = App(name="cache", group=INSTALLATION, help="Show, clear and limit the cache of baked rooms.")

@@ -1,17 +1,19 @@
-"""Commands `phibench paper` and `phibench study ...`: the tables of the paper, its experiments, and eight studies."""
+"""Commands `phibench paper`, `stroke` and `study ...`: the paper's tables and experiments, strokes, eight studies."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import App, Parameter
 
-from phibench.estimator.cli.options import DEFAULT_PRESET, SENSOR, OwnOrPreset, Whole
+from phibench.estimator.cli.options import DEFAULT_PRESET, SENSOR, OwnOrPreset, Preset, Whole, number
 
 if TYPE_CHECKING:
+    from phibench.estimator.limits.best_stroke import BestStroke
     from phibench.estimator.paper.experiment_tables import Procedure
     from phibench.estimator.paper.paper_tables import Score
 
@@ -129,6 +131,110 @@ def _experiments(directory: Path, procedure: Procedure, rig: tuple[str, ...], wi
     if out is not None:
         write_rows(rows, out)
     show_grid(table_console(wide), budget_table(rows, wide))
+    return 0
+
+
+Metres = Annotated[float, Parameter(converter=number)]
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class StrokeSetting:
+    """Rig, camera and spot for which a stroke is sought."""
+
+    rig: Annotated[
+        Path | None, Parameter(help="TOML file of the rig, as for `measure`; the default rig if not given.")
+    ] = None
+    calibration: Annotated[
+        Path | None,
+        Parameter(help="File of `phibench calibrate`. Without one the rig is as good as one put together by hand."),
+    ] = None
+    preset: Annotated[Preset, Parameter(help="Preset of the sensor.")] = DEFAULT_PRESET
+    strokes_m: Annotated[
+        tuple[Metres, Metres], Parameter(negative="", help="Shortest and longest stroke of the carriage, metres.")
+    ] = (0.10, 1.40)
+    stroke_sigma_m: Annotated[Metres, Parameter(help="Standard deviation of the single stroke, metres.")] = 0.0
+    height_m: Annotated[Metres, Parameter(help="Height of the spot above the floor, metres.")] = 0.5
+    power_mw: Annotated[Metres, Parameter(help="Power of the laser, mW.")] = 1.0
+
+    def best(self, depth_m: float) -> BestStroke:
+        """Best stroke for a distance.
+
+        Raises
+        ------
+        DatasetError
+            If a file or a number will not do.
+        """
+        from phibench.datasets.errors import DatasetError
+        from phibench.datasets.frames.sensor_card import sensor_card
+        from phibench.estimator.calibration.file import read_calibration
+        from phibench.estimator.captures.rig_file import read_rig_file
+        from phibench.estimator.limits.best_stroke import best_stroke
+        from phibench.estimator.limits.stroke_curve import Surroundings
+        from phibench.estimator.spots.spot_prediction import Laser
+
+        for name, value, low, high in (("power-mw", self.power_mw, 1e-6, 1e3), ("height-m", self.height_m, 0.0, 20.0)):
+            if not low <= value <= high:
+                raise DatasetError(f"--{name} {value:g}: must be {low:g} to {high:g}")
+        nominal = None if self.rig is None else read_rig_file(self.rig).rig
+        held = None if self.calibration is None else read_calibration(self.calibration, nominal)
+        return best_stroke(
+            depth_m,
+            nominal if held is None else held.rig,
+            covariance_rig=None if held is None else held.covariance,
+            stroke_sigma_m=self.stroke_sigma_m,
+            strokes_m=self.strokes_m,
+            around=Surroundings(heights_m=(self.height_m,)),
+            laser=Laser(power_w=1e-3 * self.power_mw),
+            card=sensor_card(self.preset),
+        )
+
+    @property
+    def words(self) -> str:
+        """Sentence on what the error holds for."""
+        rig = "the default rig" if self.rig is None else f"the rig of {self.rig}"
+        known = "as good as put together by hand" if self.calibration is None else f"calibrated by {self.calibration}"
+        return f"{rig}, {known}; {self.preset}, {self.power_mw:g} mW, spots {self.height_m:g} m high"
+
+
+_STROKE = StrokeSetting()
+
+
+def stroke(
+    *,
+    depth_m: Metres,
+    stroke_m: Annotated[tuple[Metres, ...], Parameter(consume_multiple=True, negative="", show_default=False)] = (),
+    setting: StrokeSetting = _STROKE,
+    out: Path | None = None,
+) -> int:
+    """Find the stroke that measures a distance best, and what another stroke loses.
+
+    The error is a bound: root mean square over eight azimuths of a spot on a white wall, at 1/60 s.
+    docs/studies/stroke.md says what it consists of.
+
+    Parameters
+    ----------
+    depth_m
+        Distance D of the spot from the stroke axis, metres.
+    stroke_m
+        Strokes of the table, metres; round ones if not given.
+    out
+        PNG or SVG to write: the error and its parts by the stroke.
+    """
+    from phibench.datasets.store.files import require_writable
+    from phibench.estimator.benchmark.score_tables import show_grid, table_console
+    from phibench.estimator.paper.stroke_chart import best_lines, loss_table, require_picture, write_stroke_picture
+
+    if out is not None:
+        require_picture(out)
+        require_writable(out)
+    best = setting.best(depth_m)
+    grid = loss_table(best, stroke_m)
+    for line in (*best_lines(best), setting.words, ""):
+        print(line)
+    show_grid(table_console(wide=False), grid)
+    if out is not None:
+        print(f"{write_stroke_picture(out, best)}: error of D and its parts by the stroke")
     return 0
 
 

@@ -12,8 +12,9 @@ Odometry: the distance that a track covers has a random part with the variance n
 are independent. Slip and skid stay as they are over a run, and are not known exactly.
 
 Stance, without physics: the flippers, turned down, lift the front until the common tangent of rear roller and tip
-roller is the ground. An obstacle lifts each roller's ground; the four heights give pitch and roll. The paper gives the
-mass and the overall size; `PARAMETERS` says of each other number that it is ours, with its range.
+roller is the ground. An obstacle lifts each roller's ground; the four heights give pitch and roll. No force is
+computed, so that the paper's mass, 31 kg, has no use here. Its overall size is that of the solids in `scenes/room.py`.
+All numbers of `PARAMETERS` are ours.
 """
 
 from __future__ import annotations
@@ -33,28 +34,26 @@ _SMALL_TURN_RAD = 1e-4  # below it the series' next term is 1e-17 of the first
 
 @dataclass(frozen=True)
 class VehicleParameter:
-    """Range, unit and source of one number of the vehicle."""
+    """Range, unit and meaning of one number of the vehicle."""
 
     name: str
     unit: str
     low: float
     high: float
-    source: str
     meaning: str
 
 
 _ROUNDING_RAD = 1e-9  # of sums of steps
 
 
-def _number(default: float, unit: str, low: float, high: float, meaning: str, source: str = "ours") -> Any:
+def _number(default: float, unit: str, low: float, high: float, meaning: str) -> Any:
     """Field of one parameter: all of its `VehicleParameter` but the name."""
-    entry = {"unit": unit, "low": low, "high": high, "source": source, "meaning": meaning}
-    return field(default=default, metadata=entry)
+    return field(default=default, metadata={"unit": unit, "low": low, "high": high, "meaning": meaning})
 
 
 @dataclass(frozen=True)
 class Vehicle:
-    """The vehicle; `PARAMETERS` has unit, range, source and meaning of each number.
+    """The vehicle; `PARAMETERS` has unit, range and meaning of each number.
 
     Raises
     ------
@@ -62,10 +61,6 @@ class Vehicle:
         If a number is beyond its range.
     """
 
-    mass_kg: float = _number(31.0, "kg", 31.0, 31.0, "mass", "paper")
-    length_m: float = _number(0.90, "m", 0.90, 0.90, "overall length", "paper")
-    width_m: float = _number(0.53, "m", 0.53, 0.53, "overall width", "paper")
-    height_m: float = _number(0.30, "m", 0.30, 0.30, "overall height without the mast", "paper")
     gauge_m: float = _number(0.42, "m", 0.36, 0.48, "between the middles of both tracks")
     contact_m: float = _number(0.58, "m", 0.40, 0.70, "between the axles of front and rear rollers")
     roller_m: float = _number(0.10, "m", 0.06, 0.15, "radius of the tracks' rollers")

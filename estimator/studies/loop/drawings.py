@@ -22,6 +22,7 @@ from phibench.estimator.loop.robot_pixels import Window
 from phibench.estimator.loop.simulator import REACHED, RUNNING, Observation, Setup, Simulator
 from phibench.estimator.studies.framework import COLOURS, Drawing, canvas, drawn
 from phibench.scenes.frames import Array
+from phibench.scenes.room import ROBOT_SIZE_M
 
 Ends = tuple[float, float, float]
 _CORNERS = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
@@ -157,13 +158,13 @@ def phases(track: Track) -> list[tuple[float, str]]:
 def top_view(ax: Axes, simulator: Simulator, track: Track) -> None:
     """Room, robot, way and target from above."""
     _boxes(ax, simulator.arena)
-    target, vehicle = simulator.target.point_m, simulator.setup.vehicle
+    target = simulator.target.point_m
     x, y = map(float, target[:2])
     ax.add_patch(Circle((x, y), simulator.setup.task.stand_off_m, fill=False, linestyle=":", edgecolor="black"))
     ax.plot(*np.array(track.place_m).T, color=_WAY, linewidth=1.5)
     pose = simulator.pose
     c, s = math.cos(pose.heading_rad), math.sin(pose.heading_rad)
-    outline = 0.5 * _CORNERS * (vehicle.length_m, vehicle.width_m) @ np.array([[c, s], [-s, c]])
+    outline = 0.5 * _CORNERS * ROBOT_SIZE_M[:2] @ np.array([[c, s], [-s, c]])
     ax.add_patch(Polygon(outline + (pose.x_m, pose.y_m), facecolor="#999944", edgecolor=_ROBOT, alpha=0.8))
     ax.plot(*target[:2], "*", color=_TARGET, markersize=12)
     ax.set_aspect("equal")

@@ -32,8 +32,6 @@ from phibench.scenes.motion.vehicle import PARAMETERS, Vehicle
 from phibench.scenes.random_streams import generator
 
 BASE, STREAM = "base", "study loop"
-OURS = tuple(name for name, entry in PARAMETERS.items() if entry.source == "ours")
-"""Parameters of the vehicle that the paper does not give."""
 _FINDINGS = ("reached", "time", "way", "strokes", "pull of 1 / D", "error of D")
 _NO_EFFECT = ("rim_radius_m", "vertex_radius_m", "conic", "mirror_tilt_x_rad", "mirror_tilt_y_rad")  # of a sphere
 _FEWEST = 3  # episodes of an interval
@@ -108,8 +106,8 @@ def conditions(settings: LoopSettings) -> Iterator[Condition]:
     for noise in settings.track_noises:
         yield Condition("track noise", f"{noise:g} m^0.5", (_with_vehicle(track_noise=noise),), n)
     if settings.sensitivity_episodes:
-        for name in OURS:
-            for value in (PARAMETERS[name].low, PARAMETERS[name].high):
+        for name, entry in PARAMETERS.items():
+            for value in (entry.low, entry.high):
                 setup = (_with_vehicle(**{name: value}),)
                 yield Condition("vehicle", f"{name} = {value:g}", setup, settings.sensitivity_episodes)
 
@@ -227,7 +225,7 @@ def run(settings: LoopSettings, datasets: StudyDatasets) -> Result:
     main = {condition: summary(rows) for condition, rows in runs.items() if condition.group != "vehicle"}
     shown = {"Conditions: value and interval of 95 %": condition_table(main)}
     if settings.sensitivity_episodes:
-        shown["Vehicle: ends of every range that is ours"] = vehicle_table(runs, base)
+        shown["Vehicle: ends of every range"] = vehicle_table(runs, base)
     drawings = (condition_drawing({(c.group, c.name): s for c, s in main.items()}), process_drawing())
     return Result({"table": frame(runs)}, tuple(_findings(runs, main, base)), drawings, shown, _notes(settings))
 

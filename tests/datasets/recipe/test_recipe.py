@@ -194,7 +194,7 @@ def test_the_schema_for_editors_knows_every_table() -> None:
     ("place", "part"),
     [
         ((0.1, 0.0, 0.05), "robot_body"),  # below the body
-        ((0.16, 90.0, 0.15), "robot_track"),  # in the gap between body and track
+        ((0.15, 90.0, 0.15), "robot_track"),  # in the gap between body and track
         ((0.35, 0.0, 0.25), "robot_flipper"),  # in front, between the flippers
         ((0.52, 180.0, 0.1), None),
     ],

@@ -17,7 +17,7 @@ from phibench.estimator.loop.robot_pixels import Window
 from phibench.estimator.loop.simulator import REACHED, WRONG, Setup
 from phibench.estimator.studies.framework import StudyDatasets, read_settings
 from phibench.estimator.studies.loop.drawings import episode_steps, pasted, phases, picture, show_episode
-from phibench.estimator.studies.loop.study import OURS, STUDY, conditions, delay, interval, misaligned, rms, summary
+from phibench.estimator.studies.loop.study import STUDY, conditions, delay, interval, misaligned, rms, summary
 from phibench.scenes.motion.vehicle import PARAMETERS
 from phibench.scenes.random_streams import generator
 
@@ -43,8 +43,8 @@ def episode(number: int, time_s: float, outcome: str = REACHED) -> Episode:
 
 def test_every_parameter_that_is_ours_is_tried_at_both_ends() -> None:
     found = [c for c in conditions(read_settings(STUDY)) if c.group == "vehicle"]
-    assert len(found) == 2 * len(OURS) == 2 * (len(PARAMETERS) - 4)  # mass, length, width and height are the paper's
-    for name in OURS:
+    assert len(found) == 2 * len(PARAMETERS)
+    for name in PARAMETERS:
         values = [getattr(c.setups[0].vehicle, name) for c in found if c.name.startswith(f"{name} ")]
         assert values == [PARAMETERS[name].low, PARAMETERS[name].high]
 
