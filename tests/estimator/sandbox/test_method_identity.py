@@ -127,6 +127,8 @@ def test_parts_of_a_namespace_are_packages_of_their_own(tmp_path: Path, monkeypa
     monkeypatch.syspath_prepend(tmp_path)
     assert packages_of(["space.two", "nowhere", "_finder"]) == {"nowhere": None, "space-two": "1.5"}
     assert packages_of(["space.one"]) == {"space-one": "1.5"}
+    installed(tmp_path, "late", {"late.py": ""})  # while this process runs
+    assert packages_of(["late"]) == {"late": "1.5"}
 
 
 def test_the_hash_of_a_package_is_that_of_its_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

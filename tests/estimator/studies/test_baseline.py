@@ -212,6 +212,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow  # six samples rendered, drawn and fitted; the parts above are quick
 def test_the_whole_study_in_small(data: Path, inline: None) -> None:
     settings = f'recipe = "{data / "small.toml"}"\nrendered = ["{data / "wrong.toml"}"]\n'
     settings += 'preset = "mjpeg"\ndraws = 2\nfit_draws = 1\nrigs = 10\nresamples = 100\n'

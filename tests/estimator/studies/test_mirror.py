@@ -348,13 +348,14 @@ def test_tolerances_cost_what_they_may() -> None:
 
 @pytest.fixture(scope="module")
 def tiny(tmp_path_factory: pytest.TempPathFactory) -> tuple[MirrorSettings, Result]:
-    # some 5 s: tolerances of 17 kinds of deviations are searched for two mirrors
+    # some 10 s: tolerances of 17 kinds of deviations are searched for two mirrors
     folder = tmp_path_factory.mktemp("mirror")
     (folder / "mirror.toml").write_text(TINY, encoding="utf-8")
     settings = read_settings(STUDY, False, folder / "mirror.toml")
     return settings, STUDY.run(settings, StudyDatasets(folder, Console(quiet=True), 1))
 
 
+@pytest.mark.slow
 def test_tiny_study(tiny: tuple[MirrorSettings, Result]) -> None:
     _, result = tiny
     table = result.tables["table"]
@@ -371,6 +372,7 @@ def test_tiny_study(tiny: tuple[MirrorSettings, Result]) -> None:
     assert [drawing.file_name for drawing in result.drawings] == ["mirror.png"]
 
 
+@pytest.mark.slow
 def test_the_table_for_the_choice_names_best_and_worst(tiny: tuple[MirrorSettings, Result]) -> None:
     heads, *rows = tiny[1].shown["Pick a mirror"]
     assert heads == ("criterion", "unit", "ball", "dish", "best", "worst")
@@ -416,5 +418,6 @@ def test_shipped_settings_are_sound() -> None:
     assert set(full.misaligned_m) <= set(full.depths_m)
 
 
+@pytest.mark.slow
 def test_pick_table_without_any_value(tiny: tuple[MirrorSettings, Result]) -> None:
     assert pick_table({}, tiny[0])[1][-2:] == ("-", "-")

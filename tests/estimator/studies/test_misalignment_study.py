@@ -372,6 +372,7 @@ parameters = ["tilt_y_rad", "cx_px", "roughness_alpha"]
 """
 
 
+@pytest.mark.slow  # 8 s: calibrations of three parameters
 def test_tiny_study(tmp_path: Path) -> None:
     """Three of the parameters, because every one of them costs two calibrations."""
     file = tmp_path / "tiny.toml"

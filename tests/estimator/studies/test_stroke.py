@@ -198,6 +198,7 @@ def test_shipped_settings_are_sound() -> None:
     assert 1.0 in quick.check.factors
 
 
+@pytest.mark.slow  # 15 s
 def test_tiny_study(tmp_path: Path) -> None:
     file = tmp_path / "stroke.toml"
     file.write_text(TINY, encoding="utf-8")
