@@ -1,8 +1,8 @@
 """`map` over worker processes, for many independent items on one machine.
 
 Workers are spawned, never forked: a fork copies the locks of other threads and can hang. Each runs one BLAS thread, so
-that N workers keep N cores busy. The number of workers changes no result. Data sets are made by the cluster of
-`datasets.build.workers` instead, because its tasks depend on each other.
+that N workers keep N cores busy. The number of workers changes no result. Data sets are made by
+`datasets.build.workers` instead, because a task that kills its worker must cost no other task.
 """
 
 from __future__ import annotations
@@ -58,9 +58,9 @@ def parallel_map(
                 result = function(item)
             yield result
         return
-    pool = ProcessPoolExecutor(count, get_context("spawn"), initializer=_end_with_the_parent)
+    pool = ProcessPoolExecutor(count, get_context("spawn"), initializer=end_with_the_parent)
     try:
-        with _environment(ONE_THREAD):  # processes start while items are handed over
+        with environment_of_children(ONE_THREAD):  # processes start while items are handed over
             asked: dict[Future[Result], Item] = {pool.submit(function, item): item for item in listed}
         for future in asked if in_order else as_completed(asked):
             with _naming(asked[future]):
@@ -85,7 +85,7 @@ def _naming(item: object) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _environment(added: dict[str, str]) -> Iterator[None]:
+def environment_of_children(added: dict[str, str]) -> Iterator[None]:
     """Environment variables for child processes; variables that the user has set keep their values."""
     new = [name for name in added if name not in os.environ]
     os.environ.update({name: added[name] for name in new})
@@ -96,7 +96,7 @@ def _environment(added: dict[str, str]) -> Iterator[None]:
             del os.environ[name]
 
 
-def _end_with_the_parent() -> None:
+def end_with_the_parent() -> None:
     """End a worker at once on Ctrl-C, without a traceback, and when its parent is gone, even killed.
 
     Files that it was writing have temporary names. Workers of a killed parent would wait for work for ever.

@@ -1,25 +1,25 @@
-"""Worker processes by dask.distributed: our own on this machine, or those of a running scheduler.
+"""Worker processes: our own on this machine, or those of a running scheduler of dask.
 
-One process and one Dr.Jit thread per worker, under a nanny that replaces it when it dies. Our own listen on the
-loopback device only and end with this process. `python -m phibench.datasets.build.workers` prints what this Python
-renders with: versions, variant, LLVM.
+One process and one Dr.Jit thread per worker. Our own get tasks through a pipe each and listen nowhere: whoever could
+connect to a scheduler would run code as its user, and other users of a machine share its loopback device. They end with
+this process. `python -m phibench.datasets.build.workers` prints what this Python renders with: versions, variant, LLVM.
 """
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import json
 import logging
-import re
 import signal
 import subprocess
 import sys
 import time
 import uuid
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
-from multiprocessing import resource_tracker
+from multiprocessing import get_context, resource_tracker
+from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -29,34 +29,32 @@ from phibench.datasets.build.tasks import Done, Failed, Task, fault_text, perfor
 from phibench.datasets.build.view_task import start_renderer
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.frames.request import whole_number
-from phibench.datasets.parallel import ONE_THREAD
+from phibench.datasets.parallel import ONE_THREAD, end_with_the_parent, environment_of_children
 from phibench.datasets.store.files import write_text
-from phibench.datasets.store.leftovers import OwnedFolder
 from phibench.datasets.store.provenance import code_sha256, provenance
 
 CONNECT_S = 10.0  # a scheduler that is up answers at once: a longer wait would only hide a wrong address
 WORKERS_S = 60.0
 # The queue of a cluster may replace a lost worker only after minutes. Finished work is on disk either way.
 LOST_S = 300.0
-DEATH_S = 10.0  # a nanny says at once how its worker died, on a busy machine a little later
+DEATH_S = 10.0  # a worker whose pipe has ended is on its way out
 _POLL_S = 0.005
 _LEAST_S = 0.5  # between two looks for a scheduler that is still to start
 _CENSUS_S = 2.0  # counting the workers is a call to the scheduler: not before every task
-# dask lets glibc return memory at once; a view's arrays of 45 MB would then fault every page anew, 1 s a view
-_MEMORY = {"MALLOC_TRIM_THRESHOLD_": 2**31, "MALLOC_MMAP_THRESHOLD_": 2**30, "MALLOC_TOP_PAD_": 2**26}
-_DEATH = re.compile(r"Worker process (\d+) ((?:was killed by|exited with) .*)")
+# glibc returns large arrays at once; a view's arrays of 45 MB would then fault every page anew, 1 s a view
+_MEMORY = {"MALLOC_TRIM_THRESHOLD_": f"{2**31}", "MALLOC_MMAP_THRESHOLD_": f"{2**30}", "MALLOC_TOP_PAD_": f"{2**26}"}
 _STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _MISSING = "dask.distributed is not installed: run `pip install 'phibench[cluster]'`"
 
 
 class DaskExecutor:
-    """Connected workers; an `Executor` of tasks whose files go to `out`."""
+    """Workers of a scheduler of dask; an `Executor` of tasks whose files go to `out`."""
 
-    def __init__(self, client: Any, out: Path, deaths: _Deaths | None = None) -> None:
+    def __init__(self, client: Any, out: Path) -> None:
         from distributed import as_completed
 
         self.client = client
-        self._out, self._deaths, self._code = out.resolve(), deaths, code_sha256()
+        self._out, self._code = out.resolve(), code_sha256()
         self._ended, self._tasks = as_completed(loop=client.loop), dict[str, Task]()
         self._count, self._counted, self._number = 0, -_CENSUS_S, 0
 
@@ -107,64 +105,133 @@ class DaskExecutor:
             outcome: Done | Failed = future.result()
             return outcome
         if isinstance(error, KilledWorker):
-            cause = self._deaths.cause(error.last_worker.pid) if self._deaths else "see the worker's log"
-            return Failed(cause, lethal=True)
+            return Failed("see the worker's log", lethal=True)
         return Failed(f"{type(error).__name__}: {error}")
 
 
-@contextlib.contextmanager
-def local_workers(count: int, out: Path) -> Iterator[DaskExecutor]:
-    """Start worker processes on this machine; leaving ends them, however it is left."""
-    dask, distributed = _libraries()
-    deaths = _Deaths()
-    settings = {
-        "distributed.scheduler.allowed-failures": 0,  # who is to blame is found out in `scheduler`
-        # dask looks 15 s after a death whether its nanny has a worker, and ends the nanny if not, also while the
-        # worker of a later death starts. A nanny that cannot replace its worker is met by LOST_S.
-        "distributed.deploy.lost-worker-timeout": "1000 hours",
-        "distributed.worker.memory.target": False,
-        "distributed.worker.memory.spill": False,
-        "distributed.worker.memory.pause": False,
-        "distributed.worker.memory.terminate": False,
-        "distributed.comm.timeouts.connect": "60s",
-        "distributed.worker.profile.enabled": False,
-        "distributed.nanny.pre-spawn-environ": {**_MEMORY, **ONE_THREAD},
-    }
-    with OwnedFolder("workers") as folder, dask.config.set(settings), deaths.listening(), ExitStack() as stack:
-        with _signals_kept_from_children():
-            cluster = distributed.LocalCluster(
-                n_workers=0,
-                threads_per_worker=1,
-                processes=True,
-                host="127.0.0.1",
-                scheduler_kwargs={"dashboard": False, "dashboard_address": "127.0.0.1:0"},
-                memory_limit=0,
-                silence_logs=logging.CRITICAL,
-                local_directory=str(folder),
-            )
-            stack.enter_context(cluster)
-        cluster.sync(_grow, cluster, count)
-        client = stack.enter_context(distributed.Client(cluster, set_as_default=False))
-        yield DaskExecutor(client, out, deaths)
+class LocalExecutor:
+    """Worker processes of our own; an `Executor` of tasks whose files go to `out`.
 
-
-async def _grow(cluster: Any, count: int) -> None:
-    """Start the workers of an empty cluster, as its constructor would.
-
-    An interrupted start goes on behind the shield, and leaving the cluster waits for it. A cancelled one would leave
-    workers of which the cluster does not know: its end is then a traceback.
+    A worker has one task at a time, and its own pipe: its death costs that task alone, and the next task starts another
+    worker in its place.
     """
-    while len(cluster.worker_spec) < count:
-        cluster.worker_spec.update(cluster.new_worker_spec())
-    await asyncio.shield(cluster._correct_state())
+
+    def __init__(self, count: int, out: Path) -> None:
+        self._count, self._out, self._code = count, out.resolve(), code_sha256()
+        self._idle, self._waiting = list[_Worker](), deque[Task]()
+        self._busy = dict[object, tuple[_Worker, Task]]()  # by the end of the pipe
+
+    def width(self) -> int:
+        """Number of workers; those that are not needed yet are not started."""
+        return self._count
+
+    def submit(self, task: Task) -> None:
+        """Give a task to a worker that is free, or queue it."""
+        self._waiting.append(task)
+        self._deal_out()
+
+    def next(self) -> Outcome:
+        """Wait for any task; the worker has its next one before the outcome is looked at."""
+        worker, task = self._busy.pop(wait([worker.line for worker, _ in self._busy.values()])[0])
+        outcome = worker.outcome()
+        if outcome is None:
+            outcome = Failed(worker.end(), lethal=True)
+        else:
+            self._idle.append(worker)
+        self._deal_out()
+        return task, outcome
+
+    def _deal_out(self) -> None:
+        while self._waiting and len(self._busy) < self._count:
+            worker = self._idle.pop() if self._idle else _Worker(perform, self._out, self._code)
+            task = self._waiting.popleft()
+            self._busy[worker.line] = worker, task  # first, so that an interrupted run ends this worker too
+            worker.begin(task)
+
+    def close(self) -> None:
+        """End all workers, also in the middle of a task: what they were writing has temporary names."""
+        workers = [*self._idle, *(worker for worker, _ in self._busy.values())]
+        self._idle.clear()
+        self._busy.clear()
+        for worker in workers:
+            worker.kill()
+        for worker in workers:
+            worker.end()
+
+
+Do = Callable[[Task, Path, str | None], Done | Failed]
+
+
+class _Worker:
+    """A process and our end of its pipe."""
+
+    def __init__(self, do: Do, out: Path, code: str) -> None:
+        context = get_context("spawn")
+        self.line, self._far = context.Pipe()
+        # a daemon: it ends with this process wherever that ends, and no task starts processes of its own
+        self._process = context.Process(target=_serve, args=(self._far, do, out, code), daemon=True)
+
+    def begin(self, task: Task) -> None:
+        """Send a task, the first one to a new process; if the worker has just died, `outcome` tells."""
+        if self._process.pid is None:
+            with _signals_kept_from_children(), environment_of_children({**_MEMORY, **ONE_THREAD}):
+                self._process.start()
+                self._far.close()  # ours: the pipe then ends with the worker
+        with contextlib.suppress(OSError):
+            self.line.send(task)
+
+    def outcome(self) -> Done | Failed | None:
+        """Outcome of the task; None if the worker has died."""
+        try:
+            outcome: Done | Failed = self.line.recv()
+        except (EOFError, OSError):
+            return None
+        return outcome
+
+    def kill(self) -> None:
+        """End the process at once."""
+        if self._process.pid is not None:
+            self._process.kill()
+
+    def end(self) -> str:
+        """Close the pipe and collect the process; how it ended, in words."""
+        self.line.close()
+        if self._process.pid is None:
+            return "never began"
+        self._process.join(DEATH_S)
+        status = self._process.exitcode
+        if status is None:  # it lives on, without its pipe
+            self._process.kill()
+            self._process.join()
+            return "closed its pipe"
+        return f"was killed by signal {-status}" if status < 0 else f"exited with status {status}"
+
+
+def _serve(line: Connection, do: Do, out: Path, code: str) -> None:
+    """Do tasks until the pipe ends."""
+    end_with_the_parent()
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, _STOPS)
+    with contextlib.suppress(EOFError):
+        while True:
+            line.send(do(line.recv(), out, code))
+
+
+@contextlib.contextmanager
+def local_workers(count: int, out: Path) -> Iterator[LocalExecutor]:
+    """Workers on this machine, started as tasks need them; leaving ends them, however it is left."""
+    executor = LocalExecutor(count, out)
+    try:
+        yield executor
+    finally:
+        executor.close()
 
 
 @contextlib.contextmanager
 def _signals_kept_from_children() -> Iterator[None]:
-    """Hold signals that end a run back from this thread for now, and for ever from what begins in it.
+    """Hold signals that end a run back from this thread for now, and from a process that begins until it serves.
 
-    Threads and processes inherit what is blocked. Dask's thread and the workers that it starts so leave Ctrl-C and a
-    signal to the whole group to this process, which then ends them. A signal that comes meanwhile is heard afterwards.
+    Processes inherit what is blocked. Ctrl-C while a worker imports its modules would end in a traceback of its own. A
+    signal that comes meanwhile is heard afterwards.
     """
     resource_tracker.ensure_running()  # it unblocks signals when it starts
     before = signal.pthread_sigmask(signal.SIG_BLOCK, _STOPS)
@@ -183,7 +250,7 @@ def remote_workers(scheduler: str, out: Path) -> Iterator[DaskExecutor]:
     DatasetError
         If nothing answers there, or no worker comes.
     """
-    _, distributed = _libraries()
+    distributed = _library()
     with _connect(distributed, scheduler) as client:
         try:
             client.wait_for_workers(1, timeout=WORKERS_S)
@@ -207,7 +274,7 @@ def wait_for_workers(scheduler: str, seconds: int) -> None:
     DatasetError
         With what is missing after that time.
     """
-    _, distributed = _libraries()
+    distributed = _library()
     until = time.monotonic() + whole_number("--wait-for-workers", seconds, 1)
     while True:
         left = until - time.monotonic()
@@ -238,45 +305,12 @@ def _connect(distributed: Any, scheduler: str) -> Any:
         raise DatasetError(f"{text} ({str(error).splitlines()[0] if str(error) else type(error).__name__})") from None
 
 
-def _libraries() -> tuple[Any, Any]:
+def _library() -> Any:
     try:
-        import dask
         import distributed
     except ModuleNotFoundError as error:
         raise DatasetError(_MISSING) from error
-    return dask, distributed
-
-
-class _Deaths(logging.Handler):
-    """Log handler that keeps how each worker died, as its nanny says."""
-
-    def __init__(self) -> None:
-        super().__init__(logging.INFO)
-        self._causes = dict[int, str]()
-
-    def emit(self, record: logging.LogRecord) -> None:
-        if found := _DEATH.match(record.getMessage()):
-            self._causes[int(found[1])] = found[2]
-
-    def cause(self, pid: int) -> str:
-        """Return how a process died; the scheduler may know of its end before its nanny has said how."""
-        until = time.monotonic() + DEATH_S
-        while pid not in self._causes and time.monotonic() < until:
-            time.sleep(_POLL_S)
-        return self._causes.get(pid, "no cause known")
-
-    @contextlib.contextmanager
-    def listening(self) -> Iterator[None]:
-        logger = logging.getLogger("distributed.nanny")
-        before = logger.level, logger.propagate
-        logger.setLevel(logging.INFO)
-        logger.propagate = False
-        logger.addHandler(self)
-        try:
-            yield
-        finally:
-            logger.removeHandler(self)
-            logger.level, logger.propagate = before
+    return distributed
 
 
 Environment = dict[str, Any]

@@ -73,7 +73,7 @@ class StudyDatasets:
             if not target.is_dir():
                 raise DatasetError(
                     f"the study needs the data set {name}, which is not in {self.folder}, and Mitsuba is not "
-                    "installed: pip install 'phibench[render,cluster]', or put a rendered one there (--data)"
+                    "installed: pip install 'phibench[render]', or put a rendered one there (--data)"
                 ) from error
         return open_finished(target)
 

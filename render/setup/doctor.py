@@ -110,7 +110,7 @@ def package_finding(name: str, pinned: str | None) -> Finding:
     try:
         installed = metadata.version(name)
     except metadata.PackageNotFoundError:
-        extra = "phibench[render,cluster]" if name in RENDER else "phibench"
+        extra = "phibench[render]" if name in RENDER else "phibench"
         return Finding(name, "not installed", "fault", f"{name} is not installed: run `pip install '{extra}'`.")
     if pinned in (None, installed):
         return Finding(name, installed)
@@ -160,7 +160,7 @@ def scoring_finding(after: list[Finding]) -> Finding:
     """Say what an installation without the renderer can do, unless something it needs is already found missing."""
     if any(finding.state == "fault" for finding in after):
         return Finding("use", "scoring only, once the faults are set right")
-    advice = f"scoring works; rendering needs {' and '.join(RENDER)}: run `pip install 'phibench[render,cluster]'`."
+    advice = f"scoring works; rendering needs {' and '.join(RENDER)}: run `pip install 'phibench[render]'`."
     return Finding("use", "scoring works, no renderer", "warning", advice)
 
 

@@ -114,7 +114,7 @@ def _import_mitsuba(*, needs_llvm: bool) -> ModuleType:
     try:
         import mitsuba
     except ModuleNotFoundError as error:
-        raise VariantError("Mitsuba is not installed: run `pip install 'phibench[render,cluster]'`.") from error
+        raise VariantError("Mitsuba is not installed: run `pip install 'phibench[render]'`.") from error
     except (ImportError, NameError) as error:  # drjit goes on after an ImportError, and stumbles over a name
         cause = error.__context__ or error
         raise VariantError(

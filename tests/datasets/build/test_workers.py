@@ -3,20 +3,19 @@
 import concurrent.futures
 import contextlib
 import json
-import logging
 import os
 import re
 import shlex
 import signal
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from helpers.folders import contents
+from helpers.listeners import listeners
 from helpers.processes import SMALLEST, left_of, living, quiet, said, wait_for
 
 from phibench.datasets.build import workers
@@ -44,12 +43,36 @@ def die(out: Path, signum: int) -> Made:
     return Made(())
 
 
+def leave(out: Path, status: int) -> Made:
+    os._exit(status)
+
+
 def bug(out: Path) -> Made:
     raise ZeroDivisionError
 
 
 def told(out: Path) -> Made:
     raise DatasetError("no such spot")
+
+
+LASTING = """
+import sys, time
+from pathlib import Path
+from phibench.datasets.build.tasks import Made, Task
+from phibench.datasets.build.workers import local_workers
+
+def last(out, number):
+    (out / f"begun-{number}").touch()
+    time.sleep(300.0)
+    return Made(())
+
+if __name__ == "__main__":
+    with local_workers(2, Path(sys.argv[1])) as pool:
+        for number in range(2):
+            pool.submit(Task(f"last {number}", "", last, (number,)))
+        pool.next()
+"""
+"""A program with two workers, both in tasks that do not end."""
 
 
 def tasks() -> list[Task]:
@@ -64,7 +87,7 @@ def tasks() -> list[Task]:
     return [*innocent[:3], *guilty, *innocent[3:], Task("reader", "", square, (1,), ("kill 9",))]
 
 
-@pytest.mark.parametrize("count", [pytest.param(1, marks=pytest.mark.slow), 2])  # each: 7 starts of a worker
+@pytest.mark.parametrize("count", [pytest.param(1, marks=pytest.mark.slow), 2])  # each: 6 deaths of a worker
 def test_who_kills_workers_is_named_and_all_others_finish(tmp_path: Path, count: int) -> None:
     with local_workers(count, tmp_path) as pool:
         outcomes = {task.name: outcome for task, outcome in schedule(tasks(), pool)}
@@ -78,48 +101,29 @@ def test_who_kills_workers_is_named_and_all_others_finish(tmp_path: Path, count:
     assert causes["reader"] == "not made, because kill 9 failed"
 
 
-def test_a_worker_that_starts_while_dask_looks_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """By default dask looks 15 s after a death for a worker, and gives up one that starts just then."""
-    import dask
-
-    monkeypatch.setattr(workers, "LOST_S", 30.0)
-    with dask.config.set({"distributed.deploy.lost-worker-timeout": "0.2s"}), local_workers(1, tmp_path) as pool:
-        pool.submit(Task("kill", "", die, (9,)))
-        assert pool.next()[1] == Failed("was killed by signal 9", lethal=True)
-        pool.submit(Task("square", "", square, (3,)))
-        outcome = pool.next()[1]
-    assert isinstance(outcome, Done)
-    assert outcome.result == 9
-
-
-def test_a_death_has_the_cause_of_its_own_process_also_when_that_is_said_late(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The scheduler may see a connection end before the nanny has looked at its worker."""
-    monkeypatch.setattr(workers, "DEATH_S", 5.0)
-    deaths, nanny = workers._Deaths(), logging.getLogger("distributed.nanny")
-    with deaths.listening():
-        nanny.info("Worker process 11 was killed by signal 9")
-        late = threading.Timer(0.2, nanny.info, ("Worker process 12 exited with status 3",))
-        late.start()
-        assert deaths.cause(12) == "exited with status 3"
-        assert deaths.cause(11) == "was killed by signal 9"
-        late.join()
-        monkeypatch.setattr(workers, "DEATH_S", 0.01)
-        assert deaths.cause(13) == "no cause known"
+def test_a_death_costs_its_own_task_alone_and_another_worker_comes(tmp_path: Path) -> None:
+    """Its neighbours neither die nor wait; whoever lets go of its pipe counts as dead, and so does one that exits."""
+    with local_workers(2, tmp_path) as pool:
+        for task in (Task("kill", "", die, (9,)), *(Task(f"square {i}", "", square, (i,)) for i in range(4))):
+            pool.submit(task)
+        outcomes = {task.name: outcome for task, outcome in (pool.next() for _ in range(5))}
+        pool.submit(Task("leave", "", leave, (3,)))
+        assert pool.next()[1] == Failed("exited with status 3", lethal=True)
+    assert outcomes.pop("kill") == Failed("was killed by signal 9", lethal=True)
+    assert {name: outcome.result for name, outcome in outcomes.items() if isinstance(outcome, Done)} == {
+        f"square {i}": i * i for i in range(4)
+    }
 
 
 @pytest.mark.skipif(not Path("/proc/self").is_dir(), reason="needs /proc")
 def test_workers_leave_when_their_parent_is_killed(tmp_path: Path) -> None:
-    code = (
-        "import sys, time\nfrom pathlib import Path\nfrom phibench.datasets.build.workers import local_workers\n"
-        "if __name__ == '__main__':\n    with local_workers(2, Path(sys.argv[1])) as workers:\n"
-        "        print(*workers.client.run(__import__('os').getpid).values(), flush=True)\n"
-        "        workers.client.submit(time.sleep, 300, pure=False)\n        time.sleep(300)"
-    )
-    command = [sys.executable, "-c", code, str(tmp_path)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, start_new_session=True) as parent:
-        assert parent.stdout is not None
-        assert len(parent.stdout.readline().split()) == 2
+    program = tmp_path / "lasting.py"  # a file: workers import their tasks from it
+    program.write_text(LASTING)
+    with subprocess.Popen([sys.executable, str(program), str(tmp_path)], start_new_session=True) as parent:
+        for number in range(2):
+            wait_for(tmp_path / f"begun-{number}")
         assert len(living(parent.pid)) >= 3
+        assert listeners(parent.pid) == set()  # nobody can connect: tests/attack/test_other_users.py
         parent.kill()
         parent.wait()
     assert left_of(parent.pid) == []
@@ -140,12 +144,15 @@ if "spawn_main" in " ".join(sys.orig_argv):
 START = """
 import sys
 from pathlib import Path
+from phibench.datasets.build.tasks import Made, Task
 from phibench.datasets.build.workers import local_workers
 from phibench.estimator.cli import main as cli
 
 def start() -> None:
-    with local_workers(2, Path(sys.argv[1])):
-        print("the workers are there")
+    with local_workers(2, Path(sys.argv[1])) as pool:
+        for number in range(2):
+            pool.submit(Task(f"nothing {number}", "", Made))
+        print(pool.next(), "the workers are there")
 
 cli.app.command(start)
 sys.exit(cli.main(["start"]))
@@ -163,7 +170,7 @@ sys.exit(cli.main(["start"]))
 def test_a_signal_while_workers_start_ends_in_one_sentence(
     tmp_path: Path, stop: signal.Signals, status: int, sentence: str
 ) -> None:
-    """To the whole group, as a terminal does: dask would end in a traceback, and each worker in one of its own."""
+    """To the whole group, as a terminal does: each worker would end in a traceback of its own."""
     (tmp_path / "sitecustomize.py").write_text(HELD)
     path = os.pathsep.join([str(tmp_path), *filter(None, [os.environ.get("PYTHONPATH")])])
     with subprocess.Popen(

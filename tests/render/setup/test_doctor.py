@@ -56,7 +56,7 @@ def test_an_installation_for_scoring_only_is_in_order(python: Python) -> None:
     assert child.returncode == 0, child.stdout + child.stderr
     assert lines_of(child.stdout, "fault") == []
     [line] = [line for line in child.stdout.splitlines() if "scoring works; rendering needs" in line]
-    assert "pip install 'phibench[render,cluster]'" in line
+    assert "pip install 'phibench[render]'" in line
     rows = [line.split("│")[1:-1] for line in child.stdout.splitlines() if "not installed" in line]
     assert [[cell.strip() for cell in row] for row in rows] == [
         [name, "not installed", "optional"] for name in ("mitsuba", "drjit")
@@ -74,7 +74,7 @@ def test_scoring_only_with_a_missing_package_is_a_fault(python: Python) -> None:
 def test_half_a_renderer_is_a_fault_with_the_command_to_run(python: Python) -> None:
     child = python(without("mitsuba", "no-such-thing") + DOCTOR)
     assert child.returncode == 1, child.stderr
-    assert "fault: mitsuba is not installed: run `pip install 'phibench[render,cluster]'`." in child.stdout
+    assert "fault: mitsuba is not installed: run `pip install 'phibench[render]'`." in child.stdout
     assert "Traceback" not in child.stderr
 
 

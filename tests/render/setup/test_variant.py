@@ -93,7 +93,7 @@ def test_the_environment_forces_llvm_where_there_is_a_gpu(python: Python) -> Non
 @pytest.mark.parametrize(
     ("code", "environment", "complaint"),
     [
-        ("import sys; sys.modules['mitsuba'] = None\n" + ACTIVATE, {}, "run `pip install 'phibench[render,cluster]'`."),
+        ("import sys; sys.modules['mitsuba'] = None\n" + ACTIVATE, {}, "run `pip install 'phibench[render]'`."),
         (ACTIVATE, {"PHIBENCH_VARIANT": "llvm_nonsense"}, "Mitsuba has no variant llvm_nonsense: choose one of "),
         (ACTIVATE, {"DRJIT_LIBLLVM_PATH": "/nowhere"}, "DRJIT_LIBLLVM_PATH names /nowhere, which is not a file"),
         ("import drjit\n" + ACTIVATE, {"DRJIT_LIBLLVM_PATH": ""}, "Dr.Jit was imported before its LLVM was chosen"),
