@@ -327,15 +327,27 @@ def run(
     from phibench.datasets.frames.request import whole_number
     from phibench.datasets.progress import Steps, progress_console
     from phibench.datasets.store.files import require_writable, write_atomic
-    from phibench.estimator.loop.episodes import LOST, PolicyFile, episode_frame, episodes_of, run_foreign
+    from phibench.estimator.loop.episodes import LOST, episode_frame, episodes_of, run_foreign
+    from phibench.estimator.loop.foreign_policies import PolicyFile
+    from phibench.estimator.sandbox.resolve import RunLimits
 
     whole_number("--episodes", episodes, 1)
     if out is not None:
         require_writable(out)
     setup = _setup(rooms, fidelity, calibration, as_built)
-    known = setup.rig_covariance is not None
+    known, isolations = setup.rig_covariance is not None, set[str]()
     if ".py" in policy:
-        running = run_foreign(setup, PolicyFile.of(policy), episodes, seed, limit_s=seconds, own_rigs=known)
+        limits, hidden = RunLimits(seconds=seconds), [rooms] if rooms is not None else []
+        running = run_foreign(
+            setup,
+            PolicyFile.of(policy),
+            episodes,
+            seed,
+            limits=limits,
+            hidden=hidden,
+            own_rigs=known,
+            told=isolations.add,
+        )
     else:
         running = episodes_of(setup, policy, episodes, seed, own_rigs=known)
     rows = []
@@ -344,6 +356,8 @@ def run(
             rows.append(row)
             steps.advance()
     _print(rows)
+    for sentence in sorted(isolations):
+        print(sentence)
     if out is not None:
         write_atomic(out, episode_frame(rows).write_parquet)
         print(f"{out}: {len(rows)} rows")

@@ -2,27 +2,24 @@
 
 from __future__ import annotations
 
-import ast
 import math
-import multiprocessing
-import runpy
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
-from multiprocessing.connection import Connection
+from functools import partial
 from pathlib import Path
-from typing import Any, cast
 
 import polars as pl
 
 from phibench.estimator.geometry.rig_parameters import drawn_deviation
 from phibench.estimator.loop.belief import Belief, require_filter
+from phibench.estimator.loop.foreign_policies import ANSWER_S, PolicyFile, PolicyProcess
 from phibench.estimator.loop.policies import BELIEVING, POLICIES, Policy
-from phibench.estimator.loop.simulator import REACHED, RUNNING, Action, Known, Observation, Setup, Simulator
+from phibench.estimator.loop.simulator import REACHED, RUNNING, Action, Observation, Setup, Simulator
+from phibench.estimator.sandbox.resolve import RunLimits
 from phibench.scenes.random_streams import Name, generator
 from phibench.scenes.validation import SceneError, nearest
 
 LOST = "policy failed"
-_STARTUP_S = 60.0  # a process that imports on a busy machine
 
 
 @dataclass(frozen=True)
@@ -180,155 +177,37 @@ def episode_frame(episodes: Sequence[Episode]) -> pl.DataFrame:
 # -- policies of others, in a process of their own -------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class PolicyFile:
-    """Function of a Python file that makes a policy of what is known.
+def run_foreign(
+    setup: Setup,
+    file: PolicyFile,
+    count: int,
+    *stream: Name,
+    limits: RunLimits | None = None,
+    hidden: Sequence[Path] = (),
+    own_rigs: bool = False,
+    told: Callable[[str], None] = lambda sentence: None,
+) -> Iterator[Episode]:
+    """Episodes of a policy of others: a process for each, so that what it does to one episode stays there.
 
     Parameters
     ----------
-    path : Path
-    name : str
-    """
-
-    path: Path
-    name: str
-
-    @classmethod
-    def of(cls, text: str) -> PolicyFile:
-        """From FILE.py:NAME.
-
-        Raises
-        ------
-        SceneError
-            If there is no such file, or no name is given.
-        """
-        path, _, name = text.rpartition(":")
-        if not path.endswith(".py") or not name.isidentifier():
-            raise SceneError(
-                f"policy '{text}': give FILE.py:NAME, NAME being a function from what is known to a policy"
-            )
-        if not Path(path).is_file():
-            raise SceneError(f"policy '{text}': there is no file {path}; give the path of a Python file")
-        if name not in (there := _names(Path(path))):
-            raise SceneError(f"policy '{text}': {Path(path).name} has no {name}; {nearest(name, sorted(there))}")
-        return cls(Path(path).resolve(), name)
-
-    def __call__(self, known: Known) -> Policy:
-        """Policy for an episode; the file is run in the process of the policy."""
-        content = runpy.run_path(str(self.path))
-        if not callable(content.get(self.name)):
-            raise SceneError(f"{self.path.name} has no function {self.name}")
-        policy = content[self.name](known)
-        if not callable(getattr(policy, "act", None)):
-            raise SceneError(f"{self.name} gave {type(policy).__name__}, which has no function act(observation)")
-        return cast(Policy, policy)
-
-
-def _names(path: Path) -> set[str]:
-    """Names that a Python file defines or imports; it is read, not run.
+    setup, count, *stream, own_rigs : as for `episodes_of`
+    file : PolicyFile
+    limits : RunLimits, optional
+        `seconds` are those of one answer.
+    hidden : sequence of Path
+        Folders that it cannot read, wherever they lie.
+    told : callable
+        Given the isolation of each process in a sentence.
 
     Raises
     ------
     SceneError
-        If it is no Python.
+        If the file lies in a hidden folder.
     """
-    try:
-        tree = ast.parse(path.read_bytes())
-    except (SyntaxError, ValueError) as error:
-        raise SceneError(f"{path} is no Python file: {error}") from error
-    found: set[str] = set()
-    for node in tree.body:
-        if isinstance(node, ast.FunctionDef | ast.ClassDef):
-            found.add(node.name)
-        elif isinstance(node, ast.Import | ast.ImportFrom):
-            found |= {alias.asname or alias.name for alias in node.names}
-        elif isinstance(node, ast.Assign | ast.AnnAssign):
-            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
-            found |= {target.id for target in targets if isinstance(target, ast.Name)}
-    return found
-
-
-class PolicyProcess:
-    """Policy that runs in a process of its own, which is ended when an answer takes too long.
-
-    Parameters
-    ----------
-    factory : callable
-        From `Known` to a policy; importable, because it is named to the process.
-    known : Known
-    limit_s : float
-        Time for one answer.
-    """
-
-    def __init__(self, factory: Callable[[Known], Policy], known: Known, limit_s: float = 5.0) -> None:
-        context = multiprocessing.get_context("spawn")
-        self._limit_s = limit_s
-        self._end, other = context.Pipe()
-        self._process = context.Process(target=_serve, args=(other, factory, known), daemon=True)
-        self._process.start()
-        other.close()
-        self._receive(_STARTUP_S, "start")
-
-    def act(self, observation: Observation) -> Action:
-        """Command of the next step.
-
-        Raises
-        ------
-        SceneError
-            If the policy raised, ended its process, or did not answer in time.
-        """
-        self._end.send(observation)
-        answer = self._receive(self._limit_s, "answer")
-        return Action(*answer)
-
-    def close(self) -> None:
-        """End the process."""
-        if not self._end.closed:
-            self._process.kill()
-            self._process.join()
-            self._end.close()
-
-    def _receive(self, limit_s: float, what: str) -> Any:
-        if not self._end.poll(limit_s):
-            self.close()
-            raise SceneError(f"the policy did not {what} within {limit_s:g} s: its process was ended")
-        try:
-            kind, content = self._end.recv()
-        except (EOFError, OSError) as error:
-            self.close()
-            raise SceneError("the policy ended its own process") from error
-        if kind == "raised":
-            raise SceneError(f"the policy raised {content}")
-        return content
-
-
-def _serve(end: Connection, factory: Callable[[Known], Policy], known: Known) -> None:
-    """Answer observations until the other end closes."""
-    try:
-        policy = factory(known)
-        end.send(("ready", ()))
-        while True:
-            action = policy.act(end.recv())
-            if not isinstance(action, tuple) or len(action) != len(Action._fields):
-                raise SceneError(f"act answered {type(action).__name__}, not an Action; give simulator.Action(...)")
-            end.send(("action", tuple(action)))
-    except (EOFError, BrokenPipeError):
-        return
-    except Exception as error:  # told to the other side, in one line
-        end.send(("raised", f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"))
-
-
-def run_foreign(
-    setup: Setup,
-    factory: Callable[[Known], Policy],
-    count: int,
-    *stream: Name,
-    limit_s: float = 5.0,
-    own_rigs: bool = False,
-) -> Iterator[Episode]:
-    """Episodes of a policy of others: a process for each, so that what it does to one episode stays there."""
+    start = partial(PolicyProcess, file, setup.known, limits or RunLimits(seconds=ANSWER_S), hidden)
     for number, simulator, observation in _started(setup, count, stream, own_rigs):
-        policy = _Started(factory, setup.known, limit_s)
+        policy = _Started(start, told)
         try:
             yield run_episode(simulator, policy, observation, number)
         finally:
@@ -338,14 +217,15 @@ def run_foreign(
 class _Started:
     """Policy whose process starts with the first observation, so that a faulty start loses the episode alone."""
 
-    def __init__(self, factory: Callable[[Known], Policy], known: Known, limit_s: float) -> None:
-        self._factory, self._known, self._limit_s = factory, known, limit_s
+    def __init__(self, start: Callable[[], PolicyProcess], told: Callable[[str], None]) -> None:
+        self._start, self._told = start, told
         self._process: PolicyProcess | None = None
 
     def act(self, observation: Observation) -> Action:
         """Command of the next step."""
         if self._process is None:
-            self._process = PolicyProcess(self._factory, self._known, self._limit_s)
+            self._process = self._start()
+            self._told(self._process.isolation.sentence())
         return self._process.act(observation)
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""Process of one method: started, asked for pairs, ended; and what it prints.
+"""Process of code of others: started, asked, ended; and what it prints. Of a method: asked for pairs.
 
 The process gets a short environment, in which no data set's path stands, and an empty working directory. It stays warm
 from pair to pair. After a failure it is killed with all that it started, and the next pair gets a new one.
@@ -182,9 +182,13 @@ _OUT_OF_REACH = re.compile(r"PermissionError|permission denied|system error numb
 _UNREAD = "can't open/read file"  # printed by OpenCV, which then gives None and raises nothing
 
 
-def advised(message: str, isolation: Isolation, output: str = "") -> str:
-    """A message with what helps, if the rules of the isolation are what it or the printed lines may be about."""
-    if not isolation.files or not (_OUT_OF_REACH.search(message) or _UNREAD in output):
+def advised(message: str, isolation: Isolation, output: str = "", hidden: Sequence[str] = ()) -> str:
+    """A message with what helps, if the rules of the isolation are what it or the printed lines may be about.
+
+    A hidden place is empty for the process where the system allows that: its files "do not exist" then.
+    """
+    denied = _OUT_OF_REACH.search(message) or _UNREAD in output or any(place in message for place in hidden)
+    if not isolation.files or not denied:
         return message
     return f"{message}; a method reads its own folder and has no network: --allow PATH lets it read more"
 
@@ -221,7 +225,7 @@ class MethodProcess:
         """Names of modules that the process has told of: `loaded_packages.loaded_names`."""
         self._access, self._isolation = access_of(reference, limits, hidden), Isolation(reason="it did not start")
         self._lock, self._closed = threading.Lock(), False
-        self._process: _Running | None = None
+        self._process: GuestProcess | None = None
 
     @property
     def reference(self) -> Reference:
@@ -251,7 +255,7 @@ class MethodProcess:
         with self._lock:
             if self._closed:
                 raise MethodError(f"method '{self._reference.name}' was stopped")
-            process = self._process = _Running(max(2 * size, LEAST_BYTES), self._access)
+            process = self._process = GuestProcess(max(2 * size, LEAST_BYTES), self._access)
         try:
             self._isolation = process.load(self._references, self._limits)
         except BaseException:
@@ -277,7 +281,7 @@ class MethodProcess:
             self.end()
         message = printable_line(outcome.message, _MESSAGE_LENGTH)
         if outcome.failure == "error":
-            message = advised(message, self._isolation, outcome.output)
+            message = advised(message, self._isolation, outcome.output, self._access.hidden)
         return replace(outcome, message=message)
 
     def ask_each(self, pair: Pair) -> tuple[Outcome, ...]:
@@ -322,8 +326,10 @@ class MethodProcess:
         self.end()
 
 
-class _Running:
-    """A process that runs.
+class GuestProcess:
+    """A process that runs, under a supervisor and isolated: of methods, or of a policy.
+
+    What comes back is JSON of bounded size, and has a deadline for the whole message; none of it is unpickled.
 
     Parameters
     ----------
@@ -331,11 +337,14 @@ class _Running:
         Bytes for the images of a pair.
     access : Access
         Files that it may read.
+    serves : str
+        Module of ours whose `serve` answers in the process; "" for the one of methods.
     """
 
-    def __init__(self, size: int, access: Access) -> None:
+    def __init__(self, size: int, access: Access, serves: str = "") -> None:
+        self._serves, self._kind = serves, "policy" if serves else "method"
         if os.name != "posix":
-            raise MethodError("methods run in processes of their own on Linux and macOS only")
+            raise MethodError("code of others runs in processes of its own on Linux and macOS only")
         ours, theirs = socket.socketpair()
         self._connection, self._memory = Connection(ours), MemoryFile(size)
         self._shares, self._held, self.stages = False, _NO_PAIR, dict[str, float]()
@@ -347,7 +356,7 @@ class _Running:
                 self._process = self._started(access, theirs.fileno(), self._memory.reader)
         except OSError as error:
             self._give_back()
-            raise MethodError(f"no process can be started for a method: {error.strerror or error}") from error
+            raise MethodError(f"no process can be started for a {self._kind}: {error.strerror or error}") from error
         assert self._process.stdout is not None
         self._output = OutputTail(self._process.stdout)
 
@@ -376,7 +385,12 @@ class _Running:
         """Let the process import its methods; its isolation, which it tells before any code of a method runs."""
         nonce, end, reference = secrets.token_hex(8), time.monotonic() + limits.start_seconds, references[0]
         self._shares = len(references) > 1
-        order = {"nonce": nonce, "references": [asdict(one) for one in references], "memory_mb": limits.memory_mb}
+        order = {
+            "nonce": nonce,
+            "references": [asdict(one) for one in references],
+            "memory_mb": limits.memory_mb,
+            "serves": self._serves,
+        }
         try:
             isolation = Isolation(**json.loads(self._connection.receive(limits.start_seconds)))
             self._connection.send(json.dumps(order).encode(), limits.start_seconds)
@@ -385,12 +399,12 @@ class _Running:
         except TimeoutError:
             place = self._place(reference.place)
             raise MethodError(
-                f"method '{reference.name}' is not imported after {limits.start_seconds:g} s{place}: "
+                f"{self._kind} '{reference.name}' is not imported after {limits.start_seconds:g} s{place}: "
                 "do the work in the function, not at import"
             ) from None
         except TransportError:
-            why = f"{self._death(reference.place)}{self._last_line()}"
-            raise MethodError(f"method '{reference.name}' cannot be imported: {why}") from None
+            why = f"{self.death(reference.place)}{self._last_line()}"
+            raise MethodError(f"{self._kind} '{reference.name}' cannot be imported: {why}") from None
         if fault != "":
             raise MethodError(advised(printable_line(str(fault), _MESSAGE_LENGTH), isolation))
         self.loaded = _names(reply)
@@ -407,8 +421,7 @@ class _Running:
         self._held = pair if self._shares else _NO_PAIR
         start = time.monotonic()  # by this clock alone: the method's process could tell any time
         try:
-            self._connection.send(message, limits.seconds)
-            reply = self._reply(nonce, start + limits.seconds, pair.number)
+            reply = self.exchange(message, nonce, pair.number, limits.seconds)
         except TimeoutError:
             output = last_lines(self._output.text(since=before))  # before the stack is printed, too
             late = f"no answer after {limits.seconds:g} s{self._place(file)}"
@@ -422,6 +435,12 @@ class _Running:
             self.stages = {**reply["stages"], "": reply["own_seconds"]}
         outcome = outcome_of(pair, reply, seconds)
         return replace(outcome, output=last_lines(self._output.text(since=before)))
+
+    def exchange(self, message: bytes, nonce: str, number: int, seconds: float) -> dict[str, Any]:
+        """Reply to a message that repeats its nonce and number, within so many seconds; raises as `_reply`."""
+        end = time.monotonic() + seconds
+        self._connection.send(message, seconds)
+        return self._reply(nonce, end, number)
 
     def kill(self) -> None:
         """End the process with all that it started and give back what it held; never raises."""
@@ -459,13 +478,13 @@ class _Running:
         raise TransportError("too many replies that belong to no question")
 
     def _dead(self, pair: Pair, limits: RunLimits, file: str, before: int) -> Outcome:
-        failure, message = "crash", self._death(file)
+        failure, message = "crash", self.death(file)
         text = self._output.text(since=before)
         if lacks_memory(text):
             failure, message = "memory", limits.memory_sentence(message)
         return Outcome(pair.number, None, math.nan, failure, message, last_lines(text))
 
-    def _death(self, file: str) -> str:
+    def death(self, file: str) -> str:
         """The end of the process in a few words."""
         text = self._output.text(_STACK_SECONDS)
         with contextlib.suppress(subprocess.TimeoutExpired):

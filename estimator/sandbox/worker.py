@@ -1,4 +1,4 @@
-"""Worker: the process in which a method runs, started by `sandbox.supervisor`.
+"""Worker: the process in which a method or a policy runs, started by `sandbox.supervisor`.
 
 The worker tells how it is isolated, gets a reference, imports the method, gets pairs, and answers with JSON. Every
 reply repeats number and nonce of its pair. Standard output and error are the method's alone.
@@ -80,7 +80,7 @@ def load(reference: Reference) -> Method:
         from phibench.estimator.methods.registry import KNOWN  # a second of imports that a user's method need not have
 
         return KNOWN[reference.name]
-    function = _from_file(reference) if reference.kind == "file" else _from_package(reference)
+    function = function_of_file(reference) if reference.kind == "file" else _from_package(reference)
     require_method(function, _title(reference))
     return function
 
@@ -137,7 +137,14 @@ def _title(reference: Reference) -> str:
     return f"{Path(reference.place).name}:{reference.function}" if reference.kind == "file" else reference.name
 
 
-def _from_file(reference: Reference) -> Any:
+def function_of_file(reference: Reference) -> Any:
+    """What a file has under the name of a reference; runs its code.
+
+    Raises
+    ------
+    MethodError
+        If the file has changed, its import fails, or there is no such name.
+    """
     path = Path(reference.place)
     # a process that is started anew in the middle of a run must not take up an edited file
     if name := reference.changed():
@@ -223,6 +230,9 @@ def main(line: int, reader: int, isolation: dict[str, Any]) -> None:
     faulthandler.enable(all_threads=False)
     faulthandler.register(signal.SIGUSR1, all_threads=False)
     order = json.loads(connection.receive())
+    if order["serves"]:
+        importlib.import_module(order["serves"]).serve(connection, order)
+        return
     nonce, references = order["nonce"], [Reference.of(one) for one in order["references"]]
     try:
         methods = [load(reference) for reference in references]

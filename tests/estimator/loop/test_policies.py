@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import math
-import os
 import sys
-import time
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,16 +17,17 @@ from phibench.estimator.cli import main as cli
 from phibench.estimator.loop.arena import generated_arena
 from phibench.estimator.loop.episodes import (
     LOST,
-    PolicyFile,
     episode_frame,
     run_episode,
     run_episodes,
     run_foreign,
     with_own_rig,
 )
+from phibench.estimator.loop.foreign_policies import PolicyFile, policy_of
 from phibench.estimator.loop.policies import CODED, POLICIES, Identifier, Plan
 from phibench.estimator.loop.sensing import SEEN, Reading
-from phibench.estimator.loop.simulator import CODES, Action, Known, Observation, Setup, Simulator, Task
+from phibench.estimator.loop.simulator import CODES, Action, Observation, Setup, Simulator, Task
+from phibench.estimator.sandbox.resolve import RunLimits
 from phibench.estimator.studies.loop.study import misaligned, summary
 from phibench.scenes.motion.vehicle import PlanarPose
 from phibench.scenes.validation import SceneError
@@ -111,25 +111,6 @@ class Stands:
         return Action()
 
 
-class Hangs:
-    def act(self, observation: Observation) -> Action:
-        time.sleep(3600)
-        return Action()
-
-
-class Dies:
-    def act(self, observation: Observation) -> Action:
-        os._exit(3)
-
-
-def stands(known: Known) -> Stands:
-    return Stands()
-
-
-def hangs(known: Known) -> Hangs:
-    return Hangs()
-
-
 @pytest.mark.parametrize(
     ("policy", "words"),
     [(Raises(), "ValueError in step 0: no idea"), (AnswersNan(), "action drive_m_per_s = nan: must be finite")],
@@ -162,9 +143,11 @@ def test_policies_of_files_are_named_in_one_sentence(tmp_path) -> None:
     file.write_text(
         "class P:\n    act = staticmethod(lambda seen: None)\nmake = lambda known: P()\nthree = lambda known: 3\n"
     )
-    assert PolicyFile.of(f"{file}:make")(Setup().known).act(None) is None
-    with pytest.raises(SceneError, match="gave int"):
-        PolicyFile.of(f"{file}:three")(Setup().known)
+    assert PolicyFile.of(f"{file}:make").reference().function == "make"
+    with pytest.raises(SceneError, match="three gave int"):
+        policy_of(lambda known: 3, Setup().known, "three")
+    with pytest.raises(SceneError, match="four is int, no function"):
+        policy_of(4, Setup().known, "four")
     (tmp_path / "broken.py").write_text("def make(known)\n")
     for text, words in (
         (f"{file}", "give FILE.py:NAME"),
@@ -204,14 +187,34 @@ def test_a_table_of_episodes_has_a_dash_where_nothing_was_stated(capsys: pytest.
     assert row.endswith(" -  ran into something")
 
 
+FOREIGN = """
+import time
+from phibench.estimator.loop.simulator import Action
+
+class Stands:
+    def act(self, seen):
+        return Action()
+
+class Hangs:
+    def act(self, seen):
+        time.sleep(3600)
+
+stands, hangs = lambda known: Stands(), lambda known: Hangs()
+"""
+
+
 @pytest.mark.slow
-def test_a_process_of_its_own_ends_policies_that_hang() -> None:
-    short = Setup(task=Task(longest_s=0.5))
-    (stood,) = run_foreign(short, stands, 1, "foreign")
+def test_a_process_of_its_own_ends_policies_that_hang(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Each episode has its own; what a policy may not do is told on the command line."""
+    short, file = Setup(task=Task(longest_s=0.5)), tmp_path / "mine.py"
+    file.write_text(FOREIGN)
+    (stood,) = run_foreign(short, PolicyFile.of(f"{file}:stands"), 1, "foreign")
     assert stood.outcome == "time is over", stood.cause
-    hung = list(run_foreign(short, hangs, 2, "foreign", limit_s=0.5))
+    hung = list(run_foreign(short, PolicyFile.of(f"{file}:hangs"), 2, "foreign", limits=RunLimits(seconds=0.5)))
     assert [episode.outcome for episode in hung] == [LOST, LOST]
     assert "did not answer within 0.5 s" in hung[0].cause
+    assert cli.main(["loop", "run", f"{file}:hangs", "--episodes", "1", "--seconds", "0.5"]) == 1
+    assert "isolated: " in capsys.readouterr().out
 
 
 @pytest.mark.study
