@@ -46,8 +46,8 @@ from phibench.datasets.store.provenance import code_behind
 from phibench.datasets.store.schema import Document, described
 from phibench.scenes.rig import POSITIONS
 
-INFO = "export.json"
-SHARDS = "export.jsonl"
+INFO = schema.TruthFolder.EXPORT.value
+SHARDS = schema.TruthFile.SHARDS.value
 _COPIED = (schema.RIGS, schema.ROOMS, schema.RECIPE)
 _AGAIN = "run the same `phibench export` again"
 

@@ -17,7 +17,7 @@ from phibench.datasets.frames.request import FrameOptions, whole_number
 from phibench.datasets.frames.source import FrameSource
 from phibench.datasets.read import Dataset
 from phibench.datasets.store.documents import to_table
-from phibench.datasets.store.schema import ManifestRow
+from phibench.datasets.store.schema import ManifestRow, TruthFile
 from phibench.render.sensor.settings import Sensor
 from phibench.scenes.random_streams import generator
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 Form = Literal["parquet", "webdataset", "frames"]
 SplitBy = Literal["both", "rig", "room"]
-INDEX = "pairs.parquet"
+INDEX = TruthFile.PAIRS_TABLE.value
 SPLITS = ("train", "validation", "test")
 _DOTLESS = str.maketrans("._", "_=")
 POSITION_FIELDS = ("exposure_s", "analogue_gain", "u0_px", "v0_px", "width_px", "height_px")

@@ -25,11 +25,13 @@ from phibench.datasets.film.film_plan import FilmPlan, check_drives, film_plans
 from phibench.datasets.film.film_room import key_views, renderer
 from phibench.datasets.film.film_store import (
     CHECKSUMS,
+    FILM,
     INFO,
     LIGHT_IMAGES,
     LIGHTS,
     RECIPE,
     SCHEMA_VERSION,
+    SPOTS,
     FilmCost,
     FilmFolder,
     FilmInfo,
@@ -54,7 +56,7 @@ from phibench.datasets.store.croissant import films_croissant
 from phibench.datasets.store.files import WriteError, only_run, sha256, write_text
 from phibench.datasets.store.leftovers import folder_for_work
 from phibench.datasets.store.provenance import code_behind, code_sha256
-from phibench.datasets.store.schema import CROISSANT
+from phibench.datasets.store.schema import CROISSANT, TruthFolder
 from phibench.render.film.film_truth import instant_truth
 from phibench.render.film.moving_rows import RowsImage, parted_image, rows_image, spot_time_s
 from phibench.render.optics.room_tracer import room_geometry
@@ -124,7 +126,7 @@ def _refuse_other(out: Path, name: str) -> None:
         raise DatasetError(f"{out} is a file; give a folder")
     if not out.is_dir():
         return
-    if (out / "dataset.json").exists():
+    if (out / TruthFolder.DATASET).exists():
         raise DatasetError(f"{out} holds a data set of pairs; give another folder for its films")
     if (out / INFO).is_file() and (held := read_document(out / INFO, SetInfo).name) != name:
         raise DatasetError(f"{out} holds the films of '{held}', not of '{name}'; give another folder")
@@ -147,7 +149,7 @@ def _make(plan: Plan, films: Sequence[FilmPlan], text: str, out: Path, workers: 
         schema_version=SCHEMA_VERSION, name=dataset.name, seed=dataset.seed, code_sha256=code_sha256(), films=names
     )
     write_document(out / INFO, info)
-    types = polars.read_parquet_schema(FilmFolder.of(out, names[0]).path / "film.parquet")
+    types = polars.read_parquet_schema(FilmFolder.of(out, names[0]).path / FILM)
     kinds = {column: str(dtype) for column, dtype in types.items()}
     text = films_croissant(dataset.name, version("phibench"), len(names), kinds)
     write_text(out / CROISSANT, text)
@@ -184,12 +186,12 @@ def make_film(out: Path, plan: Plan, keys: dict[str, str], film: FilmPlan) -> Fi
     rows = frame_truths(film, room, times, images, centres)
     _check_seen(film, rows)
     places, error = key_views(film, folder, keys[film.film_id], render, images)
-    write_spots(folder.path / "spots.npz", images)
-    write_table(folder.path / "film.parquet", rows)
+    write_spots(folder.path / SPOTS, images)
+    write_table(folder.path / FILM, rows)
     lights = _make_lights(film, room, folder)
     counts = tuple(map(len, places))
     views = [view_name(part, float(place)) for part, at in enumerate(places) for place in at]
-    names = ["film.parquet", "spots.npz", *lights, *views]
+    names = [FILM, SPOTS, *lights, *views]
     info = FilmInfo(
         film=film.film_id,
         key=keys[film.film_id],

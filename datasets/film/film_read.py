@@ -28,11 +28,13 @@ from phibench.datasets.exposures.expected import ExpectedRegion, expected_of_lig
 from phibench.datasets.film.film_plan import FilmPlan, film_plans
 from phibench.datasets.film.film_store import (
     CHECKSUMS,
+    FILM,
     INFO,
     LIGHT_IMAGES,
     LIGHTS,
     RECIPE,
     SCHEMA_VERSION,
+    SPOTS,
     FilmFolder,
     FilmInfo,
     SetInfo,
@@ -113,7 +115,7 @@ class Film:
     @cached_property
     def table(self) -> polars.DataFrame:
         """Truth, a row per frame: the columns of FORMAT.md."""
-        return read_table(self.folder.path / "film.parquet", self.info.frames)
+        return read_table(self.folder.path / FILM, self.info.frames)
 
     @property
     def light_depth_m(self) -> float:
@@ -123,7 +125,7 @@ class Film:
     @cached_property
     def spots(self) -> list[RowsImage]:
         """Spot in every frame, electrons per second over the exposure."""
-        return read_spots(self.folder.path / "spots.npz", self.info.frames)
+        return read_spots(self.folder.path / SPOTS, self.info.frames)
 
     @cached_property
     def lights_table(self) -> polars.DataFrame:

@@ -33,7 +33,7 @@ from phibench.datasets.input_files import InputFile, first_fault
 from phibench.datasets.store.checksums import checksums_text
 from phibench.datasets.store.files import sha256, write_bytes, write_text
 from phibench.datasets.store.layers import read_exr, write_exr
-from phibench.datasets.store.schema import CROISSANT, LOG, Document, described
+from phibench.datasets.store.schema import CROISSANT, LOG, Document, TruthFile, TruthFolder, described
 from phibench.render.film.film_truth import RATES, InstantTruth
 from phibench.render.film.moving_rows import RowsImage
 from phibench.render.optics.spot_layer import SpotLight
@@ -41,8 +41,9 @@ from phibench.render.sensor.light import Region
 from phibench.scenes.camera import FILTERS
 from phibench.scenes.frames import Array
 
-INFO, RECIPE, CHECKSUMS = "film.json", "recipe.toml", "SHA256SUMS"
-LIGHTS, LIGHT_IMAGES = "lights.parquet", "light{:02d}.npz"
+INFO, RECIPE, CHECKSUMS = TruthFolder.FILMS.value, "recipe.toml", "SHA256SUMS"
+FILM, SPOTS = TruthFile.FILM.value, TruthFile.SPOTS.value
+LIGHTS, LIGHT_IMAGES = TruthFile.LIGHTS.value, "light{:02d}.npz"
 SCHEMA_VERSION = 4
 _Model = TypeVar("_Model", bound=Document)
 _AGAIN = "run `phibench film make` again"

@@ -26,7 +26,7 @@ from phibench.datasets.rooms.room_sources import GeneratedRoom
 from phibench.datasets.store.documents import from_json, to_json
 from phibench.datasets.store.files import only_run, write_bytes, write_text
 from phibench.datasets.store.leftovers import folder_for_work
-from phibench.datasets.store.schema import Document, described
+from phibench.datasets.store.schema import Document, TruthFolder, described
 from phibench.render.film.room_image import LitRoom, Placement, quick_spot, room_image
 from phibench.render.optics.room_tracer import blocked_by, own_geometry
 from phibench.render.room.light_map import ARRAYS, BakeSettings, encoded
@@ -43,7 +43,7 @@ from phibench.scenes.room import Room
 from phibench.scenes.validation import SceneError
 from phibench.scenes.worlds.properties import drawn_properties
 
-INFO = "rooms.json"
+INFO = TruthFolder.BAKED_ROOMS.value
 _AGAIN = "run `phibench loop bake` again"
 _TRIES = 20  # properties that leave no place for a lamp are drawn again
 

@@ -23,7 +23,7 @@ from phibench.datasets.input_files import FileName, InputFile
 from phibench.datasets.store.documents import model_table, parquet_bytes
 from phibench.datasets.store.files import read_rows, write_bytes, write_text
 from phibench.datasets.store.layers import write_exr
-from phibench.datasets.store.schema import Document, Number, Position, described
+from phibench.datasets.store.schema import Document, Number, Position, TruthFile, described
 from phibench.render.sensor import processing
 from phibench.render.sensor.settings import Sensor
 from phibench.scenes.camera import FILTERS
@@ -104,8 +104,8 @@ def preview(frame: Frame) -> NDArray[np.uint8]:
 # The index.
 
 
-INDEX = "frames.jsonl"
-INDEX_TABLE = "frames.parquet"
+INDEX = TruthFile.FRAMES.value
+INDEX_TABLE = TruthFile.FRAMES_TABLE.value
 REQUEST = "request.json"
 TRUTH = ("visible", "cause", "u_px", "v_px", "phi_ray_rad", "phi_normal_rad", "phi_incidence_rad", "azimuth_rad")
 """Fields of a row as in the manifest's `down` or `up`, places and angles of its `light`."""

@@ -13,6 +13,7 @@ import json
 import math
 import re
 from collections.abc import Iterable, Iterator
+from enum import StrEnum
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer, field_validator, model_validator
@@ -327,23 +328,59 @@ def _is_finite(value: object) -> bool:
 # File names.
 
 
-INFO = "dataset.json"
-MANIFEST = "manifest.jsonl"
-TABLE = "manifest.parquet"
+class TruthFolder(StrEnum):
+    """Files that say what a folder is, of folders that tell the truth; isolation hides such a folder from methods.
+
+    Whoever writes such a folder has the name from here, so that it is hidden as soon as it can be written.
+    """
+
+    DATASET = "dataset.json"
+    FILMS = "film.json"
+    EXPORT = "export.json"
+    BAKED_ROOMS = "rooms.json"
+    IMPORTED = "imported.json"
+    UNFINISHED = ".phibench-working"
+    LOCKED = ".phibench-lock"
+
+
+class TruthFile(StrEnum):
+    """Files that tell the truth wherever they lie, each by itself; isolation hides them from methods."""
+
+    MANIFEST = "manifest.jsonl"
+    TABLE = "manifest.parquet"
+    RIGS = "rigs.jsonl"
+    ROOMS = "rooms.jsonl"
+    JOURNAL = "journal.txt"
+    SENSITIVITIES = "sensitivities.parquet"
+    FRAMES = "frames.jsonl"
+    FRAMES_TABLE = "frames.parquet"
+    PAIRS_TABLE = "pairs.parquet"
+    SHARDS = "export.jsonl"
+    FILM = "film.parquet"
+    SPOTS = "spots.npz"
+    LIGHTS = "lights.parquet"
+    MEASURED = "pairs.csv"
+
+
+SEALED_TRUTH = ".truth.json"
+"""Ending of the names of files with the truth of a sealed set."""
+INFO = TruthFolder.DATASET.value
+MANIFEST = TruthFile.MANIFEST.value
+TABLE = TruthFile.TABLE.value
 RECIPE = "recipe.toml"
-RIGS = "rigs.jsonl"
-ROOMS = "rooms.jsonl"
+RIGS = TruthFile.RIGS.value
+ROOMS = TruthFile.ROOMS.value
 ROOM_FILES = "rooms"
 CHECKSUMS = "SHA256SUMS"
 CROISSANT = "croissant.json"
 RUN = "run.json"
 LOG = "log.jsonl"
-JOURNAL = "journal.txt"
-LOCK = ".phibench-lock"
-WORKING = ".phibench-working"
+JOURNAL = TruthFile.JOURNAL.value
+LOCK = TruthFolder.LOCKED.value
+WORKING = TruthFolder.UNFINISHED.value
 DRAWS = ".phibench-draws"
 CONTACT_SHEET = "contact_sheet.png"
-SENSITIVITIES = "sensitivities.parquet"
+SENSITIVITIES = TruthFile.SENSITIVITIES.value
 NOT_DATA = (CHECKSUMS, RUN, LOG, JOURNAL, LOCK, WORKING, DRAWS, CONTACT_SHEET, SENSITIVITIES)
 """Files that SHA256SUMS does not list: itself, the diaries of the run, locks, and what is computed from it all."""
 

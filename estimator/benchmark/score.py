@@ -295,6 +295,26 @@ def saved(scored: Scored, file: Path) -> Scored:
     return replace(scored, document=write_score(file, scored.document, scored.records))
 
 
+def saved_each(scores: Sequence[Scored], files: Sequence[Path]) -> list[Scored]:
+    """The scores, each written for itself: a file that cannot be written costs no other method its score.
+
+    Raises
+    ------
+    DatasetError
+        When all others are written, with the files that are not.
+    """
+    written, faults = [], []
+    for one, file in zip(scores, files, strict=True):
+        try:
+            written.append(saved(one, file))
+        except (DatasetError, OSError) as error:
+            faults.append(f"{file} could not be written: {error}")
+    if faults:
+        told = f"{len(written)} of {len(files)} scores are written" if written else "no score is written"
+        raise DatasetError(f"{'; '.join(faults)}; {told}")
+    return written
+
+
 PRESETS = ("bayer-raw", "srgb8", "mjpeg")
 """Of a data set whose recipe has no `[frames]`."""
 REPORT = "report.html"
@@ -354,10 +374,9 @@ def bench(
         stages: dict[str, float] = {}
         done = run_and_score(names, taken, workers, console, preset, limits=limits, stages=stages)
         times[preset] = {stage: seconds / len(taken) for stage, seconds in stages.items()}
-        for name, scored in zip(names, done, strict=True):
-            path = out / f"{preset}-{name}.json"
-            write_score(path, scored.document, scored.records)
-            scores.append(path)
+        paths = [out / f"{preset}-{name}.json" for name in names]
+        saved_each(done, paths)
+        scores += paths
     if not scores:
         raise DatasetError(f"none of {', '.join(chosen)} takes a preset of {folder}: give another --method")
     return Benched(write_report(scores, out / REPORT, [time_section(times)]), tuple(scores), tuple(notes))

@@ -32,7 +32,7 @@ from phibench.datasets.store.documents import from_json, to_json
 from phibench.datasets.store.files import WriteError, read_rows, sha256, write_bytes, write_text
 from phibench.datasets.store.leftovers import OwnedFolder, folder_for_work
 from phibench.datasets.store.provenance import provenance
-from phibench.datasets.store.schema import CHECKSUMS, Document
+from phibench.datasets.store.schema import CHECKSUMS, Document, TruthFolder
 from phibench.estimator.captures.measure import Setting, read_setting
 from phibench.estimator.captures.pair_list import ListedPair, photos_of, read_pair_list
 from phibench.estimator.captures.pair_photos import PairPhotos, pair_of_photos
@@ -44,7 +44,7 @@ from phibench.estimator.pair_set import PairTruth, SpotTruth
 from phibench.scenes.laser import Beam
 from phibench.scenes.rig import Rig
 
-INFO, ROWS, FRAMES = "imported.json", "pairs.jsonl", "frames"
+INFO, ROWS, FRAMES = TruthFolder.IMPORTED.value, "pairs.jsonl", "frames"
 FORMAT: Literal["phibench imported set 1"] = "phibench imported set 1"
 RIG_FILE, SENSOR_FILE = "rig.toml", "sensor.toml"
 _REMEDY = "import the pictures again, `phibench import FOLDER --out DATASET`"

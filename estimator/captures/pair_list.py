@@ -19,12 +19,13 @@ from pathlib import Path
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.input_files import FILE_NAME, MIB, InputFile
 from phibench.datasets.store.files import write_text
+from phibench.datasets.store.schema import TruthFile
 from phibench.estimator.captures.measure import Measurement, Setting, measure
 from phibench.estimator.captures.pair_photos import LEAST_STROKE_M, MOST_STROKE_M, PairPhotos, PositionPhotos
 from phibench.estimator.captures.picture_files import read_photo
 from phibench.scenes.validation import nearest, printable_line
 
-PAIRS = "pairs.csv"
+PAIRS = TruthFile.MEASURED.value
 _FILES = ("down", "up", "down_off", "up_off")
 _NUMBERS = {
     "stroke_m": (LEAST_STROKE_M, MOST_STROKE_M),

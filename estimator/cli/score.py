@@ -107,7 +107,7 @@ def score(
     from phibench.datasets.progress import progress_console
     from phibench.datasets.store.files import require_writable
     from phibench.estimator.benchmark.document import MethodCard
-    from phibench.estimator.benchmark.score import open_scored, run_and_score, saved, wanted_pairs
+    from phibench.estimator.benchmark.score import open_scored, run_and_score, saved_each, wanted_pairs
     from phibench.estimator.benchmark.score_tables import print_scores
     from phibench.estimator.sandbox.resolve import resolve
 
@@ -122,7 +122,8 @@ def score(
         require_writable(target)
     pair_set = wanted_pairs(open_scored(directory), preset, draws, pairs, hints, calibration, boxes, sensor, frames)
     scored = run_and_score(method, pair_set, workers, progress_console(), "pairs", _seed(bootstrap_seed), run_limits)
-    scored = [one if file is None else saved(one, file) for one, file in zip(scored, files, strict=True)]
+    if targets := [file for file in files if file is not None]:
+        scored = saved_each(scored, targets)
     print_scores(scored, form, rank, output.wide, calibration is not None)
     for file in filter(None, files):
         print(f"written: {file}", file=sys.stdout if form == "terminal" else sys.stderr)

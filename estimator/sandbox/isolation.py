@@ -7,7 +7,11 @@ thread starts.
 Linux 5.13 and later have Landlock, see landlock(7): rules allow folders, the rest is denied. A seccomp filter denies
 sockets other than those between a process and its children. Landlock keeps signals within from Linux 6.12 on only, and
 never limits: the filter denies signals to the parent, which is the supervisor, and limits (prlimit) of other processes.
-Nothing here needs privileges or imports NumPy.
+Landlock has no rule for permissions, owners, times and attributes of files, nor for watching them: the filter denies
+those calls. Where the system gives a process its own view of the mounts, all but its folder is read-only there, and
+hidden folders are empty: they have neither names nor sizes nor times.
+
+Nothing here needs privileges or imports NumPy. `bwrap` and the package `landlock` were tried: docs/method.md.
 """
 
 from __future__ import annotations
@@ -96,7 +100,7 @@ def isolate(access: Access) -> Isolation:
     kernel = _Kernel()
     if len(list(Path("/proc/self/task").iterdir())) > 1:
         return Isolation(reason="threads were started before the method")
-    own_memory = kernel.own_shared_memory()
+    own_memory = kernel.own_mounts(Path.cwd(), [Path(path) for path in access.hidden])
     kernel.drop_privileges()
     shared = () if access.fresh and not own_memory else (_SHARED_MEMORY,)
     files = _limit_files(kernel, access, shared)
@@ -216,8 +220,8 @@ _BENEATH = 1  # a rule about a path and what is beneath it
 _TCP, _SCOPES = 3, 3  # bind and connect; abstract sockets and signals
 _SET_NO_NEW_PRIVS, _SET_SECCOMP, _DROP_BOUND = 38, 22, 24  # of prctl(2)
 _NEW_USER, _NEW_MOUNTS = 0x10000000, 0x00020000
-_REC_PRIVATE = 16384 | 1 << 18
-_NOSUID_NODEV = 2 | 4
+_READ_ONLY, _NOSUID_NODEV, _BIND, _REC_PRIVATE = 1, 2 | 4, 4096, 16384 | 1 << 18  # of mount(2)
+_MOUNT_SETATTR, _AT_FDCWD, _RECURSIVE = 442, -100, 0x8000
 _KEPT_CAPABILITIES = 1 << 0 | 1 << 1 | 1 << 3  # of root: owners and permissions of files, within the rules
 _CAPABILITIES_3 = 0x20080522  # version of capset(2)
 
@@ -257,8 +261,16 @@ class _Kernel:
             os.close(ruleset)
         return done
 
-    def own_shared_memory(self) -> bool:
-        """Put an empty /dev/shm in place of the machine's, for this process; False where the system does not allow."""
+    def own_mounts(self, folder: Path, hidden: Sequence[Path] = ()) -> bool:
+        """Mounts of this process alone: an empty /dev/shm, hidden folders empty, all else but a folder read-only.
+
+        A read-only mount keeps times of access, permissions and attributes as they are, by descriptors too.
+
+        Returns
+        -------
+        bool
+            False where the system does not allow a /dev/shm of its own.
+        """
         user, group = os.geteuid(), os.getegid()
         if self._library.unshare(_NEW_MOUNTS) != 0:
             if self._library.unshare(_NEW_USER | _NEW_MOUNTS) != 0:
@@ -269,10 +281,27 @@ class _Kernel:
                 Path("/proc/self/gid_map").write_text(f"{group} {group} 1")
             except OSError:
                 return False
-        mount = self._library.mount
-        mount(b"none", b"/", None, ctypes.c_ulong(_REC_PRIVATE), None)
-        options = ctypes.c_ulong(_NOSUID_NODEV)
-        return int(mount(b"phibench", bytes(_SHARED_MEMORY), b"tmpfs", options, b"mode=1777")) == 0
+        self._mount(b"none", Path("/"), None, _REC_PRIVATE)
+        shared = self._mount(b"phibench", _SHARED_MEMORY, b"tmpfs", _NOSUID_NODEV, b"mode=1777")
+        # a mount of its own, which stays as it is; the two that may be written to are left out of the change
+        self._mount(bytes(folder), folder, None, _BIND)
+        self._set_read_only(Path("/"), 1, _RECURSIVE)
+        for path in (folder, *([_SHARED_MEMORY] if shared else [])):
+            self._set_read_only(path, 0)
+        os.chdir(folder)  # through the new mount
+        for path in hidden:
+            if path.is_dir():  # a file is out of reach by its rule, and has a name that this program gave it
+                self._mount(b"phibench", path, b"tmpfs", _NOSUID_NODEV | _READ_ONLY, b"mode=755")
+        return shared
+
+    def _mount(self, source: bytes, path: Path, kind: bytes | None, flags: int, options: bytes | None = None) -> bool:
+        return int(self._library.mount(source, bytes(path), kind, ctypes.c_ulong(flags), options)) == 0
+
+    def _set_read_only(self, path: Path, on: int, flags: int = 0) -> None:
+        """Set a mount, or all from a path on, read-only or not; mount_setattr(2), Linux 5.12."""
+        attributes = struct.pack("=4Q", on, 1 - on, 0, 0)
+        here = ctypes.c_long(_AT_FDCWD)
+        self._call(_MOUNT_SETATTR, here, bytes(path), flags, attributes, ctypes.c_size_t(len(attributes)))
 
     def drop_privileges(self) -> None:
         """Take root's powers off, those of a new user namespace included: rules are for who cannot mount or trace."""
@@ -283,11 +312,12 @@ class _Kernel:
         self._library.capset(struct.pack("=Ii", _CAPABILITIES_3, 0), struct.pack("=6I", kept, kept, 0, 0, 0, 0))
 
     def filter_calls(self) -> bool:
-        """Deny calls that reach other processes; False on a machine whose calls are not listed."""
-        numbers = _NUMBERS.get(os.uname().machine)
-        if numbers is None:
+        """Deny calls that reach other processes or mark files; False on a machine whose calls are not listed."""
+        machine = os.uname().machine
+        if machine not in _NUMBERS:
             return False
-        program = b"".join(struct.pack("=HBBI", *line) for line in _filter(numbers, os.getppid()))
+        lines = _filter(_NUMBERS[machine], _DENIED[machine], os.getppid())
+        program = b"".join(struct.pack("=HBBI", *line) for line in lines)
         buffer = ctypes.create_string_buffer(program, len(program))
         header = struct.pack("@HP", len(program) // 8, ctypes.addressof(buffer))
         self._library.prctl(_SET_NO_NEW_PRIVS, 1, 0, 0, 0)
@@ -296,21 +326,33 @@ class _Kernel:
 
 # -- system calls that are denied ----------------------------------------------------------------------------------
 
-_DENIED = (
-    *("connect", "listen", "io_uring_setup", "shmget", "semget", "msgget", "mq_open"),
-    *("add_key", "request_key", "keyctl", "bpf", "perf_event_open", "open_by_handle_at", "pidfd_send_signal"),
-)
-"""Ways to other processes, by sockets or by memory that outlives a process, and past the rules for files."""
+_ELSEWHERE = {"x86_64": (42, 50, 425, 29, 64, 68, 240), "aarch64": (203, 201, 425, 194, 190, 186, 180)}
+"""connect, listen, io_uring_setup, shmget, semget, msgget, mq_open: sockets, and memory that outlives a process."""
+_PAST_RULES = {"x86_64": (248, 249, 250, 321, 298, 304, 424), "aarch64": (217, 218, 219, 280, 241, 265, 424)}
+"""add_key, request_key, keyctl, bpf, perf_event_open, open_by_handle_at, pidfd_send_signal."""
+_MARKS = {
+    "x86_64": (
+        *(90, 91, 268, 452),  # chmod, fchmod, fchmodat, fchmodat2
+        *(92, 93, 94, 260),  # chown, fchown, lchown, fchownat
+        *(132, 235, 261, 280),  # utime, utimes, futimesat, utimensat
+        *(188, 189, 190, 463, 197, 198, 199, 466, 469),  # (l, f)setxattr(at), (l, f)removexattr(at), file_setattr
+        *(253, 294, 254, 300, 301),  # inotify_init, inotify_init1, inotify_add_watch, fanotify_init, fanotify_mark
+    ),
+    "aarch64": (52, 53, 452, 54, 55, 88, 5, 6, 7, 463, 14, 15, 16, 466, 469, 26, 27, 262, 263),
+}
+"""What can be done to files that are out of reach, or to one's own to remember a pair by; and watching of files.
+
+By descriptors too: who may read a file may have one, and its owner needs no more to mark it.
+"""
+_DENIED = {machine: _ELSEWHERE[machine] + _PAST_RULES[machine] + _MARKS[machine] for machine in _MARKS}
 _SIGNALS = ("kill", "tkill", "tgkill", "rt_sigqueueinfo", "rt_tgsigqueueinfo")  # to their first argument
 _NUMBERS = {
     "x86_64": {
-        **dict(zip(_DENIED, (42, 50, 425, 29, 64, 68, 240, 248, 249, 250, 321, 298, 304, 424), strict=True)),
         **dict(zip(_SIGNALS, (62, 200, 234, 129, 297), strict=True)),
         **{"machine": 0xC000003E, "socket": 41, "socketpair": 53, "sendto": 44},
         **{"prlimit64": 302, "fcntl": 72, "ioctl": 16},
     },
     "aarch64": {
-        **dict(zip(_DENIED, (203, 201, 425, 194, 190, 186, 180, 217, 218, 219, 280, 241, 265, 424), strict=True)),
         **dict(zip(_SIGNALS, (129, 130, 131, 138, 240), strict=True)),
         **{"machine": 0xC00000B7, "socket": 198, "socketpair": 199, "sendto": 206},
         **{"prlimit64": 261, "fcntl": 25, "ioctl": 29},
@@ -321,19 +363,23 @@ _ALLOW, _DENY = (0, 0, 0x7FFF0000), (0, 0, 0x00050000 | errno.EACCES)
 _NUMBER, _MACHINE, _ARGUMENT = 0, 4, 16  # places in seccomp_data; an argument has 8 bytes, the lower half first
 _X32 = 0x40000000
 _AF_UNIX, _SOCK_DGRAM, _TYPE = 1, 2, 0xF
-_OWNERS = {"fcntl": (8, 15), "ioctl": (0x8901, 0x8902)}  # F_SETOWN(_EX), FIOSETOWN, SIOCSPGRP
-"""Requests that let the kernel signal any process when a file is ready; their second argument."""
+_REQUESTS = {
+    # F_SETOWN(_EX), F_NOTIFY; FIOSETOWN, SIOCSPGRP; FS_IOC_SETFLAGS (two sizes), FSSETXATTR, SETVERSION, ENABLE_VERITY
+    "fcntl": (8, 15, 1026),
+    "ioctl": (0x8901, 0x8902, 0x40086602, 0x40046602, 0x401C5820, 0x40087602, 0x40806685),
+}
+"""Second arguments that let the kernel signal any process when a file is ready, watch a folder, or mark a file."""
 _Line = tuple[int, int, int, int]
 
 
-def _filter(numbers: dict[str, int], supervisor: int) -> list[_Line]:
+def _filter(numbers: dict[str, int], denied: Sequence[int], supervisor: int) -> list[_Line]:
     """Program of (code, jump if true, jump if false, value) that denies calls with EACCES, see seccomp(2)."""
     deny, allow = (_RETURN, *_DENY), (_RETURN, *_ALLOW)
     lines = [(_LOAD, 0, 0, _MACHINE), (_EQUAL, 1, 0, numbers["machine"]), deny, (_LOAD, 0, 0, _NUMBER)]
     if numbers["machine"] == 0xC000003E:
         lines += [(_AT_LEAST, 0, 1, _X32), deny]
-    for name in _DENIED:
-        lines += [(_EQUAL, 0, 1, numbers[name]), deny]
+    for number in denied:
+        lines += [(_EQUAL, 0, 1, number), deny]
     # local sockets that are connected in pairs; a datagram socket could be sent from to any address
     local = [(_LOAD, 0, 0, _ARGUMENT), (_EQUAL, 1, 0, _AF_UNIX), deny]
     local += [(_LOAD, 0, 0, _ARGUMENT + 8), (_AND, 0, 0, _TYPE), (_EQUAL, 0, 1, _SOCK_DGRAM), deny, allow]
@@ -346,7 +392,7 @@ def _filter(numbers: dict[str, int], supervisor: int) -> list[_Line]:
 
 
 def _outward(numbers: dict[str, int], supervisor: int) -> list[_Line]:
-    """Part of the filter about signals to the supervisor, to its group and to all, and limits of other processes.
+    """Part of the filter about signals to the supervisor, to its group and to all, requests, and others' limits.
 
     A process number has 32 bits: the kernel ignores the upper half of the argument, and so do these lines.
     """
@@ -359,7 +405,7 @@ def _outward(numbers: dict[str, int], supervisor: int) -> list[_Line]:
         return [(_EQUAL, 0, len(body), numbers[name]), *body]
 
     lines = [line for name in _SIGNALS for line in denied(name, 0, (supervisor, -os.getpgid(supervisor), -1))]
-    for name, requests in _OWNERS.items():
+    for name, requests in _REQUESTS.items():
         lines += denied(name, 1, requests)
     # prlimit(pid, resource, new, old): one's own limits have pid 0
     own = [(_LOAD, 0, 0, _ARGUMENT), (_EQUAL, 0, 1, 0), allow]

@@ -1,8 +1,8 @@
 """Files that a method's process may read: the folder of the method's file and what `--allow` names, without the truth.
 
 The data set is never readable, wherever it lies: a method inside its folder is refused, and of a folder around it the
-rest is readable. The same holds for what is found near the method: other data sets, exported frames and
-scores, whose tables hold truth, sealed truths, and hard links to files of the data set.
+rest is readable. The same holds for what is found in the method's folder: folders and files of the store's own list
+(`schema.TruthFolder`, `schema.TruthFile`), scores, sealed truths, and hard links to files of the data set.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+from phibench.datasets.store.schema import SEALED_TRUTH, TruthFile, TruthFolder
 from phibench.estimator.sandbox.isolation import Access
 from phibench.estimator.sandbox.resolve import MethodError, Reference, RunLimits
 
@@ -39,8 +40,11 @@ def access_of(reference: Reference, limits: RunLimits, hidden: Sequence[Path] = 
         readable.append(_outside(Path(name), secret, f"--allow {name}"))
     if reference.kind == "file":
         file = Path(reference.place)
-        folder = _outside(file, secret, f"the file of method '{reference.name}'").parent
+        title = f"the file of method '{reference.name}'"
+        folder = _outside(file, secret, title).parent
         readable += [file.parent, folder]
+        if told := sorted(_FOLDERS & {entry.name for entry in _entries(folder)}):
+            raise MethodError(f"{title} lies in {folder}, which holds the truth ({told[0]}): move it out")
         secret += truth_near(folder, secret)
     for name in (sys.prefix, sys.base_prefix, __file__):
         _outside(Path(name), secret, f"Python's {name}")
@@ -56,32 +60,40 @@ def _outside(path: Path, secret: Sequence[Path], title: str) -> Path:
     return real
 
 
-_DEPTH, _ENTRIES = 4, 5000  # of the folders that are looked through: some milliseconds
-_DATASET = "dataset.json"
-_FRAMES = {"frames.jsonl", "frames.parquet"}
+_MOST_ENTRIES = 200_000  # of the folders that are looked through: a second
+_FOLDERS = frozenset(str(name) for name in TruthFolder)
+_FILES = frozenset(str(name) for name in TruthFile)
 _HEAD_BYTES = 256  # of a score's JSON, whose first field is its kind
 
 
 def truth_near(folder: Path, secret: Sequence[Path] = ()) -> list[Path]:
-    """Data sets, scores and sealed truths in a folder and three levels below it; files of `secret` by other names."""
+    """Folders and files with truth in a folder and all below it; files of `secret` by other names.
+
+    Raises
+    ------
+    MethodError
+        If there is more in it than can be looked through.
+    """
     found: list[Path] = []
     linked: dict[tuple[int, int], Path] = {}
-    level, left = [folder], _ENTRIES
-    for _ in range(_DEPTH):
+    passed = {*secret, *(Path(name).resolve() for name in (sys.prefix, sys.base_prefix))}
+    level, left = [folder], _MOST_ENTRIES
+    while level:
         below = []
         for path in level:
             entries = _entries(path)
             left -= len(entries)
-            if left < 0:
-                break
             names = {entry.name for entry in entries}
-            if _DATASET in names and path != folder:
+            if names & _FOLDERS:
                 found.append(path)
                 continue
             found += [path / entry.name for entry in entries if _holds_truth(path, entry.name, names)]
             linked.update(_linked(entries))
             below += [path / entry.name for entry in entries if entry.is_dir(follow_symlinks=False)]
-        level = [path for path in below if path not in secret]
+        if left < 0:
+            most = f"more than {_MOST_ENTRIES} files, too many to look for the truth in"
+            raise MethodError(f"the folder of the method, {folder}, holds {most}: put the method into one of its own")
+        level = [path for path in below if path not in passed]
     return [*found, *(_same_files(linked, secret) if linked else ())]
 
 
@@ -93,9 +105,9 @@ def _entries(path: Path) -> list[os.DirEntry[str]]:
 
 
 def _holds_truth(folder: Path, name: str, names: set[str]) -> bool:
-    """Tell the two files of a score, the two of exported frames, and a sealed truth."""
+    """Tell a file of the store's list, a sealed truth, and the two files of a score."""
     stem, _, kind = name.rpartition(".")
-    if name.endswith(".truth.json") or (name in _FRAMES and names >= _FRAMES):
+    if name in _FILES or name.endswith(SEALED_TRUTH):
         return True
     if kind not in ("json", "parquet") or not {f"{stem}.json", f"{stem}.parquet"} <= names:
         return False

@@ -35,7 +35,7 @@ from phibench.datasets.store.checksums import checksums_text, read_checksums
 from phibench.datasets.store.documents import to_json
 from phibench.datasets.store.files import WriteError, read_rows, sha256, write_bytes, write_text
 from phibench.datasets.store.leftovers import OwnedFolder, folder_for_work
-from phibench.datasets.store.schema import Document
+from phibench.datasets.store.schema import SEALED_TRUTH, Document
 from phibench.estimator.benchmark.dataset_pairs import TASK_VERSION, DatasetPairs, dataset_pairs
 from phibench.estimator.interface import Box, Pair
 from phibench.estimator.sealed.truth_file import MOST_PAIRS, Digest, truth_text
@@ -139,7 +139,7 @@ def read_pairs(folder: Path) -> list[PublicPair]:
 
 _FILE_TIME_S = 315532800  # 1980-01-01: a file's own time would tell the order of the work
 _SALT_BYTES = 32
-_TRUTH_FILE = "seal_{}.truth.json"
+_TRUTH_FILE = "seal_{}" + SEALED_TRUTH
 _SEED_BITS = 56
 
 

@@ -28,7 +28,7 @@ from phibench.estimator.benchmark.document import (
     write_score,
 )
 from phibench.estimator.benchmark.metrics import METRICS
-from phibench.estimator.benchmark.score import score_methods, score_outcomes
+from phibench.estimator.benchmark.score import saved_each, score_methods, score_outcomes
 from phibench.estimator.benchmark.score_tables import leaderboard, number, ranked
 from phibench.estimator.benchmark.strata import STRATA
 from phibench.estimator.benchmark.worst_images import crop, worst
@@ -46,6 +46,16 @@ def scored(oracle=None, pairs=None, name="mine", **options):
 @pytest.fixture(scope="module")
 def mine():
     return scored(limits={"seconds": 30.0})
+
+
+def test_a_score_that_cannot_be_written_costs_no_other_method_its_own(mine, tmp_path):
+    files = [tmp_path / f"{name}.json" for name in "abc"]
+    (tmp_path / "b.parquet").mkdir()
+    with pytest.raises(DatasetError, match=r"b\.json could not be written: .*; 2 of 3 scores are written$") as caught:
+        saved_each([mine] * 3, files)
+    assert "\n" not in str(caught.value)
+    assert [file.exists() for file in files] == [True, False, True]
+    assert read_score(files[2]).records == "c.parquet"
 
 
 def test_a_score_says_where_it_comes_from(mine):

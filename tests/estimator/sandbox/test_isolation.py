@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import ast
 import ctypes
 import json
 import os
+import re
 import socket
 import subprocess
 import sys
@@ -16,19 +18,32 @@ from pathlib import Path
 import pytest
 from helpers.sandbox_pairs import GOOD, HEADER, SmallPairs, method_file
 
+from phibench.datasets.store.schema import SEALED_TRUTH, TruthFile, TruthFolder
 from phibench.estimator.benchmark.score import score
 from phibench.estimator.interface import Answer, Spot
+from phibench.estimator.sandbox import readable_files
 from phibench.estimator.sandbox.isolation import _NUMBERS, Access, Isolation
 from phibench.estimator.sandbox.readable_files import access_of, truth_near
 from phibench.estimator.sandbox.resolve import MethodError, RunLimits, resolve
 from phibench.estimator.sandbox.runner import Harness, run_method
 
+ROOT = Path(__file__).resolve().parents[3]
 LIMITS = RunLimits(seconds=60.0)  # the machine may do other things: no test here is about time
 
 
 def landlock() -> bool:
     """Tell whether this kernel has Landlock, by its own word."""
     return sys.platform.startswith("linux") and ctypes.CDLL(None).syscall(444, None, 0, 1) > 0
+
+
+@cache
+def own_mounts() -> bool:
+    """The system lets a process have mounts of its own; some containers do not, and --fresh then denies /dev/shm."""
+    command = (
+        "from pathlib import Path; from phibench.estimator.sandbox.isolation import _Kernel; "
+        "print(_Kernel().own_mounts(Path.cwd()))"
+    )
+    return subprocess.run([sys.executable, "-c", command], capture_output=True, text=True).stdout.strip() == "True"
 
 
 needs_landlock = pytest.mark.skipif(
@@ -84,15 +99,38 @@ ATTACKS = {
     "write into the packages": "open(np.__file__, 'a')",
     "write elsewhere": "open('/var/tmp/phibench-was-here', 'w')",
     "home": "os.listdir(os.path.expanduser('~'))",
+    "permissions of the set": "os.chmod(DATA, 0)",
+    "permissions of another file": "os.chmod(SERVER, 0o777)",
+    "permissions of its own file": "os.chmod(__file__, 0o600)",
+    "the same by descriptor": "os.fchmod(os.open(__file__, os.O_RDONLY), 0o600)",
+    "permissions by number": "numbered(452, -100, __file__.encode(), 0o600, 0)",
+    "owner": "os.chown(SERVER, os.getuid(), -1)",
+    "owner of a link": "os.lchown(HERE / 'link.txt', os.getuid(), -1)",
+    "owner by descriptor": "os.fchown(os.open(__file__, os.O_RDONLY), os.getuid(), -1)",
+    "times of another file": "os.utime(SERVER, (1, 1))",
+    "times of its own file": "os.utime(__file__, (1, 1))",
+    "times by descriptor": "os.utime(os.open(__file__, os.O_RDONLY), (1, 1))",
+    "attribute": "os.setxattr(__file__, 'user.kept', b'1')",
+    "attribute by descriptor": "os.setxattr(os.open(__file__, os.O_RDONLY), 'user.kept', b'1')",
+    "attribute by number": "numbered(463, -100, __file__.encode(), 0, b'user.kept', bytes(16), 16)",
+    "flags of its own file": "fcntl.ioctl(os.open(__file__, os.O_RDONLY), 0x40086602, struct.pack('l', 0x40))",
+    "watching": "called('inotify_init1', 0)",
+    "watching the whole system": "called('fanotify_init', 0x200, 0)",
+    "a signal when a folder changes": "fcntl.fcntl(os.open(HERE, os.O_RDONLY), fcntl.F_NOTIFY, fcntl.DN_ACCESS)",
 }
 HELPERS = """
-import ctypes, multiprocessing, os, resource, socket, subprocess
+import ctypes, fcntl, multiprocessing, os, resource, socket, struct, subprocess
 from pathlib import Path
 
 HERE = Path(__file__).parent
 
 def called(name, *arguments):
     if getattr(ctypes.CDLL(None, use_errno=True), name)(*arguments) == -1:
+        raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))
+
+def numbered(number, *arguments):
+    call = ctypes.CDLL(None, use_errno=True).syscall
+    if call(ctypes.c_long(number), *(ctypes.c_long(x) if isinstance(x, int) else x for x in arguments)) == -1:
         raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))
 
 def linked(number):
@@ -165,8 +203,11 @@ def attacked(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, str
 def test_an_attack_is_denied(attacked: dict[str, str], name: str) -> None:
     """For want of a right, that is, and not because the attack is wrong: the same attack reaches its aim outside."""
     assert attacked[name].splitlines()[-1].startswith("denied")
-    # the parent's descriptors are closed; a tool that fails; a path in a child's sandbox
+    # the parent's descriptors are closed; a tool that fails; a path in a child's sandbox; a hidden place is empty, and
+    # all others are read-only, where the mounts are a process's own
     expected = ("PermissionError", "IndexError", "CalledProcessError", "Invalid cross-device link")
+    if own_mounts():
+        expected += ("FileNotFoundError", "Read-only file system")
     assert any(word in attacked[name] for word in expected), attacked[name]
 
 
@@ -291,13 +332,6 @@ def shared():
 IN_SHARED_MEMORY = ("processes", "lock", "shared memory")
 
 
-@cache
-def own_shared_memory() -> bool:
-    """The system lets a process have a /dev/shm of its own; some containers do not, and --fresh then denies it."""
-    command = "from phibench.estimator.sandbox.isolation import _Kernel; print(_Kernel().own_shared_memory())"
-    return subprocess.run([sys.executable, "-c", command], capture_output=True, text=True).stdout.strip() == "True"
-
-
 @pytest.mark.parametrize("fresh", [False, True])
 def test_honest_methods_go_on_working(tmp_path: Path, fresh: bool) -> None:
     """All of it; where --fresh has no shared memory to give, what needs it is refused, and the rest goes on."""
@@ -306,7 +340,7 @@ def test_honest_methods_go_on_working(tmp_path: Path, fresh: bool) -> None:
     (tmp_path / "allowed.txt").write_text("2")
     header = f"{HEADER}{USUAL}WEIGHTS = {str(tmp_path / 'allowed.txt')!r}\n"
     each = "    print(name, flush=True)\n    eval(text, globals(), dict(pair=pair))\n"
-    denied = IN_SHARED_MEMORY if fresh and not own_shared_memory() else ()
+    denied = IN_SHARED_MEMORY if fresh and not own_mounts() else ()
     going_on = {name: text for name, text in HONEST.items() if name not in denied}
     body = f"for name, text in {going_on!r}.items():\n{each}"
     reference = method_file(tmp_path / "method", f"{body}print('done')\nreturn {GOOD}", header=header)
@@ -401,7 +435,7 @@ def test_of_a_folder_around_the_data_set_the_rest_is_read(tmp_path: Path) -> Non
 assert (OUT / 'weights.txt').read_text() == 'WORD = 1'
 try:
     print(open(OUT / 'data' / 'truth.txt').read())
-except PermissionError:
+except OSError:
     print('denied')
 return {GOOD}
 """
@@ -420,25 +454,106 @@ def test_what_may_not_be_allowed_is_refused(tmp_path: Path, name: str, words: st
     assert str(caught.value).startswith("--allow ")
 
 
+@needs_landlock
+def test_hidden_places_have_neither_names_nor_times(tmp_path: Path) -> None:
+    """Where mounts are a process's own. The name of a sample may hold its D, and times of access tell what is read."""
+    if not own_mounts():
+        pytest.skip("this system gives a process no mounts of its own: names can be guessed and times seen")
+    for folder in ("data", "method"):
+        (tmp_path / folder).mkdir()
+    (tmp_path / "data" / "d2.180").write_text("truth")
+    (tmp_path / "method" / "beside.txt").write_text("1")
+    (tmp_path / "method" / "beside.txt").touch()
+    os.utime(tmp_path / "method" / "beside.txt", (1.0, 2.0))  # a time of access that the next reader would change
+    body = f"""
+import os
+from pathlib import Path
+here, data = Path(__file__).parent, Path({str(tmp_path / "data")!r})
+print((data / 'd2.180').exists(), os.access(data, os.W_OK))
+print((here / 'beside.txt').read_text(), os.statvfs(here).f_flag & 1)
+print(Path('mine').write_text('1'), os.statvfs('.').f_flag & 1)
+return {GOOD}
+"""
+    pairs = FilePairs(1, folders=(tmp_path / "data",))
+    (outcome,) = run_method(method_file(tmp_path / "method", body), pairs, LIMITS)
+    assert outcome.output.splitlines() == ["False False", "1 1", "1 0"], outcome
+    assert (tmp_path / "method" / "beside.txt").stat().st_atime == 1.0
+
+
+FAR = "a/b/c/d/e/f/g"
+
+
 def test_truth_near_a_method_is_found(tmp_path: Path) -> None:
-    for name in ("a/b/set/x", "a/plain", "deep/deep/deep", "f", "g"):
-        (tmp_path / name).mkdir(parents=True)
+    """All of the store's own list, however deep; by itself each file of the second half."""
+    for name in ("a/plain", FAR, *(f"whole/{kind.name}" for kind in TruthFolder), "single", "g"):
+        (tmp_path / name).mkdir(parents=True, exist_ok=True)
+    hidden = [*(f"whole/{kind.name}" for kind in TruthFolder), *(f"single/{kind}" for kind in TruthFile)]
     for name in (
-        "a/b/set/dataset.json",
-        "weights.parquet",
-        "config.json",
-        "a/seal_1.truth.json",
-        "a/one.parquet",
-        "f/frames.jsonl",
-        "f/frames.parquet",
-        "g/frames.jsonl",
+        *(f"whole/{kind.name}/{kind}" for kind in TruthFolder),
+        *(f"single/{kind}" for kind in TruthFile),
+        *("weights.parquet", "config.json", "a/seal_1.truth.json", "a/one.parquet", f"{FAR}/frames.jsonl"),
     ):
         (tmp_path / name).write_text("{}")
     (tmp_path / "a" / "one.json").write_text('{\n "kind": "phibench score"')
     (tmp_path / "config.parquet").write_text("not a score's: its JSON says nothing of one")
     found = {path.relative_to(tmp_path).as_posix() for path in truth_near(tmp_path)}
-    frames = {"f/frames.jsonl", "f/frames.parquet"}
-    assert found == {"a/b/set", "a/seal_1.truth.json", "a/one.json", "a/one.parquet"} | frames
+    assert found == {"a/seal_1.truth.json", "a/one.json", "a/one.parquet", f"{FAR}/frames.jsonl", *hidden}
+
+
+def test_a_method_beside_what_makes_a_folder_one_of_truth_is_refused(tmp_path: Path) -> None:
+    for kind in TruthFolder:
+        (tmp_path / kind.name).mkdir()
+        (tmp_path / kind.name / kind).write_text("{}")
+        method = method_file(tmp_path / kind.name, f"return {GOOD}")
+        with pytest.raises(MethodError, match=rf"which holds the truth \({kind}\): move it out"):
+            access_of(resolve(method), RunLimits())
+
+
+def test_a_folder_with_too_much_to_look_through_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(readable_files, "_MOST_ENTRIES", 5)
+    for number in range(4):
+        (tmp_path / str(number)).touch()
+    assert truth_near(tmp_path) == []
+    (tmp_path / "below").mkdir()
+    (tmp_path / "below" / "one").touch()
+    with pytest.raises(MethodError, match="more than 5 files, too many to look for the truth in: put the method into"):
+        truth_near(tmp_path)
+
+
+NAMES = re.compile(r"[\w.{}-]+\.(json|jsonl|parquet|csv|npz|npy)")
+OPEN = {
+    "croissant.json": "says what a set holds, and hashes",
+    "run.json": "time and workers",
+    "log.jsonl": "time and causes of tasks",
+    "request.json": "how frames were drawn",
+    "seal.json": "public half of a sealed set",
+    "pairs.jsonl": "public pairs of a sealed set; an imported set is hidden whole",
+    "done.json": "key and hashes of a film",
+    "light{:02d}.npz": "light of a film, which is hidden whole",
+    "fetch.json": "state of a download",
+    "archives.jsonl": "names and hashes of archives",
+    "MANIFEST.json": "the same, of a release",
+    "published.csv": "table of the paper, shipped with this package",
+    "{preset}-{name}.json": "a score: told by its content",
+}
+"""Names that a method may read, and why."""
+
+
+def test_every_file_that_is_written_is_on_the_list_or_open() -> None:
+    """A new format has to be put into one of the two; the list is that of the store."""
+    listed = {SEALED_TRUTH, *map(str, TruthFolder), *map(str, TruthFile)}
+    named = set()
+    for file in sorted(path for folder in ("datasets", "estimator") for path in (ROOT / folder).rglob("*.py")):
+        if file.parts[-2] in ("cli", "studies", "sandbox") or "studies" in file.parts:
+            continue
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Assign | ast.AnnAssign) and node.value is not None:
+                for one in ast.walk(node.value):
+                    if isinstance(one, ast.Constant) and isinstance(one.value, str) and NAMES.fullmatch(one.value):
+                        named.add(one.value)
+    assert {"dataset.json", "frames.jsonl"} <= named
+    assert named - listed - set(OPEN) == set()
+    assert not set(OPEN) & listed
 
 
 # -- what is said --------------------------------------------------------------------------------------------------
