@@ -138,7 +138,7 @@ def _title(reference: Reference) -> str:
 
 
 def function_of_file(reference: Reference) -> Any:
-    """What a file has under the name of a reference; runs its code.
+    """Object of a file that a reference names; runs the file's code.
 
     Raises
     ------
