@@ -84,7 +84,7 @@ class Crops:
         """Answers of a network for all of them."""
         found = Network(file, CROP)
         uv, factor = found.run(planes=self.planes, scalars=self.scalars)
-        scale = float(found.metadata["covariance_scale"])
+        scale = found.scale
         return Answers(uv.astype(float) - self.uv_px, covariances(factor.astype(float), scale))
 
 

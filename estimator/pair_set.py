@@ -17,6 +17,9 @@ from phibench.estimator.interface import Pair
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import Rig
 
+LEAST_BOX_PX = 16
+"""Side of the smallest box, as in a recipe."""
+
 
 @dataclass(frozen=True)
 class Distraction:
@@ -102,6 +105,8 @@ class PairTruth(ShortForm):
         Of `depth_m` where it was measured by a tape; 0 of an exact one.
     axis_depth_m : float
         D of the beam's axis; NaN where it is not known.
+    box_px2 : float
+        Area of a search box where there is one: the smaller of both.
     """
 
     number: int
@@ -124,6 +129,7 @@ class PairTruth(ShortForm):
     lamp_level: float | None = None
     depth_sigma_m: float = 0.0
     axis_depth_m: float = math.nan
+    box_px2: float = LEAST_BOX_PX**2
 
     def _title(self) -> str:
         return f"Truth of pair {self.number}: '{self.sample_id}', draw {self.draw}, {self.preset}"

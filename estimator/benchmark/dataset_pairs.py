@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -34,7 +35,7 @@ from phibench.estimator.limits.off_frame_bound import FrameCounts, on_off_limit,
 from phibench.estimator.limits.position_bound import SpotLimit, spot_limit
 from phibench.estimator.limits.processed_bound import chain_limit
 from phibench.estimator.limits.spot_snr import processed_snr, raw_snr
-from phibench.estimator.pair_set import Distraction, PairSet, PairTruth, SpotTruth, truth_folders
+from phibench.estimator.pair_set import LEAST_BOX_PX, Distraction, PairSet, PairTruth, SpotTruth, truth_folders
 from phibench.estimator.spots.gaussian_spot import SpotBlur
 from phibench.estimator.spots.image_planes import PROCESSED
 from phibench.estimator.spots.spot_prediction import spot_blur
@@ -54,10 +55,6 @@ TASK_VERSION = 6
 
 _OF_THE_SPOT = 0.01  # of its brightest pixel: dimmer pixels are not the spot's
 _FLUX = 2  # place of the flux among the unknowns of a Fisher matrix
-
-
-LEAST_BOX_PX = 16
-"""Side of the smallest box, as in a recipe."""
 
 
 class DatasetPairs(DrawnPairs, ShortForm):
@@ -121,6 +118,7 @@ class DatasetPairs(DrawnPairs, ShortForm):
             laser_level=source.request.laser_level,
             lamp_level=source.request.lamp_level,
             axis_depth_m=sample.row.depth_m,
+            box_px2=_box_px2(pair_draw),
         )
 
     def number_of(self, sample_id: str, draw: int = 0, preset: str | None = None) -> int:
@@ -176,6 +174,11 @@ class DatasetPairs(DrawnPairs, ShortForm):
             text = json.dumps([self._sensor.preset, dict(self._sensor.numbers)], sort_keys=True)
             found["sensor_sha256"] = hashlib.sha256(text.encode()).hexdigest()
         return found
+
+
+def _box_px2(pair_draw: PairDraw) -> float:
+    sizes = (math.prod(region.shape) for region in pair_draw.boxes or ())
+    return float(min(sizes, default=LEAST_BOX_PX**2))
 
 
 def _reopened(folder: Path, *others: Any) -> DatasetPairs:

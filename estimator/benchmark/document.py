@@ -28,13 +28,13 @@ from phibench.estimator.benchmark.answer_errors import Rules
 from phibench.estimator.benchmark.causes import count, count_failures
 from phibench.estimator.benchmark.intervals import Estimate
 from phibench.estimator.benchmark.metrics import METRICS, Measured
-from phibench.estimator.benchmark.pair_bounds import excesses
 from phibench.estimator.benchmark.records import COLUMN_TYPES
 from phibench.estimator.benchmark.strata import Stratum, count_pairs, light_shift, measured, strata
+from phibench.estimator.limits.beyond_images import excesses
 from phibench.scenes.validation import printable_line
 
 KIND: Literal["phibench score"] = "phibench score"
-VERSION = 4
+VERSION = 5
 SCORER = "phibench.estimator.benchmark.score"
 """Module whose code, with all that it imports, is behind a score."""
 
@@ -47,6 +47,7 @@ class Value(Document):
     high: float | None
     n: int = Field(description="records")
     samples: int = Field(description="samples that the interval resamples")
+    share: float | None = Field(description="of the visible spots, or pairs, that it rests on; null if on all of them")
     note: str
 
     @classmethod
@@ -54,7 +55,16 @@ class Value(Document):
         """From a measurement, and the fields that a subclass has besides."""
         e = measured.estimate
         numbers = {"value": finite(e.value), "low": finite(e.low), "high": finite(e.high)}
-        return cls.model_validate({**numbers, **fields, "n": measured.n, "samples": measured.samples, "note": e.note})
+        return cls.model_validate(
+            {
+                **numbers,
+                **fields,
+                "n": measured.n,
+                "samples": measured.samples,
+                "share": finite(measured.share),
+                "note": e.note,
+            }
+        )
 
     @property
     def estimate(self) -> Estimate:
@@ -122,19 +132,23 @@ class MethodCard(Document):
 
 
 class Flag(Document):
-    """A quantity that is better than the images allow, as `pair_bounds.Excess`; null is an infinite ratio."""
+    """A quantity that is better than the images allow, as `beyond_images.Excess`; null is an infinite ratio."""
 
     quantity: str
+    part: str = Field(description="images or pairs that show it best")
     ratio: float | None
-    pairs: int
+    pairs: int = Field(description="pairs, or images of one position")
     chance: float
 
     @property
     def text(self) -> str:
         """Sentence about it."""
-        times = "without error" if self.ratio is None else f"{self.ratio:.3g} times better than the images allow"
+        often = self.quantity in ("exact answers", "faint spots")
+        better = "as often as the images allow" if often else "better than the images allow"
+        times = "without error" if self.ratio is None else f"{self.ratio:.3g} times {better}"
         chance = f"below {1e-6:g}" if self.chance < 1e-6 else f"{self.chance:.1g}"
-        return f"knows more than the images: {self.quantity} {times} ({self.pairs} pairs, by chance {chance})"
+        where = f"{self.part}, {self.pairs}"
+        return f"knows more than the images: {self.quantity} {times} ({where}; by chance {chance})"
 
 
 class Spread(Document):

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import Literal
 
@@ -78,6 +78,11 @@ FAMILIES: dict[str, pl.Expr] = {
 """Which records enter a metric; those of pairs take each pair once, by its row "down"."""
 
 _RELATIVE = ("depth_relative", "depth_counted", "root_bound_depth", "rank_depth2", "inverse_depth", "root_pair_depth")
+CHOSEN = (
+    *("bound", "raw bound", "phi bound", "depth bound", "pair bound", "pair phi bound", "pair depth bound"),
+    *("pull", "depth pull", "claimed"),
+)
+"""Families whose records a method chooses by what it answers and claims: their metrics are given with their share."""
 OF_PAIRS = ("any pair", "pair", "depth", "depth bound", "depth pull", "timed", "pair depth bound")
 
 WHY_EMPTY = {
@@ -285,11 +290,15 @@ def applies(name: str, sees: str) -> bool:
 
 @dataclass(frozen=True)
 class Measured:
-    """An estimate with its numbers of records and samples."""
+    """An estimate with its numbers of records and samples.
+
+    `share` is that of the visible spots, or pairs, which the records are; NaN of metrics that are of all of them.
+    """
 
     estimate: Estimate
     n: int
     samples: int
+    share: float = math.nan
 
 
 def prepared(records: pl.DataFrame) -> pl.DataFrame:
@@ -330,7 +339,14 @@ def measure(
         groups.setdefault(clusters.key, {}).update(_statistics(part, chosen, clusters))
     for number, ready in enumerate(groups.values()):
         found |= _resampled(ready, rules, generator(*stream, number))
-    return {name: found[name] for name in wanted}
+    return {name: _with_share(metric, found[name], records) for name, metric in wanted.items()}
+
+
+def _with_share(metric: Metric, measured: Measured, records: pl.DataFrame) -> Measured:
+    if metric.family not in CHOSEN:
+        return measured
+    every = len(records.filter(FAMILIES["pair" if metric.family in OF_PAIRS else "visible"]))
+    return replace(measured, share=measured.n / every if every else math.nan)
 
 
 def trusted(metric: Metric, estimate: Estimate, samples: int) -> Estimate:

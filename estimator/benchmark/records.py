@@ -30,8 +30,10 @@ from phibench.estimator.benchmark.answer_errors import (
 )
 from phibench.estimator.benchmark.pair_bounds import SpotBoundsOfImages, pair_bounds
 from phibench.estimator.geometry.least_squares_depth import nominal_depth
+from phibench.estimator.geometry.phi import outline_circle
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.estimator.interface import OK, Answer, Outcome, Spot
+from phibench.estimator.limits.beyond_images import searched_px2
 from phibench.estimator.pair_set import PairSet, PairTruth, SpotTruth
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import POSITIONS, Rig
@@ -81,6 +83,7 @@ COLUMNS: dict[str, str] = {
     "false_detection": "a position where the spot is not visible, or further than match_px from it",
     "counted_px": "distance_px if detected, match_px if missed",
     "phi_convention": "ray, normal, incidence or outline",
+    "phi_from": "method or pixels",
     "phi_rad": "the method's, else estimator.geometry.phi of its pixel through the nominal rig",
     "phi_true_rad": "truth in that convention; outline: estimator.geometry.phi of the true pixel through the true rig",
     "phi_error_rad": "phi_rad - phi_true_rad, in units of phi_ray: times d phi_ray / d phi along the gradient",
@@ -91,7 +94,13 @@ COLUMNS: dict[str, str] = {
     "pull_v": "second component",
     "mahalanobis2": "e^T C^-1 e",
     "bound_px2": "trace of the bound (docs/limits.md): expected squared distance at it",
-    "raw_bound_px2": "the same of the raw pixels behind the image",
+    "bound_uu_px2": "the bound itself: variance of u",
+    "bound_uv_px2": "covariance of u and v",
+    "bound_vv_px2": "variance of v",
+    "raw_bound_px2": "as bound_px2, of the raw pixels behind the image",
+    "raw_bound_uu_px2": "that bound itself: variance of u",
+    "raw_bound_uv_px2": "covariance of u and v",
+    "raw_bound_vv_px2": "variance of v",
     "bound_phi_rad2": "variance of phi at the bound",
     "pair_bound_px2": "as bound_px2, of both images together: one point of the room",
     "pair_bound_phi_rad2": "variance of phi at that bound",
@@ -105,14 +114,19 @@ COLUMNS: dict[str, str] = {
     "depth_error_m": "depth_estimate_m - depth_m",
     "depth_relative": "depth_error_m / depth_m",
     "depth_sigma_m": "claimed: the method's with its own depth, else from its covariances; with a calibration's part",
+    "claimed_sigma_m": "the method's sigma of its own D, without a calibration's part",
+    "claimed_low_m": "lower end of the method's 95 % interval of its own D",
+    "claimed_high_m": "upper end",
     "depth_pull": "depth_error_m / depth_sigma_m; of real pairs the tape's standard deviation is added",
     "depth_within": "D in the claimed 95 % interval: the method's own, widened as its sigma is, else |pull| <= 1.96",
     "bound_depth_m2": "variance of D at the bounds of both spots, each by itself; without calibration",
     "pair_bound_depth_m2": "the same of both images together",
     "possible_position_chi2": "errors of the pair's positions over what is possible, squared; 3 degrees of freedom",
-    "possible_phi_rad2": "smallest possible variance of phi, sum of both images",
     "possible_depth_m2": "smallest possible variance of D",
-    "pair_phi_error_rad2": "squared errors of phi, sum of both images",
+    "possible_spot_px2": "trace of the smallest possible covariance of this position, at most 0.5 px^2 along any axis",
+    "possible_spot_chi2": "squared error of this position over that covariance; 2 degrees of freedom",
+    "possible_spot_phi_rad2": "smallest possible variance of this phi",
+    "searched_px2": "area in which a search has to look for the spot: its box, or a quarter of the mirror's disc",
     "seconds": "inside the method",
     "failure": "of the harness; empty if none",
     "message": "about the failure",
@@ -128,7 +142,7 @@ _OF_FRAMES = ("exposure_s", "analogue_gain", "laser_level", "lamp_level")
 _WHOLE = ("number", "draw", "jpeg_quality")
 _TEXTS = (
     *("sample_id", "image", "preset", "unseen_because", "bayer"),
-    *("status", "phi_convention", "depth_from", "failure", "message"),
+    *("status", "phi_convention", "phi_from", "depth_from", "failure", "message"),
 )
 _TRUTH_VALUES = (
     *("hinted", "saturated", "visible", "detected", "missed"),
@@ -274,14 +288,14 @@ def _image_columns(
         "false_detection": false,
         "counted_px": np.where(visible & known, np.where(detected, error.distance_px, rules.match_px), np.nan),
         **phi,
-        "claimed_uu_px2": claimed[:, 0, 0],
-        "claimed_uv_px2": claimed[:, 0, 1],
-        "claimed_vv_px2": claimed[:, 1, 1],
+        **_parts("claimed", claimed),
         "pull_u": pull[:, 0],
         "pull_v": pull[:, 1],
         "mahalanobis2": np.sum(pull**2, axis=-1),
         "bound_px2": np.trace(bound, axis1=1, axis2=2),
+        **_parts("bound", bound),
         "raw_bound_px2": np.trace(raw, axis1=1, axis2=2),
+        **_parts("raw_bound", raw),
         "bound_phi_rad2": phi_variance(nominal, xy, bound),
         "rank_phi2_rad2": np.where(
             known,
@@ -289,6 +303,12 @@ def _image_columns(
             np.nan,
         ),
     }
+
+
+def _parts(name: str, matrices: Array) -> dict[str, Array]:
+    """Columns of symmetric matrices of (u, v), shape (n, 2, 2)."""
+    places = {"uu": (0, 0), "uv": (0, 1), "vv": (1, 1)}
+    return {f"{name}_{part}_px2": matrices[:, i, j] for part, (i, j) in places.items()}
 
 
 def _ranked_phi_error(nominal: Rig, spots: list[SpotTruth], uv: Array, phi: dict[str, Any]) -> Array:
@@ -313,6 +333,7 @@ def _phi_columns(
     truth = np.array([s.phi_rad.get(c, o) for s, c, o in zip(spots, convention, outline, strict=True)])
     return {
         "phi_convention": [c if np.isfinite(x) else None for c, x in zip(convention, phi, strict=True)],
+        "phi_from": [_from(*x) for x in zip(np.isfinite(own), np.isfinite(phi), strict=True)],
         "phi_rad": phi,
         "phi_true_rad": truth,
         "phi_error_rad": (phi - truth) * in_ray_units(true, xy, convention),
@@ -339,17 +360,24 @@ def _joint_columns(
     for position, uv, C in zip(POSITIONS, (xy1, xy2), (joint.down_px2, joint.up_px2), strict=True):
         images[position]["pair_bound_px2"] = np.trace(C, axis1=1, axis2=2)
         images[position]["pair_bound_phi_rad2"] = phi_variance(nominal, uv, C)
+    for place, position in enumerate(POSITIONS):
+        for name in ("possible_spot_px2", "possible_spot_chi2", "possible_spot_phi_rad2"):
+            images[position][name] = getattr(joint, name)[place]
     return {
         "pair_bound_depth_m2": joint.depth_m2,
         "possible_position_chi2": joint.possible_position_chi2,
-        "possible_phi_rad2": joint.possible_phi_rad2,
         "possible_depth_m2": joint.possible_depth_m2,
-        "pair_phi_error_rad2": sum(images[p]["phi_error_rad"] ** 2 for p in POSITIONS),
     }
 
 
 _BOUND_NAMES = ("bound_px2", "raw_bound_px2")
 _TRUE_PX, _ERROR_PX = ("u_true_px", "v_true_px"), ("du_px", "dv_px")
+
+
+def _searched_px2(nominal: Rig, truths: list[PairTruth]) -> Array:
+    radius = float(outline_circle(nominal)[1])
+    boxes = (t.box_px2 if t.hinted else None for t in truths)
+    return np.array([searched_px2(radius, box) for box in boxes])
 
 
 def _nominal_stroke_m(truths: list[PairTruth]) -> Array:
@@ -372,8 +400,8 @@ def _pair_columns(
     found_m = nominal_depth(nominal, nominal_h, (answers[0], answers[1]), (claims[0], claims[1]), calibration)
     own, own_sigma = (np.array([_own_depth(o.answer, name) for o in outcomes]) for name in ("depth_m", "sigma_depth_m"))
     has_own = np.isfinite(own)
-    own_sigma = np.hypot(own_sigma, found_m.calibration_sigma_m)
-    depth, sigma = np.where(has_own, own, found_m.depth_m), np.where(has_own, own_sigma, found_m.sigma_m)
+    of_own = np.hypot(own_sigma, found_m.calibration_sigma_m)
+    depth, sigma = np.where(has_own, own, found_m.depth_m), np.where(has_own, of_own, found_m.sigma_m)
     pull = (depth - true_m) / np.where(sigma > 0.0, np.hypot(sigma, true_sigma_m), np.nan)
     intervals = np.array([_own_interval(o.answer) for o in outcomes])
     within = _within(depth, true_m, pull, intervals, np.hypot(found_m.calibration_sigma_m, true_sigma_m))
@@ -388,6 +416,7 @@ def _pair_columns(
         "jpeg_quality": [t.jpeg_quality for t in truths],
         **{name: [getattr(t, name) for t in truths] for name in _OF_FRAMES},
         "hinted": [t.hinted for t in truths],
+        "searched_px2": _searched_px2(nominal, truths),
         "depth_m": true_m,
         "axis_depth_m": np.array([t.axis_depth_m for t in truths], float),
         "stroke_m": h,
@@ -395,11 +424,14 @@ def _pair_columns(
         "pair_false": false,
         "pair_electrons": np.minimum(down["electrons"], up["electrons"]),
         "depth_found": found,
-        "depth_from": [_depth_from(*x) for x in zip(has_own, np.isfinite(depth), strict=True)],
+        "depth_from": [_from(*x) for x in zip(has_own, np.isfinite(depth), strict=True)],
         "depth_estimate_m": depth,
         "depth_error_m": depth - true_m,
         "depth_relative": depth / true_m - 1.0,
         "depth_sigma_m": sigma,
+        "claimed_sigma_m": np.where(has_own, own_sigma, np.nan),
+        "claimed_low_m": intervals[:, 0],
+        "claimed_high_m": intervals[:, 1],
         "depth_pull": pull,
         "depth_within": within,
         "bound_depth_m2": _bound_depth(nominal, nominal_h, *truth, *bounds).sigma_m ** 2,
@@ -459,7 +491,7 @@ def _within(depth: Array, true_m: Array, pull: Array, intervals: Array, added_m:
     return [bool(x) if there else None for x, there in zip(inside, known, strict=True)]
 
 
-def _depth_from(own: bool, there: bool) -> str | None:
+def _from(own: bool, there: bool) -> str | None:
     if not there:
         return None
     return "method" if own else "pixels"

@@ -167,6 +167,7 @@ def score_outcomes(
     rules: Rules,
     seed: int = 0,
     limits: Mapping[str, Any] | None = None,
+    told: Callable[[int], None] = lambda done: None,
 ) -> Scored:
     """Score what a method has answered on all pairs; parameters as for `score_methods`."""
     ordered = in_order(outcomes, len(pairs))
@@ -174,6 +175,7 @@ def score_outcomes(
     for i in range(0, max(len(ordered), 1), AT_ONCE):
         leading = parts[-1].leading if parts else None
         parts.append(examine(CachedPairs(pairs), ordered[i : i + AT_ONCE], rules, leading))
+        told(min(i + AT_ONCE, len(ordered)))
     return _scored(method, pairs, parts, rules, seed, limits or {})
 
 

@@ -26,7 +26,7 @@ from phibench.estimator.benchmark.causes import CAUSES, KINDS, NOISE, TAKEN_FOR
 from phibench.estimator.benchmark.compare import Difference
 from phibench.estimator.benchmark.document import ScoreDocument, Value
 from phibench.estimator.benchmark.intervals import Estimate
-from phibench.estimator.benchmark.metrics import METRICS, RANKS, applies
+from phibench.estimator.benchmark.metrics import CHOSEN, METRICS, RANKS, applies
 from phibench.estimator.methods.registry import REFUSED
 
 Form = Literal["terminal", "csv", "markdown", "latex", "json"]
@@ -450,11 +450,12 @@ def latex(grid: Grid) -> str:
 
 def scores_csv(documents: Sequence[ScoreDocument], by: str = "phi") -> str:
     """One row per method: every metric with its interval, in the units of the files, in full."""
-    names = [f"{name}{end}" for name in METRICS for end in ("", "_low", "_high")]
+    ends = {name: ("", "_low", "_high", *(("_share",) if METRICS[name].family in CHOSEN else ())) for name in METRICS}
+    names = [f"{name}{end}" for name in METRICS for end in ends[name]]
     rows = []
     for document in ranked(documents, by):
-        values = (document.metrics[name] for name in METRICS)
-        numbers = [x for value in values for x in (value.value, value.low, value.high)]
+        values = ((document.metrics[name], len(ends[name])) for name in METRICS)
+        numbers = [x for one, n in values for x in (one.value, one.low, one.high, one.share)[:n]]
         flags = ", ".join(flag.quantity for flag in document.flags)
         rows.append([document.method.name, document.pairs, document.images, document.samples, flags, *numbers])
     return _csv(["method", "pairs", "images", "samples", "knows_more", *names], rows)
@@ -520,8 +521,11 @@ def head(name: str) -> str:
 
 
 def shown_parts(name: str, value: Value) -> tuple[str, str]:
-    """Value and interval of a metric in the unit of tables."""
-    return cell_parts(value.estimate, METRICS[name].shown[0], DIGITS, significant=True)
+    """Value and interval of a metric in the unit of tables; an efficiency with the share of spots that it rests on."""
+    shown, interval = cell_parts(value.estimate, METRICS[name].shown[0], DIGITS, significant=True)
+    if METRICS[name].kind != "efficiency" or value.value is None or value.share is None:
+        return shown, interval
+    return f"{shown} of {100.0 * value.share:.0f} %", interval
 
 
 def _parts(name: str, value: Value) -> tuple[str, str]:

@@ -129,24 +129,32 @@ def check(
     *,
     data: Path | None = None,
     release: Path | None = None,
+    method: str | None = None,
+    workers: Whole = 1,
+    limits: Limits = LIMITS,
     json: Annotated[bool, Parameter(negative="", help="The outcome as one JSON document.")] = False,
 ) -> int:
     """Check a score file of an open set: a sentence for each fault. The exit code is 1 if there is one.
 
-    Form, version, hashes, pairs, impossible values, errors and statistics; with --data truth and bounds as well.
+    Form, version, hashes, pairs, impossible values, errors and statistics. With --data every column is built again from
+    the answers. With --method as well the method is run again.
 
     Parameters
     ----------
     file
         JSON file that `phibench score --out` wrote, with its Parquet file beside it.
     data
-        Folder of the data set that was scored: truth and bounds are computed again.
+        Folder of the data set that was scored: truth, bounds, errors, causes and worst images are computed again.
     release
         MANIFEST.json of a release: the data set must be one of it.
+    method
+        The method itself, as for `phibench score`: its hashes are compared, and with --data its answers.
+    workers
+        Pairs that are worked on at a time when the method is run again.
     """
     from phibench.estimator.sealed.score_check import check_score
 
-    checked = check_score(file, data, release)
+    checked = check_score(file, data, release, method, limits.of_run, workers)
     if json:
         sys.stdout.write(checked.text())
         return int(bool(checked.faults))

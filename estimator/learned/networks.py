@@ -4,13 +4,17 @@ One thread: the same bytes every time.
 
 A file ends with the SHA-256 of all that is before it. It is an entry of the model's metadata, so that other programs
 read the file as they read any ONNX model. `learned.crop_training` and `learned.frame_training` make the weights.
+
+A file may be a stranger's. Its size, its hash, its layers and its numbers are looked at before anything of it runs.
 """
 
 from __future__ import annotations
 
 import hashlib
+import json
+import math
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -25,6 +29,7 @@ from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.datasets.input_files import MIB, InputFile
 from phibench.datasets.store.files import write_bytes
 from phibench.estimator.interface import Image, Spot
+from phibench.estimator.learned.network_file import NetworkFileError, Node, read_model, require_layers
 from phibench.estimator.learned.network_input import (
     FRAME_PLANES,
     PLANES,
@@ -36,6 +41,7 @@ from phibench.estimator.learned.network_input import (
     cut,
 )
 from phibench.scenes.frames import Array, BoolArray
+from phibench.scenes.validation import printable_line
 
 VERSION = "1"
 """Version of what a network gets and answers; a change of either raises it."""
@@ -50,6 +56,8 @@ _REMEDY = "install phibench anew, or train it: docs/learned.md"
 _MOST_BYTES = MIB
 _HASH = b"r\x4a\x0a\x06sha256\x12\x40"  # field 14 of a model, 74 bytes: the key, and a value of 64
 _TAIL = len(_HASH) + 64
+_SCALE = "covariance_scale"  # entry of the metadata: factor of the covariance
+_MOST_LN = 50.0  # of a precision's factor: of deviations beyond e^-50 and e^50 px
 
 
 class NetworkError(DatasetError):
@@ -71,11 +79,7 @@ def shipped(name: str) -> Network:
     NetworkError
         As of `Network`, or if the file belongs to another release.
     """
-    path = Path(__file__).with_name(f"{name}.onnx")
-    found = network(path, name)
-    if found.sha256 != SHIPPED[name]:
-        raise NetworkError(f"{path} belongs to another release of phibench; {_REMEDY}")
-    return found
+    return network(Path(__file__).with_name(f"{name}.onnx"), name, SHIPPED[name])
 
 
 def sealed(model: bytes) -> bytes:
@@ -105,6 +109,8 @@ class Network:
     ----------
     path : Path
     name : `CROP` or `DETECT`
+    sha256 : str, optional
+        That the file must state.
 
     Raises
     ------
@@ -112,7 +118,7 @@ class Network:
         If onnxruntime is missing, or the file is damaged, of another version or no such network.
     """
 
-    def __init__(self, path: Path, name: str) -> None:
+    def __init__(self, path: Path, name: str, sha256: str | None = None) -> None:
         file = InputFile(path, _REMEDY, NetworkError, _MOST_BYTES)
         model = file.read()
         if model[-_TAIL:-64] != _HASH:
@@ -120,25 +126,46 @@ class Network:
         if model[-64:] != hashlib.sha256(model[:-_TAIL]).hexdigest().encode():
             raise file.fault("is damaged: its bytes do not have the SHA-256 that it states")
         self.sha256 = model[-64:].decode()
-        self._session = _session(model, file)
-        self.metadata: dict[str, str] = dict(self._session.get_modelmeta().custom_metadata_map)
-        if self.metadata.get("name") != name:
-            raise file.fault(f"holds '{self.metadata.get('name')}', not '{name}'")
-        if self.metadata.get("version") != VERSION:
-            raise file.fault(f"is of version {self.metadata.get('version')}, this phibench needs version {VERSION}")
+        if sha256 not in (None, self.sha256):
+            raise file.fault("belongs to another release of phibench")
+        try:
+            self.metadata = _checked(model, name)
+        except NetworkFileError as error:
+            raise file.fault(str(error)) from error
+        self._file, self._session = file, _session(model, file)
 
     def run(self, **inputs: NDArray[np.float32]) -> list[NDArray[np.float32]]:
         """Outputs for inputs with a leading axis of items."""
-        return list(self._session.run(None, inputs))
+        try:
+            return list(self._session.run(None, inputs))
+        except Exception as error:  # its own kinds, some without a common base
+            raise self._file.fault(f"cannot be run: {type(error).__name__}") from error
 
-    def number(self, key: str) -> float:
-        """Number of the metadata."""
-        return float(self.metadata[key])
+    @property
+    def scale(self) -> float:
+        """Factor of the covariance."""
+        return float(self.metadata[_SCALE])
+
+    def thresholds(self, kind: str) -> tuple[float, float]:
+        """Least heat of a spot alone, and of one in each image, for a kind of images.
+
+        Raises
+        ------
+        NetworkError
+            If the network has none for them.
+        """
+        try:
+            alone, each = (float(x) for x in json.loads(self.metadata["thresholds"])[kind])
+        except (KeyError, TypeError, ValueError) as error:
+            raise self._file.fault(f"has no two thresholds for {kind}") from error
+        if not (math.isfinite(alone) and math.isfinite(each)):
+            raise self._file.fault(f"has thresholds for {kind} that are not finite")
+        return alone, each
 
     def position(self, crop: CropInput, scale: float | None = None) -> Position:
         """Position of the spot in a crop, with its covariance; by default with the network's own scale."""
         uv, factor = self.run(planes=crop.planes[None], scalars=crop.scalars[None])
-        scale = self.number("covariance_scale") if scale is None else scale
+        scale = self.scale if scale is None else scale
         return Position(np.asarray(uv[0], float), covariances(np.asarray(factor, float), scale)[0])
 
 
@@ -153,15 +180,60 @@ def covariances(factors: Array, scale: float) -> Array:
         Factor of the covariance, from crops of rooms that were not trained in.
     """
     lower = np.zeros((len(factors), 2, 2))
-    lower[:, 0, 0], lower[:, 1, 0], lower[:, 1, 1] = np.exp(factors[:, 0]), factors[:, 1], np.exp(factors[:, 2])
+    first, last = (np.exp(np.clip(factors[:, k], -_MOST_LN, _MOST_LN)) for k in (0, 2))
+    lower[:, 0, 0], lower[:, 1, 0], lower[:, 1, 1] = first, factors[:, 1], last
     inverse = np.linalg.inv(lower)
     return np.asarray(scale * np.swapaxes(inverse, 1, 2) @ inverse)
 
 
 @lru_cache(maxsize=8)
-def network(path: Path, name: str) -> Network:
+def network(path: Path, name: str, sha256: str | None = None) -> Network:
     """Network of a file, read once."""
-    return Network(path, name)
+    return Network(path, name, sha256)
+
+
+def _checked(model: bytes, name: str) -> dict[str, str]:
+    """Metadata of a model that has the layers of a network and only them.
+
+    Raises
+    ------
+    NetworkFileError
+        If it is not.
+    """
+    found = read_model(model)
+    if found.metadata.get("name") != name:
+        raise NetworkFileError(f"holds '{printable_line(str(found.metadata.get('name')), 40)}', not '{name}'")
+    if found.metadata.get("version") != VERSION:
+        stated = printable_line(str(found.metadata.get("version")), 20)
+        raise NetworkFileError(f"is of version {stated}, this phibench needs version {VERSION}")
+    graph = _GRAPHS[name](_Recorder())
+    for kind, given, right in (("inputs", found.inputs, graph.inputs), ("outputs", found.outputs, graph.outputs)):
+        if given != list(right):
+            raise NetworkFileError(
+                f"has the {kind} {printable_line(', '.join(given), 60) or '-'}: {', '.join(right)} are needed"
+            )
+    require_layers(found, graph.nodes, weight_shapes(name), _OPSET)
+    for key, value in graph.constants.items():
+        if key not in found.tensors or not np.array_equal(found.tensors[key], value):
+            raise NetworkFileError(f"has another constant '{key}' than this network")
+    if strange := sorted(set(found.tensors) - set(graph.constants) - set(weight_shapes(name))):
+        raise NetworkFileError(f"has the weights '{printable_line(strange[0], 40)}', which this network does not know")
+    try:
+        scale = float(found.metadata[_SCALE])
+    except (KeyError, ValueError) as error:
+        raise NetworkFileError(f"states no number {_SCALE}") from error
+    if not 0.0 < scale < math.inf:
+        raise NetworkFileError(f"states {_SCALE} = {scale:g}: a finite number above 0 is needed")
+    return found.metadata
+
+
+class _Recorder:
+    """Nodes as `network_file.Node`, in place of onnx's helper."""
+
+    def make_node(self, kind: str, inputs: Sequence[str], outputs: Sequence[str], **attributes: Any) -> Node:
+        """One operator."""
+        plain = {key: tuple(x) if isinstance(x, list) else int(x) for key, x in attributes.items()}
+        return Node(kind, tuple(inputs), tuple(outputs), plain)
 
 
 def _session(model: bytes, file: InputFile) -> Any:
@@ -194,6 +266,17 @@ CORRECTION_PX = 0.1
 CELLS = SIDE_PX // 2
 DETECTOR = (("e1", FRAME_PLANES, 12), ("e2", 12, 16), ("e3", 16, 16), ("e4", 16, 16))
 """Of the network of frames: name, planes in, planes out; 3 x 3 cells each, cut at 0; then one plane of 1 x 1."""
+
+
+def weight_shapes(name: str) -> dict[str, tuple[int, ...]]:
+    """Shapes of a network's weights by name."""
+    of_cells = (
+        [("cells", (3, CONVOLUTIONS[-1][2], 1, 1), 3)] if name == CROP else [("heat", (1, DETECTOR[-1][2], 1, 1), 1)]
+    )
+    layers = CONVOLUTIONS if name == CROP else DETECTOR
+    sizes: list[tuple[str, tuple[int, ...], int]] = [(one[0], (one[2], one[1], 3, 3), one[2]) for one in layers]
+    sizes += [*of_cells, *((key, (of, to), to) for key, of, to in DENSE if name == CROP)]
+    return {f"{key}{end}": shape for key, w, b in sizes for end, shape in ((".w", w), (".b", (b,)))}
 
 
 def cell_places() -> NDArray[np.float32]:

@@ -5,7 +5,6 @@ The networks come with phibench, or from files: `estimator.learned` has their in
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -64,12 +63,12 @@ def learned_detect(detector: Path | None = None, crop: Path | None = None) -> Me
 
     def method(pair: Pair) -> Answer:
         finder = _named(DETECT, detector)
-        alone, each = json.loads(finder.metadata["thresholds"])[kind_of(pair.card)]
+        alone, each = finder.thresholds(kind_of(pair.card))
         # a box is a hundredth of the mirror: as many false peaks of the lower threshold as of the higher one elsewhere
         least = Thresholds(each if pair.box_down is not None and pair.box_up is not None else alone, each, each)
         down, up = (_candidates(finder, pair, position, each) for position in POSITIONS)
         choice = choose(pair.rig, pair.stroke_m, down, up, least, sure=True)
-        found = _named(CROP, crop), finder.number("covariance_scale")
+        found = _named(CROP, crop), finder.scale
         first = _spot(*found, pair, "down", down, choice.down)
         return Answer(first, _spot(*found, pair, "up", up, choice.up))
 

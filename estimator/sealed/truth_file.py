@@ -21,7 +21,7 @@ from phibench.datasets.errors import DatasetError
 from phibench.datasets.input_files import InputFile, Name
 from phibench.datasets.store.documents import from_json, to_json
 from phibench.datasets.store.schema import Document, Number
-from phibench.estimator.pair_set import Distraction, PairTruth, SpotTruth
+from phibench.estimator.pair_set import LEAST_BOX_PX, Distraction, PairTruth, SpotTruth
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import Rig
 
@@ -106,6 +106,7 @@ class TruthRow(Document):
     laser_level: _Real | None = None
     lamp_level: _Real | None = None
     axis_depth_m: _RealOrNan = math.nan
+    box_px2: _Real = float(LEAST_BOX_PX**2)
 
     @model_validator(mode="before")
     @classmethod

@@ -78,7 +78,7 @@ def scored(name, oracle, pairs=None):
 
 @pytest.fixture(scope="module")
 def scores():
-    flag = Flag(quantity="D", ratio=924.0, pairs=40, chance=0.0)
+    flag = Flag(quantity="D", part="all pairs", ratio=924.0, pairs=40, chance=0.0)
     half, records = scored("half", shifted(0.5))
     flagged = half.model_copy(update={"flags": [flag]})
     return [scored("ideal", sampler()), scored("mixed <b>&", mixed), (flagged, records)]
@@ -103,7 +103,7 @@ def test_the_page_fetches_nothing_and_runs_nothing(html):
 
 def test_a_method_that_knows_more_than_the_images_is_marked(html):
     text = " ".join(Page(html).text.split())
-    assert "! half knows more than the images: D 924 times better than the images allow (40 pairs" in text
+    assert "! half knows more than the images: D 924 times better than the images allow (all pairs, 40;" in text
     assert "half !" in text
     assert "ideal !" not in text
 

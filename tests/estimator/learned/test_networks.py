@@ -186,7 +186,7 @@ def test_files_that_will_not_do_are_refused_in_one_sentence(name: str, tmp_path:
         (sealed(other), "is of version 2, this phibench needs version 1"),
         (b"", "does not end as"),
         (model[:-1], "does not end as"),
-        (sealed(b"no network"), "is no network that onnxruntime can run"),
+        (sealed(b"no network"), "is no ONNX model"),
         (sealed(_renamed(bare, name)), f"not '{name}'"),
     ]
     for place in generator("flipped bits").integers(0, len(model), 20):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,19 +24,26 @@ from phibench.estimator.interface import Answer, Outcome, Spot
 from phibench.estimator.sealed.score_check import check_score, schema_text
 
 ROOT = Path(__file__).parents[3]
-CARD = MethodCard.of("my_phi:extract", kind="file", place="my_phi.py", sha256="0" * 64)
+CARD = MethodCard.of(
+    "my_phi:extract", kind="file", place="my_phi.py", sha256="0" * 64, packages={"numpy": "2.0"}, files_complete=True
+)
 Change = Callable[[pl.DataFrame], pl.DataFrame]
 
 
 @pytest.fixture(scope="module")
 def honest(bench_dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Score of answers 0.3 px beside the truth, silent on one image."""
+    """Score of answers 0.3 px beside the truth, with claims, silent on one image, with a D and an angle of its own."""
     pairs = dataset_pairs(open_finished(bench_dataset), "bayer-raw")
+    claim = ((0.09, 0.02), (0.02, 0.04))
 
     def outcome(number: int) -> Outcome:
         truth = pairs.truth(number)
-        down, up = (Spot((one.uv_px[0] + 0.3, one.uv_px[1])) for one in (truth.down, truth.up))
-        return Outcome(number, Answer(down, Spot.missing("not seen") if number == 1 else up), 0.01)
+        down, up = (Spot((one.uv_px[0] + 0.3, one.uv_px[1]), claim) for one in (truth.down, truth.up))
+        if number == 1:
+            return Outcome(number, Answer(down, Spot.missing("not seen")), 0.01)
+        own = replace(up, phi_rad=truth.up.phi_rad["normal"] + 1e-4, phi_convention="normal")
+        D = 1.01 * truth.depth_m
+        return Outcome(number, Answer(down, own, D, 0.02, (0.9 * D, 1.2 * D)) if number else Answer(down, up), 0.01)
 
     scored = score_outcomes(CARD, pairs, [outcome(number) for number in range(len(pairs))], Rules())
     path = tmp_path_factory.mktemp("handed-in") / "mine.json"
@@ -46,11 +54,15 @@ def honest(bench_dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
 def test_an_honest_score_has_no_fault(honest: Path, bench_dataset: Path, capsys: pytest.CaptureFixture[str]) -> None:
     checked = check_score(honest, bench_dataset)
     assert checked.faults == ()
-    assert [text.split(":")[0] for text in checked.unchecked] == ["that the data set is a released one"]
+    assert [text.split(":")[0] for text in checked.unchecked if not text.startswith("code_sha256")] == [
+        "method.sha256, modules, files and packages",
+        "seconds, limits and isolation",
+        "that the data set is a released one",
+    ]
     assert cli.main(["submission", "check", str(honest), "--json"]) == 0
     document = json.loads(capsys.readouterr().out)  # the document and nothing else
     assert (document["valid"], document["faults"], document["pairs"]) == (True, [], 3)
-    assert len(document["unchecked"]) == 2
+    assert len([text for text in document["unchecked"] if not text.startswith("code_sha256")]) == 4
 
 
 def _with_metric(document: ScoreDocument) -> dict[str, Any]:
@@ -142,7 +154,7 @@ def test_another_version_is_one_sentence(honest: Path, tmp_path: Path, capsys: p
     path.write_text(json.dumps({**json.loads(honest.read_text()), "version": 2}))
     assert cli.main(["submission", "check", str(path)]) == 2
     said = capsys.readouterr().err.strip()
-    assert "has version 2, this program reads 4: score again" in said
+    assert "has version 2, this program reads 5: score again" in said
     assert "\n" not in said
     path.write_text(honest.read_text())
     with pytest.raises(DatasetError, match="missing: it belongs to"):
