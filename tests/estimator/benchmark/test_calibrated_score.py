@@ -13,6 +13,7 @@ from helpers.bench_cases import RIG, Cases, cases
 from scipy import stats
 
 from phibench.datasets.read import Dataset, open_finished
+from phibench.estimator.benchmark import score as scoring
 from phibench.estimator.benchmark.answer_errors import Rules
 from phibench.estimator.benchmark.dataset_pairs import CalibratedPairs, of_calibration
 from phibench.estimator.benchmark.metrics import measure, prepared
@@ -209,7 +210,10 @@ def test_score_prints_the_general_row(misaligned: Dataset, tmp_path: Path, capsy
     assert seen["sigma_m"] > 0.0
 
 
-def test_methods_are_scored_with_a_calibration(misaligned: Dataset, tmp_path: Path) -> None:
+def test_methods_are_scored_with_a_calibration(
+    misaligned: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(scoring, "write_report", lambda *_: tmp_path)  # thirty figures
     nominal = misaligned.samples[0].nominal_rig
     file = written(tmp_path / "c.json", truth_of_rig(misaligned), nominal)
     common = ("score", misaligned.folder, "--method", "detect", "--preset", "bayer-raw")
