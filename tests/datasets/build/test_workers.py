@@ -12,6 +12,7 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from helpers.folders import contents
@@ -193,9 +194,10 @@ def test_a_signal_while_workers_start_ends_in_one_sentence(
 # A scheduler of others.
 
 
-def commands(mark: str, folder: Path) -> list[list[str]]:
-    """Commands of docs/cluster.md below a mark, for a smaller recipe and another folder."""
-    block = re.search(rf"<!-- {mark} -->\n((?:    .*\n)+)", PAGE)
+def commands(mark: str, folder: Path, tls: bool = False) -> list[list[str]]:
+    """Commands of docs/cluster.md below a mark, for a smaller recipe and another folder; without TLS unless asked."""
+    text = PAGE if tls else PAGE.replace(" --protocol tls", "")
+    block = re.search(rf"<!-- {mark} -->\n((?:    .*\n)+)", text)
     assert block is not None
     lines = [shlex.split(line) for line in block[1].splitlines()]
     words = {"smoke": str(SMALLEST), "dask": str(BIN / "dask")}
@@ -221,12 +223,23 @@ def running(*commands: list[str], **environment: str) -> Iterator[None]:
 
 @pytest.mark.slow
 def test_the_documented_scheduler_gives_the_same_bytes(smallest_dataset: Path, tmp_path: Path) -> None:
-    scheduler, worker, run = commands("loopback", tmp_path)
-    with running(scheduler, worker):
-        done = subprocess.run(run, capture_output=True, text=True, timeout=300)
+    """With its key: a command that has none is refused."""
+    scheduler, worker, run = commands("loopback", tmp_path, tls=True)
+    assert "tls" in scheduler
+    keys = re.search(r"<!-- keys -->\n((?:    .*\n|\n)+)", PAGE)
+    assert keys is not None
+    script = "\n".join(line[4:] for line in keys[1].splitlines())
+    subprocess.run(["bash", "-ec", script], cwd=tmp_path, check=True, capture_output=True)
+    own = {"DASK_CONFIG": str(tmp_path / "out" / "keys")}
+    with running(scheduler, worker, **own):
+        options: Any = {"capture_output": True, "text": True, "timeout": 300}
+        done = subprocess.run(run, env={**os.environ, **own}, **options)
         assert done.returncode == 0, done.stderr
         assert contents(tmp_path / "smoke") == contents(smallest_dataset)
-        again = subprocess.run(run, capture_output=True, text=True, timeout=300)
+        without = subprocess.run(run, **options)
+        assert without.returncode == 2
+        assert "no dask scheduler answers at" in without.stderr
+        again = subprocess.run(run, env={**os.environ, **own}, **options)
         assert "nothing to do" in again.stderr
 
 
