@@ -1,8 +1,10 @@
 """Alignment of the paper: with the camera vertical, move the mirror sideways until its image is centred.
 
 The mirror is aligned when its centre lies on the vertical through the lens. The outline gives the centre. The nominal
-tilt and principal point of the camera give the vertical; their errors usually dominate. Of a mirror of revolution it is
-the vertex that counts. The outline gives it for an upright axis: a tilt of the mirror moves its rim aside.
+tilt and principal point of the camera give the vertical; their errors usually dominate. The paper's check, that all
+vertical edges pass through the image's centre, tells both where the room has such edges (`edge_meeting`), and serves a
+camera of which nothing is known, too. Of a mirror of revolution it is the vertex that counts. The outline
+gives it for an upright axis: a tilt of the mirror moves its rim aside.
 """
 
 from __future__ import annotations
@@ -15,14 +17,26 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from PIL import ImageDraw
+from skimage.measure import blur_effect
 
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.frames.sensor_card import SensorCard
+from phibench.estimator.calibration.edge_meeting import (
+    CameraTilt,
+    EdgeMeeting,
+    edge_meeting,
+    stated_tilt,
+    with_vertical,
+)
 from phibench.estimator.calibration.outline_picture import overlay, shown, write_picture
+from phibench.estimator.calibration.vertical_edges import MIN_EDGES, edges_about, measured_vertical
 from phibench.estimator.outline.ball_circle import BallCircle, find_circle
 from phibench.estimator.outline.contour import aside_by_tilt_m
+from phibench.estimator.outline.edge_ring import Circle
+from phibench.estimator.outline.limb_image import planes_of
 from phibench.estimator.outline.outline import find_outline
 from phibench.estimator.outline.outline_result import Outline
+from phibench.estimator.outline.outline_start import grey, rig_circle
 from phibench.estimator.spots.camera_codes import light_of, rgb_picture
 from phibench.estimator.spots.image_planes import ImageError
 from phibench.scenes.camera import Camera
@@ -33,6 +47,10 @@ from phibench.scenes.rig import Rig
 
 _SIGNIFICANT = 2.5  # of a distance in two axes: 4 % of aligned mirrors are further off
 _CENTRE, _MOVE = (0, 255, 0), (255, 60, 60)
+_EDGE, _TO_MEETING = (0, 200, 255), (0, 110, 160)
+_EDGES_LEGEND = "blue: vertical edges, and their lines"
+_CONTRADICTED = 13.8  # chi^2 of two degrees of freedom: 0.1 % of true statements give more
+_SQUARE = 0.65  # of the outline's radius: half a square whose corners stay inside the mirror
 _RADIUS_MM, _DISTANCE_MM = 60.0, 260.0
 _NEAREST, _FARTHEST_MM = 1.02, 1e4  # in radii; nearer, the lens is at the mirror
 _ARROW_TIMES = 20.0  # the move is a few pixels: the picture draws it larger
@@ -50,6 +68,9 @@ class Alignment:
     sigma_outline_m, sigma_m : float
         Standard deviation along each horizontal axis: from the image alone, and with tilt and principal point.
     outline : Outline
+    camera : CameraTilt
+    meeting : EdgeMeeting or None
+        Where the room's vertical edges pass; None where they were not used, or there are too few.
     """
 
     move_world_m: Array
@@ -58,6 +79,8 @@ class Alignment:
     sigma_outline_m: float
     sigma_m: float
     outline: Outline = field(repr=False)
+    camera: CameraTilt = field(repr=False)
+    meeting: EdgeMeeting | None = field(default=None, repr=False)
 
 
 @dataclass(frozen=True)
@@ -162,6 +185,7 @@ def alignment(
     principal_point_sigma_px: float = 5.0,
     outline_sigma_factor: float = 1.0,
     mirror_tilt_sigma_rad: float = math.radians(0.5),
+    vertical: bool = True,
 ) -> Alignment:
     """Move that centres the mirror, with its standard deviation.
 
@@ -176,6 +200,8 @@ def alignment(
         Widens the outline's standard deviation, which was checked in the room `lab` and in rooms like it.
     mirror_tilt_sigma_rad : float
         How well the axis of a mirror of revolution is known to be upright, each axis; of no effect for a sphere.
+    vertical : bool
+        Use the room's vertical edges, where three or more agree.
 
     Raises
     ------
@@ -185,18 +211,34 @@ def alignment(
     if not (tilt_sigma_rad >= 0.0 and principal_point_sigma_px >= 0.0 and mirror_tilt_sigma_rad >= 0.0):
         raise ImageError("the standard deviations of tilts and principal point must be 0 or above")
     found = find_outline(image, rig, card).widened(outline_sigma_factor)
-    s, R = found.sphere_in_camera_m, rig.T_world_camera.R
-    offset = R @ s
-    move = np.array([-offset[0], -offset[1], 0.0])
+    s, R, camera = found.sphere_in_camera_m, rig.T_world_camera.R, rig.camera
+    known, meeting = stated_tilt(rig, tilt_sigma_rad, principal_point_sigma_px), None
+    if vertical:
+        known, meeting = _by_edges(known, image, found, rig, card)
+    beside, doubt_m2 = known.beside_m(s, np.array([camera.fx_px, camera.fy_px]))
+    move = -(R @ beside) * (1.0, 1.0, 0.0)
     in_camera = R.T @ move
-    camera = rig.camera
-    move_px = camera.project(s + in_camera) - camera.project(s)
     own = R @ found.covariance_m2 @ R.T
     sigma_outline = float(np.sqrt(0.5 * (own[0, 0] + own[1, 1])))
-    doubt = math.hypot(tilt_sigma_rad, principal_point_sigma_px / camera.fx_px) * float(s[2])
+    doubt = float(np.sqrt(0.5 * np.trace(doubt_m2)))
     if isinstance(rig.mirror, RevolvedMirror):
         doubt = math.hypot(doubt, mirror_tilt_sigma_rad * aside_by_tilt_m(rig))
-    return Alignment(move, in_camera, move_px, sigma_outline, math.hypot(sigma_outline, doubt), found)
+    move_px = camera.project(s + in_camera) - camera.project(s)
+    return Alignment(move, in_camera, move_px, sigma_outline, math.hypot(sigma_outline, doubt), found, known, meeting)
+
+
+def _by_edges(
+    stated: CameraTilt, image: NDArray[Any], outline: Outline, nominal: Rig, card: SensorCard | None
+) -> tuple[CameraTilt, EdgeMeeting | None]:
+    """The camera's tilt by the vertical edges of a picture, and where they pass; as stated without any."""
+    rig = outline.rig(nominal)
+    circle = rig_circle(rig)
+    try:
+        edges = edges_about(grey(planes_of(image, card)), circle)
+        meeting = edge_meeting(edges, circle)
+        return with_vertical(stated, nominal, measured_vertical(edges, rig, outline.covariance_m2)), meeting
+    except ImageError:
+        return stated, None
 
 
 def write_alignment_picture(path: Path, image: NDArray[np.uint8], rig: Rig, found: Alignment) -> Path:
@@ -211,7 +253,19 @@ def write_alignment_picture(path: Path, image: NDArray[np.uint8], rig: Rig, foun
     for side in (-0.4, 0.4):
         back = (u + du - head * math.cos(turn + side), v + dv - head * math.sin(turn + side))
         draw.line((u + du, v + dv, *back), fill=_MOVE, width=2)
-    return drawn.write(path, f"red: move x {_ARROW_TIMES:g}")
+    if found.meeting is None:
+        return drawn.write(path, f"red: move x {_ARROW_TIMES:g}")
+    _draw_edges(draw, found.meeting, round(1.0 / drawn.times))
+    return drawn.write(path, f"red: move x {_ARROW_TIMES:g}", _EDGES_LEGEND)
+
+
+def _draw_edges(draw: ImageDraw.ImageDraw, meeting: EdgeMeeting, block: int) -> None:
+    """Draw vertical edges, and thinly their lines to where they meet, with `block` pixels of the frame in one."""
+    u, v = (meeting.uv_px + 0.5) / block - 0.5
+    for edge in meeting.edges:
+        points = [tuple(point) for point in (edge + 0.5) / block - 0.5]
+        draw.line([points[0], (u, v)], fill=_TO_MEETING, width=1)
+        draw.line(points, fill=_EDGE, width=3)
 
 
 def circle_of(image: NDArray[Any], card: SensorCard) -> BallCircle:
@@ -231,6 +285,25 @@ def distance_of(circle: BallCircle, focal_px: float, radius_m: float) -> float:
     return radius_m / math.sin(math.atan(circle.circle_px[2] / focal_px))
 
 
+def meeting_of(image: NDArray[Any], card: SensorCard, circle: BallCircle) -> EdgeMeeting | None:
+    """Point through which vertical edges pass, of an unknown camera; None where fewer than three agree."""
+    try:
+        return edge_meeting(edges_about(grey(planes_of(image, card)), circle.circle_px), circle.circle_px)
+    except ImageError:
+        return None
+
+
+def sharpness(image: NDArray[Any], card: SensorCard | None, circle: Circle) -> float:
+    """Sharpness of what the mirror shows, 0 to 1: one less the blur of F. Crete et al., Proc. SPIE 6492, 64920I (2007).
+
+    It compares neighbouring pixels before and after a blur, in the square inside the outline. Noise hardly changes
+    where it is largest, as it does that of gradients. Pictures of one scene and exposure can be compared.
+    """
+    u, v, half = round(circle[0]), round(circle[1]), max(int(_SQUARE * circle[2]), 1)
+    inside = grey(planes_of(image, card))[max(v - half, 0) : v + half, max(u - half, 0) : u + half]
+    return 1.0 - float(blur_effect(inside)) if min(inside.shape) > 0 else math.nan  # type: ignore[no-untyped-call]
+
+
 def circle_in_words(circle: BallCircle) -> str:
     """Centre and radius with their standard deviations, and what is missing for a move in millimetres."""
     (u, v, radius), (su, sv, sr) = circle.circle_px, circle.sigma_px
@@ -240,12 +313,53 @@ def circle_in_words(circle: BallCircle) -> str:
     )
 
 
-def write_circle_picture(path: Path, image: NDArray[np.uint8], card: SensorCard, circle: BallCircle) -> Path:
-    """Draw an outline into a copy of the image of at most 1600 px; PNG."""
+def write_circle_picture(
+    path: Path, image: NDArray[np.uint8], card: SensorCard, circle: BallCircle, meeting: EdgeMeeting | None = None
+) -> Path:
+    """Draw an outline, and vertical edges with their lines, into a copy of the image of at most 1600 px; PNG."""
     picture, block = shown(rgb_picture(image, card))
     points = [tuple(point) for point in (circle.points_px + 0.5) / block - 0.5]
-    ImageDraw.Draw(picture).line([*points, points[0]], fill=_CENTRE, width=2)
+    draw = ImageDraw.Draw(picture)
+    draw.line([*points, points[0]], fill=_CENTRE, width=2)
+    if meeting is not None:
+        _draw_edges(draw, meeting, block)
     return write_picture(path, picture)
+
+
+def edges_in_words(meeting: EdgeMeeting | None, outline_sigma_px: float = 0.0) -> str:
+    """The paper's check in one sentence: where vertical edges pass the middle of the outline."""
+    if meeting is None:
+        return (
+            f"vertical edges (the paper's check): fewer than {MIN_EDGES} agree, so that the check says nothing; show "
+            "the mirror a room with door frames, corners or shelves"
+        )
+    sigma = math.hypot(meeting.sigma_px, outline_sigma_px)
+    off = meeting.off_px / sigma
+    right, down = meeting.uv_px - meeting.centre_px
+    return (
+        f"vertical edges (the paper's check): {len(meeting.edges)} meet {meeting.off_px:.1f} +- {sigma:.1f} px from "
+        f"the middle of the mirror's outline ({_aside(right, down)}): "
+        + ("they pass through it" if off < _SIGNIFICANT else "they miss it: mirror and lens are not on one vertical")
+    )
+
+
+def camera_in_words(found: Alignment) -> str:
+    """Words of the camera's tilt by the edges."""
+    camera = found.camera
+    if camera.chi2 is None:
+        return "camera: as stated; no vertical edges were used"
+    x, y = np.degrees(camera.tilt_rad)
+    sigma = math.degrees(float(np.sqrt(0.5 * np.trace(camera.covariance[:2, :2]))))
+    doubt = "" if camera.chi2 < _CONTRADICTED else "; doubtful: the edges contradict the stated standard deviations"
+    return (
+        f"camera: with the edges its vertical is ({x:+.2f}, {y:+.2f}) +- {sigma:.2f} deg from the nominal one, along x "
+        f"and y of the image{doubt}"
+    )
+
+
+def sharpness_in_words(value: float) -> str:
+    """Sharpness, and what to do with it."""
+    return f"sharpness in the mirror: {value:.3f}; turn the lens until it is largest, in pictures of the same scene"
 
 
 def verdict(found: Alignment) -> str:
@@ -271,7 +385,14 @@ def in_words(found: Alignment) -> str:
     right, down = (float(v) for v in found.move_px)
     return (
         f"move the mirror by {1e3 * size:.2f} mm (world x {x:+.2f} mm, y {y:+.2f} mm); in the image its outline moves "
-        f"{abs(right):.1f} px {'right' if right >= 0 else 'left'} and {abs(down):.1f} px "
-        f"{'down' if down >= 0 else 'up'}; standard deviation {1e3 * found.sigma_m:.2f} mm per axis, of which "
+        f"{_aside(right, down)}; standard deviation {1e3 * found.sigma_m:.2f} mm per axis, of which "
         f"{1e3 * found.sigma_outline_m:.3f} mm are the image's"
+    )
+
+
+def _aside(right_px: float, down_px: float) -> str:
+    """A step in the image in words."""
+    return (
+        f"{abs(right_px):.1f} px {'right' if right_px >= 0 else 'left'} and {abs(down_px):.1f} px "
+        f"{'down' if down_px >= 0 else 'up'}"
     )

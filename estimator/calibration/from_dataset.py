@@ -27,11 +27,13 @@ from phibench.estimator.outline.limb_image import Measured
 from phibench.estimator.outline.outline import find_outline
 from phibench.estimator.outline.outline_result import Outline, mean_measured, mean_outline
 from phibench.estimator.spots.simple_spots import find_spot
+from phibench.scenes.frames import Array
 from phibench.scenes.rig import POSITIONS, Rig
 
 LAYERS = "layers"
 SPOT_SIGMA_PX = 0.02
 """Of the centroid in noise-free layers."""
+MOST_FOCAL_SIGMA = 0.2
 
 
 @dataclass(frozen=True)
@@ -53,6 +55,7 @@ class DatasetCalibration:
     images, outlines : tuples that belong together
     names : of the images
     verdict : Verdict
+    prior_sigmas : shape (p,), of the nominal numbers
     """
 
     bundle: Bundle
@@ -61,6 +64,7 @@ class DatasetCalibration:
     outlines: tuple[Outline, ...]
     names: tuple[str, ...]
     verdict: Verdict
+    prior_sigmas: Array
 
     def write_picture(self, path: Path) -> Path:
         """Overlay of the image whose outline fits worst, see `outline_picture.write_overlay`."""
@@ -78,6 +82,7 @@ def calibrate_dataset(
     ruler: Ruler | None = None,
     vertical: bool = False,
     outline_sigma_factor: float = 1.0,
+    focal_sigma: float | None = None,
 ) -> DatasetCalibration:
     """Calibrate the rig of some samples and write the file.
 
@@ -98,6 +103,8 @@ def calibrate_dataset(
         Also use the room's vertical edges, see `find_vertical`; the room is to have some.
     outline_sigma_factor : float
         Widens the outlines' standard deviations, which were checked in the room `lab` and in rooms like it.
+    focal_sigma : float, optional
+        How well the nominal focal length is known, relative; see `sigmas_of`.
 
     Raises
     ------
@@ -117,11 +124,31 @@ def calibrate_dataset(
     found = [find_outline(image.pixels, rig, image.card) for image in images]
     outlines = [one.widened(outline_sigma_factor) for one in found]
     upright = _vertical(images, outlines, rig) if vertical else None
-    bundle = calibrate(rig, mean_outline(outlines), known, upright)
+    sigmas = sigmas_of(focal_sigma)
+    bundle = calibrate(rig, mean_outline(outlines), known, upright, sigmas)
     made_from = _made_from(dataset, chosen, preset, outlines, known, upright)
     # in the order of the images, one per pose
     names = [f"{sample.row.sample_id} {position}" for sample, position in one_per_pose(chosen)]
-    return write_bundle(out, bundle, rig, images, outlines, names, made_from)
+    return write_bundle(out, bundle, rig, images, outlines, names, made_from, sigmas)
+
+
+def sigmas_of(focal_sigma: float | None) -> Array:
+    """Standard deviations of the nominal numbers, shape (p,); that of the focal length as stated, or 0.003.
+
+    A lens that was turned since its focal length was measured is known to 0.018 only: see docs/capture.md.
+
+    Raises
+    ------
+    DatasetError
+        If it is not above 0, or not below 0.2.
+    """
+    if focal_sigma is None:
+        return prior_sigmas()
+    if not 0.0 < focal_sigma < MOST_FOCAL_SIGMA:
+        raise DatasetError(
+            f"--focal-sigma {focal_sigma:g}: must be above 0 and below {MOST_FOCAL_SIGMA:g}, parts of the focal length"
+        )
+    return prior_sigmas({"focal_relative": focal_sigma})
 
 
 def write_bundle(
@@ -132,11 +159,12 @@ def write_bundle(
     outlines: Sequence[Outline],
     names: Sequence[str],
     made_from: dict[str, Any],
+    sigmas: Array,
 ) -> DatasetCalibration:
     """Write a calibration and judge it; images, their outlines and names belong together."""
     write_calibration(out, bundle, nominal, made_from)
-    verdict = verdict_of(bundle, prior_sigmas(), list(outlines))
-    return DatasetCalibration(bundle, nominal, tuple(images), tuple(outlines), tuple(names), verdict)
+    verdict = verdict_of(bundle, sigmas, list(outlines))
+    return DatasetCalibration(bundle, nominal, tuple(images), tuple(outlines), tuple(names), verdict, sigmas)
 
 
 def frame_outline(dataset: Dataset, sample: Sample, position: str, preset: str, laser_off: bool = True) -> Outline:

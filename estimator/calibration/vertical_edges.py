@@ -28,8 +28,9 @@ from skimage.transform import probabilistic_hough_line
 
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.estimator.geometry.reflection import reflect
+from phibench.estimator.outline.edge_ring import Circle
 from phibench.estimator.outline.limb_image import Measured, planes_of
-from phibench.estimator.outline.outline_start import grey
+from phibench.estimator.outline.outline_start import grey, rig_circle
 from phibench.estimator.spots.image_planes import ImageError
 from phibench.scenes.frames import Array, Pose
 from phibench.scenes.rig import Rig
@@ -66,11 +67,10 @@ class Unwrapped:
         return self.centre_px + radius[:, None] * np.stack([np.cos(azimuth), np.sin(azimuth)], axis=-1)
 
 
-def unwrapped(picture: Array, rig: Rig) -> Unwrapped:
-    """Unwrap a picture, shape (H, W), about the middle of the outline that the rig gives it."""
-    outline = rig.outline_px()
-    centre, radius = outline.mean(axis=0), 0.5 * float(np.ptp(outline, axis=0).mean())
-    low, high = (part * radius for part in RADII)
+def unwrapped(picture: Array, circle: Circle) -> Unwrapped:
+    """Unwrap a picture, shape (H, W), about the circle of an outline."""
+    centre, radius_px = np.array(circle[:2]), circle[2]
+    low, high = (part * radius_px for part in RADII)
     columns = int(2.0 * np.pi * 0.5 * (low + high) / _STEP_PX)
     r, azimuth = np.arange(low, high), np.arange(columns) * (2.0 * np.pi / columns)
     u, v = centre[0] + np.outer(r, np.cos(azimuth)), centre[1] + np.outer(r, np.sin(azimuth))
@@ -80,8 +80,13 @@ def unwrapped(picture: Array, rig: Rig) -> Unwrapped:
 
 
 def edges_of(picture: Array, rig: Rig) -> list[Array]:
-    """Pixels, each of shape (k, 2), of all nearly radial edges of a picture of shape (H, W)."""
-    polar = unwrapped(picture, rig)
+    """Pixels, each of shape (k, 2), of all nearly radial edges of a picture of shape (H, W), about a rig's outline."""
+    return edges_about(picture, rig_circle(rig))
+
+
+def edges_about(picture: Array, circle: Circle) -> list[Array]:
+    """The same about the circle of an outline, for a picture of an unknown camera."""
+    polar = unwrapped(picture, circle)
     across = _gradient(polar.light)
     found, taken = [], np.zeros(across.shape, bool)
     noise = 1.4826 * float(np.median(np.abs(across)))
@@ -227,7 +232,11 @@ def find_vertical(
     ImageError
         If fewer than three edges agree on a vertical within 0.05 rad of the nominal one.
     """
-    edges = edges_of(grey(planes_of(image, card)), rig)
+    return measured_vertical(edges_of(grey(planes_of(image, card)), rig), rig, sphere_covariance_m2)
+
+
+def measured_vertical(edges: Sequence[Array], rig: Rig, sphere_covariance_m2: Array | None = None) -> Measured:
+    """The same from the pixels of edges, each of shape (k, 2)."""
     found = vertical_of(edges, rig)
     covariance = found.covariance
     if sphere_covariance_m2 is not None:
@@ -246,20 +255,25 @@ def vertical_of(edges: Sequence[Array], rig: Rig) -> Vertical:
     """
     up = rig.T_world_camera.R.T[:, 2]
     rays = [_rays(edge, rig) for edge in edges]
-    chosen = _agreeing(rays, up)
-    if len(chosen) < MIN_EDGES:
-        raise ImageError(
-            f"{len(chosen)} vertical edges were found that agree: {MIN_EDGES} are needed; show the mirror a room with "
-            "door frames, corners or shelves, or leave the vertical out"
-        )
+    chosen = agreeing(*_slopes(rays, up), MAX_TILT_RAD) if len(rays) >= MIN_EDGES else list(range(len(rays)))
+    require_edges(len(chosen))
     kept = [rays[k] for k in chosen]
     for _ in range(_ROUNDS):
-        fit = _regression(kept, up)
-        up = up + fit.tilt @ np.stack(_horizontal(up))
+        fit = regression(*_slopes(kept, up))
+        up = up + fit.shift @ np.stack(_horizontal(up))
         up = up / np.linalg.norm(up)
     x, y = _horizontal(up)
     turn = np.stack([x[:2], y[:2]])
     return Vertical(up, turn.T @ fit.covariance @ turn, len(kept), sum(len(r.origin_m) for r in kept), fit.scale)
+
+
+def require_edges(count: int) -> None:
+    """Raise `ImageError` for too few edges."""
+    if count < MIN_EDGES:
+        raise ImageError(
+            f"{count} vertical edges were found that agree: {MIN_EDGES} are needed; show the mirror a room with "
+            "door frames, corners or shelves, or leave the vertical out"
+        )
 
 
 @dataclass(frozen=True)
@@ -305,22 +319,22 @@ def _slopes(rays: Sequence[EdgeRays], up: Array) -> tuple[Array, Array, Array]:
     return azimuth, slope, 1.0 / (1.0 / weight + (nearer - slope) ** 2 + _LEAST_SLOPE_RAD**2)
 
 
-def _agreeing(rays: Sequence[EdgeRays], up: Array) -> list[int]:
-    """Numbers of the edges whose slopes belong to one vertical near `up`: the pair that most others agree with."""
-    if len(rays) < MIN_EDGES:
-        return list(range(len(rays)))
-    azimuth, slope, weight = _slopes(rays, up)
+def agreeing(azimuth: Array, value: Array, weight: Array, most: float) -> list[int]:
+    """Numbers of the edges whose values belong to one shift of at most `most`: the pair that most others agree with.
+
+    An edge at the azimuth a has the value shift . (-sin a, cos a), besides its error. Arguments as for `regression`.
+    """
     across = np.stack([-np.sin(azimuth), np.cos(azimuth)], axis=-1)
-    i, j = np.triu_indices(len(rays), 1)
+    i, j = np.triu_indices(len(value), 1)
     sine = across[i, 0] * across[j, 1] - across[i, 1] * across[j, 0]
     i, j, sine = i[np.abs(sine) > 0.3], j[np.abs(sine) > 0.3], sine[np.abs(sine) > 0.3]
-    tilt = np.stack(
-        [slope[i] * across[j, 1] - slope[j] * across[i, 1], slope[j] * across[i, 0] - slope[i] * across[j, 0]]
+    shift = np.stack(
+        [value[i] * across[j, 1] - value[j] * across[i, 1], value[j] * across[i, 0] - value[i] * across[j, 0]]
     )
-    tilt = (tilt / sine).T[np.linalg.norm(tilt / sine, axis=0) < MAX_TILT_RAD]
-    if not len(tilt):
+    shift = (shift / sine).T[np.linalg.norm(shift / sine, axis=0) < most]
+    if not len(shift):
         return []
-    off = np.abs(slope - tilt @ across.T) * np.sqrt(_evened(weight))
+    off = np.abs(value - shift @ across.T) * np.sqrt(_evened(weight))
     score = np.sum(np.clip(1.0 - (off / _SLOPE_LIMIT) ** 2, 0.0, None), axis=-1)
     return [int(k) for k in np.flatnonzero(off[np.argmax(score)] < _SLOPE_LIMIT)]
 
@@ -332,30 +346,34 @@ def _evened(weight: Array) -> Array:
 
 @dataclass(frozen=True)
 class Regression:
-    """Tilt, shape (2,), of the vertical along `_horizontal`, its covariance, and the slopes' scatter."""
+    """Shift, shape (2,), that edges have in common, its covariance, and the scatter of the edges' values.
 
-    tilt: Array
+    Of slopes the shift is the tilt of the vertical along `_horizontal`.
+    """
+
+    shift: Array
     covariance: Array
     scale: float
 
 
-def _regression(rays: Sequence[EdgeRays], up: Array) -> Regression:
-    """Tilt from the edges' slopes, with Tukey's weights.
+def regression(azimuth: Array, value: Array, weight: Array) -> Regression:
+    """Shift from the edges' values shift . (-sin a, cos a), with Tukey's weights.
+
+    Azimuths a, values, and one over the variances that the edges' own points give, shape (K,) each.
 
     An edge's points are wrong together (its neighbourhood, JPEG's blocks): what counts is how well edges agree. So the
     covariance is a sandwich over edges (CR2: Bell and McCaffrey, Survey Methodology 28, 169, 2002), averaged with the
     pooled one, which is steadier where edges are few. Two degrees of freedom are the vertical's own.
     """
-    azimuth, slope, weight = _slopes(rays, up)
     across = np.stack([-np.sin(azimuth), np.cos(azimuth)], axis=-1)
     weight = _evened(weight)
-    trust = np.ones(slope.size)
+    trust = np.ones(value.size)
     for _ in range(8):
         w = weight * trust
         inverse = np.linalg.inv(across.T @ (w[:, None] * across))
-        tilt = inverse @ across.T @ (w * slope)
-        off = np.sqrt(weight) * (slope - across @ tilt)
-        scale = 1.4826 * float(np.median(np.abs(off))) * np.sqrt(slope.size / (slope.size - 2.0))
+        shift = inverse @ across.T @ (w * value)
+        off = np.sqrt(weight) * (value - across @ shift)
+        scale = 1.4826 * float(np.median(np.abs(off))) * np.sqrt(value.size / (value.size - 2.0))
         scale = max(scale, _LEAST_SCALE)  # few edges may agree by chance
         trust = np.clip(1.0 - (off / (_TUKEY * scale)) ** 2, 0.0, None) ** 2
     u2 = np.minimum((off / (_TUKEY * scale)) ** 2, 1.0)
@@ -366,7 +384,7 @@ def _regression(rays: Sequence[EdgeRays], up: Array) -> Regression:
     degrees = max(float(trust.sum()) - 2.0, 1.0)
     pooled = max(float(np.sum(trust * off**2)) / degrees, _LEAST_SCALE**2) * meat
     covariance = inverse @ (0.5 * (scores.T @ scores + pooled) / slack**2) @ inverse
-    return Regression(tilt, covariance, scale)
+    return Regression(shift, covariance, scale)
 
 
 def _by_sphere(edges: Sequence[Array], rig: Rig, found: Vertical, step_m: float = 2e-5) -> Array:

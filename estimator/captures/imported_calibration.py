@@ -14,8 +14,9 @@ from phibench.datasets.errors import DatasetError
 from phibench.datasets.read import place_of
 from phibench.datasets.store.files import require_writable
 from phibench.estimator.calibration.bundle import Bundle, KnownSpot, calibrate
-from phibench.estimator.calibration.from_dataset import DatasetCalibration, Photograph, write_bundle
+from phibench.estimator.calibration.from_dataset import DatasetCalibration, Photograph, sigmas_of, write_bundle
 from phibench.estimator.calibration.spots import method_for
+from phibench.estimator.calibration.vertical_edges import find_vertical
 from phibench.estimator.captures.imported_set import ImportedRow, ImportedSet, open_imported
 from phibench.estimator.captures.measure import (
     outlines_as_one,
@@ -33,8 +34,9 @@ from phibench.estimator.interface import Pair
 from phibench.estimator.methods.fit_place import kept
 from phibench.estimator.methods.locate import SharedPair
 from phibench.estimator.methods.raw_likelihood import with_posteriors
+from phibench.estimator.outline.limb_image import Measured
 from phibench.estimator.outline.outline import find_outline
-from phibench.estimator.outline.outline_result import Outline
+from phibench.estimator.outline.outline_result import Outline, mean_measured
 from phibench.estimator.spots.image_planes import ImageError
 from phibench.scenes.rig import POSITIONS, Rig
 
@@ -48,6 +50,8 @@ def calibrate_imported(
     samples: Sequence[str] = (),
     spots: bool = False,
     outline_sigma_factor: float = 1.0,
+    vertical: bool = False,
+    focal_sigma: float | None = None,
 ) -> DatasetCalibration:
     """Calibrate the rig of an imported set and write the file.
 
@@ -61,17 +65,23 @@ def calibrate_imported(
         found contradicts the tape or itself by more than outline and ruler allow.
     outline_sigma_factor : float
         As in `calibrate_dataset`.
+    vertical : bool
+        Also use the room's vertical edges, of the pictures that show three or more.
+    focal_sigma : float, optional
+        As in `calibrate_dataset`.
 
     Raises
     ------
     DatasetError
-        If no picture shows the mirror's outline, or no spot is left.
+        If no picture shows the mirror's outline, none has vertical edges that are wanted, or no spot is left.
     """
     require_writable(out)
     imported = open_imported(folder)
     rows = _rows(imported, samples, spots)
     images, outlines, names = _outlines(imported, rows, outline_sigma_factor)
-    aligned = calibrate(imported.rig, outlines_as_one(outlines))
+    upright = _vertical(images, outlines, imported.rig) if vertical else None
+    sigmas = sigmas_of(focal_sigma)
+    aligned = calibrate(imported.rig, outlines_as_one(outlines), (), upright, sigmas)
     # spots are looked for with the mirror where it is: a rig off by some pixels has other epipolar lines
     rig = with_blur_of(aligned.rig, outlines)
     known: dict[str, KnownSpot] = {}
@@ -91,7 +101,7 @@ def calibrate_imported(
             raise DatasetError(
                 f"no spot of {folder} to calibrate with; of {next(iter(left_out))}: {next(iter(left_out.values()))}"
             )
-    bundle = calibrate(imported.rig, outlines_as_one(outlines), list(known.values()))
+    bundle = calibrate(imported.rig, outlines_as_one(outlines), list(known.values()), upright, sigmas)
     made_from: dict[str, Any] = {
         "dataset": imported.info.name,
         "samples": list(known) or sorted({row.sample_id for row in rows}),
@@ -101,10 +111,11 @@ def calibrate_imported(
         **({SHAPE: shape.document()} if shape.images else {}),
         "sphere_in_camera_m": [outline.sphere_in_camera_m.tolist() for outline in outlines],
         "sigma_m": [outline.sigma_m.tolist() for outline in outlines],
+        "vertical_in_camera": None if upright is None else upright.value.tolist(),
         "spot_uv_px": [[spot.uv_down_px.tolist(), spot.uv_up_px.tolist()] for spot in known.values()],
         "spot_depth_m": [spot.depth_m for spot in known.values()],
     }
-    return write_bundle(out, bundle, imported.rig, images, outlines, names, made_from)
+    return write_bundle(out, bundle, imported.rig, images, outlines, names, made_from, sigmas)
 
 
 def _rows(imported: ImportedSet, samples: Sequence[str], spots: bool) -> list[ImportedRow]:
@@ -141,6 +152,29 @@ def _outlines(
     if fault is not None and not outlines:
         raise fault
     return images, outlines, names
+
+
+def _vertical(images: Sequence[Photograph], outlines: Sequence[Outline], nominal: Rig) -> Measured:
+    """Mean vertical of the pictures that show one, with the covariance of a single one.
+
+    Pictures of one room show the same edges, whose own errors they share.
+
+    Raises
+    ------
+    ImageError
+        If no picture shows one.
+    """
+    found: list[Measured] = []
+    fault: ImageError | None = None
+    for image, outline in zip(images, outlines, strict=True):
+        try:
+            found.append(find_vertical(image.pixels, outline.rig(nominal), image.card, outline.covariance_m2))
+        except ImageError as error:
+            fault = error
+    if fault is not None and not found:
+        raise fault
+    mean = mean_measured(found)
+    return replace(mean, covariance=mean.covariance * len(found))
 
 
 def _shape(

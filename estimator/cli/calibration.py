@@ -28,6 +28,7 @@ def calibrate(
     height_sigma_m: float = math.inf,
     azimuth_sigma_deg: float = math.inf,
     outline_sigma_factor: float = 1.0,
+    focal_sigma: float | None = None,
     picture: Path | None = None,
 ) -> int:
     """Calibrate a rig from the images of a data set; write a calibration file and a picture.
@@ -55,6 +56,9 @@ def calibrate(
     outline_sigma_factor
         Widens the outline's standard deviation. 1 holds in the room `lab`; take 1.5 to 2 in a room with more lamps,
         edges or patterns.
+    focal_sigma
+        How well the nominal focal length is known, relative: 0.003 by default. Give 0.018 for a lens that was turned
+        since it was measured.
     picture
         PNG to write: the outline on the frame, with its residuals enlarged; by default beside the calibration.
     """
@@ -64,7 +68,7 @@ def calibrate(
     from phibench.estimator.calibration.spots import Ruler
     from phibench.estimator.captures.imported_calibration import calibrate_imported
     from phibench.estimator.captures.imported_set import is_imported, open_imported
-    from phibench.estimator.geometry.rig_parameters import PARAMETERS, has_effect, prior_sigmas
+    from phibench.estimator.geometry.rig_parameters import PARAMETERS, has_effect
     from phibench.scenes.misalignment import PARAMETERS as MISALIGNMENT
 
     if not spots and (math.isfinite(height_sigma_m) or math.isfinite(azimuth_sigma_deg)):
@@ -73,19 +77,20 @@ def calibrate(
     require_writable(out)  # a folder such as "." has no name to which an ending could be given
     picture = out.with_suffix(".png") if picture is None else picture
     if is_imported(directory):
-        if vertical or ruler != Ruler() or preset not in (DEFAULT_PRESET, open_imported(directory).preset):
+        if ruler != Ruler() or preset not in (DEFAULT_PRESET, open_imported(directory).preset):
             raise DatasetError(
                 f"{directory} holds pictures: their kind and the tape's standard deviation were imported with them; "
-                "leave --preset, --vertical and the sigmas out"
+                "leave --preset and the sigmas out"
             )
-        found = calibrate_imported(directory, out, sample, spots, outline_sigma_factor)
+        found = calibrate_imported(directory, out, sample, spots, outline_sigma_factor, vertical, focal_sigma)
     else:
-        found = calibrate_dataset(directory, out, sample, preset, spots, ruler, vertical, outline_sigma_factor)
+        more = vertical, outline_sigma_factor, focal_sigma
+        found = calibrate_dataset(directory, out, sample, preset, spots, ruler, *more)
     print(f"{found.verdict}.")
     print(f"{found.write_picture(picture)}: the outline on the frame that fits worst, residuals enlarged")
     print(_LAB)
     print(f"\n{'parameter':18s} {'unit':4s} {'correction':>11s} {'sigma':>8s} {'prior sigma':>11s}")
-    every = zip(PARAMETERS, found.bundle.values, prior_sigmas(), has_effect(found.nominal), strict=True)
+    every = zip(PARAMETERS, found.bundle.values, found.prior_sigmas, has_effect(found.nominal), strict=True)
     for name, value, prior in (row[:3] for row in every if row[3]):
         unit = MISALIGNMENT[name].unit
         print(f"{name:18s} {unit:4s} {value:+11.3e} {found.bundle.sigmas[name]:8.1e} {prior:11.1e}")
@@ -114,8 +119,12 @@ def align(
     mirror_tilt_sigma_deg: float = 0.5,
     outline_sigma_factor: float = 1.0,
     sensor: Path | None = None,
+    vertical: bool = True,
 ) -> int:
-    """Print by how far and in which direction the mirror must move to be centred.
+    """Print by how far and in which direction the mirror must move to be centred, and how sharp the picture is.
+
+    Vertical edges of the room make the paper's check: of an aligned rig they pass through the middle of the mirror's
+    image. Where the rig is known they also tell the camera's tilt, and the move becomes more certain.
 
     A rig file says camera and mirror, of any shape. Without one the mirror is a sphere, and numbers say the rest. Of a
     camera whose focal length is not stated, the circle of the mirror's outline is printed and drawn, in pixels.
@@ -152,22 +161,30 @@ def align(
         As in `phibench calibrate`.
     sensor
         TOML file of the sensor; by default the preset of the kind of file is assumed.
+    vertical
+        Use the room's vertical edges, where three or more agree; --no-vertical leaves them out.
     """
     from phibench.datasets.errors import DatasetError
     from phibench.datasets.frames.sensor_file import read_sensor_file
     from phibench.estimator.calibration.align import (
         Numbers,
         alignment,
+        camera_in_words,
         circle_in_words,
         circle_of,
+        edges_in_words,
         in_words,
+        meeting_of,
         rig_of_numbers,
+        sharpness,
+        sharpness_in_words,
         verdict,
         write_alignment_picture,
         write_circle_picture,
     )
     from phibench.estimator.captures.picture_files import read_picture, sensor_choice
     from phibench.estimator.captures.rig_file import read_rig_file, require_camera_size
+    from phibench.estimator.outline.outline_start import rig_circle
 
     numbers = Numbers(radius_mm, distance_mm, focal_px, cx_px, cy_px, focus_mm)
     numbers.require_sound()
@@ -184,13 +201,21 @@ def align(
         require_camera_size(known, (pixels.shape[1], pixels.shape[0]), str(image))
     if known is None:
         circle = circle_of(pixels, card)
+        meeting = meeting_of(pixels, card, circle) if vertical else None
         print(circle_in_words(circle))
-        print(f"{write_circle_picture(out, pixels, card, circle)}: outline; look at it")
+        print(f"{write_circle_picture(out, pixels, card, circle, meeting)}: outline and vertical edges; look at it")
+        if vertical:
+            print(edges_in_words(meeting, float(circle.sigma_px[:2].max())))
+        print(sharpness_in_words(sharpness(pixels, card, circle.circle_px)))
         return 0
     doubts = math.radians(tilt_sigma_deg), principal_point_sigma_px, outline_sigma_factor
-    found = alignment(pixels, known, card, *doubts, math.radians(mirror_tilt_sigma_deg))
+    found = alignment(pixels, known, card, *doubts, math.radians(mirror_tilt_sigma_deg), vertical)
     print(verdict(found))
     print(f"{write_alignment_picture(out, pixels, known, found)}: outline, and the move drawn 20 times as long")
     print(in_words(found))
+    if vertical:
+        print(edges_in_words(found.meeting))
+    print(camera_in_words(found))
+    print(sharpness_in_words(sharpness(pixels, card, rig_circle(found.outline.rig(known)))))
     print(_LAB)
     return 0

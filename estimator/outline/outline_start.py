@@ -75,7 +75,7 @@ def radii_px(rig: Rig) -> tuple[float, float]:
     ImageError
         If no such outline can be seen in the rig's image.
     """
-    camera, radius = rig.camera, _nominal(rig)[2]
+    camera, radius = rig.camera, rig_circle(rig)[2]
     largest = math.hypot(camera.width_px, camera.height_px)
     if not _LEAST_RADIUS_PX <= radius <= largest:
         raise ImageError(
@@ -86,7 +86,8 @@ def radii_px(rig: Rig) -> tuple[float, float]:
     return _RADII[0] * radius, _RADII[1] * radius
 
 
-def _nominal(rig: Rig) -> Circle:
+def rig_circle(rig: Rig) -> Circle:
+    """Middle (u, v) and mean radius, pixels, of the outline that a rig gives."""
     outline = rig.outline_px()
     u, v = outline.mean(axis=0)
     return float(u), float(v), 0.5 * float(np.ptp(outline, axis=0).mean())

@@ -11,13 +11,15 @@ import pytest
 from helpers.ball_photographs import ball_photograph
 from helpers.limb_frames import limb_light
 from PIL import Image
+from scipy import ndimage
 
 from phibench.datasets.frames.sensor_card import sensor_card
-from phibench.estimator.calibration.align import alignment, circle_of, distance_of, nominal_centre
+from phibench.estimator.calibration.align import alignment, circle_of, distance_of, nominal_centre, sharpness
 from phibench.estimator.captures.picture_files import read_linear, read_picture
 from phibench.estimator.captures.rig_file import read_rig_file
 from phibench.estimator.cli import main as cli
 from phibench.estimator.outline.contour import aside_by_tilt_m
+from phibench.estimator.outline.outline_start import rig_circle
 from phibench.estimator.spots.camera_codes import linear_to_srgb
 from phibench.estimator.spots.image_planes import ImageError
 from phibench.render.sensor.camera_chain import Chain
@@ -41,7 +43,8 @@ def light() -> np.ndarray:
 
 
 def test_the_move_brings_the_mirror_above_the_lens(light) -> None:
-    found = alignment(light, Rig(), tilt_sigma_rad=0.0, principal_point_sigma_px=0.0)
+    found = alignment(light, Rig(), tilt_sigma_rad=0.0, principal_point_sigma_px=0.0, vertical=False)
+    assert found.meeting is None
     assert found.move_world_m == pytest.approx([-OFF_M[0], -OFF_M[1], 0.0], abs=3e-6)
     assert found.move_px == pytest.approx(-1430.0 / 0.2605 * np.array(OFF_M), abs=0.05)
     assert found.sigma_m == found.sigma_outline_m
@@ -69,10 +72,56 @@ def test_command_reads_the_cameras_jpeg_and_draws(light, tmp_path, capsys) -> No
     assert said.index("centred, as far as") < said.index("arrow.png") < said.index("1.70 mm")
     assert "--outline-sigma-factor" in said
     assert "1.70 mm" in said  # |(1.5, 0.8)|
+    assert "the paper's check): fewer than 3 agree" in said  # a room without edges
+    assert "sharpness in the mirror: 0." in said
     assert "left" in said
     assert "down" in said
     before, after = (np.asarray(Image.open(path).convert("RGB"), float) for path in (file, out))
     assert (np.abs(after - before).max(axis=-1) > 30).sum() > 1000  # the outline alone is 2000 px long
+
+
+def with_edges(light: np.ndarray, rig: Rig) -> np.ndarray:
+    """Nine bright sectors on the walls in the mirror: edges through the middle of its outline."""
+    u0, v0, radius = rig_circle(rig)
+    v, u = np.mgrid[: light.shape[1], : light.shape[2]]
+    away, turn = np.hypot(u - u0, v - v0), np.arctan2(v - v0, u - u0)
+    bright = np.zeros(turn.shape)
+    for start in np.linspace(-3.0, 2.6, 9):
+        for border, sign in ((start, 1.0), (start + 0.3, -1.0)):
+            bright += sign / (1.0 + np.exp(-np.clip((turn - border) * away / 0.5, -50.0, 50.0)))
+    return np.asarray(light * (1.0 + 0.5 * bright * ((away > 0.4 * radius) & (away < 0.94 * radius))), np.float32)
+
+
+def test_vertical_edges_make_the_papers_check(tmp_path, capsys) -> None:
+    """An aligned rig whose edges pass through the middle: found, drawn, and worth more than 0.1 deg and 5 px."""
+    light = with_edges(limb_light(Rig(), np.random.default_rng(33), room=room), Rig())
+    used = alignment(light, Rig())
+    assert used.meeting is not None
+    assert len(used.meeting.edges) >= 15
+    assert used.meeting.off_px < 0.3
+    # 18 edges tell the point to some hundredths of a pixel; what is left is 1 - 0.83 of the principal point's 0.91 mm
+    assert used.sigma_m < 0.25 * np.hypot(0.26 * np.radians(0.1), 0.26 * 5.0 / 1430.0)
+    assert np.linalg.norm(used.move_world_m) < 3.0 * used.sigma_m
+    file, out = tmp_path / "frame.jpg", tmp_path / "drawn.png"
+    file.write_bytes(Chain(sensor("mjpeg")).jpeg_bytes(Light(light), NoiseStream(("align", "edges"))))
+    assert cli.main(["align", str(file), "--out", str(out)]) == 0
+    said = capsys.readouterr().out
+    for words in ("the paper's check): ", "they pass through it", "deg from the nominal one", "turn the lens until"):
+        assert words in said, said
+    drawn = np.asarray(Image.open(out).convert("RGB"), int)
+    assert (np.abs(drawn - (0, 200, 255)).max(axis=-1) < 10).sum() > 1000  # fifteen edges of 50 px, 3 px wide
+
+
+def test_a_blurred_picture_is_less_sharp_at_any_noise() -> None:
+    """Checks of 24 px in noise of 0 and 5 %: sharpness falls with the blur, and noise does not turn that around."""
+    rng, (v, u) = np.random.default_rng(9), np.mgrid[:720, :1280]
+    checks = 1.0 + 0.5 * np.sign(np.sin(u / 24.0) * np.sin(v / 24.0))
+    for noise in (0.0, 0.05):
+        found = []
+        for blur_px in (0.7, 1.0, 1.5, 2.5, 4.0):
+            light = ndimage.gaussian_filter(checks, blur_px) + noise * rng.standard_normal(checks.shape)
+            found.append(sharpness(np.repeat(light[None], 3, axis=0), None, (639.5, 359.5, 339.0)))
+        assert np.all(np.diff(found) < -0.01), found
 
 
 @pytest.fixture
@@ -150,6 +199,7 @@ def test_a_photograph_of_an_unknown_camera_gives_the_circle(tmp_path, capsys) ->
     said = capsys.readouterr().out
     assert f"radius {photo.radius_px:.0f}"[:-1] in said
     assert "give --focal-px" in said
+    assert "vertical edges (the paper's check): " in said
     assert Image.open(out).size == (640, 480)
     assert cli.main(["align", str(file), "--cx-px", "319.5", "--out", str(out)]) == 2
     assert "--cx-px 319.5: needs --focal-px" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""The vertical from edges: points of exact vertical lines by another way, and a true room's layer."""
+"""The vertical from edges, and the point through which they pass: exact vertical lines by another way."""
 
 from __future__ import annotations
 
@@ -8,7 +8,10 @@ import numpy as np
 import pytest
 from helpers.oracles import true_pixel
 
-from phibench.estimator.calibration.vertical_edges import edges_of, find_vertical, vertical_of
+from phibench.estimator.calibration.bundle import apparent_outline
+from phibench.estimator.calibration.edge_meeting import EdgeMeeting, edge_meeting, stated_tilt, with_vertical
+from phibench.estimator.calibration.vertical_edges import edges_of, find_vertical, measured_vertical, vertical_of
+from phibench.estimator.outline.outline_start import rig_circle
 from phibench.estimator.spots.image_planes import ImageError
 from phibench.scenes.frames import Pose, as_matrix, as_vector, rotation_xyz
 from phibench.scenes.rig import Rig
@@ -108,3 +111,83 @@ def test_the_spheres_own_error_is_in_the_covariance() -> None:
     )
     change = np.linalg.norm((vertical_of(edges, upright(moved)).up - vertical_of(edges, upright(rig)).up)[:2])
     assert 0.3 * 1.3e-4 < change < 3.0 * 1.3e-4
+
+
+# -- the point through which edges pass --------------------------------------------------------------------------------
+
+
+def above_lens(beside_m: tuple[float, float], tilt_deg: tuple[float, float], principal_point_px: float = 0.0) -> Rig:
+    """A mirror beside the vertical through the lens, in world axes, under a tilted camera."""
+    pose = Pose("world", "camera", (0.0, 0.0, 0.45), rotation_xyz(*np.radians(tilt_deg), 0.0))
+    centre = as_vector(pose.R.T @ np.array([*beside_m, 0.26]))
+    camera = replace(Rig().camera, cx_px=639.5 + principal_point_px, cy_px=359.5 - principal_point_px)
+    return replace(Rig(), camera=camera, T_world_camera=pose, T_camera_sphere=Pose("camera", "sphere", centre))
+
+
+def met(rig: Rig, further: list[np.ndarray] | None = None) -> EdgeMeeting:
+    return edge_meeting([*lines(rig), *(further or [])], rig_circle(rig))
+
+
+@pytest.mark.parametrize("tilt_deg", [(0.0, 0.0), (1.0, -0.6)])
+def test_edges_meet_in_the_middle_of_the_outline_where_the_mirror_is_above_the_lens(tilt_deg) -> None:
+    """A tilt of the camera leaves it so: 0.7 px/deg remain, as the middle of an ellipse is not its cone's axis."""
+    found = met(above_lens((0.0, 0.0), tilt_deg))
+    assert len(found.edges) == len(FEET_M)
+    assert found.off_px < 0.8 * float(np.hypot(*tilt_deg)) + 1e-6
+
+
+def test_edges_miss_the_middle_by_the_mirrors_offset() -> None:
+    """1 mm moves the outline by 5.5 px and the point by 2.3 px more: the same share for twice as much, and along it."""
+    one, two = met(above_lens((1e-3, 0.0), (0.0, 0.0))), met(above_lens((0.0, 2e-3), (0.0, 0.0)))
+    off = [found.uv_px - found.centre_px for found in (one, two)]
+    assert 2.0 < off[0][0] < 2.6
+    assert off[1][1] == pytest.approx(2.0 * off[0][0], rel=0.1)
+    # the edges stand unevenly around, and lines of an offset rig are bent
+    assert abs(off[0][1]) + abs(off[1][0]) < 0.4
+
+
+def test_lines_that_do_not_meet_there_are_left_out_or_refused() -> None:
+    rig = above_lens((0.0, 0.0), (0.0, 0.0))
+    u, v, radius = rig_circle(rig)
+    aside = np.stack([np.linspace(u - 200.0, u - 120.0, 30), np.full(30, v + 0.25 * radius)], axis=-1)
+    assert len(met(rig, [aside]).edges) == len(FEET_M)
+    with pytest.raises(ImageError, match="3 are needed"):
+        edge_meeting(lines(rig)[:2], rig_circle(rig))
+    # both sides of a post, and one more of it: they say nothing along themselves
+    post = [np.stack([u + np.linspace(190.0, 290.0, 30), np.full(30, v + k)], axis=-1) for k in (-1.0, 0.0, 1.0)]
+    with pytest.raises(ImageError, match="3 are needed"):
+        edge_meeting(post, rig_circle(rig))
+
+
+def test_edges_make_an_unknown_principal_point_harmless() -> None:
+    """A camera tilted by 0.3 deg whose principal point is 6 px off: nobody knows of either.
+
+    Without edges the tilt moves the mirror by 0.36 deg x 0.26 m = 1.6 mm, the principal point by 8.5 px x 0.26 m / f
+    = 1.5 mm. With them 1 - 0.83 of what the principal point does is left, and less, as tilt and point share it out.
+    """
+    true, beside_m = above_lens((1.2e-3, -0.7e-3), (0.3, -0.2), 6.0), np.array([1.2e-3, -0.7e-3])
+    nominal = above_lens((0.0, 0.0), (0.0, 0.0))
+    sphere = apparent_outline(nominal, true)
+    pose = replace(nominal.T_camera_sphere, translation_m=as_vector(sphere))
+    stated = stated_tilt(nominal, np.radians(0.5), 10.0)
+    vertical = measured_vertical(lines(true), replace(nominal, T_camera_sphere=pose))
+    focal = np.array([nominal.camera.fx_px, nominal.camera.fy_px])
+    off, sigma = {}, {}
+    for name, camera in (("stated", stated), ("edges", with_vertical(stated, nominal, vertical))):
+        found, covariance = camera.beside_m(sphere, focal)
+        off[name] = float(np.linalg.norm(found[:2] - beside_m))
+        sigma[name] = float(np.sqrt(0.5 * np.trace(covariance)))
+    assert off["stated"] > 1e-3
+    assert off["edges"] < 0.2 * off["stated"]
+    assert off["edges"] < 3.0 * sigma["edges"]
+    assert sigma["edges"] < 0.2 * sigma["stated"]
+
+
+def test_edges_that_contradict_what_was_stated_widen_sigma() -> None:
+    """A camera that is said to be vertical to 0.01 deg and leans by 1.5 deg."""
+    rig = tilted(-1.5, 0.0)
+    stated = stated_tilt(upright(rig), np.radians(0.01), 0.1)
+    found = with_vertical(stated, upright(rig), measured_vertical(lines(rig, 0.05), upright(rig)))
+    assert found.chi2 is not None
+    assert found.chi2 > 100.0
+    assert np.sqrt(found.covariance[0, 0]) > np.radians(0.05)

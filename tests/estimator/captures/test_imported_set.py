@@ -15,10 +15,13 @@ from phibench.datasets.errors import DatasetError
 from phibench.datasets.read import Sample, open_dataset
 from phibench.estimator.benchmark.document import read_score
 from phibench.estimator.benchmark.score import wanted_pairs
+from phibench.estimator.calibration.bundle import apparent_vertical
 from phibench.estimator.calibration.file import read_calibration
 from phibench.estimator.captures.imported_set import import_pairs, imported_pairs, open_imported
 from phibench.estimator.captures.pair_list import read_pair_list
 from phibench.estimator.cli.main import main
+from phibench.estimator.geometry.rig_parameters import PARAMETERS
+from phibench.estimator.outline.limb_image import Measured
 from phibench.estimator.outline.outline_result import Outline
 from phibench.estimator.spots.image_planes import ImageError
 
@@ -166,6 +169,50 @@ def test_the_rig_is_calibrated_from_pictures(
     blur_px, *_ = held.made_from["spot_shape"]["values"]
     assert blur_px != held.rig.camera.blur_sigma_px
     assert wanted_pairs(open_imported(imported), None, calibration=file).pair(0).rig.camera.blur_sigma_px == blur_px
+
+
+def test_vertical_edges_of_pictures_tell_the_tilt(
+    imported: Path, sample: Sample, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
+) -> None:
+    """Two pictures that show a vertical 0.01 rad off count as one; where none shows any, one sentence says so."""
+    module, seen = "phibench.estimator.captures.imported_calibration", Measured(np.array([0.01, 0.0]), 1e-8 * np.eye(2))
+    outline = Outline(sample.rig.sphere_in_camera_m, np.diag([4e-6, 4e-6, 2e-5]) ** 2, 1.0, 1.0, 0.7, 0.1, 1000, 5)
+    monkeypatch.setattr(f"{module}.find_outline", lambda *_: outline)
+    lacking = ImageError("0 vertical edges were found that agree: 3 are needed; leave the vertical out")
+    told, rig = [], open_imported(imported).rig
+
+    def calibrated(answers: list[Measured | ImageError], *more: str) -> int:
+        waiting = iter(answers)
+
+        def answer(*given: object) -> Measured:
+            told.append(given)
+            found = next(waiting)
+            if isinstance(found, ImageError):
+                raise found
+            return found
+
+        monkeypatch.setattr(f"{module}.find_vertical", answer)
+        return main(["calibrate", str(imported), "--out", str(tmp_path / "rig.json"), *more])
+
+    tilt, sigmas = [PARAMETERS.index(f"tilt_{axis}_rad") for axis in "xy"], []
+    for answers, more in (([], ()), ([seen, seen], ("--vertical",)), ([lacking, seen], ("--vertical",))):
+        assert calibrated(answers, *more) == 0
+        held = read_calibration(tmp_path / "rig.json", rig)
+        sigmas.append(np.sqrt(np.diag(held.covariance))[tilt])
+    assert held.made_from["vertical_in_camera"] == pytest.approx([0.01, 0.0])
+    # tilt and principal point share it out: in a picture of 320 px the point's 5 px are as much as the prior's tilt
+    assert apparent_vertical(rig, held.rig) == pytest.approx([0.01, 0.0], abs=2e-4)
+    assert np.all(sigmas[1] < 0.95 * sigmas[0])
+    assert sigmas[1] == pytest.approx(sigmas[2])
+    # the camera's picture, its card and the outline's error are handed on
+    assert all(given[0].shape[-1] == 3 and given[2] is not None for given in told)
+    (tmp_path / "rig.json").unlink()
+    capsys.readouterr()
+    assert calibrated([lacking, lacking], "--vertical") == 2
+    said = capsys.readouterr().err
+    assert "0 vertical edges" in said
+    assert said.count("\n") == 1
+    assert not (tmp_path / "rig.json").exists()
 
 
 @pytest.mark.parametrize(
