@@ -12,7 +12,7 @@ handled at its own wavelength. Nobody has published electron-level data of a C31
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
 import numpy as np
@@ -67,6 +67,33 @@ class Detector:
         """Expected electrons per joule of ambient band light on a pixel, for the filters R, G, B."""
         pairs = zip(self.band_efficiency, self.band_wavelength_nm, strict=True)
         return tuple(efficiency * photons_per_joule(nm) for efficiency, nm in pairs)
+
+
+def refocused(camera: Camera, focus_distance_m: float) -> Camera:
+    """The same lens turned until it is focused at another distance.
+
+    A thin lens: its image lies at v = fx x pitch, and 1/v + 1/focus_distance is one over its focal length. So fx and fy
+    grow as the plane of focus comes nearer. The aperture stays; the f-number grows with fx.
+
+    Raises
+    ------
+    SceneError
+        If the distance is not beyond the lens's focal length.
+    """
+    image_m = camera.fx_px * camera.pixel_pitch_um * 1e-6
+    per_lens_m = 1.0 / image_m + 1.0 / camera.focus_distance_m
+    if not focus_distance_m * per_lens_m > 1.0:
+        raise SceneError(
+            f"focus_distance_m {focus_distance_m:g}: must be above {1.0 / per_lens_m:.4g} m, the lens's focal length"
+        )
+    times = 1.0 / ((per_lens_m - 1.0 / focus_distance_m) * image_m)
+    return replace(
+        camera,
+        fx_px=camera.fx_px * times,
+        fy_px=camera.fy_px * times,
+        f_number=camera.f_number * times,
+        focus_distance_m=focus_distance_m,
+    )
 
 
 def photons_per_joule(wavelength_nm: float) -> float:

@@ -386,6 +386,7 @@ def outlines_as_one(outlines: Sequence[Outline]) -> Measured:
 
 
 _MOVED_SIGMAS = 5.0
+_GROWN = 0.003  # of the outline's size: one rig's outlines in ten rooms differ by less
 
 
 def _calibration_note(held: Calibration, nominal: Rig, outlines: Sequence[Outline]) -> str:
@@ -401,6 +402,13 @@ def _calibration_note(held: Calibration, nominal: Rig, outlines: Sequence[Outlin
     if off > _MOVED_SIGMAS:
         moved = 1e3 * float(np.linalg.norm(across))
         return f"{text}; doubtful: the mirror has moved by {moved:.2f} mm ({off:.0f} sigma) since; calibrate again"
+    grown, sigma = (then.value - now.value)[2] / now.value[2], np.sqrt((now.covariance + then.covariance)[2, 2])
+    if abs(grown) > max(_GROWN, _MOVED_SIGMAS * float(sigma) / now.value[2]):
+        size = f"{100.0 * abs(grown):.1f} % {'larger' if grown > 0.0 else 'smaller'}"
+        return (
+            f"{text}; doubtful: the mirror's outline is {size} than then: the lens was refocused, or the mirror moved "
+            "along the axis; calibrate again"
+        )
     return f"{text}; the mirror is still where it was"
 
 

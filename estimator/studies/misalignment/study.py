@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cache
 from typing import Annotated, Any
 
@@ -17,6 +18,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.progress import Steps
 from phibench.estimator.calibration.bundle import Bundle
+from phibench.estimator.geometry.paper_depth import load_published
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.estimator.studies.findings import Finding, Row
 from phibench.estimator.studies.framework import Drawing, Result, Settings, Study, StudyDatasets
@@ -34,6 +36,7 @@ from phibench.estimator.studies.misaligned_rigs import (
 )
 from phibench.estimator.studies.misalignment.drawings import azimuth_drawing, interaction_drawing, ranking_drawing
 from phibench.estimator.studies.misalignment.interactions import Interactions, interaction_findings, interactions, rows
+from phibench.estimator.studies.misalignment.refocus import FOCUS_M, LENS_M, refocus, refocus_findings, thin_lens
 from phibench.estimator.studies.misalignment.tables import (
     Rank,
     Search,
@@ -232,6 +235,14 @@ def _noise(settings: MisalignmentSettings, nominal: Rig, places: Places) -> Arra
     return np.stack(errors)
 
 
+def _refocused(settings: MisalignmentSettings, nominal: Rig) -> tuple[Finding, ...]:
+    """Errors of D after the lens was turned, in the paper's 25 experiments."""
+    rig = replace(nominal, camera=thin_lens(nominal.camera, LENS_M))
+    places = [(row.real_depth_m, row.baseline_m) for row in load_published()]
+    rows = [refocus(rig, focus_m, places, settings.height_m) for focus_m in FOCUS_M]
+    return tuple(refocus_findings(rows))
+
+
 def _findings(
     settings: MisalignmentSettings,
     table: pl.DataFrame,
@@ -251,6 +262,7 @@ def _findings(
         *tolerance_findings(tolerances, "exact", middle, settings.cost),
         *calibrated_findings(ranks[CALIBRATED], ranks["exact"]),
         *noise_findings(noise, places.depths_m),
+        *_refocused(settings, default_rig()),
         *interaction_findings(drawn),
     )
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import re
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,12 +14,13 @@ from PIL import Image
 
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.read import Sample, open_dataset
-from phibench.estimator.captures.measure import measure, outlines_as_one, read_setting
+from phibench.estimator.captures.measure import _calibration_note, measure, outlines_as_one, read_setting
 from phibench.estimator.captures.pair_photos import PairPhotos, PositionPhotos
 from phibench.estimator.captures.picture_files import read_photo
 from phibench.estimator.cli.main import main
 from phibench.estimator.outline.outline_result import Outline
 from phibench.estimator.spots.image_planes import ImageError
+from phibench.scenes.rig import Rig
 
 Files = dict[str, list[Path]]
 
@@ -310,3 +312,22 @@ def test_a_grey_jpeg_is_told(case: Case, tmp_path: Path, capsys) -> None:
             picture.convert("L").rotate(180 * (name == "up")).save(tmp_path / f"{name}.jpg")
     grey = {name: [tmp_path / f"{name}.jpg"] for name in ("down", "up")}
     assert "grey picture of 8 bits" in refused(capsys, case.arguments(grey, names=("down", "up")))
+
+
+@pytest.mark.parametrize(
+    ("depth_m", "words"),
+    [
+        (0.2600, "still where it was"),
+        (0.2577, "0.9 % larger than then: the lens was refocused, or"),
+        (0.2623, "0.9 % smaller than then"),
+    ],
+)
+def test_a_calibration_says_that_the_lens_was_turned(depth_m: float, words: str) -> None:
+    """0.26 m then, with 20 um along the axis: a lens turned from far to 0.46 m moves the outline's place by 2.3 mm."""
+
+    def outline(depth: float) -> Outline:
+        return Outline(np.array([0.0, 0.0, depth]), np.diag([4e-6, 4e-6, 2e-5]) ** 2, 1.0, 1.0, 0.7, 0.1, 1000, 5)
+
+    made = {"sphere_in_camera_m": [[0.0, 0.0, 0.26]], "sigma_m": [[4e-6, 4e-6, 2e-5]]}
+    held = SimpleNamespace(made_from=made)
+    assert words in _calibration_note(held, Rig(), [outline(depth_m)])
