@@ -131,8 +131,13 @@ def errors_m(pair: Pair, sensor: Sensor, draws: int, *names: str) -> Array:
 
     Every draw is of another camera, as the bound counts the fixed pattern as noise.
     """
-    uv = np.stack([_fitted(pair, i, sensor, draws, names) for i in range(2)])
+    uv = fitted_px(pair, sensor, draws, *names)
     return np.asarray(depth_exact(pair.rig, pair.baseline_m, uv[0], uv[1]).depth_m - pair.depth_m)
+
+
+def fitted_px(pair: Pair, sensor: Sensor, draws: int, *names: str) -> Array:
+    """Pixels that likelihood fits find in raw frames of both images, shape (2, draws, 2); NaN where a fit fails."""
+    return np.stack([_fitted(pair, i, sensor, draws, names) for i in range(2)])
 
 
 def _fitted(pair: Pair, i: int, sensor: Sensor, draws: int, names: tuple[str, ...]) -> Array:

@@ -31,6 +31,7 @@ from phibench.estimator.geometry.panorama import (
 from phibench.estimator.geometry.phi import outline_circle
 from phibench.estimator.studies.findings import Finding, Row
 from phibench.estimator.studies.framework import Result, Settings, Study, StudyDatasets
+from phibench.estimator.studies.isotropy.binocular import Binocular, Laws, tried
 from phibench.estimator.studies.isotropy.drawings import lines_drawing, misaligned_drawing, noise_drawing
 from phibench.estimator.studies.isotropy.lines import Line, epipolar_line, half_width_rad, hidden_share
 from phibench.estimator.studies.isotropy.noise import (
@@ -124,6 +125,13 @@ def run(settings: IsotropySettings, datasets: StudyDatasets) -> Result:
         *baseline_findings(azimuths, curves[VERTICAL], curves[HORIZONTAL], scene.baseline_m),
         *misaligned_findings(wrong, words),
         *occlusion_findings(hidden, scene.baseline_m),
+        *tried(
+            Binocular(scene.rig, scene.baseline_m, scene.depth_m, scene.height_m),
+            settings.occlusion_heights_m,
+            Laws(draws=settings.draws),
+            scene.background,
+            sensor(settings.preset),
+        ),
         *line_findings(*lines),
         *(row for name, found in edges.items() for row in edge_findings(name, found)),
     )
