@@ -7,7 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from phibench.datasets.errors import DatasetError
+from phibench.estimator.calibration.from_dataset import sigmas_of
 from phibench.estimator.geometry.paper_depth import load_published
+from phibench.estimator.geometry.rig_parameters import PARAMETERS, prior_sigmas
 from phibench.estimator.studies.misaligned_rigs import Places, errors
 from phibench.estimator.studies.misalignment.refocus import FAR_M, OLD, OUTLINE, refocus, refocus_findings, thin_lens
 from phibench.scenes.camera import Camera, refocused
@@ -62,3 +65,15 @@ def test_the_errors_are_those_of_the_misalignment() -> None:
     there = Places(np.array([2.18, 4.18]), np.array([0.0]), 0.5, 0.425)
     expected = errors(rig(), Misalignment(focal_relative=row.relative), there, ("exact",))[0, :, 0]
     assert row.errors[OLD] == pytest.approx(expected, rel=1e-9)
+
+
+def test_a_calibration_takes_the_statement_about_the_lens() -> None:
+    """By default the prior of all calibrations; a stated one changes no other number. Nonsense is one sentence."""
+    focal = PARAMETERS.index("focal_relative")
+    assert np.array_equal(sigmas_of(None), prior_sigmas())
+    stated = sigmas_of(0.018)
+    assert stated[focal] == 0.018
+    assert np.array_equal(np.delete(stated, focal), np.delete(prior_sigmas(), focal))
+    for value in (0.0, -0.01, 0.2, float("nan")):
+        with pytest.raises(DatasetError, match=r"--focal-sigma .*: must be above 0 and below 0\.2"):
+            sigmas_of(value)
