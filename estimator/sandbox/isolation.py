@@ -290,7 +290,8 @@ class _Kernel:
             self._set_read_only(path, 0)
         os.chdir(folder)  # through the new mount
         for path in hidden:
-            if path.is_dir():  # a file is out of reach by its rule, and has a name that this program gave it
+            # a file is out of reach by its rule, and has a name that this program gave it
+            if path.is_dir() and not folder.is_relative_to(path):
                 self._mount(b"phibench", path, b"tmpfs", _NOSUID_NODEV | _READ_ONLY, b"mode=755")
         return shared
 

@@ -16,6 +16,7 @@ from functools import cache
 from pathlib import Path
 
 import pytest
+from helpers.listeners import as_nobody
 from helpers.sandbox_pairs import GOOD, HEADER, SmallPairs, method_file
 
 from phibench.datasets.store.schema import SEALED_TRUTH, TruthFile, TruthFolder
@@ -478,6 +479,31 @@ return {GOOD}
     (outcome,) = run_method(method_file(tmp_path / "method", body), pairs, LIMITS)
     assert outcome.output.splitlines() == ["False False", "1 1", "1 0"], outcome
     assert (tmp_path / "method" / "beside.txt").stat().st_atime == 1.0
+
+
+ORDINARY = """
+import ctypes, tempfile
+ctypes.CDLL(None).prctl(4, 1, 0, 0, 0)  # /proc/self is its own again, as of a process that never was another user's
+os.chdir(tempfile.mkdtemp())
+print(_Kernel().own_mounts(Path.cwd(), [Path('/mnt')]))
+for path in ('/', '.', '/dev/shm'):
+    print(os.statvfs(path).f_flag & 1)
+print(os.listdir('/mnt'))
+Path('own').write_text('1')
+os.remove('own')
+os.chdir('/')
+"""
+
+
+@pytest.mark.skipif(getattr(os, "getuid", lambda: 1)() != 0, reason="only root can become another user")
+def test_an_ordinary_user_gets_mounts_of_its_own_where_there_are_user_namespaces() -> None:
+    """What root's mounts are to the tests above; some systems switch user namespaces off."""
+    names = "from phibench.estimator.sandbox.isolation import _Kernel"
+    imports = f"import ctypes, os, tempfile\nfrom pathlib import Path\n{names}"
+    done = as_nobody(ORDINARY, imports=imports)
+    if done.stdout.startswith("False"):
+        pytest.skip("no user namespaces here")
+    assert done.stdout.split("\n")[:5] == ["True", "1", "0", "0", "[]"], done.stderr
 
 
 FAR = "a/b/c/d/e/f/g"
