@@ -6,9 +6,9 @@ A truth is never shown to a method. Positions are pixels (u, v), integers at pix
 from __future__ import annotations
 
 import math
+import threading
 import time
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -183,35 +183,60 @@ def truth_folders(pairs: object) -> tuple[Path, ...]:
 class CachedPairs:
     """Pairs and truths of another set, each asked for once and kept; make a new one for the next part of a set.
 
-    A pair's truth is asked for with it: both begin with the layers of the same sample, of which a set keeps the last.
+    Both begin with the layers of the same sample, of which a set keeps the last. A pair's truth is made before the next
+    pair, not with its own: it takes longer where both spots are seen, and the method would tell by the clock.
 
     Parameters
     ----------
     pairs : PairSet
+    before : CachedPairs, optional
+        The part before, of the same set: its last truth is made first. Threads may ask both.
 
     Attributes
     ----------
-    truth_seconds : float
-        CPU-seconds of the truths so far.
+    truth_seconds, late_seconds : float
+        CPU-seconds of the truths so far, and of those of them that no pair waited for.
     """
 
-    def __init__(self, pairs: PairSet) -> None:
-        self._pairs = pairs
+    def __init__(self, pairs: PairSet, before: CachedPairs | None = None) -> None:
+        self._pairs, self._before = pairs, before
         self.folders = truth_folders(pairs)
-        self.truth_seconds = 0.0
-        self.pair = cache(self._pair)
-        self.truth = cache(self._truth)
+        self.truth_seconds = self.late_seconds = 0.0
+        self._lock: threading.RLock = threading.RLock() if before is None else before._lock
+        self._last: int | None = None
+        self._made: dict[int, Pair] = {}
+        self._truths: dict[int, PairTruth] = {}
 
-    def _pair(self, number: int) -> Pair:
-        pair = self._pairs.pair(number)
-        self.truth(number)
-        return pair
+    def pair(self, number: int) -> Pair:
+        """Images of a pair."""
+        if (found := self._made.get(number)) is not None:
+            return found
+        with self._lock:
+            if number not in self._made:
+                for part in (self._before, self):
+                    if part is not None and part._last is not None:
+                        part._truth(part._last)
+                self._before, self._last = None, number
+                self._made[number] = self._pairs.pair(number)
+            return self._made[number]
 
-    def _truth(self, number: int) -> PairTruth:
+    def truth(self, number: int) -> PairTruth:
+        """Exact answer for a pair."""
+        if (found := self._truths.get(number)) is not None:
+            return found  # without waiting for a pair that is being made
+        with self._lock:
+            self.late_seconds += self._truth(number)
+            return self._truths[number]
+
+    def _truth(self, number: int) -> float:
+        """Make a truth that is not there yet; CPU-seconds that it took."""
+        if number in self._truths:
+            return 0.0
         start = time.thread_time()
-        truth = self._pairs.truth(number)
-        self.truth_seconds += time.thread_time() - start
-        return truth
+        self._truths[number] = self._pairs.truth(number)
+        took = time.thread_time() - start
+        self.truth_seconds += took
+        return took
 
     def __len__(self) -> int:
         return len(self._pairs)

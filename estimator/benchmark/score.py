@@ -59,6 +59,7 @@ from phibench.estimator.sandbox.runner import Harness, Ran, asked_here, function
 
 Ask = Callable[[PairSet, Sequence[int]], Iterable[tuple[Outcome, ...]]]
 """Pairs and numbers to the outcomes of every method: `sandbox.runner.Harness.outcomes`."""
+_LATE = "late"
 AT_ONCE = 16
 """Pairs that are examined together; twice as many are in memory. One of MJPEG frames, on and off, takes 11 MB."""
 
@@ -133,12 +134,13 @@ def score_methods(
             answers.append(outcomes)
             told(answered + len(answers))
         answered += len(answers)
-        if stages is not None:
-            stages["bounds"] = stages.get("bounds", 0.0) + held.truth_seconds
         fits = KeptFits()
         for part, outcomes in zip(parts, zip(*answers, strict=True), strict=True):
             with _timed("statistics", stages):
                 part.append(examine(held, outcomes, rules, part[-1].leading if part else None, fits))
+        if stages is not None:
+            for stage, seconds in (("bounds", held.truth_seconds), (_LATE, held.late_seconds)):
+                stages[stage] = stages.get(stage, 0.0) + seconds
     with _timed("statistics", stages):
         return [
             _scored(method, pairs, part, rules, seed, limits or {}) for method, part in zip(methods, parts, strict=True)
@@ -147,8 +149,9 @@ def score_methods(
 
 def _asked(pairs: PairSet, ask: Ask) -> Iterator[tuple[CachedPairs, Iterable[tuple[Outcome, ...]]]]:
     """Some pairs of a set and their outcomes to come, then the next ones."""
+    held = None
     for start in range(0, len(pairs), AT_ONCE):
-        held = CachedPairs(pairs)
+        held = CachedPairs(pairs, held)
         yield held, ask(held, range(start, min(start + AT_ONCE, len(pairs))))
 
 
@@ -416,7 +419,8 @@ def run_and_score(
         scored = score_methods(cards, made, harness.outcomes, None, seed, limits.document(), steps.reach, stages)
     if stages is not None:
         stages.update(harness.stages)
-        stages["draw"] -= stages["bounds"]  # made in the same turn: `CachedPairs`
+        # bounds are made in the turns of pairs, but for the late ones: `CachedPairs`
+        stages["draw"] -= stages["bounds"] - stages.pop(_LATE)
         stages |= {stage: stages[stage] + seconds for stage, seconds in making.items()}
     told = zip(scored, harness.failed_outputs, harness.isolations, harness.ran, strict=True)
     return [replace(ran_with(isolated(one, isolation), ran), output=output) for one, output, isolation, ran in told]

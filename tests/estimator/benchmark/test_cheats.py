@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import cache
 from itertools import product
+from pathlib import Path
 
 import numpy as np
 import polars as pl
@@ -25,7 +26,9 @@ from helpers.bench_cases import (
 )
 from scipy.stats import norm
 
+from phibench.datasets.read import open_finished
 from phibench.estimator.benchmark.answer_errors import Rules
+from phibench.estimator.benchmark.dataset_pairs import dataset_pairs
 from phibench.estimator.benchmark.metrics import measure, prepared
 from phibench.estimator.benchmark.records import records
 from phibench.estimator.interface import Answer, Spot
@@ -41,7 +44,7 @@ from phibench.estimator.limits.beyond_images import (
     most_found,
     searched_px2,
 )
-from phibench.estimator.pair_set import PairTruth
+from phibench.estimator.pair_set import CachedPairs, PairTruth
 from phibench.scenes.random_streams import generator
 
 RULES = Rules(resamples=99)
@@ -218,6 +221,46 @@ def test_clipped_covariances_and_the_number_of_tests() -> None:
     assert len(tried) == TESTS + 1
     assert TESTS / TIMES + 1.0 / TIMES_FINDING == 1.0
     assert {one.quantity for one in tried} == set(QUANTITIES)
+
+
+# -- time --------------------------------------------------------------------------------------------------------------
+
+
+def test_no_pair_waits_for_its_own_truth() -> None:
+    """Bounds take 1 s longer where both spots are seen: a method would know by the clock which spot is hidden."""
+    asked: list[tuple[str, int]] = []
+
+    class Told(Cases):
+        def pair(self, number):
+            asked.append(("pair", number))
+            return super().pair(number)
+
+        def truth(self, number):
+            asked.append(("truth", number))
+            return super().truth(number)
+
+    told, before, due = Told(pairs(60).truths), None, list[tuple[str, int]]()
+    for start in (0, 3):
+        held = CachedPairs(told, before)
+        for number in range(start, start + 3):
+            held.pair(number)
+            due += [("truth", number - 1)] * (number > 0) + [("pair", number)]
+            assert asked == due
+        before = held
+    assert held.late_seconds == 0.0
+    assert held.truth(5) is held.truth(5)
+    assert held.pair(4) is held.pair(4)
+    assert asked == [*due, ("truth", 5)]
+    assert held.late_seconds > 0.0
+
+
+def test_the_order_of_pairs_is_that_of_a_stream(bench_dataset: Path) -> None:
+    """Whoever counts pairs learns nothing of sample or preset: their order is drawn."""
+    order = dataset_pairs(open_finished(bench_dataset)).pair_draws
+    names = [(one.sample_id, one.preset) for one in order]
+    assert len(set(names)) == len(names) == 9
+    assert names != sorted(names)
+    assert [one.number for one in order] == list(range(9))
 
 
 # -- cheats that know nothing ------------------------------------------------------------------------------------------
