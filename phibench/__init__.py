@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from phibench.datasets.scene.scene_export import mitsuba_scene
     from phibench.datasets.training import PairDataset
     from phibench.estimator.benchmark.score import score
     from phibench.estimator.geometry.phi import phi
@@ -37,6 +38,7 @@ __all__ = [
     "depth_exact",
     "find_spot",
     "make",
+    "mitsuba_scene",
     "open_dataset",
     "phi",
     "score",
@@ -51,6 +53,7 @@ _HOMES = {
     "depth_exact": "phibench.estimator.geometry.triangulate",
     "find_spot": "phibench.estimator.spots.simple_spots",
     "make": "phibench.estimator.paper.sensitivity_table",
+    "mitsuba_scene": "phibench.datasets.scene.scene_export",
     "open_dataset": "phibench.estimator.scored_dataset",
     "phi": "phibench.estimator.geometry.phi",
     "score": "phibench.estimator.benchmark.score",

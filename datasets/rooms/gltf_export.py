@@ -18,26 +18,26 @@ from PIL import Image
 
 from phibench.render.sensor.srgb import srgb_encoded
 from phibench.scenes.faces import FaceTable, face_table
-from phibench.scenes.frames import Array
+from phibench.scenes.frames import Array, Vector
 from phibench.scenes.room import Room
 from phibench.scenes.shapes import Shape
 from phibench.scenes.textures import Bitmap, Checker, Texture, Uniform
 
 _CELL = 64  # texels along a side of a checker's cell
 _MAGIC, _JSON, _BIN = 0x46546C67, 0x4E4F534A, 0x004E4942
-_FLOAT, _PLACES, _VERTICES = 5126, "VEC2", "VEC3"
+_FLOAT, _UNSIGNED, _PLACES, _VERTICES = 5126, 5125, "VEC2", "VEC3"
 _STRENGTH = "KHR_materials_emissive_strength"
 
 
 def glb_of(room: Room) -> bytes:
     """Bytes of a `.glb` file; `MeshSettings(up_axis="y", metres_per_unit=1, emission_w_m2_sr=1)` reads it."""
-    document = _Document()
+    document = GltfDocument()
     for shape in (*room.surfaces, *room.furniture):
         document.add(shape)
     return document.encoded(room.name)
 
 
-class _Document:
+class GltfDocument:
     """Parts of a glTF document in the making; equal textures are written once."""
 
     def __init__(self) -> None:
@@ -45,19 +45,52 @@ class _Document:
         self._lists: dict[str, list[dict[str, Any]]] = {
             name: [] for name in ("nodes", "meshes", "materials", "textures", "images", "accessors", "bufferViews")
         }
+        self._lists["cameras"] = []
         self._textures: dict[Texture, int] = {}
 
     def add(self, shape: Shape) -> None:
         """Add a shape as a node."""
         table = face_table((shape,))
-        x, y, z = np.moveaxis(table.corners_m.reshape(-1, 3), 1, 0)
-        attributes = {"POSITION": self._accessor(np.stack([x, z, -y], axis=-1), _VERTICES)}
+        attributes = {"POSITION": self._accessor(y_up(table.corners_m.reshape(-1, 3)), _VERTICES)}
         texture = table.textures[0]
         if not isinstance(texture, Uniform) and not table.emits[0]:
             attributes["TEXCOORD_0"] = self._accessor(_places(table), _PLACES)
-        primitive = {"attributes": attributes, "material": self._material(shape.name, table)}
-        mesh = self._put("meshes", {"name": shape.name, "primitives": [primitive]})
-        self._put("nodes", {"name": shape.name, "mesh": mesh})
+        self._put_mesh(shape.name, {"attributes": attributes, "material": self._material(shape.name, table)})
+
+    def add_mesh(
+        self,
+        name: str,
+        points_m: Array,
+        material: dict[str, Any],
+        triangles: NDArray[np.integer[Any]],
+        normals: Array | None = None,
+    ) -> None:
+        """Add a mesh of world points (N, 3) with one material; `triangles` have the shape (M, 3)."""
+        attributes = {"POSITION": self._accessor(y_up(points_m), _VERTICES)}
+        if normals is not None:
+            attributes["NORMAL"] = self._accessor(y_up(normals), _VERTICES)
+        corners = np.ascontiguousarray(triangles, "<u4")
+        view = self._view(corners.tobytes())
+        entry = {"bufferView": view, "componentType": _UNSIGNED, "count": corners.size, "type": "SCALAR"}
+        indices = self._put("accessors", entry)
+        primitive = {"attributes": attributes, "indices": indices, "material": self._put("materials", material)}
+        self._put_mesh(name, primitive)
+
+    def add_camera(self, name: str, perspective: dict[str, float], matrix: Array) -> None:
+        """Add a camera whose axes are the columns of a matrix (4, 4) of glTF's world."""
+        camera = self._put("cameras", {"name": name, "type": "perspective", "perspective": perspective})
+        self._put("nodes", {"name": name, "camera": camera, "matrix": matrix.T.ravel().tolist()})
+
+    @staticmethod
+    def emitting(name: str, radiance_w_m2_sr: Vector) -> dict[str, Any]:
+        """Black material that shines."""
+        light, black = max(radiance_w_m2_sr), {"metallicFactor": 0.0, "baseColorFactor": [0.0, 0.0, 0.0, 1.0]}
+        factor = [value / light for value in radiance_w_m2_sr]
+        return {"name": name, "pbrMetallicRoughness": black, "emissiveFactor": factor} | _emission(light)
+
+    def _put_mesh(self, name: str, primitive: dict[str, Any]) -> None:
+        mesh = self._put("meshes", {"name": name, "primitives": [primitive]})
+        self._put("nodes", {"name": name, "mesh": mesh})
 
     def encoded(self, name: str) -> bytes:
         """Bytes of the file."""
@@ -120,6 +153,12 @@ class _Document:
     def _put(self, name: str, value: dict[str, Any]) -> int:
         self._lists[name].append(value)
         return len(self._lists[name]) - 1
+
+
+def y_up(points: Array) -> Array:
+    """World vectors, shape (..., 3), in glTF's axes."""
+    x, y, z = np.moveaxis(np.asarray(points, float), -1, 0)
+    return np.stack([x, z, -y], axis=-1)
 
 
 def _emission(strength: float) -> dict[str, Any]:

@@ -127,6 +127,7 @@ def merge(*shards: Path, out: Path) -> int:
 def verify(
     directory: Path,
     *,
+    mitsuba: Whole | None = None,
     json: Annotated[bool, Parameter(negative="", help="The outcome as one JSON document.")] = False,
 ) -> int:
     """Check every file, hash, row and certificate of a data set; exit code 1 if there is a fault.
@@ -135,18 +136,30 @@ def verify(
     ----------
     directory
         Folder of a data set, or of an export.
+    mitsuba
+        Also compare so many samples with Mitsuba's path tracer: light, outline, and the spot's flux and centroid.
     """
+    from dataclasses import replace
     from json import dumps
 
     from phibench.datasets.export.export_make import INFO, verify_export
     from phibench.datasets.verify import verify as verify_dataset
 
     if (directory / INFO).is_file():
-        faults = verify_export(directory)
-        closing = f"{directory}: {len(faults)} fault{'s' * (len(faults) != 1)}"
-        print(dumps({"faults": list(faults), "valid": not faults}) if json else "\n".join([*faults, closing]))
-        return 1 if faults else 0
+        if mitsuba is not None:
+            from phibench.datasets.errors import DatasetError
+
+            raise DatasetError(
+                f"{directory} is an export: --mitsuba renders the samples of a data set; name its folder"
+            )
+        wrong = verify_export(directory)
+        closing = f"{directory}: {len(wrong)} fault{'s' * (len(wrong) != 1)}"
+        print(dumps({"faults": list(wrong), "valid": not wrong}) if json else "\n".join([*wrong, closing]))
+        return 1 if wrong else 0
     report = verify_dataset(directory)
+    if mitsuba is not None and report.ok:
+        faults, notes = _by_mitsuba(directory, mitsuba, silent=json)
+        report = replace(report, faults=faults, notes=(*report.notes, *notes))
     if json:
         print(dumps({**vars(report), "valid": report.ok}))
         return 0 if report.ok else 1
@@ -157,6 +170,21 @@ def verify(
     count = len(report.faults)
     print(f"{directory}: {report.files} files, {report.samples} samples, {count} fault{'s' * (count != 1)}")
     return 0 if report.ok else 1
+
+
+def _by_mitsuba(directory: Path, count: int, *, silent: bool) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Faults and notes by Mitsuba's path tracer; a line is printed for each view as it is done."""
+    from phibench.datasets.read import open_dataset
+    from phibench.datasets.scene.scene_check import check_sample, chosen_samples
+
+    faults, notes = list[str](), list[str]()
+    for sample in chosen_samples(open_dataset(directory), count):
+        for checked in check_sample(sample):
+            faults += checked.faults
+            notes.append(f"Mitsuba: {checked}")
+            if not silent:
+                print(checked, flush=True)
+    return tuple(faults), tuple(notes) if silent else ()
 
 
 @dataset.command

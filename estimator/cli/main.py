@@ -31,6 +31,7 @@ from phibench.estimator.cli.film import film, loop
 from phibench.estimator.cli.methods import method
 from phibench.estimator.cli.options import DATA, INSTALLATION, METHODS, SENSOR, answer_to_old_spelling
 from phibench.estimator.cli.room import room
+from phibench.estimator.cli.scene import scene
 from phibench.estimator.cli.score import bench, compare, report, results, score
 from phibench.estimator.cli.seal import seal, submission
 from phibench.estimator.cli.studies import paper, stroke, study
@@ -50,7 +51,7 @@ app = App(
     suppress_keyboard_interrupt=False,
     result_action="return_value",
 )
-for _group in (dataset, film, room, method, seal, submission, sensor, loop, study):
+for _group in (dataset, film, room, scene, method, seal, submission, sensor, loop, study):
     app.command(_group)
 app.command(export, group=DATA)
 app.command(release, group=DATA)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers.oracles import TARGETS, project_cv2
-from helpers.path_ambient import path_trace
+from helpers.path_ambient import path_trace, traced_scene
 from helpers.path_spots import compare
 
 from phibench.render.optics.spot_layer import spot_layer
@@ -20,7 +20,7 @@ from phibench.render.optics.truth import spot_truth, truth_layer
 from phibench.render.room.ambient import render_ambient
 from phibench.render.room.camera_plugin import sensor_dict
 from phibench.render.room.light_map import BakeSettings, bake
-from phibench.render.room.scene import load_scene, scene_dict, to_scene_mm
+from phibench.render.room.scene import to_scene_mm
 from phibench.render.setup.variant import activate
 from phibench.scenes.camera import Camera, Detector
 from phibench.scenes.catalog import c310_camera, default_rig, lab
@@ -82,7 +82,7 @@ def test_accuracy_truth_layer_against_mitsuba_geometry(mi: ModuleType, rig: Rig)
     v, u = np.nonzero(np.isfinite(planes["x_m"]))
     pick = rng.choice(len(u), 4000, replace=False)
     u, v = u[pick], v[pick]
-    scene = load_scene(mi, scene_dict(mi, view, room))
+    scene = traced_scene(mi, view, room)
     origins, directions = _sensor_rays(mi, view, np.stack([u, v], axis=-1).astype(float))
     first = scene.ray_intersect(mi.Ray3f(mi.Point3f(origins.T), mi.Vector3f(directions.T)))
     reflected = first.spawn_ray(first.to_world(mi.reflect(first.wi)))

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers.oracles import TARGETS
+from helpers.path_ambient import traced_scene
 
 from phibench.render.room.ambient import render_ambient
 from phibench.render.room.light_map import BakeSettings, LightMap, bake
-from phibench.render.room.scene import load_scene, scene_dict
 from phibench.render.setup.variant import activate
 from phibench.scenes.catalog import c310_rig, lab
 
@@ -41,7 +41,7 @@ def noise(a: np.ndarray, b: np.ndarray) -> float:
 def trace(seed: int) -> np.ndarray:
     """`path` with the multijitter sampler and Mitsuba's own Russian roulette."""
     mi = activate()
-    scene = load_scene(mi, scene_dict(mi, VIEW, ROOM))
+    scene = traced_scene(mi, VIEW, ROOM)
     integrator = mi.load_dict({"type": "path", "max_depth": 16})
     image = np.array(mi.render(scene, integrator=integrator, spp=PATH_SAMPLES, seed=seed), dtype=float)
     return image.transpose(2, 0, 1)

@@ -2,15 +2,28 @@
 
 from __future__ import annotations
 
+from types import ModuleType
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
-from phibench.render.room.scene import load_scene, scene_dict
+from phibench.render.plugins.plugin_tree import mitsuba_dict
+from phibench.render.plugins.standard_scene import standard_scene
+from phibench.render.room.camera_plugin import sensor_dict
+from phibench.render.room.scene import load_scene
 from phibench.render.setup.variant import activate
 from phibench.scenes.rig import View
 from phibench.scenes.room import Room
 
+Crop = tuple[int, int, int, int]
 _PASS = 16  # samples per pixel and pass: bounds the memory
+
+
+def traced_scene(mi: ModuleType, view: View, room: Room, crop: Crop | None = None) -> Any:
+    """Scene of a view, with our sensor instead of the standard one."""
+    scene = mitsuba_dict(mi, standard_scene(view, room, light="ambient"))
+    return load_scene(mi, scene | {"sensor": sensor_dict(mi, view, crop)})
 
 
 def path_trace(
@@ -19,7 +32,7 @@ def path_trace(
     samples_per_pixel: int,
     max_depth: int,
     seed: int,
-    crop: tuple[int, int, int, int] | None = None,
+    crop: Crop | None = None,
 ) -> NDArray[np.float32]:
     """Expected photo-electrons per second per pixel, planes R, G, B.
 
@@ -42,7 +55,7 @@ def path_trace(
     if not any(surface.emits for surface in room.surfaces):
         return np.zeros((3, height, width), dtype=np.float32)
     mi = activate()
-    scene = load_scene(mi, scene_dict(mi, view, room, crop))
+    scene = traced_scene(mi, view, room, crop)
     integrator = mi.load_dict({"type": "path", "max_depth": max_depth, "rr_depth": 1000})
     passes = [_PASS] * (samples_per_pixel // _PASS) + [samples_per_pixel % _PASS] * (samples_per_pixel % _PASS > 0)
     seeds = np.random.SeedSequence(seed).generate_state(len(passes), dtype=np.uint32)
@@ -58,12 +71,12 @@ def path_runs(
     samples_per_pixel: int,
     max_depth: int,
     runs: int,
-    crop: tuple[int, int, int, int],
+    crop: Crop,
     first_seed: int = 0,
 ) -> NDArray[np.float32]:
     """Independent runs over a small window, one pass each, shape (runs, 3, height, width); else as `path_trace`."""
     mi = activate()
-    scene = load_scene(mi, scene_dict(mi, view, room, crop))
+    scene = traced_scene(mi, view, room, crop)
     integrator = mi.load_dict({"type": "path", "max_depth": max_depth, "rr_depth": 1000})
     # the multijitter sampler lays out the samples of a pass anew for each seed
     seeds = range(first_seed, first_seed + runs)

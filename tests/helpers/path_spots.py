@@ -10,8 +10,10 @@ import numpy as np
 
 from phibench.render.optics.spot_layer import spot_layer
 from phibench.render.optics.truth import spot_truth
+from phibench.render.plugins.mirror_plugins import cap_grid, grid_plugin, mirror_bsdf, mirror_plugin
+from phibench.render.plugins.plugin_tree import Plugin, mitsuba_dict
 from phibench.render.room.camera_plugin import MM_PER_M, sensor_dict
-from phibench.render.room.scene import cap_grid, grid_mesh, load_scene, mirror_bsdf, mirror_entry, to_scene_mm
+from phibench.render.room.scene import load_scene, to_scene_mm
 from phibench.scenes.frames import rotation_facing
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.revolved_mirror import RevolvedMirror
@@ -34,7 +36,8 @@ def _spot_scene(mi: ModuleType, view: View, spot: LaserSpot, crop: tuple[int, in
         "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.0, 0.0, 0.0]}},
     }
     sensor = sensor_dict(mi, view, crop) | {"sampler": {"type": "independent"}}
-    return load_scene(mi, {"type": "scene", "sensor": sensor, "mirror": _mirror(mi, view, spot), "spot": disk})
+    scene = mitsuba_dict(mi, Plugin("scene", "scene", {"mirror": _mirror(view, spot)}))
+    return load_scene(mi, scene | {"sensor": sensor, "spot": disk})
 
 
 def _brute_force(
@@ -50,7 +53,7 @@ def _brute_force(
     return np.array(passes, dtype=float)
 
 
-def _mirror(mi: ModuleType, view: View, spot: LaserSpot) -> Any:
+def _mirror(view: View, spot: LaserSpot) -> Plugin:
     """The mirror; of a mirror of revolution the part around the spot's image, with facets of 15 micrometres.
 
     Interpolated normals bend the map from the film to the wall in each facet, by as much as their error of 6e-6 rad
@@ -58,14 +61,14 @@ def _mirror(mi: ModuleType, view: View, spot: LaserSpot) -> Any:
     """
     mirror = view.rig.mirror
     if not isinstance(mirror, RevolvedMirror):
-        return mirror_entry(mi, view)
+        return mirror_plugin(view)
     place = np.array([spot_truth(view, spot, ()).reflection_point_world_m])
     x, y, _ = ((place - view.sphere_centre_m) @ view.T_world_sphere.R)[0]
     radius, turn, steps = math.hypot(x, y), math.atan2(y, x), np.linspace(-1.0, 1.0, _FACETS + 1)
     assert _PATCH_M < radius < mirror.profile.rim_radius_m - _PATCH_M
     grid = cap_grid(mirror.profile, radius - _PATCH_M * steps, turn + _PATCH_M / radius * steps)
-    bsdf = mi.load_dict(mirror_bsdf(mirror, view.rig.camera.detector.band_wavelength_nm))
-    return grid_mesh(mi, view, *grid, bsdf, closed=False)
+    bsdf = mirror_bsdf(mirror, view.rig.camera.detector.band_wavelength_nm)
+    return grid_plugin(view, *grid, bsdf, closed=False)
 
 
 def compare(mi: ModuleType, rig: Rig, spot: LaserSpot, half: int, paths: float) -> dict[str, float]:

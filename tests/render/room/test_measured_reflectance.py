@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -23,7 +22,6 @@ from phibench.scenes.laser import LaserSpot
 from phibench.scenes.mirror import ReflectanceTable, SphereMirror
 from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.rig import Rig
-from phibench.scenes.validation import SceneError
 
 BANDS_NM = (460.0, 540.0, 610.0)
 ANGLES = ReflectanceTable((450.0, 700.0), (0.50, 0.40, 0.90, 0.60, 0.70, 0.80), (0.0, 40.0, 80.0))
@@ -150,16 +148,3 @@ def test_a_table_that_does_not_do_is_one_sentence(table: dict[str, Any], laser_n
         check_recipe(raw)
     _, line = str(caught.value).splitlines()
     assert line.startswith(f"  {begin}")
-
-
-def test_path_tracing_refuses_what_it_does_not_know() -> None:
-    mi = activate()
-    from phibench.render.room.scene import mirror_bsdf
-
-    with pytest.raises(SceneError, match="one angle and a smooth mirror"):
-        mirror_bsdf(SphereMirror(reflectance_table=ANGLES), BANDS_NM)
-    flat = SphereMirror(reflectance_table=ReflectanceTable((460.0, 610.0), (0.3, 0.6), (8.0,)))
-    assert mirror_bsdf(flat, BANDS_NM)["specular_reflectance"]["value"] == pytest.approx([0.3, 0.46, 0.6])
-    with pytest.raises(SceneError, match="one angle and a smooth mirror"):
-        mirror_bsdf(replace(flat, roughness_alpha=0.001), BANDS_NM)
-    assert mi is not None

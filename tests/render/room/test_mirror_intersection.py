@@ -9,8 +9,8 @@ import pytest
 from helpers.revolved_rigs import PROFILES, revolved
 
 from phibench.render.optics.ray_tracer import lens_rays, reflect
+from phibench.render.plugins.mirror_plugins import cap_grid, cap_places
 from phibench.render.room.mirror_intersection import mirror_intersection
-from phibench.render.room.scene import cap_grid, cap_places
 from phibench.render.setup.variant import activate
 
 

@@ -1,0 +1,157 @@
+"""Room, robot, holder and lamps as standard Mitsuba plugins.
+
+Plain rectangles and cuboids are Mitsuba's own; every other shape is a mesh of its faces, with the place of its corners
+on its texture. Meshes lie in their shape's own frame, those of `Mesh` in the world's, so that both stroke positions
+share them. What shines has albedo 0: without a material an emitter would reflect, Mitsuba's default being 0.5.
+
+Mitsuba draws points on a shining texture from its first period, without the transform of its coordinates. A shining
+rectangle therefore takes the size of its picture. Walls of a photographed room have one texel beyond each edge, behind
+the next wall.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from phibench.render.plugins.plugin_tree import Picture, Plugin, Rgb, Triangles, Value
+from phibench.render.room.camera_plugin import MM_PER_M
+from phibench.render.room.scene import to_scene_mm
+from phibench.scenes.faces import face_table
+from phibench.scenes.frames import Array, Pose
+from phibench.scenes.rig import View
+from phibench.scenes.room import Room
+from phibench.scenes.shapes import Cuboid, Mesh, Rectangle, Shape
+from phibench.scenes.textures import Bitmap, Texture, Uniform
+
+BLACK = Rgb((0.0, 0.0, 0.0))
+
+
+def room_plugins(view: View, room: Room, *, lit: bool = True) -> dict[str, Plugin]:
+    """Every shape of a room with robot and holder, under its key; `lit` False switches off all that shines."""
+    shapes = {shape_key(i): shape_plugin(view, shape, i, lit=lit) for i, shape in enumerate(room.shapes(view))}
+    return shapes | tube_plugins(view)
+
+
+def shape_key(index: int) -> str:
+    """Key of the shape with an object id; sorts like the ids."""
+    return f"shape_{index:04d}"
+
+
+def shape_plugin(view: View, shape: Shape, index: int, *, lit: bool = True) -> Plugin:
+    """One shape with its material and, if it shines, its light."""
+    texture = shape.texture
+    if isinstance(shape, Rectangle) and shape.emits:
+        light: Rgb | Plugin | None = Rgb(shape.radiance_w_m2_sr)
+    elif isinstance(texture, Bitmap) and texture.is_radiance:
+        light = _bitmap(texture, shape.name, index)
+    else:
+        light = None
+    values: dict[str, Value] = {}
+    if light is None:
+        values["bsdf"] = _material(shape, index)
+    else:
+        values["bsdf"] = diffuse(BLACK)
+        if lit:
+            values["emitter"] = Plugin("emitter", "area", {"radiance": light})
+    if isinstance(shape, Rectangle) and (isinstance(texture, Uniform) or light is not None):
+        size, pose = _emitting_size(shape) if isinstance(light, Plugin) else (shape.size_m, shape.T_world_shape)
+        half = (0.5 * size[0], 0.5 * size[1], 1.0 / MM_PER_M)
+        return _shape("rectangle", {"to_world": placed(view, pose, half)} | values, shape, index)
+    if isinstance(shape, Cuboid) and isinstance(texture, Uniform):
+        half = (0.5 * shape.size_m[0], 0.5 * shape.size_m[1], 0.5 * shape.size_m[2])
+        return _shape("cube", {"to_world": placed(view, shape.T_world_shape, half)} | values, shape, index)
+    pose = Pose("world", "shape") if isinstance(shape, Mesh) else shape.T_world_shape
+    mesh = _faces_mesh(shape, index)
+    own: dict[str, Value] = {"filename": mesh, "face_normals": True, "to_world": placed(view, pose)}
+    return _shape("ply", own | values, shape, index)
+
+
+def placed(view: View, pose: Pose, scale_m: tuple[float, float, float] | None = None) -> Array:
+    """Transform, shape (4, 4), of a shape's frame to the scene's; a mesh is in millimetres already."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = pose.R * (1.0 if scale_m is None else MM_PER_M * np.array(scale_m))
+    matrix[:3, 3] = to_scene_mm(view, pose.t)
+    return matrix
+
+
+def diffuse(albedo: Rgb | Plugin) -> Plugin:
+    """Lambertian surface."""
+    return Plugin("bsdf", "diffuse", {"reflectance": albedo})
+
+
+def tube_plugins(view: View) -> dict[str, Plugin]:
+    """Two faces of a glass tube around the mirror; nothing where there is none."""
+    tube = view.tube
+    if tube is None:
+        return {}
+    ends = [to_scene_mm(view, tube.origin_m + height * tube.axis) for height in (tube.low_m, tube.high_m)]
+    found = {}
+    for name, radius, inside, outside in (
+        ("glass_inner", tube.inner_m, 1.0, tube.index),
+        ("glass_outer", tube.outer_m, tube.index, 1.0),
+    ):
+        values: dict[str, Value] = {"p0": ends[0], "p1": ends[1], "radius": MM_PER_M * radius}
+        values["bsdf"] = Plugin("bsdf", "dielectric", {"int_ior": inside, "ext_ior": outside})
+        found[name] = Plugin("shape", "cylinder", values, name, name)
+    return found
+
+
+def _shape(kind: str, values: dict[str, Value], shape: Shape, index: int) -> Plugin:
+    return Plugin("shape", kind, values, shape_key(index), shape.name)
+
+
+def _emitting_size(shape: Rectangle) -> tuple[tuple[float, float], Pose]:
+    """Size and pose of a shining rectangle: those of its picture."""
+    texture = shape.texture
+    assert isinstance(texture, Bitmap)
+    period = [texture.texel_m[i] * texture.values.shape[1 - i] for i in (0, 1)]
+    middle = [texture.origin_m[i] + 0.5 * period[i] for i in (0, 1)]
+    pose = shape.T_world_shape @ Pose("shape", "picture", (middle[0], middle[1], 0.0))
+    return (period[0], period[1]), pose
+
+
+def _faces_mesh(shape: Shape, index: int) -> Triangles:
+    """Mesh of a shape's faces, its corners placed on the texture as `scenes.faces` says."""
+    own = shape if isinstance(shape, Mesh) else replace(shape, T_world_shape=Pose("world", "shape"))
+    table = face_table([own])
+    corners = table.corners_m.reshape(-1, 3)
+    patch = np.repeat(table.patch, 3)
+    uv = None if isinstance(shape.texture, Uniform) else table.places(patch, corners) / _period(shape.texture)
+    faces = np.arange(len(corners)).reshape(-1, 3)
+    return Triangles(shape_key(index), MM_PER_M * corners, faces, uv=uv)
+
+
+def _period(texture: Texture) -> tuple[int, ...]:
+    """Texels, or cells of a checker, of one period: columns and rows."""
+    return texture.values.shape[1::-1] if isinstance(texture, Bitmap) else (2, 2)
+
+
+def _material(shape: Shape, index: int) -> Plugin:
+    """Diffuse ground, below a smooth dielectric coat if that has a refractive index."""
+    albedo = _albedo(shape.texture, shape.name, index)
+    if shape.coat == 0.0:
+        material = diffuse(albedo)
+    else:
+        ior: dict[str, Value] = {"int_ior": shape.coat, "ext_ior": 1.0, "nonlinear": True}
+        material = Plugin("bsdf", "plastic", {"diffuse_reflectance": albedo} | ior)
+    if isinstance(shape, Mesh) and shape.two_sided:
+        return Plugin("bsdf", "twosided", {"material": material})
+    return material
+
+
+def _albedo(texture: Texture, label: str, index: int) -> Rgb | Plugin:
+    if isinstance(texture, Uniform):
+        return Rgb(texture.albedo)
+    if isinstance(texture, Bitmap):
+        return _bitmap(texture, label, index)
+    colours: dict[str, Value] = {"color0": Rgb(texture.albedo_even), "color1": Rgb(texture.albedo_odd)}
+    return Plugin("texture", "checkerboard", colours)
+
+
+def _bitmap(texture: Bitmap, label: str, index: int) -> Plugin:
+    """Bitmap with linear values, repeated."""
+    picture = Picture(shape_key(index), texture.values[..., :3])
+    values: dict[str, Value] = {"filename": picture, "raw": True, "filter_type": "bilinear", "wrap_mode": "repeat"}
+    return Plugin("texture", "bitmap", values, label=label)
