@@ -8,7 +8,7 @@ are
   (docs/model.md) is known. The noise is that of the mean, from the scatter of the windows: it holds the noise of both
   renderers.
 * **outline**: the mirror's share of windows around places of it, as a distance across the outline.
-* **spot**: flux and centroid of its light on a film eight times as fine.
+* **spot**: flux and centroid of its light on a film sixteen times as fine.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ _WINDOWS = {"in the mirror": 8, "beside it": 3}
 _SIDE_PX, _SAMPLES = 16, 144  # of a window, and of each of its pixels
 _EVEN = 4.0  # brightest pixel of a window over its median: no lamp
 _AROUND, _OUTLINE_SIDE_PX, _FINEST = 8, 8, 16
-_FINER, _SPOT_RUNS, _SPOT_SAMPLES = 8, 4, 1 << 21
+_FINER, _SPOT_RUNS, _SPOT_SAMPLES = 16, 8, 1 << 20
 Crop = tuple[int, int, int, int]
 
 
@@ -293,15 +293,15 @@ def _spot(scene: _Loaded) -> dict[str, Difference]:
     if not row.visible or row.light is None:
         return {}
     u, v = camera.project(sample.rig.camera.rays(np.array([row.light.u_px, row.light.v_px])))
-    half = _half_px(scene)
-    low = np.floor(np.array([u, v]) + 0.5).astype(int) - half
+    half = int(np.ceil(_FINER * _half_px(scene)))
+    low = np.floor(_FINER * (np.array([u, v]) + 0.5)).astype(int) - half
     side = 2 * half + 1
-    if low.min() < 0 or low[0] + side > camera.width_px or low[1] + side > camera.height_px:
+    if low.min() < 0 or np.any(low + side > _FINER * np.array([camera.width_px, camera.height_px])):
         return {}
-    crop = (*(_FINER * low), _FINER * side, _FINER * side)
-    samples = max(1, round(np.sqrt(_SPOT_SAMPLES / (crop[2] * crop[3])))) ** 2
-    middle = (np.arange(_FINER * side) + 0.5) / _FINER - 0.5
-    places = np.stack(np.meshgrid(low[0] + middle, low[1] + middle), axis=-1)
+    crop = (int(low[0]), int(low[1]), side, side)
+    samples = max(1, round(np.sqrt(_SPOT_SAMPLES / side**2))) ** 2
+    middle = (np.arange(side) + 0.5) / _FINER - 0.5
+    places = np.stack(np.meshgrid(low[0] / _FINER + middle, low[1] / _FINER + middle), axis=-1)
     watts = etendue(camera, places)[..., 0] / _FINER**2
     seeds = [seed_32("mitsuba spot", sample.row.sample_id, scene.position, k) for k in range(_SPOT_RUNS)]
     runs = np.array([scene.rendered("spot", crop, samples, seed, _FINER)[..., 0] * watts for seed in seeds])
@@ -321,15 +321,15 @@ def _spot(scene: _Loaded) -> dict[str, Difference]:
     }
 
 
-def _half_px(scene: _Loaded) -> int:
+def _half_px(scene: _Loaded) -> float:
     """Half of a window that holds the spot's light without blur: by the spread of the layer's, less the blur's."""
     layer = scene.sample.spot(scene.position).electrons_per_s[0]
     rows, columns = layer.sum(axis=1), layer.sum(axis=0)
     spread = max(_variance(rows), _variance(columns)) - scene.camera.blur_sigma_px**2 - 1.0 / 12.0
-    return int(np.ceil(1.0 + _SPREADS * np.sqrt(max(spread, 0.0))))
+    return _LEAST_PX + _SPREADS * float(np.sqrt(max(spread, 0.0)))
 
 
-_SPREADS = 6.0
+_LEAST_PX, _SPREADS = 0.5, 6.0
 
 
 def _variance(weights: Array) -> float:

@@ -150,7 +150,7 @@ def in_carried_pixels(camera: Camera, plane: Array, order: int = 1) -> Array:
 
 
 def what_is_lost(view: View, room: Room) -> list[str]:
-    """What the scene of a view does not carry, one sentence each."""
+    """Sentences on what the scene of a view does not carry."""
     camera, scene = view.rig.camera, carried(view.rig.camera)
     lost = [f"The Gaussian blur of the lens, sigma {camera.blur_sigma_px:g} px: pixels are means over their square."]
     distortion = {name: getattr(camera, name) for name in ("k1", "k2", "k3", "p1", "p2")}

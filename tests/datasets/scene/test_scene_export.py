@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 
 import phibench
 from phibench.datasets.read import Sample, open_dataset
@@ -77,7 +78,9 @@ def test_the_spot_has_its_flux(sample: Sample, exported: Path) -> None:
 def test_the_dictionary_is_the_same_scene(sample: Sample, exported: Path) -> None:
     """Pixels of both, same seed. float32 sums in another order: 1e-5."""
     mi = activate()
-    scenes = (mi.load_file(str(exported / "down.xml")), mi.load_dict(phibench.mitsuba_scene(sample, "down")))
+    ordered = {"parallel": False, "optimize": False}  # else lamps have another order, and other random numbers
+    taken = mi.load_dict(phibench.mitsuba_scene(sample, "down"), **ordered)
+    scenes = (mi.load_file(str(exported / "down.xml"), **ordered), taken)
     one, two = (np.array(mi.render(scene, spp=4, seed=1)) for scene in scenes)
     assert one.shape == (90, 160, 3)
     assert np.abs(one - two).max() <= 1e-5 * one.max()
@@ -87,10 +90,34 @@ def test_files_of_an_export(exported: Path) -> None:
     names = sorted(path.name for path in exported.iterdir())
     lights = [f"{place}{light}" for place in ("down", "up") for light in ("-ambient", "-spot", "")]
     assert names == sorted(
-        ["README.md", "meshes", "pictures", *(f"{x}.xml" for x in lights), *(f"{x}-phibench.exr" for x in lights)]
+        [
+            *("README.md", "meshes", "pictures", "down.glb", "up.glb"),
+            *(f"{light}{end}" for light in lights for end in (".xml", "-phibench.exr")),
+        ]
     )
     text = (exported / "README.md").read_text(encoding="utf-8")
     assert "sigma 0.7 px" in text
+
+
+def test_the_gltf_has_room_rig_mirror_and_camera(sample: Sample, exported: Path) -> None:
+    """Read by another program: the mirror's ball, the camera's place and way, the spot before its board."""
+    scene = trimesh.load(exported / "up.glb")
+    nodes = set(scene.graph.nodes_geometry)
+    assert {"mirror", "laser_spot", "robot_mast", "camera_housing", "floor"} <= nodes
+    ball, view = scene.geometry["mirror"], sample.view("up")
+    x, y, z = view.sphere_centre_m
+    assert ball.bounds.mean(axis=0) == pytest.approx([x, z, -y], abs=1e-6)
+    # facets of two degrees lie inside the ball; normals outwards give a volume above 0
+    assert ball.volume == pytest.approx(4.0 / 3.0 * np.pi * 0.06**3, rel=1e-3)
+    x, y, z = sample.row.spot_world_m
+    assert scene.geometry["laser_spot"].vertices.mean(axis=0) == pytest.approx([x, z, -y], abs=2e-4)
+    data = (exported / "up.glb").read_bytes()
+    document = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
+    (node,) = [one for one in document["nodes"] if "camera" in one]
+    matrix = np.reshape(node["matrix"], (4, 4)).T
+    x, y, z = view.camera_centre_m
+    assert matrix[:3, 3] == pytest.approx([x, z, -y])
+    assert -matrix[:3, 2] == pytest.approx([0.0, 1.0, 0.0])  # looks up, along -z of its own
 
 
 def test_the_readmes_comparison_runs(exported: Path) -> None:
