@@ -121,7 +121,7 @@ def test_the_gltf_has_room_rig_mirror_and_camera(sample: Sample, exported: Path)
 
 
 def test_the_readmes_comparison_runs(exported: Path) -> None:
-    """What README.md says to type, with the scene rendered coarsely; two bounces lack some 12 % of this room's light."""
+    """What README.md says to type, with the scene rendered coarsely; two bounces lack 12 % of its light."""
     script = """
 import mitsuba as mi
 mi.set_variant("scalar_rgb")
