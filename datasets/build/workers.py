@@ -297,12 +297,25 @@ def _connect(distributed: Any, scheduler: str) -> Any:
     if is_file and not path.is_file():
         raise DatasetError(f"there is no scheduler file {path}; start `dask scheduler --scheduler-file {path}` first")
     where = {"scheduler_file": str(path)} if is_file else {"address": scheduler}
+    if _wants_key(path if is_file else None, scheduler):
+        raise DatasetError(f"the scheduler at {scheduler} asks for a key (tls): set DASK_CONFIG to its folder")
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
     try:
         return distributed.Client(**where, timeout=CONNECT_S, set_as_default=False)
     except Exception as error:  # nonsense in an address or a file ends in many kinds
         text = f"no dask scheduler answers at {scheduler} within {CONNECT_S:g} s"
         raise DatasetError(f"{text} ({str(error).splitlines()[0] if str(error) else type(error).__name__})") from None
+
+
+def _wants_key(file: Path | None, address: str) -> bool:
+    """Tell a scheduler with TLS if dask's settings name no certificate of a client: its own words are a traceback."""
+    from dask import config
+
+    if file is not None:
+        with contextlib.suppress(OSError, ValueError, AttributeError):
+            address = str(json.loads(file.read_text(encoding="utf-8")).get("address"))
+    settings = ("distributed.comm.tls.client.cert", "distributed.client.security-loader")
+    return address.startswith("tls:") and not any(config.get(name, None) for name in settings)
 
 
 def _library() -> Any:

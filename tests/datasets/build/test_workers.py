@@ -238,7 +238,8 @@ def test_the_documented_scheduler_gives_the_same_bytes(smallest_dataset: Path, t
         assert contents(tmp_path / "smoke") == contents(smallest_dataset)
         without = subprocess.run(run, **options)
         assert without.returncode == 2
-        assert "no dask scheduler answers at" in without.stderr
+        assert "asks for a key (tls): set DASK_CONFIG to its folder" in without.stderr
+        assert "Traceback" not in without.stderr
         again = subprocess.run(run, env={**os.environ, **own}, **options)
         assert "nothing to do" in again.stderr
 
@@ -265,6 +266,9 @@ def test_a_scheduler_that_is_not_there(tmp_path: Path, monkeypatch: pytest.Monke
     assert "there is no scheduler file" in refusal(tmp_path, str(tmp_path / "none.json"))
     (tmp_path / "bad.json").write_text("{}")
     (tmp_path / "worse.json").write_text("{")
+    (tmp_path / "key.json").write_text('{"address": "tls://127.0.0.1:9"}')
+    for name in ("tls://127.0.0.1:9", str(tmp_path / "key.json")):
+        assert "asks for a key (tls)" in refusal(tmp_path / "out", name)
     for name in ("bad.json", "worse.json"):
         assert "no dask scheduler answers at" in refusal(tmp_path / "out", str(tmp_path / name))
     assert not (tmp_path / "out").exists()
