@@ -150,3 +150,22 @@ def test_published_errors_are_no_law_of_one_over_h() -> None:
              for name in ("table1", "table2", "table3")}  # fmt: skip
     changes = [sum(a != b for a, b in pairwise(s)) for s in signs.values()]
     assert changes == [1, 0, 3]
+
+
+def test_the_concordance_has_a_row_for_every_figure_table_and_equation_and_a_page_for_each() -> None:
+    section = PAGE.split("## Concordance")[1].split("\n## ")[0]
+    rows = [line.strip("| ").split(" | ") for line in section.split("\n") if line.startswith("|")][2:]
+    assert {len(row) for row in rows} == {5}
+    places = [row[0] for row in rows]
+    assert numbered(places, r"Figs?\. (\d+)(?: to (\d+))?") == set(range(1, 12))
+    assert numbered(places, r"Tables? (\d+)(?: to (\d+))?") == {1, 2, 3, 4}
+    assert numbered(places, r"[Ee]qs?\. \((\d+)\)(?: to \((\d+)\))?") == set(range(1, 8))
+    assert {place.split(":")[0].split(".")[0] for place in places} >= {"Abstract", *"124567", "open"}
+    # what has a command has a result and a page
+    assert [row for row in rows if row[2] != "-" and ("-" in (row[3], row[4]) or "](" not in row[4])] == []
+
+
+def numbered(places: list[str], pattern: str) -> set[int]:
+    """Numbers that places name, ranges spelt out."""
+    found = (match for place in places for match in re.finditer(pattern, place))
+    return {n for match in found for n in range(int(match[1]), int(match[2] or match[1]) + 1)}
