@@ -26,6 +26,27 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--study", action="store_true", help="run the tests of many minutes too (marked study)")
 
 
+PROOFS = "accuracy"
+"""Word of the tests that README offers as proofs: `pytest -k accuracy`."""
+
+
+@pytest.hookimpl(tryfirst=True)  # before pytest-xdist reads the number of processes
+def pytest_cmdline_main(config: pytest.Config) -> None:
+    """Let two processes share the proofs, unless `-n`, `-s` or `--pdb` is given."""
+    option = config.option
+    given = getattr(option, "numprocesses", 0) is not None or option.capture == "no" or option.usepdb
+    if option.keyword == PROOFS and not given and "PYTEST_XDIST_WORKER" not in os.environ:
+        option.numprocesses, option.dist = min(2, os.cpu_count() or 1), "worksteal"
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Leave unread, of the proofs, test files without the word: reading all takes as long as ten of them."""
+    if config.option.keyword != PROOFS or not collection_path.name.startswith("test_"):
+        return None
+    inside = PROOFS in collection_path.relative_to(ROOT).as_posix()
+    return None if inside or PROOFS in collection_path.read_text(encoding="utf-8").lower() else True
+
+
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Leave out slow tests and benchmarks unless they are asked for: by an option, or by their full name."""
     named = [argument.removeprefix("./") for argument in config.args if "::" in argument]

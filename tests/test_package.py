@@ -9,6 +9,7 @@ import sys
 import tomllib
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -231,3 +232,39 @@ def test_mistakes_of_a_function_are_failures_of_its_pairs(bench_dataset: Path) -
         asked_here(lambda: extract)  # type: ignore[arg-type, misc]
     with pytest.raises(DatasetError, match="there is no folder"):
         phibench.score("nowhere", extract)
+
+
+@pytest.mark.parametrize(
+    ("options", "processes"),
+    [
+        ({}, 2),
+        ({"keyword": "accuracy_of_the_fit"}, None),
+        ({"keyword": ""}, None),
+        ({"numprocesses": 0}, 0),
+        ({"capture": "no"}, None),
+        ({"usepdb": True}, None),
+    ],
+)
+def test_two_processes_share_the_proofs_of_readme(
+    options: dict[str, object], processes: int | None, pytestconfig: pytest.Config, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`pytest -k accuracy`, as README has it; what is printed (`-s`) or debugged stays in one."""
+    (ours,) = (plugin for plugin in pytestconfig.pluginmanager.get_plugins() if hasattr(plugin, "PROOFS"))
+    monkeypatch.delenv("PYTEST_XDIST_WORKER", raising=False)
+    monkeypatch.setattr("os.cpu_count", lambda: 4)
+    told = {"keyword": "accuracy", "numprocesses": None, "capture": "fd", "usepdb": False, "dist": "no", **options}
+    config = SimpleNamespace(option=SimpleNamespace(**told))
+    ours.pytest_cmdline_main(config)
+    assert config.option.numprocesses == processes
+    assert (config.option.dist == "worksteal") == (processes == 2)
+
+
+def test_only_files_without_the_word_are_left_unread_for_the_proofs(pytestconfig: pytest.Config) -> None:
+    (ours,) = (plugin for plugin in pytestconfig.pluginmanager.get_plugins() if hasattr(plugin, "PROOFS"))
+    proofs, others = (SimpleNamespace(option=SimpleNamespace(keyword=word)) for word in ("accuracy", "phi"))
+    files = sorted((ROOT / "tests").rglob("test_*.py"))
+    read = {file for file in files if not ours.pytest_ignore_collect(file, proofs)}
+    assert {file for file in files if "def test_accuracy" in file.read_text(encoding="utf-8")} <= read
+    assert set((ROOT / "tests" / "accuracy").glob("test_*.py")) <= read
+    assert len(read) < len(files) / 2
+    assert not any(ours.pytest_ignore_collect(file, others) for file in files)

@@ -14,7 +14,7 @@ import pytest
 
 from phibench.datasets.frames.sensor_card import SensorCard, sensor_card
 from phibench.estimator.interface import Answer, Box, Pair, Spot
-from phibench.estimator.methods.locate import around, clipped, each_spot, locate, red_peak
+from phibench.estimator.methods.locate import SharedPair, around, clipped, each_spot, locate, red_peak
 from phibench.estimator.methods.pair_light import laser_light, mirror_mask
 from phibench.estimator.methods.registry import KNOWN, METHODS, BuiltIn
 from phibench.estimator.methods.simple import at_the_red_peak
@@ -77,7 +77,8 @@ WORST_PX = {
 
 @cache
 def easy(preset: str, number: int, laser_off: bool = True) -> Pair:
-    return EasyPairs(preset, laser_off=laser_off).pair(number)
+    """A pair, with what methods share: a score shows them the same, and nine methods look for its spots once."""
+    return SharedPair.of(EasyPairs(preset, laser_off=laser_off).pair(number))
 
 
 def errors(method: BuiltIn, preset: str, count: int) -> np.ndarray:
