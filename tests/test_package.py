@@ -44,7 +44,7 @@ def test_the_public_names_are_there() -> None:
     assert {name: getattr(phibench, name) for name in ("Pair", "Answer", "Spot")} == {
         name: getattr(interface, name) for name in ("Pair", "Answer", "Spot")
     }
-    assert len(set(phibench.__all__) - {"__version__"}) == 11
+    assert len(set(phibench.__all__) - {"__version__"}) == 12
     assert set(phibench.__all__) <= set(dir(phibench))
     assert all(callable(getattr(phibench, name)) for name in phibench.__all__ if name != "__version__")
     with pytest.raises(AttributeError, match="no attribute 'open'; it has Answer"):
