@@ -47,8 +47,10 @@ _SAME_PX, _SAME = 3.0, 0.04  # pixels, and parts of the radius
 _AGREE = 2.0  # standard deviations by which edges and the fall of the light may differ
 _OF_EDGES, _OF_FALL = 0.75, 0.25  # of what the two are apart: error of either where it is the answer
 _MODEL = 0.003  # of the radius: what the model of the fall errs, by one real ball under 40 lights
-_SURE_CONTRAST = 30.0  # of an edge all around, which a smooth fall never is
+_SURE_CONTRAST = 30.0  # of an edge all around, where the fall describes the light no better
 _LEAST_GAIN = 0.35  # of the logarithm: by which the fall must describe the light better than the edges
+_NO_GAIN = 0.1  # below it the edges are the answer: 0.04 among patterns, 0.14 to 0.42 on a defocused black ball
+_BETWEEN = 1.0 / 12.0  # variance over the square of an interval in which all places are alike
 
 
 @dataclass(frozen=True)
@@ -134,7 +136,7 @@ def find_circle(light: NDArray[Any], radii_px: tuple[float, float] | None = None
 def beside_limb(light: NDArray[Any], found: BallCircle) -> BallCircle:
     """The circle by edges, or by the fall of the light where that is another one and describes the light better.
 
-    What the two are apart counts in the covariance.
+    Where neither describes it clearly better, the middle of the two. What they are apart counts in the covariance.
     """
     block = max(1, math.ceil(max(light.shape[:2]) / LONGEST_PX))
     small = shrunk(light if light.ndim == 2 else light.mean(axis=-1), block)
@@ -150,13 +152,17 @@ def beside_limb(light: NDArray[Any], found: BallCircle) -> BallCircle:
     if (np.abs(apart) < _AGREE * np.sqrt(np.diag(own + limb.covariance_px2 + floor / 4.0))).all():
         shared = (_OF_EDGES * most) ** 2 * np.eye(3)
         return replace(found, covariance_px2=(own + shared) * block**2)
-    if limb.gain < _LEAST_GAIN:  # the room in the ball is not smooth: its edges are what there is
+    if limb.gain < _NO_GAIN:  # the room in the ball is not smooth: its edges are what there is
         shared = (0.0 if found.contrast >= _SURE_CONTRAST else _OF_FALL * most) ** 2 * np.eye(3)
         return replace(found, covariance_px2=(own + shared) * block**2)
-    u, v, radius = limb.circle_px
-    whole = ((u + 0.5) * block - 0.5, (v + 0.5) * block - 0.5, radius * block)
-    shared = floor + (_OF_FALL * most) ** 2 * np.eye(3)
-    return replace(found, circle_px=whole, covariance_px2=(limb.covariance_px2 + shared) * block**2)
+    if limb.gain < _LEAST_GAIN:
+        u, v, radius = np.array(near) + 0.5 * apart
+        covariance = (own + limb.covariance_px2) / 4.0 + floor + _BETWEEN * most**2 * np.eye(3)
+    else:
+        u, v, radius = limb.circle_px
+        covariance = limb.covariance_px2 + floor + (_OF_FALL * most) ** 2 * np.eye(3)
+    whole = ((float(u) + 0.5) * block - 0.5, (float(v) + 0.5) * block - 0.5, float(radius) * block)
+    return replace(found, circle_px=whole, covariance_px2=covariance * block**2)
 
 
 def refined(light: NDArray[Any], found: BallCircle, floor_px: float = _FLOOR_PX) -> BallCircle:

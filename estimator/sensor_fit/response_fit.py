@@ -8,7 +8,8 @@ the variance from frame to frame
 with D the variance of dark frames. K is the gain of the smallest signals. Eight sets of terms are fitted, from none
 (the straight line of EMVA 1288) to all three. Each has the weight of its Bayes factor in Schwarz's approximation,
 the straight line's prior being 0.5. The result is the weighted mean; its sigma holds the spread of the sets. Where no
-set fits within counting noise, all sigmas grow by the root of the least mean square (Birge's ratio).
+set fits within counting noise, all sigmas grow by the root of the least mean square (Birge's ratio). A straight line
+has a bend of 0 +- 0.3 % at full range, as far as the noise leaves it open: 0.3 % move K by 0.5 %.
 
 Where light or exposure times are stated, the signal is compared with them: a straight line with an offset and the
 weights 1 / signal^2, over signals from 5 to 95 % of the brightest (EMVA 1288, release 4.0, section 6.7). A deviation
@@ -31,6 +32,7 @@ from phibench.scenes.frames import Array
 _TERMS = (1, 2, 3)
 _STRAIGHT_PRIOR = 0.5
 _BENT = 0.95  # posterior share of the bent sets from which on the response is said to bend
+_UNSEEN = 0.003  # standard deviation of the bend at u = 1 that a response has which is taken for straight
 _CHANCE = 1e-4  # of counting noise alone, below which a fit is a misfit
 _STEEPEST = 0.2  # least slope of x(y): flatter ones are no response
 _ROUNDS = 4  # of the rounding, which depends on the noise
@@ -136,11 +138,12 @@ class Response:
 
 @dataclass(frozen=True)
 class _Set:
-    """One set of terms, fitted: parameters K and a_j, shape (replicates, 1 + terms)."""
+    """One set of terms, fitted: parameters K and a_j, shape (replicates, 1 + terms); dK/da_1 of the straight one."""
 
     terms: tuple[int, ...]
     x: Array
     chi2: float
+    gain_by_bend: float = 0.0
 
 
 def fit_response(levels: Sequence[NoiseOfLevel], dark_dn2: Array, range_dn: float) -> Response:
@@ -215,7 +218,15 @@ class _Fitter:
         change = np.linalg.pinv(done.jac)
         columns = range(self.seen.shape[1])
         shifts = np.stack([self._residuals(terms, done.x, k) - done.fun for k in columns])
-        return _Set(terms, done.x - shifts @ change.T, float(np.sum(done.fun**2)))
+        x = done.x - shifts @ change.T
+        return _Set(terms, x, float(np.sum(done.fun**2)), 0.0 if terms else self._gain_by_bend(float(done.x[0])))
+
+    def _gain_by_bend(self, gain: float) -> float:
+        """dK/da_1 of the straight line: how K moves where the response has a small a_1."""
+        u, y = self.u[:, 0], self.signal[:, 0]
+        by_gain = y / self.sigma
+        by_bend = (gain * y * u - 4.0 * u * (gain * y + self.dark[0])) / self.sigma
+        return -float(by_gain @ by_bend) / float(by_gain @ by_gain)
 
 
 def _mean(sets: list[_Set], count: int, names: int, range_dn: float, reach_dn: float) -> Response:
@@ -231,6 +242,7 @@ def _mean(sets: list[_Set], count: int, names: int, range_dn: float, reach_dn: f
     x = np.stack([_padded(one) for one in sets])
     mean = np.tensordot(weight, x, axes=1)
     spread2 = weight @ (x[:, 0] - mean[0]) ** 2
+    spread2[0] += weight[0] * (sets[0].gain_by_bend * _unseen_bend(sets)) ** 2
     noise2 = (birge - 1.0) * np.array([jackknife_sigma(column) ** 2 for column in mean.T])
     sigmas = np.sqrt(np.array([jackknife_sigma(column) ** 2 for column in mean.T]) + spread2 + noise2)
     straight = sets[0].x[:, 0]
@@ -249,6 +261,12 @@ def _mean(sets: list[_Set], count: int, names: int, range_dn: float, reach_dn: f
         reach_dn=reach_dn,
         levels=names,
     )
+
+
+def _unseen_bend(sets: list[_Set]) -> float:
+    """Standard deviation of a_1 where none is found: what is usual, or less where the noise would show it."""
+    shown = [jackknife_sigma(one.x[:, 1]) for one in sets if one.terms == _TERMS[:1]]
+    return float(sum(sigma**-2 for sigma in [_UNSEEN, *shown] if sigma > 0.0) ** -0.5)
 
 
 def _padded(one: _Set) -> Array:

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from phibench.estimator.outline.ball_circle import find_circle
-from phibench.estimator.outline.limb_circle import limb_circle
+from phibench.estimator.outline.ball_circle import BallCircle, beside_limb, find_circle
+from phibench.estimator.outline.limb_circle import LimbCircle, limb_circle
 from phibench.estimator.spots.image_planes import ImageError
 from phibench.scenes.random_streams import generator
 
@@ -70,3 +70,21 @@ def test_a_clear_edge_stays_where_it_is() -> None:
     found = find_circle(ball(true, (0.0, 0.0, 3.0), 1.0, 3, contrast=0.5))
     assert np.abs(np.subtract(found.circle_px, true)).max() < 0.8
     assert found.sigma_px.max() < 1.5
+
+
+@pytest.mark.parametrize(
+    ("gain", "contrast", "radius_px", "least_px"),
+    # a quarter of 10 px for an answer; over the root of 12 for the middle, where all places between are alike
+    [(0.5, 20.0, 240.0, 2.5), (0.2, 20.0, 235.0, 2.88), (0.2, 40.0, 235.0, 2.88), (0.05, 20.0, 230.0, 2.5)],
+)
+def test_where_neither_is_clearly_better_the_middle_is_the_answer(
+    monkeypatch: pytest.MonkeyPatch, gain: float, contrast: float, radius_px: float, least_px: float
+) -> None:
+    """Edges at 230 px, the fall at 240 px, both claim 0.5 px; of one real ball edges were up to 17 sigma off."""
+    own = 0.25 * np.eye(3)
+    limb = LimbCircle((300.0, 300.0, 240.0), own, gain)
+    monkeypatch.setattr("phibench.estimator.outline.ball_circle.limb_circle", lambda *_: limb)
+    edges = BallCircle((300.0, 300.0, 230.0), (0.0, 0.0), own, contrast, 3.0, np.zeros(360))
+    found = beside_limb(np.zeros((600, 600)), edges)
+    assert found.circle_px == pytest.approx((300.0, 300.0, radius_px))
+    assert least_px < found.sigma_px.min() <= found.sigma_px.max() < least_px + 0.2
