@@ -30,7 +30,7 @@ from pydantic import ValidationError
 
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.input_files import InputFile, first_fault
-from phibench.datasets.store.checksums import checksums_text
+from phibench.datasets.store.checksums import checksums_text, differing_files, read_checksums
 from phibench.datasets.store.files import sha256, write_bytes, write_text
 from phibench.datasets.store.layers import read_exr, write_exr
 from phibench.datasets.store.schema import CROISSANT, LOG, Document, TruthFile, TruthFolder, described
@@ -366,14 +366,6 @@ def verify(out: Path) -> list[str]:
         raise DatasetError(f"{out} holds no films: it has no {INFO}; make them with `phibench film make`")
     if not (out / CHECKSUMS).is_file():
         raise DatasetError(f"{out} has no {CHECKSUMS}: it was not finished; {_AGAIN}")
-    lines = InputFile(out / CHECKSUMS, _AGAIN).read().decode("utf-8", errors="replace").splitlines()
-    listed = dict(line.split("  ", 1)[::-1] for line in lines if "  " in line)
-    info = read_document(out / INFO, SetInfo)
-    faults = [f"{name}: not in {CHECKSUMS}" for name in data_files(out, info.films) if name not in listed]
-    for name, digest in listed.items():
-        path = out / name
-        if not path.is_file():
-            faults.append(f"{name}: missing")
-        elif sha256(path) != digest:
-            faults.append(f"{name}: has other bytes than when it was made")
-    return faults
+    listed, info = read_checksums(out), read_document(out / INFO, SetInfo)
+    faults = [f"{name} is not listed in {CHECKSUMS}" for name in data_files(out, info.films) if name not in listed]
+    return faults + differing_files(out, listed)

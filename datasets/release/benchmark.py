@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import hashlib
 import json
+import tarfile
 import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.input_files import SETTINGS_BYTES, FileName, InputFile, Name
@@ -25,6 +26,7 @@ VERSION = "4.0"
 """Version of the benchmark. The first number counts sets of recipes, the second one additions that change no sample."""
 MANIFEST = "MANIFEST.json"
 FORMAT = "phibench release 1"
+_BLOCK = tarfile.BLOCKSIZE
 Kind = Literal["pairs", "sealed", "films"]
 Digest = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
 
@@ -129,7 +131,7 @@ def _without_numbers(values: dict[str, Any]) -> dict[str, Any]:
 class Archive(Document):
     """One archive: a tar file with a share of a data set's files."""
 
-    name: FileName
+    name: Annotated[FileName, Field(pattern=r"^[^/]+\.tar$")]
     size: Annotated[int, Field(ge=0)]
     sha256: Digest
 
@@ -149,6 +151,17 @@ class ReleasedPart(Document):
     size: Annotated[int, Field(ge=1)]
     sums_sha256: Digest
     archives: Annotated[tuple[Archive, ...], Field(strict=False, min_length=1)]
+
+    @model_validator(mode="after")
+    def _archives_hold_the_files(self) -> ReleasedPart:
+        """Refuse sizes that no archives of these files have: a header, the bytes and less than a block for each."""
+        least = self.size + _BLOCK * self.files
+        most = least + _BLOCK * self.files + (tarfile.RECORDSIZE + 2 * _BLOCK) * len(self.archives)
+        if not least <= self.download <= most:
+            raise ValueError(f"{self.download} bytes of archives do not hold {self.files} files of {self.size} bytes")
+        if len({archive.name for archive in self.archives}) != len(self.archives):
+            raise ValueError("two archives have one name")
+        return self
 
     @property
     def count_text(self) -> str:

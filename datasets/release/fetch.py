@@ -1,49 +1,52 @@
 """Fetching of a released data set from a folder or an HTTP server: verified, resumable, all or nothing.
 
-`pooch` downloads each archive and checks its SHA-256, which `MANIFEST.json` holds. Archives are unpacked beside the
-final folder, in OUT.part. When all files have the hashes of the data set's own list, the folder gets its name.
-Whatever ends a fetch before that leaves OUT.part alone. The next one goes on where it ended: within an archive, too, if
-the server gives ranges of bytes (RFC 9110, section 14).
+`source` brings each archive, whose SHA-256 `MANIFEST.json` holds. Archives are unpacked beside the final folder, in
+OUT.part, after a look at all their headers. When all files have the hashes of the data set's own list, the folder gets
+its name. Whatever ends a fetch before that leaves OUT.part alone, and the next one goes on where it ended. What nobody
+but its user can have put into OUT.part is never removed.
 """
 
 from __future__ import annotations
 
+import contextlib
 import json
-import logging
 import os
 import re
 import shutil
 import tarfile
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
-from urllib.parse import urlsplit
+from typing import IO, TYPE_CHECKING, Any
 
 from rich.console import Console
 
 from phibench.datasets.build.forecast import megabytes
 from phibench.datasets.errors import DatasetError
+from phibench.datasets.film.film_store import verify as film_faults
 from phibench.datasets.input_files import FILE_NAME, SETTINGS_BYTES, InputFile
 from phibench.datasets.progress import Steps, progress_console
 from phibench.datasets.release.benchmark import MANIFEST, Archive, ReleasedPart, chosen_parts, read_manifest_file
+from phibench.datasets.release.source import Partial, Source
 from phibench.datasets.store import schema
-from phibench.datasets.store.checksums import differing_files, read_checksums
+from phibench.datasets.store.checksums import damaged, differing_files, read_checksums
 from phibench.datasets.store.files import WriteError, only_run, sha256, write_text
-from phibench.datasets.store.leftovers import OwnedFolder, folder_for_work, remove_tree
+from phibench.datasets.store.leftovers import (
+    TEMPORARY_PREFIX,
+    OwnedFolder,
+    folder_for_work,
+    remove_leftovers,
+    remove_tree,
+)
 from phibench.scenes.validation import nearest, printable_line
 
 if TYPE_CHECKING:
-    import requests
+    from phibench.datasets.release.paced_http import Patience
 
-SOURCE = "PHIBENCH_SOURCE"
-"""Environment variable: the default place of releases, a folder or an HTTP address."""
 _STATE, _SET, _ARCHIVES = "fetch.json", "set", "archives"
-_TIMEOUT_S = 60.0
 _TRIES = 3
 _CHUNK = 1 << 20
-_NETWORK_CHUNK = 1 << 14  # what is lost at most where a connection breaks off
+_BLOCK = tarfile.BLOCKSIZE
 
 
 @dataclass(frozen=True)
@@ -63,6 +66,7 @@ def fetch(
     *,
     manifest_sha256: str | None = None,
     tries: int = _TRIES,
+    patience: Patience | None = None,
     console: Console | None = None,
 ) -> Fetched:
     """Fetch one data set of a release.
@@ -74,6 +78,7 @@ def fetch(
     source : folder of a release, or its HTTP address; by default that of `PHIBENCH_SOURCE`
     manifest_sha256 : SHA-256 that `MANIFEST.json` must have, for who got it from elsewhere
     tries : attempts at a file before the fetch ends
+    patience : how long a server is waited for
 
     Raises
     ------
@@ -81,7 +86,7 @@ def fetch(
         In one sentence: no source, no such name, something else in the folder, a source that cannot be reached or
         breaks off, a file with another hash. Nothing is then under the final name.
     """
-    out, console, place = Path(out), console or progress_console(), _Source.of(source, tries)
+    out, console, place = Path(out), console or progress_console(), Source.of(source, tries, patience)
     title, part = _listed(name, place, out, manifest_sha256)
     if out.exists() or out.is_symlink():
         if _is_the_set(out, part):
@@ -92,16 +97,16 @@ def fetch(
         _claim(stage, title, part)
         with only_run(stage):
             fetched = _archives(place, stage, title, part, console)
-            _check(stage, title, part, place)
+            _check(stage, title, part, place, fetched == len(part.archives))
             (stage / _SET).rename(out)
     except OSError as error:
         text = str(error) if isinstance(error, WriteError) else f"could not write to {stage}: {error}"
         raise DatasetError(f"{text}; then run the same command again") from error
-    remove_tree(stage)
+    _remove_own(stage)
     return Fetched(out, title, fetched, len(part.archives))
 
 
-def _listed(name: str, place: _Source, out: Path, manifest_sha256: str | None) -> tuple[str, ReleasedPart]:
+def _listed(name: str, place: Source, out: Path, manifest_sha256: str | None) -> tuple[str, ReleasedPart]:
     """Title and entry of a data set in the source's manifest."""
     with folder_for_work(out.parent), OwnedFolder("fetch", out.parent) as folder:
         path = place.get(MANIFEST, folder, None)
@@ -143,7 +148,10 @@ def _what_it_is(out: Path, title: str, part: ReleasedPart) -> str:
 def _claim(stage: Path, title: str, part: ReleasedPart) -> None:
     """Say what the folder is for; refuse one of something else, or of another data set."""
     meant = {"title": title, "sums_sha256": part.sums_sha256}
-    if stage.is_dir() and any(not path.name.startswith(".") for path in stage.iterdir()):
+    if stage.is_dir() and (foreign := _foreign(stage)):
+        told = f"{stage} holds other files, such as {printable_line(foreign, 80)}, and the set would grow there"
+        raise DatasetError(f"{told}; move them away, or give another --out")
+    if stage.is_dir() and any((stage / name).exists() for name in (_STATE, _SET, _ARCHIVES)):
         state = stage / _STATE
         if not state.is_file():
             raise DatasetError(
@@ -156,10 +164,36 @@ def _claim(stage: Path, title: str, part: ReleasedPart) -> None:
     if not (stage / _STATE).is_file():
         _write_state(stage, meant | {"unpacked": []})
     free = shutil.disk_usage(stage).free
-    begun = sum(_Partial(stage / _ARCHIVES, archive).size for archive in part.archives)
+    begun = sum(Partial(stage / _ARCHIVES, archive).size for archive in part.archives)
     left = part.size + max(archive.size for archive in part.archives) - _size(stage / _SET) - begun
     if free < left:
         raise DatasetError(f"{title} needs {megabytes(left)} more in {stage.parent}, and {megabytes(free)} are free")
+
+
+_OWN_FILES = re.compile(r"[0-9a-f]{64}\.(part|validator)|tmp[a-z0-9_]{8}")
+"""Begun archives, and what a killed fetch left of `pooch`'s own temporary files."""
+
+
+def _foreign(stage: Path) -> str:
+    """A file or folder in the stage that no fetch has put there; empty if there is none. Hidden ones count."""
+    known = {_STATE, _SET, _ARCHIVES, schema.LOCK}
+    for path in sorted(stage.iterdir()):
+        if path.name not in known and not path.name.startswith(TEMPORARY_PREFIX):
+            return path.name
+    for path in sorted((stage / _ARCHIVES).glob("*")):
+        if not (_OWN_FILES.fullmatch(path.name) or path.suffix == ".tar") or not path.is_file():
+            return f"{_ARCHIVES}/{path.name}"
+    return next((f"{_SET}/{name}" for name in _files(stage / _SET) if not re.fullmatch(FILE_NAME, name)), "")
+
+
+def _remove_own(stage: Path) -> None:
+    """Remove the stage; what somebody has put there meanwhile stays, and the stage with it."""
+    _remove_strays(stage / _ARCHIVES, [])
+    remove_leftovers(stage)
+    (stage / _STATE).unlink(missing_ok=True)
+    with contextlib.suppress(OSError):
+        (stage / _ARCHIVES).rmdir()
+        stage.rmdir()
 
 
 def _write_state(stage: Path, state: dict[str, Any]) -> None:
@@ -170,7 +204,7 @@ def _size(folder: Path) -> int:
     return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
 
 
-def _archives(place: _Source, stage: Path, title: str, part: ReleasedPart, console: Console) -> int:
+def _archives(place: Source, stage: Path, title: str, part: ReleasedPart, console: Console) -> int:
     """Fetch and unpack the archives that are missing; return how many."""
     state = InputFile(stage / _STATE, f"remove {stage}", limit_bytes=SETTINGS_BYTES).json()
     done = [text for text in state.get("unpacked", []) if isinstance(text, str)]
@@ -181,13 +215,13 @@ def _archives(place: _Source, stage: Path, title: str, part: ReleasedPart, conso
     current: Archive | None = None
 
     def running() -> str:
-        begun = 0 if current is None else _Partial(stage / _ARCHIVES, current).size
+        begun = 0 if current is None else Partial(stage / _ARCHIVES, current).size
         return f"{current.name}, {megabytes(begun)} of {megabytes(current.size)}" if current and begun else ""
 
     with Steps(console, title, len(todo), running=running) as steps:
         for current in todo:
             path = place.get(current.name, stage / _ARCHIVES, current)
-            unpack(path, stage / _SET, title, part.size)
+            unpack(path, stage / _SET, title, part.size, part.files)
             done.append(current.sha256)
             _write_state(stage, state | {"unpacked": done})
             path.unlink()  # a disk need not hold all archives beside the set
@@ -195,240 +229,116 @@ def _archives(place: _Source, stage: Path, title: str, part: ReleasedPart, conso
     return len(todo)
 
 
-def _remove_strays(folder: Path, archives: list[Archive]) -> None:
+def _remove_strays(folder: Path, archives: Sequence[Archive]) -> None:
     """Remove what a killed fetch left of `pooch`'s own temporary files; the run holds the folder alone."""
-    parts = [_Partial(folder, archive) for archive in archives]
-    kept = {folder / archive.name for archive in archives}
-    kept |= {path for part in parts for path in (part.path, part.validator)}
-    for path in set(folder.glob("*")) - kept:
-        path.unlink()
+    parts = [Partial(folder, archive) for archive in archives]
+    kept = {path for part in parts for path in (part.path, part.validator)}
+    for path in folder.glob("*"):
+        if path not in kept and _OWN_FILES.fullmatch(path.name):
+            path.unlink()
 
 
-def unpack(archive: Path, folder: Path, title: str, most: int) -> None:
-    """Unpack an archive of plain files below `title/`; anything else in it is refused before it is written.
+def unpack(archive: Path, folder: Path, title: str, most: int, files: int) -> None:
+    """Unpack an archive of plain files below `title/`; all names and sizes are looked at before a file is written.
 
     Parameters
     ----------
-    most : bytes that the members may have together
+    most, files : bytes and files that the folder may have then, with those that are there
 
     Raises
     ------
     DatasetError
-        For a link, a device, a name that leads out of the folder or comes twice, or too many bytes.
+        For a link, a device, a name that leads out of the folder or comes twice, or too many files or bytes.
     """
-    seen, left = set[str](), most
-    try:
-        with tarfile.open(archive, "r:") as tar:
-            for member in tar:
-                name = member.name.removeprefix(f"{title}/")
-                if not member.isreg() or name == member.name or not re.fullmatch(FILE_NAME, name) or name in seen:
-                    told = printable_line(member.name, 80)
-                    raise DatasetError(f"{archive.name} holds '{told}', which no release has; nothing of it is used")
-                seen.add(name)
-                left -= member.size
-                if left < 0:
-                    raise DatasetError(f"{archive.name} holds more bytes than {MANIFEST} says; nothing of it is used")
-                source = tar.extractfile(member)
-                assert source is not None  # it is a regular file
-                (folder / name).parent.mkdir(parents=True, exist_ok=True)
-                with source, (folder / name).open("wb") as target:
-                    shutil.copyfileobj(source, target, _CHUNK)
-    except tarfile.TarError as error:
-        raise DatasetError(f"{archive.name} is no tar file: {error}; ask who made the release") from error
+    with archive.open("rb") as file:
+        members, there = dict[str, tuple[int, int]](), set(_files(folder))
+        for name, place, size in _members(file, archive.name, title):
+            if name in members:
+                raise _strange(archive.name, name)
+            members[name] = (place, size)
+            if len(members) > files:
+                raise DatasetError(f"{archive.name} holds more files {_SAID}")
+        if len(there | set(members)) > files:
+            raise DatasetError(f"{archive.name} and {folder} hold more files {_SAID}, or move away what is yours there")
+        held = sum((folder / name).lstat().st_size for name in there - set(members))
+        if held + sum(size for _, size in members.values()) > most:
+            raise DatasetError(f"{archive.name} holds more bytes {_SAID}")
+        for name, (place, size) in members.items():
+            file.seek(place)
+            _write_member(file, folder / name, size)
 
 
-def _check(stage: Path, title: str, part: ReleasedPart, place: _Source) -> None:
-    """Compare all files with the data set's own list; on any fault all archives are fetched again the next time."""
+_SAID = f"than {MANIFEST} says; nothing of it is used, so ask who made the release"
+
+
+def _members(file: IO[bytes], archive: str, title: str) -> Iterator[tuple[str, int, int]]:
+    """Name, place and size of each member of a tar file as `release_make` writes it: one header of 512 bytes each.
+
+    `tarfile` would also follow headers that say more of the next member: longer names, other sizes, holes.
+    """
+    end = file.seek(0, os.SEEK_END)
+    place = 0
+    while place < end:
+        file.seek(place)
+        try:
+            member = tarfile.TarInfo.frombuf(file.read(_BLOCK), "utf-8", "surrogateescape")
+        except tarfile.HeaderError as error:
+            if type(error).__name__ == "EOFHeaderError":  # zeros: the end
+                return
+            raise DatasetError(f"{archive} is no tar file: {error}; ask who made the release") from error
+        name = member.name.removeprefix(f"{title}/")
+        is_plain = member.type in (tarfile.REGTYPE, tarfile.AREGTYPE) and member.size >= 0
+        if not is_plain or name == member.name or not re.fullmatch(FILE_NAME, name):
+            raise _strange(archive, member.name)
+        if place + _BLOCK + member.size > end:
+            raise DatasetError(f"{archive} is no tar file: it ends within {name}; ask who made the release")
+        yield name, place + _BLOCK, member.size
+        place += _BLOCK + -(-member.size // _BLOCK) * _BLOCK
+
+
+def _strange(archive: str, name: str) -> DatasetError:
+    what = f"{archive} holds '{printable_line(name, 80)}', which no release has"
+    return DatasetError(f"{what}; nothing of it is used, so ask who made the release")
+
+
+def _write_member(file: IO[bytes], path: Path, size: int) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.unlink(missing_ok=True)  # a link in its place would lead elsewhere
+    with path.open("xb") as target:
+        while size:
+            data = file.read(min(size, _CHUNK))
+            target.write(data)
+            size -= len(data)
+
+
+def _files(folder: Path) -> list[str]:
+    """Names of all that lies in a folder and below, but folders."""
+    found = (path for path in folder.rglob("*") if path.is_symlink() or not path.is_dir())
+    return sorted(path.relative_to(folder).as_posix() for path in found)
+
+
+def _check(stage: Path, title: str, part: ReleasedPart, place: Source, is_fresh: bool) -> None:
+    """Compare all files with the data set's own list; on a damaged one all archives are fetched again the next time.
+
+    Parameters
+    ----------
+    is_fresh : bool
+        True if all archives were unpacked in this run: what differs then was packed so.
+    """
     folder = stage / _SET
     sums = folder / schema.CHECKSUMS
     faults = [f"{schema.CHECKSUMS} is not the one that {MANIFEST} names"]
     if sums.is_file() and sha256(sums) == part.sums_sha256:
         listed = read_checksums(folder)
-        there = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
-        strange = sorted(there - set(listed) - {schema.CHECKSUMS, schema.JOURNAL})
-        faults = differing_files(folder, listed) + [f"{name} is not listed" for name in strange]
+        if strange := sorted(set(_files(folder)) - set(listed) - {schema.CHECKSUMS, schema.JOURNAL}):
+            told = f"{folder} holds {printable_line(strange[0], 80)}, which is not listed in {schema.CHECKSUMS}"
+            raise DatasetError(f"{told}; move it away if it is yours, or else ask who made the release")
+        other = film_faults if part.kind == "films" else lambda folder: differing_files(folder, listed)
+        faults = damaged(folder) if part.kind == "pairs" else other(folder)
     if faults:
         remove_tree(folder)
         _write_state(stage, {"title": title, "sums_sha256": part.sums_sha256, "unpacked": []})
+        if is_fresh:
+            told = f"its archives are those of {MANIFEST}, but {faults[0]}"
+            raise DatasetError(f"{title} from {place.name} contradicts itself: {told}; ask who made the release")
         raise DatasetError(f"{title} from {place.name} is damaged: {faults[0]}; run the same command again")
-
-
-# Where files come from.
-
-
-@dataclass(frozen=True)
-class _Source:
-    """Folder or HTTP address of a release."""
-
-    name: str
-    is_folder: bool
-    tries: int
-
-    @classmethod
-    def of(cls, given: str | None, tries: int) -> _Source:
-        place = given or os.environ.get(SOURCE, "")
-        if not place:
-            raise DatasetError(f"no host is set: give --from with a folder or an address, or set {SOURCE}")
-        if urlsplit(place).scheme in ("http", "https"):
-            return cls(place.rstrip("/"), False, tries)
-        if not Path(place).is_dir():
-            raise DatasetError(
-                f"--from {place}: there is no such folder; give a folder, or an address with http:// or https://"
-            )
-        return cls(place, True, tries)
-
-    def get(self, name: str, folder: Path, archive: Archive | None) -> Path:
-        """File of the release in `folder`; one that lies there with the right hash is kept.
-
-        Raises
-        ------
-        DatasetError
-            If it cannot be had, or has another hash than the manifest says.
-        """
-        import pooch
-        import requests
-
-        digest = None if archive is None else f"sha256:{archive.sha256}"
-        url = f"{Path(self.name).resolve().as_posix()}/{name}" if self.is_folder else f"{self.name}/{name}"
-        files = pooch.create(
-            folder,
-            self.name,
-            registry={name: digest},
-            urls={name: url},
-            retry_if_failed=0 if self.is_folder else self.tries - 1,
-        )
-        download = _copy if self.is_folder else pooch.HTTPDownloader(timeout=_TIMEOUT_S)
-        if archive is not None and not self.is_folder:
-            download = _Partial(folder, archive).download
-        again = "run the same command again; archives that are there are kept"
-        try:
-            with _quiet(pooch.get_logger()):
-                return Path(files.fetch(name, downloader=download))
-        except requests.HTTPError as error:
-            raise DatasetError(f"{self.name} does not give {name}: {printable_line(str(error), 200)}") from error
-        except requests.ConnectionError as error:
-            if archive is None:
-                raise DatasetError(
-                    f"{self.name} does not answer: check the address, and that its server runs"
-                ) from error
-            raise DatasetError(f"{name} from {self.name} broke off: {_reason(error)}; {again}") from error
-        except requests.RequestException as error:
-            raise DatasetError(f"{name} from {self.name} broke off: {_reason(error)}; {again}") from error
-        except ValueError as error:  # pooch's word for another hash
-            if archive is None:
-                raise
-            told = f"{name} from {self.name} is damaged: its SHA-256 is not the one in {MANIFEST}"
-            raise DatasetError(f"{told}; {again}, and if it stays so, ask who gave the release") from error
-        except FileNotFoundError as error:
-            raise DatasetError(f"{self.name} has no {name}; it may be no release, or an unfinished one") from error
-
-
-class _Partial:
-    """First bytes of an archive, kept under a name made of its SHA-256 until the archive is whole.
-
-    Parameters
-    ----------
-    folder : Path
-    archive : Archive
-        Name, size in bytes and SHA-256, as the manifest has them.
-
-    Attributes
-    ----------
-    path, validator : Path
-        The bytes, and the server's entity tag or time of change for them (empty if it names neither). Without the
-        second file the first is of no use: a server had packed the bytes for the way, and ranges count packed ones.
-    """
-
-    def __init__(self, folder: Path, archive: Archive) -> None:
-        self._archive = archive
-        self.path, self.validator = folder / f"{archive.sha256}.part", folder / f"{archive.sha256}.validator"
-
-    @property
-    def size(self) -> int:
-        """Bytes that are there."""
-        return self.path.stat().st_size if self.path.is_file() else 0
-
-    def download(self, url: str, target: str, _pooch: Any) -> None:
-        """Put the whole archive into the file `target`, from the bytes that are there and the rest of the server's.
-
-        Bytes that were put together from two answers are taken with the right SHA-256 only; else all are asked for.
-
-        Raises
-        ------
-        requests.RequestException
-            If the connection breaks off, or the server refuses; what came stays.
-        ValueError
-            If the server sends more than the archive has.
-        """
-        if not (self.size and self.validator.is_file() and self._completed(url)):
-            with _answer(url, {}) as answer:
-                answer.raise_for_status()
-                self._take_whole(answer)
-        self.path.replace(target)
-        self.validator.unlink(missing_ok=True)
-
-    def _completed(self, url: str) -> bool:
-        """Ask for the bytes that are missing; False if the server does not give them, or if they do not fit."""
-        begun = self.size
-        if begun < self._archive.size:
-            asked = {"Range": f"bytes={begun}-", "If-Range": self.validator.read_text("ascii", "ignore")}
-            with _answer(url, {key: value for key, value in asked.items() if value}) as answer:
-                if answer.status_code == 200:  # no ranges here, or another file by now
-                    self._take_whole(answer)
-                    return True
-                if answer.status_code not in (206, 412, 416):  # 503, say: what is there may still do
-                    answer.raise_for_status()
-                if not answer.headers.get("Content-Range", "").startswith(f"bytes {begun}-"):
-                    return False
-                self._take(answer, "ab")
-        return sha256(self.path) == self._archive.sha256
-
-    def _take_whole(self, answer: requests.Response) -> None:
-        self.validator.unlink(missing_ok=True)
-        self.path.unlink(missing_ok=True)
-        if answer.headers.get("Content-Encoding", "identity") == "identity":
-            tag, changed = answer.headers.get("ETag", ""), answer.headers.get("Last-Modified", "")
-            strong = tag if tag.startswith('"') else changed  # a weak tag will not do
-            self.validator.write_text(strong, "ascii", "ignore")
-        self._take(answer, "wb")
-
-    def _take(self, answer: requests.Response, mode: str) -> None:
-        import requests
-
-        with self.path.open(mode) as file:
-            for chunk in answer.iter_content(_NETWORK_CHUNK):
-                file.write(chunk)
-                if file.tell() > self._archive.size:
-                    self.validator.unlink(missing_ok=True)
-                    raise ValueError(f"{self._archive.name} has more bytes than {MANIFEST} says")
-        # a range may be shorter than what was asked for, and without a length nobody else notices the end
-        ended_early = answer.status_code == 206 or "Content-Length" not in answer.headers
-        if ended_early and self.size < self._archive.size:
-            raise requests.ConnectionError(f"{self._archive.name} ended early")
-
-
-def _answer(url: str, headers: dict[str, str]) -> requests.Response:
-    """Server's answer, its body not yet read, and not to be packed for the way."""
-    import requests
-
-    return requests.get(url, headers={"Accept-Encoding": "identity", **headers}, stream=True, timeout=_TIMEOUT_S)
-
-
-def _copy(url: str, target: str, _pooch: Any) -> None:
-    shutil.copyfile(url, target)
-
-
-def _reason(error: Exception) -> str:
-    """Kind of a failed connection, without the library's nested quotation of it."""
-    return re.sub(r"(?<!^)(?=[A-Z])", " ", type(error).__name__).lower()
-
-
-@contextmanager
-def _quiet(logger: logging.Logger) -> Iterator[None]:
-    """Keep a library's lines off the terminal, where our own progress is."""
-    level = logger.level
-    logger.setLevel(logging.ERROR)
-    try:
-        yield
-    finally:
-        logger.setLevel(level)

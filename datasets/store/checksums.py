@@ -117,6 +117,8 @@ def read_checksums(folder: Path) -> dict[str, str]:
             f"{folder} has no {schema.CHECKSUMS}: it was not finished; run `phibench dataset make` again"
         )
     lines = InputFile(path, "run `phibench dataset repair`").read().decode("utf-8", errors="replace").splitlines()
+    if not lines:
+        raise DatasetError(f"{path} is damaged: it lists no file")
     for number, line in enumerate(lines, 1):
         if _LINE.fullmatch(line) is None:  # a name that leads out of the folder is none either
             raise DatasetError(f"{path} line {number} is damaged: it is not '<SHA-256>  <file>'")

@@ -173,7 +173,7 @@ def test_damage_is_found_and_mended(film_windows: Path, tmp_path: Path) -> None:
     assert verify(out) == []
     table = out / "films" / FILM / "film.parquet"
     table.write_bytes(table.read_bytes()[:-1])
-    assert verify(out) == [f"films/{FILM}/film.parquet: has other bytes than when it was made"]
+    assert verify(out) == [f"films/{FILM}/film.parquet is damaged: its SHA-256 is not the listed one"]
     (out / "films" / FILM / "done.json").write_text(json.dumps({"film": 3}), encoding="utf-8")
     with pytest.raises(DatasetError, match=r"done\.json is damaged.*again"):
         film_of(out)

@@ -16,9 +16,9 @@ from helpers.small_release import SMALL, Made, ask, flip, snapshot
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.plan.plan import make_plan
 from phibench.datasets.recipe.load import parse_recipe, recipe_text, with_numbers
-from phibench.datasets.release import fetch as fetching
 from phibench.datasets.release.benchmark import PARTS, VERSION, Part, content_sha256
 from phibench.datasets.release.release_make import ReleaseRequest, _card, dry_run, release
+from phibench.datasets.release.source import SOURCE
 from phibench.datasets.store.checksums import damaged, differing_files, read_checksums
 from phibench.estimator.cli.main import main
 from phibench.estimator.sealed.sealed_set import seal
@@ -229,7 +229,7 @@ def test_command_line_speaks_in_sentences(tmp_path: Path, capsys: pytest.Capture
     assert main(["release", "--part", "films", "--dry-run", *options]) == 0
     assert "phibench-v4-films: 6 films" in capsys.readouterr().out
     assert main(["fetch", "dev", "--out", str(tmp_path / "d")]) == 2
-    assert fetching.SOURCE in capsys.readouterr().err
+    assert SOURCE in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
 
 
