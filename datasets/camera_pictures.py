@@ -77,9 +77,15 @@ def read_camera_picture(file: InputFile, data: bytes | None = None) -> CameraPic
     if data[:2] == b"P5":
         return CameraPicture(_sealed(_pgm(file, data)), "raw")
     picture = file.picture(FORMATS, data)
+    with file.decoding("is a damaged picture"):  # what a decoder has not looked at yet: texts, tags and tables
+        return _of_decoded(file, picture)
+
+
+def _of_decoded(file: InputFile, picture: Image.Image) -> CameraPicture:
     if getattr(picture, "n_frames", 1) > 1 and picture.format != "JPEG":  # a JPEG's others are its previews
         raise file.fault(f"holds {picture.n_frames} pictures: one is read")  # type: ignore[attr-defined]
-    exif = picture.getexif()
+    with file.decoding("has damaged EXIF data; `exiftool -all= FILE` removes them"):
+        exif = picture.getexif()
     camera = printable_line(" ".join(str(exif[tag]) for tag in (_MAKE, _MODEL) if tag in exif), 80)
     kind, pixels = _pixels(file, picture)
     orientation = _orientation(file, exif.get(_ORIENTATION, 1), kind)

@@ -61,6 +61,21 @@ FileName = Annotated[str, AfterValidator(_below)]
 NoFileName = Annotated[str | None, AfterValidator(_below)]
 """Name of a file relative to the folder of its document: no absolute path, and no part that begins with a dot."""
 
+
+def below(folder: Path, name: str) -> Path:
+    """Path of a file below a folder that somebody else may have filled.
+
+    Raises
+    ------
+    DatasetError
+        If a link leads out of the folder: what lies there would become part of what is made of it.
+    """
+    path = folder / name
+    if not path.resolve().is_relative_to(folder.resolve()):
+        raise DatasetError(f"{path} is a link that leads out of {folder}; put the file itself there")
+    return path
+
+
 _PART = r"""(?:[\w-]+|"[^"\n]*"|'[^'\n]*')"""
 _LONG_KEY = re.compile(rf"(?<![\w-]){_PART}(?:[ \t]*\.[ \t]*{_PART}){{{KEY_PARTS},}}")
 
@@ -151,6 +166,20 @@ class InputFile:
             raise self.fault(f"is larger than {self.limit_bytes / MIB:.0f} MiB, the most that is read of its kind")
         return data
 
+    @contextlib.contextmanager
+    def decoding(self, what: str) -> Iterator[None]:
+        """Whatever a decoder raises becomes a sentence "`what`: reason"; its faults are of many kinds.
+
+        A lack of memory is no fault of the file and goes on as it is.
+        """
+        try:
+            yield
+        except (DatasetError, MemoryError):
+            raise
+        except Exception as error:
+            reason = printable_line(str(error).partition("\n")[0], 200) or type(error).__name__
+            raise self.fault(f"{what}: {reason}") from error
+
     # Documents.
 
     def text(self, data: bytes | None = None, encoding: str = "utf-8") -> str:
@@ -239,7 +268,7 @@ class InputFile:
             if rows * len(found) > TABLE_VALUES:
                 raise self.fault(f"has {rows} rows of {len(found)} columns: at most {TABLE_VALUES} values are read")
             return polars.read_parquet(io.BytesIO(data))
-        except DatasetError:
+        except (DatasetError, MemoryError):
             raise
         except (Exception, polars.exceptions.PanicException) as error:  # a decoder's faults are of many kinds
             reason = printable_line(str(error).partition("\n")[0], 200) or type(error).__name__
@@ -259,24 +288,22 @@ class InputFile:
             If it cannot be read, or holds other arrays, or an array of another type or number of axes.
         """
         content = self.read() if data is None else data
-        try:
-            with warnings.catch_warnings(), zipfile.ZipFile(io.BytesIO(content)) as archive:
-                warnings.simplefilter("ignore")  # of strange texts in a header
-                members = {entry.filename: entry for entry in archive.infolist()}
-                if missing := [name for name in forms if f"{name}.npy" not in members]:
-                    raise self.fault(f"has no array '{missing[0]}'")
-                if len(archive.infolist()) != len(forms):
-                    raise self.fault(f"holds more than {', '.join(forms)}")
-                # what is stored as it is cannot be larger than the file
-                if any(entry.compress_type != zipfile.ZIP_STORED for entry in members.values()):
-                    raise self.fault("is compressed: only plain arrays are read")
-                stored = {name: archive.read(f"{name}.npy") for name in forms}
-                return {name: self._array(name, stored[name], *forms[name]) for name in forms}
-        except DatasetError:
-            raise
-        except Exception as error:  # a decoder's faults are of many kinds
-            reason = printable_line(str(error), 200) or type(error).__name__
-            raise self.fault(f"cannot be read: {reason}") from error
+        with (
+            self.decoding("cannot be read"),
+            warnings.catch_warnings(),
+            zipfile.ZipFile(io.BytesIO(content)) as archive,
+        ):
+            warnings.simplefilter("ignore")  # of strange texts in a header
+            members = {entry.filename: entry for entry in archive.infolist()}
+            if missing := [name for name in forms if f"{name}.npy" not in members]:
+                raise self.fault(f"has no array '{missing[0]}'")
+            if len(archive.infolist()) != len(forms):
+                raise self.fault(f"holds more than {', '.join(forms)}")
+            # what is stored as it is cannot be larger than the file
+            if any(entry.compress_type != zipfile.ZIP_STORED for entry in members.values()):
+                raise self.fault("is compressed: only plain arrays are read")
+            stored = {name: archive.read(f"{name}.npy") for name in forms}
+            return {name: self._array(name, stored[name], *forms[name]) for name in forms}
 
     def _array(self, name: str, data: bytes, kind: str, axes: int) -> NDArray[Any]:
         """Array of the bytes of an `.npy` file; NumPy's reader would take memory for any shape that a header tells."""
@@ -321,6 +348,8 @@ class InputFile:
             raise self.fault(f"has too many pixels: at most {PICTURE_PIXELS:.0e} are read") from error
         except UnidentifiedImageError as error:
             raise self.fault(f"is not a picture of the format {' or '.join(formats)}") from error
+        except MemoryError:
+            raise
         except Exception as error:  # a decoder's faults are of many kinds
             raise self.fault(f"is a damaged picture: {printable_line(str(error), 200)}") from error
 

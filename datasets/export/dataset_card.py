@@ -16,6 +16,7 @@ from phibench.datasets.export.containers import FOLDER, hugging_face_features
 from phibench.datasets.export.pair_rows import INDEX, POSITION_FIELDS, SPLITS, ExportRequest
 from phibench.datasets.frames.frame_files import VALUES, FrameRow
 from phibench.datasets.read import Dataset
+from phibench.datasets.shown_text import markdown_text
 from phibench.datasets.store.croissant import (
     LICENSE_URL,
     PARQUET,
@@ -96,7 +97,8 @@ def column_texts(request: ExportRequest) -> dict[str, str]:
 
 def card(dataset: Dataset, request: ExportRequest, table: DataFrame) -> str:
     """README of an export: YAML header, what it is, columns."""
-    lines = ["---", *_header(dataset, request, table), "---", "", f"# {dataset.info.name}, {request.frames.preset}", ""]
+    name = markdown_text(dataset.info.name)
+    lines = ["---", *_header(dataset, request, table), "---", "", f"# {name}, {request.frames.preset}", ""]
     lines += [_description(dataset, request, table), "", *_reading(request), "", "## Splits", ""]
     by = {"both": "rig or room", "rig": "rig", "room": "room"}[request.split_by]
     lines += [f"No two splits share a {by}, and draws of one pair stay together.", "", "| split | pairs |", "|---|---|"]

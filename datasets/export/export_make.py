@@ -167,7 +167,8 @@ def verify_export(folder: str | Path) -> list[str]:
     if not (folder / schema.CHECKSUMS).is_file():
         raise DatasetError(f"{folder} has no {schema.CHECKSUMS}: it was not finished; {_AGAIN}")
     listed = read_checksums(folder)
-    there = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
+    found = (path for path in folder.rglob("*") if path.is_symlink() or not path.is_dir())  # pipes and sockets, too
+    there = {path.relative_to(folder).as_posix() for path in found}
     strange = sorted(there - set(listed) - {schema.CHECKSUMS, SHARDS, schema.LOCK})
     return differing_files(folder, listed) + [f"{name} is not of the export" for name in strange]
 
@@ -261,7 +262,7 @@ def _finish(
         table = table.with_columns(_names(request, shards, column))
     write_bytes(out / INDEX, parquet_bytes(table))
     for name in _COPIED:
-        write_bytes(out / name, (dataset.folder / name).read_bytes())
+        write_bytes(out / name, InputFile(dataset.folder / name, "run `phibench dataset repair`").read())
     write_text(out / "LICENSE", LICENSE_TEXT)
     hashes = {name: digest for shard in shards for name, digest in rows[shard.name].files.items()}
     write_text(out / schema.CROISSANT, croissant(dataset, request, table, out, hashes))

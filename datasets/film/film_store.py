@@ -323,10 +323,7 @@ def read_table(path: Path, frames: int) -> polars.DataFrame:
     DatasetError
         If it cannot be read or has another number of rows.
     """
-    try:
-        table = polars.read_parquet(io.BytesIO(InputFile(path, _AGAIN).read()))
-    except polars.exceptions.PolarsError as error:
-        raise DatasetError(f"{path} is damaged; {_AGAIN}") from error
+    table = InputFile(path, _AGAIN).table()
     if len(table) != frames or "row_light_u_px" not in table.columns:
         raise DatasetError(f"{path} does not hold {frames} frames; {_AGAIN}")
     return table

@@ -1,9 +1,9 @@
 """Fetching of a released data set from a folder or an HTTP server: verified, resumable, all or nothing.
 
-`source` brings each archive, whose SHA-256 `MANIFEST.json` holds. Archives are unpacked beside the final folder, in
-OUT.part, after a look at all their headers. When all files have the hashes of the data set's own list, the folder gets
-its name. Whatever ends a fetch before that leaves OUT.part alone, and the next one goes on where it ended. What nobody
-but its user can have put into OUT.part is never removed.
+`release_source` brings each archive, whose SHA-256 `MANIFEST.json` holds. Archives are unpacked beside the final
+folder, in OUT.part, after a look at all their headers. When all files have the hashes of the data set's own list, the
+folder gets its name. Whatever ends a fetch before that leaves OUT.part alone, and the next one goes on where it ended.
+What only its user can have put into OUT.part is never removed.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from phibench.datasets.film.film_store import verify as film_faults
 from phibench.datasets.input_files import FILE_NAME, SETTINGS_BYTES, InputFile
 from phibench.datasets.progress import Steps, progress_console
 from phibench.datasets.release.benchmark import MANIFEST, Archive, ReleasedPart, chosen_parts, read_manifest_file
-from phibench.datasets.release.source import Partial, Source
+from phibench.datasets.release.release_source import Partial, Source
 from phibench.datasets.store import schema
 from phibench.datasets.store.checksums import damaged, differing_files, read_checksums
 from phibench.datasets.store.files import WriteError, only_run, sha256, write_text

@@ -31,7 +31,7 @@ CHUNK = 1 << 14  # what is lost at most where a connection breaks off
 
 @dataclass(frozen=True)
 class Patience:
-    """How long a server is waited for, and how much it may say before the body.
+    """Bounds of time on a server, and of what it may say before the body.
 
     Parameters
     ----------
@@ -59,7 +59,7 @@ class _HeldUpError(OSError):
 
 
 class Pace:
-    """What an exchange with a server may take: one for each file and try.
+    """Time and bytes that an exchange with a server may take: one for each file and try.
 
     Parameters
     ----------

@@ -21,6 +21,7 @@ from phibench.scenes.validation import printable_line
 _KINDS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 MOST_ENTRIES = 3 * MOST_TRIANGLES
+_MOST_READ = 8 * MOST_ENTRIES  # of all arrays: places, corners, colours and texture coordinates, most of them twice
 
 
 class GltfDocument:
@@ -49,6 +50,7 @@ class GltfDocument:
         if not str(version).startswith("2."):
             raise file.fault(f"is glTF {printable_line(str(version), 10)}: 2.0 is read")
         self._buffers: dict[int, bytes] = {}
+        self._read = 0
 
     def _chunks(self, data: bytes) -> tuple[bytes, bytes]:
         """Text and binary chunk of a .glb file."""
@@ -159,6 +161,9 @@ class GltfDocument:
         wide, kind = _WIDTHS.get(accessor.get("type", "")), _KINDS.get(accessor.get("componentType", 0))
         if wide is None or kind is None or wide not in ((width,) if isinstance(width, int) else width):
             raise self.file.fault(f"is damaged: accessor {number} has a type that its use does not allow")
+        self._read += count  # an array that many parts share is read for each of them
+        if self._read > _MOST_READ:
+            raise self.file.fault(f"has arrays of more than {_MOST_READ} entries together: at most that many are read")
         values = np.zeros((count, wide), kind)
         if "bufferView" in accessor:
             data, stride = self.view(accessor["bufferView"])

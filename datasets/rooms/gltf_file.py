@@ -26,6 +26,7 @@ from phibench.datasets.rooms.mesh_parts import (
     Paint,
     Picture,
     check_count,
+    check_parts,
     is_no_picture,
     leaves_picture,
     mirrored_repeat,
@@ -107,6 +108,7 @@ class _Reader:
             transform = outer @ self._transform(node)
             if "mesh" in node:
                 found += self._of_node(number, node, transform)
+                check_parts(self.file, len(found))
             waiting += [(child, transform, depth + 1) for child in node.get("children", [])]
         check_count(self.file, self._count)
         return found

@@ -22,11 +22,13 @@ from phibench.datasets.rooms.mesh_parts import (
     MeshPart,
     check_count,
     check_part,
+    check_parts,
     damaged,
     named_parts,
 )
 from phibench.datasets.rooms.obj_file import obj_parts
 from phibench.datasets.rooms.ply_file import ply_parts
+from phibench.datasets.rooms.polygons import CuttingError
 from phibench.datasets.rooms.room_files import RoomError
 
 _READERS = {".glb": gltf_parts, ".gltf": gltf_parts, ".obj": obj_parts, ".ply": ply_parts}
@@ -49,12 +51,15 @@ def read_mesh(path: Path, one_file: bool = False) -> tuple[MeshPart, ...]:
     try:
         with np.errstate(all="ignore"):
             parts = reader(file, Companions(file, one_file))
-    except DatasetError:
+    except (DatasetError, MemoryError):
         raise
+    except CuttingError as error:
+        raise file.fault(f"has {error}: export triangles") from error
     except Exception as error:  # documents and arrays can contradict each other in any way
         raise damaged(file) from error
     found = named_parts(part for part in parts if len(part.triangles))
     check_count(file, sum(len(part.triangles) for part in found))
+    check_parts(file, len(found))
     for part in found:
         check_part(file, part)
     return found

@@ -23,6 +23,8 @@ from phibench.scenes.frames import Array, Vector
 from phibench.scenes.validation import printable_line
 
 MOST_TRIANGLES = 1_000_000
+MOST_PARTS = 5_000
+_MOST_PICTURES = 400_000_000  # pixels of all pictures of a file
 REMEDY = "export it again as one .glb file with its textures inside"
 DAMAGED = "is damaged: it ends early, or its numbers do not go together"
 PICTURES = ("PNG", "JPEG", "BMP", "TGA", "TIFF", "WEBP")
@@ -144,6 +146,9 @@ class Companions:
         digest = hashlib.sha256(data).hexdigest()
         if digest not in self._pictures:
             self._pictures[digest] = _pixels(owner, data)
+            if sum(picture.size for picture in self._pictures.values()) > 3 * _MOST_PICTURES:
+                most = f"{_MOST_PICTURES:.0e} pixels"
+                raise self.file.fault(f"has pictures of more than {most} together: make them smaller")
         return self._pictures[digest]
 
 
@@ -206,6 +211,17 @@ def check_count(file: InputFile, count: int) -> None:
     """
     if not 0 < count <= MOST_TRIANGLES:
         raise file.fault(f"has {count} triangles: 1 to {MOST_TRIANGLES} are read")
+
+
+def check_parts(file: InputFile, count: int) -> None:
+    """Refuse a file with too many parts: each costs time, however small it is.
+
+    Raises
+    ------
+    RoomError
+    """
+    if count > MOST_PARTS:
+        raise file.fault(f"has more than {MOST_PARTS} parts: join objects of one material")
 
 
 def check_part(file: InputFile, part: MeshPart) -> None:

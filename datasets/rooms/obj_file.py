@@ -15,17 +15,19 @@ import numpy as np
 from phibench.datasets.input_files import InputFile
 from phibench.datasets.rooms.mesh_parts import (
     BRIGHTEST,
+    MOST_PARTS,
     MOST_TRIANGLES,
     WHITE,
     Companions,
     MeshPart,
     Paint,
     check_count,
+    check_parts,
     damaged,
     leaves_picture,
     three_numbers,
 )
-from phibench.datasets.rooms.polygons import triangulated
+from phibench.datasets.rooms.polygons import Cutting, triangulated
 from phibench.render.sensor.srgb import srgb_decoded
 from phibench.scenes.frames import Array, Vector, as_vector
 from phibench.scenes.validation import printable_line
@@ -33,6 +35,8 @@ from phibench.scenes.validation import printable_line
 _FREE_FORM = ("curv", "curv2", "surf", "cstype", "bmat", "deg", "step", "parm", "trim", "hole", "scrv", "sp", "con")
 _SCRIPTS = ("call", "csh")
 _MOST_CORNERS = 10_000
+_MOST_VERTICES = 3 * MOST_TRIANGLES  # and as many texture coordinates
+_MOST_LINES = 4 * _MOST_VERTICES
 _OPTIONS = {
     **dict.fromkeys(("-blendu", "-blendv", "-clamp", "-cc", "-imfchan", "-texres", "-boost", "-bm", "-type"), 1),
     "-mm": 2,
@@ -123,6 +127,8 @@ class _Reader:
         if self.triangles > MOST_TRIANGLES:
             check_count(self.file, self.triangles)
         group = self.groups.setdefault((self.label, self.material), _Group())
+        if len(self.groups) > MOST_PARTS:
+            check_parts(self.file, len(self.groups))
         group.corners.append(corners)
         group.places.append(places)
 
@@ -145,10 +151,12 @@ def obj_parts(file: InputFile, companions: Companions) -> list[MeshPart]:
         If it is damaged, has what is not read, or names a file or a material that is not there.
     """
     reader = _Reader(file)
-    for line in _lines(file.read()):
+    for line in _lines(file):
         words = line.split()
         if words:
             reader.line(words)
+    if max(len(reader.vertices), len(reader.places)) > _MOST_VERTICES:
+        raise file.fault(f"has more than {_MOST_VERTICES} vertices or texture coordinates")
     materials = _materials(file, companions, reader.libraries)
     check_count(file, reader.triangles)
     points = np.array(reader.vertices, float).reshape(-1, 3)
@@ -157,18 +165,21 @@ def obj_parts(file: InputFile, companions: Companions) -> list[MeshPart]:
     colours = tints if len(tints) == len(points) else None
     if len(tints) and colours is None:
         raise file.fault(f"has {len(points)} vertices and colours of {len(tints)} of them: give all a colour, or none")
-    parts = []
+    parts, cutting = [], Cutting()
     for (label, name), group in reader.groups.items():
         material = materials.get(name)
         if material is None and name and reader.libraries:
             raise file.fault(f"uses the material '{printable_line(name, 60)}', which none of its libraries has")
         title = "_".join(filter(None, (label, name))) or file.path.stem
-        parts.append(_part(file, companions, title, group, points, places, colours, material))
+        parts.append(_part(file, companions, title, group, points, places, colours, material, cutting))
     return parts
 
 
-def _lines(data: bytes) -> Iterator[str]:
+def _lines(file: InputFile) -> Iterator[str]:
     """Lines without comments; one that ends in a backslash goes on."""
+    data = file.read()
+    if data.count(b"\n") + data.count(b"\r") > 2 * _MOST_LINES:
+        raise file.fault(f"has more than {_MOST_LINES} lines")
     text = data.decode("utf-8", errors="replace").replace("\r\n", "\n").replace("\r", "\n").replace("\\\n", " ")
     return (line.partition("#")[0] for line in text.split("\n"))
 
@@ -182,15 +193,18 @@ def _part(
     places: Array,
     colours: Array | None,
     material: _Material | None,
+    cutting: Cutting,
 ) -> MeshPart:
     corners, uv_corners = [], []
     for polygon, place in zip(group.corners, group.places, strict=True):
         if max(polygon) >= len(points) or max(place) >= len(places):
             raise file.fault("has faces with vertices or texture coordinates that are not there")
-        pieces = np.array([[0, 1, 2]]) if len(polygon) == 3 else triangulated(points[list(polygon)])
+        pieces = np.array([[0, 1, 2]]) if len(polygon) == 3 else triangulated(points[list(polygon)], cutting)
         corners.append(np.array(polygon, np.int64)[pieces])
         uv_corners.append(np.array(place, np.int64)[pieces])
     triangles, numbers = np.concatenate(corners), np.concatenate(uv_corners)
+    if not np.isfinite(points[triangles]).all():
+        raise file.fault(f"has vertices that are not finite numbers, in the part '{printable_line(title, 60)}'")
     uv = places[numbers] if len(places) and numbers.min() >= 0 else None
     paint = light = None
     if material is not None:
@@ -200,7 +214,8 @@ def _part(
         if not (np.isfinite(colours).all() and colours.min() >= 0.0 and colours.max() <= 1.0):
             raise file.fault("has vertex colours outside 0 to 1")
         paint = Paint(face_colours=srgb_decoded(colours)[triangles].mean(axis=1))
-    return MeshPart(title, points, triangles, paint, light)
+    used, own = np.unique(triangles, return_inverse=True)  # a thousand parts do not carry all vertices each
+    return MeshPart(title, points[used], own.reshape(-1, 3), paint, light)
 
 
 def _paint(file: InputFile, companions: Companions, material: _Material, uv: Array | None) -> Paint | None:
@@ -248,7 +263,7 @@ def _materials(file: InputFile, companions: Companions, libraries: list[str]) ->
 
 def _library(file: InputFile) -> list[_Material]:
     found: list[_Material] = []
-    for line in _lines(file.read()):
+    for line in _lines(file):
         words = line.split()
         if not words:
             continue

@@ -31,6 +31,9 @@ _REMEDY = f"give a picture as {IN_WORDS}, OpenEXR or Radiance HDR"
 _HDR_MAGIC = (b"#?RADIANCE", b"#?RGBE")
 _OVERSHOOT = 0.01  # of the light, below 0
 _EXR_MAGIC = b"\x76\x2f\x31\x01"
+_EXR_VALUES = 4 * PICTURE_PIXELS  # of all channels: R, G, B and A of the largest picture
+_EXPOSURE = re.compile(rb"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
+_ROWS = 256  # decoded at once
 
 
 def read_panorama(path: Path) -> Light:
@@ -96,18 +99,17 @@ def _exr(file: InputFile) -> Light:
     """Channels R, G and B, or Y alone, of an OpenEXR file."""
     import OpenEXR
 
-    try:
+    with file.decoding("is a damaged OpenEXR file"):
         with quiet_terminal(), OpenEXR.File(str(file.path), header_only=True) as opened:
             low, high = (np.asarray(corner, dtype=np.int64) for corner in opened.header()["dataWindow"])
+            channels, parts = len(opened.header().get("channels", ())), len(opened.parts)
         columns, rows = (high - low + 1).tolist()
-        if not 0 < columns * rows <= PICTURE_PIXELS:
+        if not (0 < columns and 0 < rows and columns * rows <= PICTURE_PIXELS):
             raise file.fault(f"has {columns} x {rows} pixels: at most {PICTURE_PIXELS:.0e} are read")
+        if parts != 1 or columns * rows * channels > _EXR_VALUES:
+            raise file.fault(f"has {channels} channels in {parts} parts: one part with R, G and B is read")
         with quiet_terminal(), OpenEXR.File(str(file.path), separate_channels=True) as opened:
             planes = {name: np.asarray(channel.pixels) for name, channel in opened.channels().items()}
-    except RoomError:
-        raise
-    except Exception as error:  # the library's faults are of many kinds
-        raise file.fault(f"is a damaged OpenEXR file: {printable_line(str(error), 200)}") from error
     names = ("R", "G", "B") if "R" in planes else ("Y", "Y", "Y")
     if not all(name in planes and planes[name].shape == (rows, columns) for name in names):
         raise file.fault("has no channels R, G and B of one size")
@@ -132,10 +134,24 @@ def _hdr(file: InputFile, data: bytes) -> Light:
         coded = _hdr_pixels(pixels, rows, columns)
     except (IndexError, ValueError) as error:
         raise file.fault("is a damaged Radiance file: its rows do not have the stated length") from error
-    exposures = [float(x) for x in re.findall(rb"^EXPOSURE=\s*([-+.\deE]+)\s*$", head, re.M)]
-    scale = np.exp2(coded[..., 3].astype(np.int32) - 136.0) * (coded[..., 3] > 0)
-    light = coded[..., :3] * (scale / np.prod(exposures, initial=1.0))[..., None]
-    return np.asarray(light, np.float32)
+    exposure = _exposure(file, head)
+    light = np.empty((rows, columns, 3), np.float32)
+    for start in range(0, rows, _ROWS):
+        part = coded[start : start + _ROWS]
+        scale = np.exp2(part[..., 3].astype(np.int32) - 136.0) * (part[..., 3] > 0)
+        light[start : start + _ROWS] = part[..., :3] * (scale / exposure)[..., None]
+    return light
+
+
+def _exposure(file: InputFile, head: bytes) -> float:
+    """Product of all exposures that a header states."""
+    exposure = 1.0
+    for text in re.findall(rb"^EXPOSURE=(.*)$", head, re.M):
+        exposure *= float(text) if _EXPOSURE.fullmatch(text.strip()) else 0.0
+        if not 1e-30 < exposure < 1e30:
+            shown = printable_line(text.decode("latin-1").strip(), 40)
+            raise file.fault(f"has EXPOSURE={shown}: a number above 0 is needed")
+    return exposure
 
 
 def _hdr_pixels(data: bytes, rows: int, columns: int) -> NDArray[np.uint8]:

@@ -24,7 +24,7 @@ from phibench.datasets.rooms.mesh_parts import (
     check_count,
     damaged,
 )
-from phibench.datasets.rooms.polygons import triangulated
+from phibench.datasets.rooms.polygons import Cutting, triangulated
 from phibench.render.sensor.srgb import srgb_decoded
 from phibench.scenes.frames import Array
 from phibench.scenes.validation import printable_line
@@ -44,6 +44,7 @@ _CORNERS = ("vertex_indices", "vertex_index")
 _COLOURS = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
 _PLACES = (("s", "t"), ("texture_u", "texture_v"), ("u", "v"))
 _MOST_CORNERS = 10_000  # of one polygon
+_MOST_ENTRIES = 3 * MOST_TRIANGLES  # of one kind
 
 
 @dataclass(frozen=True)
@@ -134,13 +135,19 @@ def _header(file: InputFile, data: bytes) -> tuple[str, list[_Element], list[str
             raise file.fault(f"has a line in its header that is not PLY's: {printable_line(line, 60)}")
     if order is None:
         raise damaged(file)
+    if sum(element.count for element in elements) > 2 * _MOST_ENTRIES:
+        raise file.fault(f"has more than {2 * _MOST_ENTRIES} entries: at most that many are read")
+    if any(len({p.name for p in element.properties}) < len(element.properties) for element in elements):
+        raise file.fault("has a property twice")
+    if len({element.name for element in elements}) < len(elements):
+        raise file.fault("has an element twice")
     return order, elements, pictures, stop + 1
 
 
 def _count(file: InputFile, word: str) -> int:
     count = int(word)
-    if not 0 <= count <= 3 * MOST_TRIANGLES:
-        raise file.fault(f"has {printable_line(word, 20)} entries of one kind: at most {3 * MOST_TRIANGLES} are read")
+    if not 0 <= count <= _MOST_ENTRIES:
+        raise file.fault(f"has {printable_line(word, 20)} entries of one kind: at most {_MOST_ENTRIES} are read")
     return count
 
 
@@ -259,7 +266,7 @@ def _triangles(file: InputFile, points: Array, polygons: Any) -> tuple[NDArray[n
     found: list[Any] = []
     owner: list[int] = []
     corner: list[Any] = []
-    total = 0
+    total, cutting = 0, Cutting()
     for number, polygon in enumerate(polygons):
         index = np.asarray(polygon).astype(np.int64)
         if len(index) < 3:
@@ -268,7 +275,7 @@ def _triangles(file: InputFile, points: Array, polygons: Any) -> tuple[NDArray[n
             raise file.fault(f"has a face of {len(index)} corners: at most {_MOST_CORNERS} are read")
         if index.min() < 0 or index.max() >= len(points):
             raise file.fault("has faces with vertices that are not there")
-        pieces = triangulated(points[index])
+        pieces = triangulated(points[index], cutting)
         total += len(pieces)
         if total > MOST_TRIANGLES:
             check_count(file, total)

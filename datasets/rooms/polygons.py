@@ -5,6 +5,8 @@ Corners lie in a plane, or nearly. The triangles have the polygon's corners and 
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,12 +15,40 @@ from phibench.scenes.frames import Array
 _FLAT = 1e-12  # of the polygon's area: turns below it are straight
 
 
-def triangulated(points: Array) -> NDArray[np.int64]:
+MOST_CUTTING = 30_000_000
+"""Corners that are looked at for all concave polygons of a file together, one for each ear; some 10 s."""
+_TURN_COST = 20  # corners that could be looked at in the time of one turn
+
+
+class CuttingError(ValueError):
+    """Concave polygons that would take too long."""
+
+
+@dataclass
+class Cutting:
+    """Rest of `MOST_CUTTING`: one for each file."""
+
+    left: int = MOST_CUTTING
+
+    def take(self, corners: int) -> None:
+        """Count corners that are looked at."""
+        self.left -= corners
+        if self.left < 0:
+            raise CuttingError("concave polygons of too many corners")
+
+
+def triangulated(points: Array, cutting: Cutting) -> NDArray[np.int64]:
     """Triangles of one polygon by the numbers of its corners, shape (n - 2, 3).
 
     Parameters
     ----------
     points : shape (n, 3), n from 3 up
+    cutting : Cutting
+
+    Raises
+    ------
+    CuttingError
+        If the concave polygons of the file take too long.
 
     Notes
     -----
@@ -36,7 +66,7 @@ def triangulated(points: Array) -> NDArray[np.int64]:
     flat = _flattened(points, normal / size)
     if _is_convex(flat, size):
         return fan
-    return _by_ears(flat, size)
+    return _by_ears(flat, size, cutting)
 
 
 def _normal(points: Array) -> Array:
@@ -69,10 +99,10 @@ def _is_convex(flat: Array, size: float) -> bool:
     return abs(around - 2.0 * np.pi) < 1.0  # once around: a star that winds twice is not convex
 
 
-def _by_ears(flat: Array, size: float) -> NDArray[np.int64]:
+def _by_ears(flat: Array, size: float, cutting: Cutting) -> NDArray[np.int64]:
     left, found = list(range(len(flat))), []
     while len(left) > 3:
-        ear = next((k for k in range(len(left)) if _is_ear(flat, left, k, size)), None)
+        ear = next((k for k in range(len(left)) if _is_ear(flat, left, k, size, cutting)), None)
         if ear is None:  # it crosses itself
             break
         found.append((left[ear - 1], left[ear], left[(ear + 1) % len(left)]))
@@ -81,10 +111,12 @@ def _by_ears(flat: Array, size: float) -> NDArray[np.int64]:
     return np.array(found, np.int64)
 
 
-def _is_ear(flat: Array, left: list[int], k: int, size: float) -> bool:
+def _is_ear(flat: Array, left: list[int], k: int, size: float, cutting: Cutting) -> bool:
+    cutting.take(_TURN_COST)
     a, b, c = left[k - 1], left[k], left[(k + 1) % len(left)]
     if float(_turn(flat[a], flat[b], flat[c])) <= _FLAT * size:
         return False
+    cutting.take(len(left))
     others = flat[[p for p in left if p not in (a, b, c)]]
     corners = flat[[a, b, c]]
     others = others[~(others[:, None] == corners).all(axis=2).any(axis=1)]  # a corner that occurs twice is no obstacle

@@ -17,6 +17,7 @@ from typing import Any
 import polars as pl
 
 from phibench.datasets.errors import DatasetError
+from phibench.datasets.shown_text import markdown_cell, markdown_text
 from phibench.datasets.store.files import write_text
 from phibench.estimator.benchmark.answer_errors import Rules
 from phibench.estimator.benchmark.compare import (
@@ -251,7 +252,7 @@ def results_page(parts: Sequence[Part], by: str = "phi") -> str:
     text = [_INTRODUCTION, _LEGEND.format(quantity={"phi": "phi", "depth": "D"}[by])]
     text.append("## What was scored\n\n" + "\n".join(_sources(parts)) + "\n")
     for part in parts:
-        text.append(f"## {part.title}\n")
+        text.append(f"## {markdown_text(part.title)}\n")
         text += [_titled(grid) for grid in grids(part)]
         text += ["".join(f"{_item(note)}\n" for note in part.notes)] * bool(part.notes)
     return "\n".join(text)
@@ -260,24 +261,23 @@ def results_page(parts: Sequence[Part], by: str = "phi") -> str:
 def _titled(grid: Grid) -> str:
     """Table in Markdown below its title in bold."""
     _, _, rest = markdown(grid).partition("\n\n")
-    return f"**{grid.title}**\n\n{rest}"
+    return f"**{markdown_text(grid.title)}**\n\n{rest}"
 
 
 def _item(note: str) -> str:
     """Item of a list, a sentence in lines of at most 120 characters."""
-    text = note if note.endswith(".") else f"{note}."
+    text = markdown_text(note if note.endswith(".") else f"{note}.")
     return textwrap.fill(f"* {text}", 120, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False)
 
 
+_SOURCE_HEADS = ("preset", "data set", "pairs", "samples", "task", "hash of the data set", "scored by")
+
+
 def _sources(parts: Sequence[Part]) -> Iterator[str]:
-    yield "| preset | data set | pairs | samples | task | hash of the data set | scored by |"
-    yield "|---|---|---|---|---|---|---|"
-    for part in parts:
-        first = part.scores[0]
-        programs = sorted({one.program or "not told" for one in part.scores})
-        digest = str(first.pair_set.get("dataset_sha256"))[:12]
-        cells = (part.title, first.pair_set.get("name"), first.pairs, first.samples, first.pair_set.get("task_version"))
-        yield "| " + " | ".join(map(str, (*cells, digest, ", ".join(programs)))) + " |"
+    yield f"| {' | '.join(_SOURCE_HEADS)} |"
+    yield "|---" * len(_SOURCE_HEADS) + "|"
+    for row in _source_rows(parts):
+        yield f"| {' | '.join(map(markdown_cell, row))} |"
 
 
 def results_html(parts: Sequence[Part], by: str = "phi") -> str:
@@ -287,7 +287,7 @@ def results_html(parts: Sequence[Part], by: str = "phi") -> str:
         "Two stars in a paired difference: shown by the test, corrected for 16 metrics.",
         f"Methods are ordered by the rank of {by if by == 'phi' else 'D'}.",
     )
-    sections = [Section("What was scored", intro, (), (_source_rows(parts),), ("",))]
+    sections = [Section("What was scored", intro, (), ((_SOURCE_HEADS, *_source_rows(parts)),), ("",))]
     for part in parts:
         made = grids(part)
         tables = tuple((grid.heads, *grid.rows) for grid in made)
@@ -295,9 +295,13 @@ def results_html(parts: Sequence[Part], by: str = "phi") -> str:
     return report_html([], sections, by, title="phibench results")
 
 
-def _source_rows(parts: Sequence[Part]) -> tuple[tuple[str, ...], ...]:
-    lines = [line for line in _sources(parts) if not line.startswith("|---")]
-    return tuple(tuple(cell.strip() for cell in line.strip("|").split("|")) for line in lines)
+def _source_rows(parts: Sequence[Part]) -> Iterator[tuple[str, ...]]:
+    for part in parts:
+        first = part.scores[0]
+        programs = sorted({one.program or "not told" for one in part.scores})
+        digest = str(first.pair_set.get("dataset_sha256"))[:12]
+        cells = (part.title, first.pair_set.get("name"), first.pairs, first.samples, first.pair_set.get("task_version"))
+        yield (*map(str, cells), digest, ", ".join(programs))
 
 
 def results_document(parts: Sequence[Part]) -> dict[str, Any]:

@@ -22,12 +22,14 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from phibench.datasets.shown_text import csv_text, latex_text, markdown_cell, markdown_text
 from phibench.estimator.benchmark.causes import CAUSES, KINDS, NOISE, TAKEN_FOR
 from phibench.estimator.benchmark.compare import Difference
 from phibench.estimator.benchmark.document import ScoreDocument, Value
 from phibench.estimator.benchmark.intervals import Estimate
 from phibench.estimator.benchmark.metrics import CHOSEN, METRICS, RANKS, applies
 from phibench.estimator.methods.registry import REFUSED
+from phibench.scenes.validation import printable_line
 
 Form = Literal["terminal", "csv", "markdown", "latex", "json"]
 
@@ -431,12 +433,13 @@ def markdown(grid: Grid) -> str:
     """Table in Markdown, a line of text before it."""
     marks = ["--:" if kind == "r" else ":--" for kind in grid.columns]
     lines = [_row(grid.heads), _row(marks), *map(_row, grid.rows)]
-    return "\n".join((f"{grid.title}\n", *lines, *(("", grid.note) if grid.note else ()))) + "\n"
+    note = ("", markdown_text(grid.note)) if grid.note else ()
+    return "\n".join((f"{markdown_text(grid.title)}\n", *lines, *note)) + "\n"
 
 
 def latex(grid: Grid) -> str:
     """Table in LaTeX, for the package booktabs."""
-    lines = [" & ".join(map(_escaped, row)) + r" \\" for row in (grid.heads, *grid.rows)]
+    lines = [" & ".join(map(latex_text, row)) + r" \\" for row in (grid.heads, *grid.rows)]
     body = [
         rf"\begin{{tabular}}{{{grid.columns.lower()}}}",
         r"\toprule",
@@ -445,7 +448,7 @@ def latex(grid: Grid) -> str:
         *lines[1:],
         r"\bottomrule",
     ]
-    return "\n".join((f"% {grid.title}", *body, r"\end{tabular}")) + "\n"
+    return "\n".join((f"% {printable_line(grid.title)}", *body, r"\end{tabular}")) + "\n"
 
 
 def scores_csv(documents: Sequence[ScoreDocument], by: str = "phi") -> str:
@@ -496,18 +499,14 @@ def _difference_fields(d: Difference) -> dict[str, str | float | int | None]:
 def _csv(heads: list[str], rows: Sequence[Sequence[object]]) -> str:
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator="\n")
-    writer.writerows([heads, *(["" if x is None else x for x in row] for row in rows)])
+    writer.writerows(
+        [heads, *(["" if x is None else csv_text(x) if isinstance(x, str) else x for x in row] for row in rows)]
+    )
     return buffer.getvalue()
 
 
 def _row(cells: Sequence[str]) -> str:
-    return "| " + " | ".join(cell.replace("|", "\\|").replace("\n", " ") for cell in cells) + " |"
-
-
-def _escaped(text: str) -> str:
-    for mark in "\\&%$#_{}":
-        text = text.replace(mark, r"\textbackslash " if mark == "\\" else f"\\{mark}")
-    return text.replace("\n", " ")
+    return "| " + " | ".join(map(markdown_cell, cells)) + " |"
 
 
 # -- numbers -------------------------------------------------------------------------------------------------------

@@ -11,13 +11,15 @@ import csv
 import io
 import math
 import re
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
 from phibench.datasets.errors import DatasetError
-from phibench.datasets.input_files import FILE_NAME, MIB, InputFile
+from phibench.datasets.input_files import FILE_NAME, MIB, InputFile, below
+from phibench.datasets.shown_text import csv_text
 from phibench.datasets.store.files import write_text
 from phibench.datasets.store.schema import TruthFile
 from phibench.estimator.captures.measure import Measurement, Setting, measure
@@ -83,15 +85,16 @@ def read_pair_list(folder: Path) -> list[ListedPair]:
         raise file.fault(f"has columns between {name}: save it with commas between them, and points in numbers")
     if strange := [column for column in columns if column not in known]:
         raise file.fault(f"has the column {printable_line(strange[0], 40)!r}; {nearest(strange[0], known)}")
+    if twice := [column for column in columns if columns.count(column) > 1]:
+        raise file.fault(f"has the column '{twice[0]}' twice")
     if lacking := [column for column in _NEEDED if column not in columns]:
         raise file.fault(f"has no column '{lacking[0]}'")
     if not 0 < len(lines) <= _MOST_ROWS:
         raise file.fault(f"has {len(lines)} pairs: 1 to {_MOST_ROWS} are read")
     found = [_row(line, partial(_fault_of_line, file, number)) for number, line in lines]
-    names = [row.name for row in found]
-    if len(set(names)) != len(names):
-        twice = next(name for name in names if names.count(name) > 1)
-        raise file.fault(f"has the name {twice} twice")
+    counts = Counter(row.name for row in found)
+    if len(counts) != len(found):
+        raise file.fault(f"has the name {counts.most_common(1)[0][0]} twice")
     return found
 
 
@@ -136,10 +139,10 @@ def photos_of(folder: Path, row: ListedPair, setting: Setting) -> PairPhotos:
     Raises
     ------
     DatasetError
-        As `read_photo` and `PairPhotos`.
+        As `read_photo` and `PairPhotos`, or if a link leads out of the folder.
     """
     groups = {
-        key: tuple(read_photo(folder / name, setting.known.rig, setting.sensor) for name in names)
+        key: tuple(read_photo(below(folder, name), setting.known.rig, setting.sensor) for name in names)
         for key, names in row.files.items()
     }
     return PairPhotos(
@@ -238,5 +241,5 @@ def _values(result: Result) -> Iterable[float | str | None]:
 
 def _cell(value: float | str | None) -> str:
     if isinstance(value, str):
-        return value
+        return csv_text(value)
     return "" if value is None else f"{value:.6g}"

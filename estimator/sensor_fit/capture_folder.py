@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import io
 import re
+import struct
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -320,10 +321,12 @@ def read_header(data: bytes, name: str) -> JpegHeader:
         with Image.open(io.BytesIO(data), formats=("JPEG",)) as picture:
             tables = picture.quantization  # type: ignore[attr-defined]
             layers = picture.layer  # type: ignore[attr-defined]
-    except OSError as error:
+    except (OSError, ValueError, SyntaxError, LookupError, TypeError, struct.error) as error:
         raise CaptureError(f"{name} is no JPEG file; give the bytes that the camera sent") from error
     if len(layers) != 3 or not tables:
         raise CaptureError(f"{name} has {len(layers)} planes: a colour JPEG of the camera has three")
+    if any(layer[3] not in tables or not layer[1] or not layer[2] for layer in layers):
+        raise CaptureError(f"{name} is a damaged JPEG file: its planes have no tables or no size")
     of_luma, of_chroma = (tuple(int(step) for step in tables[layers[k][3]]) for k in (0, 1))
     factors = (layers[0][1] // layers[1][1], layers[0][2] // layers[1][2])
     if factors not in _SUBSAMPLING:

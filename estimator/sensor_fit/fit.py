@@ -14,6 +14,7 @@ import numpy as np
 
 from phibench.datasets.frames.sensor_card import SensorCard, sensor_card
 from phibench.datasets.frames.sensor_file import FitTables, Measured, SensorFile, allowed_numbers
+from phibench.datasets.input_files import InputFile
 from phibench.estimator.sensor_fit.capture_folder import (
     RAW,
     Capture,
@@ -251,7 +252,7 @@ def _take_jpeg(draft: _Draft, capture: Capture) -> JpegHeader | None:
     if capture.kind != "mjpeg":
         return None
     first = next(g for g in _every_group(capture) if g.files).files[0]
-    found = read_header(first.read_bytes(), str(first))
+    found = read_header(InputFile(first, "give the camera's own picture", CaptureError).read(), str(first))
     if found.quality is not None:
         draft.take("jpeg_quality", found.quality)
     else:

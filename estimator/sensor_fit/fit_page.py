@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import base64
-import html
 import io
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from phibench.datasets.shown_text import html_text, markdown_cell, markdown_text
 from phibench.datasets.store.files import write_bytes, write_text
 from phibench.estimator.sensor_fit.capture_folder import CaptureError
 from phibench.estimator.sensor_fit.fit import SensorFit
@@ -39,9 +39,10 @@ def write_page(path: Path, found: SensorFit) -> Path:
     rows = numbers_of(found)
     plot = _plots(found)
     if path.suffix.lower() == ".md":
-        lines = ["# Sensor fit", "", *_source_lines(found), "", "| number | value | sigma |", "|---|---|---|"]
-        lines += [f"| {name} | {value} | {sigma} |" for name, value, sigma in rows]
-        lines += ["", *(f"* {said}" for said in remarks_of(found))]
+        source = (f"* {markdown_text(line)}" for line in _source_lines(found))
+        lines = ["# Sensor fit", "", *source, "", "| number | value | sigma |", "|---|---|---|"]
+        lines += [f"| {' | '.join(map(markdown_cell, row))} |" for row in rows]
+        lines += ["", *(f"* {markdown_text(said)}" for said in remarks_of(found))]
         if plot is not None:
             picture = path.with_suffix(".png")
             write_bytes(picture, plot)
@@ -87,13 +88,13 @@ def _text(value: object) -> str:
 
 
 def _source_lines(found: SensorFit) -> list[str]:
-    return [f"* {name}: {value}" for name, value in found.file.tables.source.items()]
+    return [f"{name}: {value}" for name, value in found.file.tables.source.items()]
 
 
 def _html(found: SensorFit, rows: list[tuple[str, str, str]], plot: bytes | None) -> str:
-    cells = "".join("<tr>" + "".join(f"<td>{html.escape(x)}</td>" for x in row) + "</tr>\n" for row in rows)
-    missing = "".join(f"<li>{html.escape(said)}</li>\n" for said in remarks_of(found))
-    source = "".join(f"<li>{html.escape(line[2:])}</li>" for line in _source_lines(found))
+    cells = "".join("<tr>" + "".join(f"<td>{html_text(x)}</td>" for x in row) + "</tr>\n" for row in rows)
+    missing = "".join(f"<li>{html_text(said)}</li>\n" for said in remarks_of(found))
+    source = "".join(f"<li>{html_text(line)}</li>" for line in _source_lines(found))
     image = "" if plot is None else f'<img alt="plots" src="data:image/png;base64,{base64.b64encode(plot).decode()}">'
     return (
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><title>Sensor fit</title>\n'

@@ -23,7 +23,7 @@ from phibench.datasets.errors import DatasetError
 from phibench.datasets.film.film_store import verify as film_faults
 from phibench.datasets.release.benchmark import Archive
 from phibench.datasets.release.fetch import Fetched, fetch, unpack
-from phibench.datasets.release.source import SOURCE
+from phibench.datasets.release.release_source import SOURCE
 from phibench.datasets.store.checksums import damaged
 from phibench.estimator.sealed.sealed_set import read_seal
 

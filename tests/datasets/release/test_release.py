@@ -18,7 +18,7 @@ from phibench.datasets.plan.plan import make_plan
 from phibench.datasets.recipe.load import parse_recipe, recipe_text, with_numbers
 from phibench.datasets.release.benchmark import PARTS, VERSION, Part, content_sha256
 from phibench.datasets.release.release_make import ReleaseRequest, _card, dry_run, release
-from phibench.datasets.release.source import SOURCE
+from phibench.datasets.release.release_source import SOURCE
 from phibench.datasets.store.checksums import damaged, differing_files, read_checksums
 from phibench.estimator.cli.main import main
 from phibench.estimator.sealed.sealed_set import seal

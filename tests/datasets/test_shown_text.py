@@ -1,0 +1,83 @@
+"""Texts of strangers, read back by parsers of the outputs: nothing but text, and the text itself."""
+
+import csv
+import html
+import io
+import re
+from collections.abc import Callable
+from html.parser import HTMLParser
+
+import pytest
+
+from phibench.datasets.shown_text import csv_text, html_text, latex_text, markdown_cell, markdown_text
+
+NASTY = (
+    *("<script>alert(1)</script>", "<img src=x onerror=alert(1)>", "a & b", "&lt;b&gt;", "[a](http://b)", "![a](b)"),
+    *("[a][b]", "[a]: http://b", "http://evil.invalid/x", "www.evil.invalid", "me@evil.invalid", "mailto:a", "`code`"),
+    *("*a*", "**a**", "_a_", "__a__", "~~a~~", "a*b*c", "# head", "- item", "* item", "1. item", "> quote", "a|b"),
+    *("a\\|b", "a\\", "$\\frac{1}{2}$", "\\input{/etc/passwd}", "100 %", "a^b~c", "=1+1", "+1", "-1", "@sum", "\t=1"),
+    *("a\n# b", "a\r\n\r\n<b>", "\x1b[31m", "\u202eabc", "--- | ---", "<!-- x", "{{ 7 * 7 }}", "x" * 5000, ""),
+)
+PLAIN = ("chain_fit", "0.413 [0.341, 0.471]", "0.0663 [0.0529, 0.0801] **", "1.2 *", "-", "97.7; 0.16", "rms D / %")
+
+
+def github(text: str) -> str:
+    """HTML by CommonMark with GitHub's tables and lines through words."""
+    from markdown_it import MarkdownIt
+
+    return MarkdownIt("commonmark", {"html": True}).enable(["table", "strikethrough"]).render(text)
+
+
+def site(text: str) -> str:
+    """HTML by the parser of our own pages, where it is installed."""
+    return pytest.importorskip("markdown").markdown(text, extensions=["tables", "footnotes", "attr_list"])
+
+
+@pytest.mark.parametrize("page_of", [github, site])
+@pytest.mark.parametrize("text", NASTY)
+def test_markdown_shows_the_text_alone(text: str, page_of: Callable[[str], str]) -> None:
+    for shown in (f"* {markdown_text(text)}", f"# {markdown_text(text)}"):
+        page = page_of(shown)
+        assert set(re.findall(r"</?([a-z0-9]+)", page)) <= {"ul", "li", "h1"}, page
+    page = page_of(f"| a | b |\n|---|---|\n| {markdown_cell(text)} | end |")
+    cells = re.findall(r"<td>(.*?)</td>", page, re.DOTALL)
+    assert len(cells) == 2
+    assert cells[1] == "end"
+    assert "<" not in cells[0]
+    words = " ".join(text.split())
+    if words.isprintable() and len(words) < 2000:
+        assert html.unescape(cells[0]) == words
+
+
+@pytest.mark.parametrize("text", PLAIN)
+def test_tables_of_numbers_are_as_before(text: str) -> None:
+    assert markdown_cell(text) == text
+
+
+@pytest.mark.parametrize("text", NASTY)
+def test_html_has_no_tag_of_a_text(text: str) -> None:
+    tags: list[str] = []
+
+    class Parser(HTMLParser):
+        def handle_starttag(self, tag: str, attrs: object) -> None:
+            tags.append(tag)
+
+    Parser().feed(f'<p title="{html_text(text)}">{html_text(text)}</p>')
+    assert tags == ["p"]
+
+
+@pytest.mark.parametrize("text", NASTY)
+def test_latex_has_no_command_of_a_text(text: str) -> None:
+    """Only what the function itself writes: a backslash before a mark, or one of five words."""
+    shown = latex_text(text)
+    rest = re.sub(r"\\(?:[&%$#_{}]|text(?:backslash|asciitilde|asciicircum|less|greater|quotedbl)\{\})", "", shown)
+    assert not re.search(r"[\\&%$#_{}~^<>\"\n]", rest), shown
+
+
+@pytest.mark.parametrize("text", NASTY)
+def test_no_cell_of_a_table_is_a_formula(text: str) -> None:
+    buffer = io.StringIO()
+    csv.writer(buffer).writerow([csv_text(text), "end"])
+    [[cell, end]] = csv.reader(io.StringIO(buffer.getvalue()))
+    assert end == "end"
+    assert not cell.strip().startswith(("=", "+", "-", "@"))
