@@ -37,6 +37,7 @@ from phibench.datasets.film.film_store import (
     FilmInfo,
     FrameTruth,
     SetInfo,
+    ViewHashes,
     finite_or_none,
     light_record,
     log_film,
@@ -135,6 +136,8 @@ def _refuse_other(out: Path, name: str) -> None:
 def _make(plan: Plan, films: Sequence[FilmPlan], text: str, out: Path, workers: int | None, console: Console) -> Made:
     keys = _keys(plan, films)
     todo = [film for film in films if not _is_done(out, film, keys[film.film_id])]
+    for name in {film.film_id for film in films} - {film.film_id for film in todo}:
+        FilmFolder.of(out, name).begun.unlink(missing_ok=True)  # of a run that was killed at its very end
     if todo:
         (out / CHECKSUMS).unlink(missing_ok=True)
         one = partial(make_film, out, plan, keys)
@@ -179,13 +182,14 @@ def make_film(out: Path, plan: Plan, keys: dict[str, str], film: FilmPlan) -> Fi
     room = plan.room(film.pair.room)
     render = renderer(plan, film, room)
     folder = FilmFolder.of(out, film.film_id)
+    hashes = ViewHashes(folder)
     folder.done.unlink(missing_ok=True)
     began = time.process_time()
     times = [spot_time_s(film.scene, frame) for frame in range(film.scene.times.frames)]
     images, centres = frame_spots(film, room, times)
     rows = frame_truths(film, room, times, images, centres)
     _check_seen(film, rows)
-    places, error = key_views(film, folder, keys[film.film_id], render, images)
+    places, error = key_views(film, folder, keys[film.film_id], render, images, hashes)
     write_spots(folder.path / SPOTS, images)
     write_table(folder.path / FILM, rows)
     lights = _make_lights(film, room, folder)
@@ -208,6 +212,7 @@ def make_film(out: Path, plan: Plan, keys: dict[str, str], film: FilmPlan) -> Fi
         sha256={name: sha256(folder.path / name) for name in names},
     )
     write_document(folder.done, info)
+    hashes.remove()
     return FilmCost(film.film_id, round(time.process_time() - began, 3))
 
 

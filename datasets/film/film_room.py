@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.film.film_plan import FilmPlan
-from phibench.datasets.film.film_store import FilmFolder, read_view, view_key, write_view
+from phibench.datasets.film.film_store import FilmFolder, ViewHashes, read_view, write_view
 from phibench.datasets.plan.plan import Plan
 from phibench.datasets.recipe.tables import AmbientTable
 from phibench.render.film.key_views import ALLOWED, PoseParts, ViewError, blended, compare, key_offsets_m, key_weights
@@ -95,7 +95,7 @@ def light_views(rig: Rig, film: FilmPlan) -> Iterator[tuple[Array, list[View]]]:
 
 
 def key_views(
-    film: FilmPlan, folder: FilmFolder, key: str, render: Render, images: Sequence[RowsImage]
+    film: FilmPlan, folder: FilmFolder, key: str, render: Render, images: Sequence[RowsImage], hashes: ViewHashes
 ) -> tuple[list[Array], ViewError]:
     """Render key views until views that were left out agree; return their places, part by part, and the worst error.
 
@@ -111,7 +111,9 @@ def key_views(
         for part, at in enumerate(places):
             if part in errors and not errors[part].largest > ALLOWED:
                 continue
-            views = np.stack([_key_view(film, folder, key, render, parts, (part, float(place))) for place in at])
+            views = np.stack(
+                [_key_view(film, folder, key, render, parts, (part, float(place)), hashes) for place in at]
+            )
             errors[part] = held_out_error(film, render, parts, part, at, views, images)
         # a part that no frame falls into has nothing to prove
         worst = max(errors.values(), key=lambda error: -1.0 if math.isnan(error.largest) else error.largest)
@@ -128,17 +130,24 @@ def key_views(
 
 
 def _key_view(
-    film: FilmPlan, folder: FilmFolder, key: str, render: Render, parts: PoseParts, pose: tuple[int, float]
+    film: FilmPlan,
+    folder: FilmFolder,
+    key: str,
+    render: Render,
+    parts: PoseParts,
+    pose: tuple[int, float],
+    hashes: ViewHashes,
 ) -> NDArray[np.float32]:
-    """Key view from its file, or rendered and written: files of a killed run, or of fewer keys, are told by their key.
+    """Key view from its file, or rendered and written: files of a killed run, or of fewer keys, have key and hash.
 
     The places of few keys are among those of twice as many, but for rounding.
     """
     path, (part, place) = folder.view(*pose), pose
     wanted = hashlib.sha256(f"{key} {path.name}".encode()).hexdigest()
-    if view_key(path) != wanted:
+    if not hashes.holds(path, wanted):
         planes = render(parts.view(part, place), pose, seed_32(*film.names, "key", path.name))
         write_view(path, planes, film.region, {"film": film.film_id, "place": place, "part": part, "key": wanted})
+        hashes.add(path)
     return read_view(path, film.region)
 
 

@@ -14,6 +14,7 @@ log.jsonl                  diary of the runs: when each film was made, and what 
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
 import math
@@ -29,7 +30,7 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from phibench.datasets.errors import DatasetError
-from phibench.datasets.input_files import InputFile, first_fault
+from phibench.datasets.input_files import FileName, InputFile, first_fault
 from phibench.datasets.store.checksums import checksums_text, differing_files, read_checksums
 from phibench.datasets.store.files import sha256, write_bytes, write_text
 from phibench.datasets.store.layers import read_exr, write_exr
@@ -38,7 +39,7 @@ from phibench.render.film.film_truth import RATES, InstantTruth
 from phibench.render.film.moving_rows import RowsImage
 from phibench.render.optics.spot_layer import SpotLight
 from phibench.render.sensor.light import Region
-from phibench.scenes.camera import FILTERS
+from phibench.scenes.camera import FILTERS, LARGEST_SIDE_PX
 from phibench.scenes.frames import Array
 
 INFO, RECIPE, CHECKSUMS = TruthFolder.FILMS.value, "recipe.toml", "SHA256SUMS"
@@ -75,7 +76,7 @@ class FilmInfo(Document):
     )
     pixel_ratio: float | None = described("1", "held-out view: rms error of a pixel near the spot, over its noise")
     position_ratio: float | None = described("1", "held-out view: error of the spot's position, over its bound")
-    sha256: dict[str, str] = described("-", "hash of each file, relative to the film's folder")
+    sha256: dict[FileName, str] = described("-", "hash of each file, relative to the film's folder")
 
     @property
     def region(self) -> Region:
@@ -123,6 +124,11 @@ class FilmFolder:
     def done(self) -> Path:
         """File that says that the film is complete."""
         return self.path / "done.json"
+
+    @property
+    def begun(self) -> Path:
+        """File of a film that is being made: the hashes of its key views."""
+        return self.path / "views.json"
 
     def info(self) -> FilmInfo:
         """Content of `done.json`.
@@ -201,12 +207,51 @@ def read_view(path: Path, region: Region) -> NDArray[np.float32]:
     return planes
 
 
-def view_key(path: Path) -> object:
-    """Key in the header of a key view; None where there is no readable one."""
-    try:
-        return read_exr(path).header.get("key") if path.is_file() else None
-    except DatasetError:
-        return None
+class ViewHashes:
+    """SHA-256 of the key views of a film that is being made, in a file that goes when the film is complete.
+
+    A view is kept only if it has the hash that was written down when it was rendered: its header alone would let
+    changed pixels be hashed anew. A film that is made again begins with the hashes of its `done.json`.
+    """
+
+    def __init__(self, folder: FilmFolder) -> None:
+        self._folder, self._file = folder, folder.begun
+        self._known: dict[str, str] = {}
+        with contextlib.suppress(DatasetError):  # without it, or damaged: all views are rendered again
+            if self._file.is_file():
+                self._known = read_document(self._file, _Views).sha256
+            elif folder.done.is_file():
+                self._known = {name: one for name, one in folder.info().sha256.items() if name.startswith("views/")}
+        self._write()
+
+    def holds(self, path: Path, key: str) -> bool:
+        """True if a view is there, is of this key, and has the bytes that were written."""
+        try:
+            known = self._known.get(self._name(path))
+            return known is not None and sha256(path) == known and read_exr(path).header.get("key") == key
+        except (DatasetError, OSError):
+            return False
+
+    def add(self, path: Path) -> None:
+        """Write down the hash of a view that was rendered now."""
+        self._known[self._name(path)] = sha256(path)
+        self._write()
+
+    def remove(self) -> None:
+        """Remove the file: `done.json` has the hashes."""
+        self._file.unlink(missing_ok=True)
+
+    def _name(self, path: Path) -> str:
+        return path.relative_to(self._folder.path).as_posix()
+
+    def _write(self) -> None:
+        write_document(self._file, _Views(sha256=dict(sorted(self._known.items()))))
+
+
+class _Views(Document):
+    """`views.json` of a film that is being made."""
+
+    sha256: dict[FileName, str]
 
 
 # Spots.
@@ -238,8 +283,10 @@ def read_spots(path: Path, frames: int) -> list[RowsImage]:
     """
     arrays = InputFile(path, _AGAIN).arrays(_ARRAYS)
     origins, shapes, values = (arrays[name] for name in _ARRAYS)
+    if shapes.shape[1:] != (2,) or (shapes < 0).any() or (shapes > LARGEST_SIDE_PX).any():
+        raise DatasetError(f"{path} is damaged: its images have no size; {_AGAIN}")
     sizes = 9 * np.prod(shapes, axis=1)
-    if origins.shape != (frames, 2) or shapes.shape != (frames, 2) or (shapes < 0).any() or sizes.sum() != len(values):
+    if origins.shape != (frames, 2) or shapes.shape != (frames, 2) or sizes.sum() != len(values):
         raise DatasetError(f"{path} is damaged: it does not hold {frames} images; {_AGAIN}")
     ends = np.cumsum(sizes)
     result = []

@@ -21,6 +21,7 @@ from phibench.datasets.film.film_show import picture
 from phibench.datasets.film.film_store import verify
 from phibench.datasets.film.film_video import read_frames, write_frames, write_mp4, write_videos
 from phibench.datasets.recipe.load import parse_recipe
+from phibench.datasets.store.layers import read_exr, write_exr
 from phibench.estimator.film.film_frames import film_frames
 from phibench.render.film.key_views import PoseParts
 from phibench.render.optics.spot_layer import spot_layer
@@ -181,6 +182,25 @@ def test_damage_is_found_and_mended(film_windows: Path, tmp_path: Path) -> None:
     recipe.write_text(TEXT, encoding="utf-8")
     make_films(recipe, out, 1)
     assert verify(out) == []
+
+
+def test_a_key_view_that_was_changed_under_its_own_header_is_rendered_again(film_windows: Path, tmp_path: Path) -> None:
+    """The header has the right key and the right sums of the changed pixels; the hash in `done.json` is another."""
+    out = tmp_path / "films"
+    shutil.copytree(film_windows, out)
+    folder = film_of(out).folder
+    view = sorted(folder.path.glob("views/*.exr"))[0]
+    before, found = view.read_bytes(), read_exr(view)
+    planes = {name: 2.0 * plane for name, plane in found.planes.items()}
+    write_exr(view, planes, found.header, found.origin_px)
+    assert view.read_bytes() != before
+    assert len(verify(out)) == 1
+    recipe = tmp_path / "films.toml"
+    recipe.write_text(TEXT, encoding="utf-8")
+    assert make_films(recipe, out, 1).made == (FILM,)
+    assert view.read_bytes() == before
+    assert verify(out) == []
+    assert not folder.begun.exists()
 
 
 @pytest.mark.parametrize("name", ["film.avi", "film.mkv"])
