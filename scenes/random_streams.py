@@ -13,6 +13,9 @@ import numpy as np
 from phibench.scenes.frames import Array
 
 Name = str | int
+LEAST_SECRET_SEED = 2**128
+LARGEST_SEED = 2 * LEAST_SECRET_SEED - 1
+"""Root seeds go from 0; those from `LEAST_SECRET_SEED` on hold 128 bits that the system drew."""
 
 
 def seed_sequence(*names: Name) -> np.random.SeedSequence:

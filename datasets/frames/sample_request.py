@@ -14,7 +14,7 @@ import numpy as np
 from phibench.datasets.frames.request import AUTO, Exposure, FrameOptions, FrameRequest
 from phibench.datasets.recipe.distributions import DistributionTable, quantile
 from phibench.datasets.recipe.tables import SENSOR_KEYS, FramesTable
-from phibench.scenes.random_streams import Name, generator
+from phibench.scenes.random_streams import LEAST_SECRET_SEED, Name, generator, philox_key
 
 Names = tuple[str, int, str]
 _CAMERAS = 2**31
@@ -63,8 +63,12 @@ def _exposure(names: Names, frames: FramesTable) -> Exposure:
 
 
 def _camera_seed(names: Names, frames: FramesTable) -> int:
+    """Name of the camera's fixed pattern. Of a secret root it has 128 bits of it: 31 bits are found by trying all."""
     name, seed, sample_id = names
     owner = (sample_id,) if frames.camera == "per_sample" else ()
+    if seed >= LEAST_SECRET_SEED:
+        low, high = philox_key(name, seed, _STREAM, "camera", *owner).tolist()
+        return int(low) + (int(high) << 64)
     return int(generator(name, seed, _STREAM, "camera", *owner).integers(_CAMERAS))
 
 

@@ -42,6 +42,7 @@ from phibench.datasets.recipe.room_tables import RoomsTable, RoomTable
 from phibench.scenes.catalog import BOARD_SIZE_M
 from phibench.scenes.mirror import MetalName
 from phibench.scenes.misalignment import OF_REVOLVED, PARAMETERS
+from phibench.scenes.random_streams import LARGEST_SEED
 
 MIN_STROKE_M, MAX_STROKE_M = 1e-3, 10.0
 DatasetName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$", max_length=64)]
@@ -105,7 +106,7 @@ class DatasetTable(Table):
     """`[dataset]`."""
 
     name: DatasetName = Field(description="name of the data set")
-    seed: int = Field(default=0, ge=0, le=2**63 - 1, description="root of all random streams; 0 is legal")
+    seed: int = Field(default=0, ge=0, le=LARGEST_SEED, description="root of all random streams; 0 is legal")
 
 
 _LATER_RIG = ("mirror", "metal", "reflectance")

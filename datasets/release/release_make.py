@@ -12,7 +12,6 @@ import hashlib
 import io
 import json
 import os
-import secrets
 import stat
 import tarfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -29,7 +28,7 @@ from phibench.datasets.film.film_forecast import films_forecast
 from phibench.datasets.film.film_make import make_films
 from phibench.datasets.film.film_plan import film_plans
 from phibench.datasets.film.film_store import INFO as FILM_INFO
-from phibench.datasets.input_files import SETTINGS_BYTES, InputFile
+from phibench.datasets.input_files import InputFile
 from phibench.datasets.make import cost, make
 from phibench.datasets.progress import Steps, progress_console
 from phibench.datasets.recipe.load import parse_recipe, recipe_files, with_numbers
@@ -46,6 +45,7 @@ from phibench.datasets.release.benchmark import (
     read_manifest_file,
     same_but_drawn,
 )
+from phibench.datasets.release.secret_seed import secret_seed
 from phibench.datasets.store import schema
 from phibench.datasets.store.checksums import checksums_text, read_checksums
 from phibench.datasets.store.croissant import LICENSE_TEXT, LICENSE_URL, croissant_text, file_object
@@ -67,7 +67,6 @@ Seal = Callable[[Path, Path], object]
 ARCHIVE_BYTES = 500_000_000
 DIARY, README = "archives.jsonl", "README.md"
 _TIME_S = 315532800  # 1980-01-01, as all files of a sealed set have
-_LEAST_SEED, _SEED_BITS = 2**56, 62
 _SEAL = "seal.json"
 _IMAGE_BYTES, _IMAGES = 730_000, 4  # of a sealed pair at 1280 x 720; the mean of 40 pairs in three presets
 
@@ -226,25 +225,8 @@ def _seed(request: ReleaseRequest, part: Part, make_it: bool = True) -> int | No
     """Seed of a part: the recipe's, or the secret one. None if that is still to be drawn."""
     if part.kind != "sealed":
         return drawn_numbers(part.text())[0]
-    path = request.secret_seed
-    assert path is not None  # `_check_folders`
-    if not path.exists():
-        if not make_it:
-            return None
-        path.parent.mkdir(parents=True, exist_ok=True)
-        # a secret is the one number that must not come from a named stream
-        number = 2**_SEED_BITS + secrets.randbelow(2**_SEED_BITS)
-        handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, stat.S_IRUSR | stat.S_IWUSR)
-        with os.fdopen(handle, "w", encoding="ascii") as file:
-            file.write(f"{number}\n")
-            file.flush()
-            os.fsync(file.fileno())
-    if path.stat().st_mode & (stat.S_IRWXG | stat.S_IRWXO):
-        raise DatasetError(f"{path} may be read by others; run `chmod 600 {path}`, or draw another seed if it was seen")
-    text = InputFile(path, "give a file with one whole number", limit_bytes=SETTINGS_BYTES).text().strip()
-    if not (text.isascii() and text.isdigit() and len(text) < 20 and int(text) >= _LEAST_SEED):
-        raise DatasetError(f"{path} holds no secret seed: give one whole number of 2^56 or more, below 10^19")
-    return int(text)
+    assert request.secret_seed is not None  # `_check_folders`
+    return secret_seed(request.secret_seed, make_it)
 
 
 def _assigned(request: ReleaseRequest) -> dict[str, Path]:

@@ -44,6 +44,7 @@ from phibench.datasets.store.schema import (
     row_line,
 )
 from phibench.scenes.holder import OF_TUBES
+from phibench.scenes.random_streams import LARGEST_SEED
 from phibench.scenes.revolved_mirror import RevolvedMirror
 from phibench.scenes.rig import Rig
 from phibench.scenes.validation import nearest, printable_line
@@ -105,7 +106,7 @@ def from_json(kind: type[T], document: Any) -> T:
 _LATER = {"form", "form_radius_m", "coat", "window", "sun", "holder", "metal", "reflectance_table", *OF_TUBES}
 """Fields that older versions do not have, whose default is what these versions meant: `mirror.form` in version 4."""
 _LARGEST = 1e12
-_LARGEST_WHOLE = 2**63 - 1  # seeds and names of random streams
+_LARGEST_WHOLE = LARGEST_SEED  # seeds and names of random streams
 
 
 def _difference(given: Any, whole: Any, place: str = "its root") -> str:

@@ -53,10 +53,11 @@ class WriteError(OSError):
         return f"could not write {self.filename}: {self.strerror}; {advice}"
 
 
-def write_atomic(path: Path, write: Callable[[Path], None]) -> Path:
+def write_atomic(path: Path, write: Callable[[Path], None], *, secret: bool = False) -> Path:
     """Let `write` fill a temporary file in the folder of `path`, flush it to the disk, then rename it to `path`.
 
-    On any exception, a full disk and Ctrl-C included, the temporary file is removed and `path` is as before.
+    On any exception, a full disk and Ctrl-C included, the temporary file is removed and `path` is as before. A secret
+    file is its owner's alone (mode 600) from its first byte on.
 
     Raises
     ------
@@ -65,7 +66,7 @@ def write_atomic(path: Path, write: Callable[[Path], None]) -> Path:
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        _write_and_rename(path, write)
+        _write_and_rename(path, write, secret)
         _flush_folder(path.parent)
     except OSError as error:
         raise WriteError(path, error) from error
@@ -84,6 +85,15 @@ def write_bytes(path: Path, data: bytes) -> Path:
 def write_text(path: Path, text: str) -> Path:
     """Write `text` to `path` atomically, UTF-8, line ends as they are."""
     return write_bytes(path, text.encode())
+
+
+def write_secret(path: Path, text: str) -> Path:
+    """Write `text` to `path` atomically, for the eyes of its owner alone."""
+
+    def write(temporary: Path) -> None:
+        temporary.write_bytes(text.encode())
+
+    return write_atomic(path, write, secret=True)
 
 
 _KINDS = {stat.S_IFDIR: "a folder", stat.S_IFIFO: "a FIFO", stat.S_IFSOCK: "a socket"}
@@ -118,8 +128,8 @@ def remove_temporary(folder: Path) -> None:
             path.unlink(missing_ok=True)
 
 
-def _write_and_rename(path: Path, write: Callable[[Path], None]) -> None:
-    temporary = _temporary(path)
+def _write_and_rename(path: Path, write: Callable[[Path], None], secret: bool) -> None:
+    temporary = _temporary(path, secret)
     try:
         with owned(temporary):
             write(temporary)
@@ -130,10 +140,12 @@ def _write_and_rename(path: Path, write: Callable[[Path], None]) -> None:
         raise
 
 
-def _temporary(path: Path) -> Path:
-    """Name of a new empty file beside `path`, with its suffix and the permissions of an ordinary file."""
+def _temporary(path: Path, secret: bool) -> Path:
+    """Name of a new empty file beside `path`, with its suffix; unless secret, with an ordinary file's permissions."""
     handle, name = tempfile.mkstemp(prefix=TEMPORARY_PREFIX, suffix=path.suffix, dir=path.parent)
     os.close(handle)
+    if secret:  # mode 600, as the system makes it
+        return Path(name)
     umask = os.umask(0)
     os.umask(umask)
     Path(name).chmod(0o666 & ~umask)

@@ -31,6 +31,7 @@ def make(
     shard: str | None = None,
     samples: Whole | None = None,
     seed: Whole | None = None,
+    secret_seed: Path | None = None,
     replace: Annotated[bool, Parameter(negative="")] = False,
     room_files: Path | None = None,
     leave_out_refused: Annotated[bool, Parameter(negative="")] = False,
@@ -55,7 +56,9 @@ def make(
     samples
         How many samples to draw, instead of the recipe's number.
     seed
-        Root of all random streams, instead of the recipe's; a secret one for a set that is to be sealed.
+        Root of all random streams, instead of the recipe's. Other users of the machine see it in the list of processes.
+    secret_seed
+        File of a root of 128 bits, for a set that is to be sealed; it is drawn if the file is not there.
     replace
         Delete or make again finished work that does not fit, of another seed or recipe; what fits is kept.
     room_files
@@ -67,6 +70,8 @@ def make(
     """
     given: Any = {"shard": shard, "samples": samples, "seed": seed, "replace": replace, "room_files": room_files}
     given["leave_out_refused"] = leave_out_refused
+    if secret_seed is not None:
+        given["seed"] = _secret(secret_seed, seed, make_it=not dry_run)
     if wait_for_workers is not None and scheduler is None:
         from phibench.datasets.errors import DatasetError
 
@@ -84,6 +89,16 @@ def make(
         wait(scheduler, wait_for_workers)
     make_dataset(recipe, out, workers, scheduler=scheduler, **given)
     return 0
+
+
+def _secret(path: Path, seed: int | None, make_it: bool) -> int | None:
+    """Seed of a file; a dry run draws none, and takes the recipe's."""
+    from phibench.datasets.errors import DatasetError
+    from phibench.datasets.release.secret_seed import secret_seed as seed_of
+
+    if seed is not None:
+        raise DatasetError("--seed and --secret-seed are two seeds: give one of them")
+    return seed_of(path, make_it)
 
 
 @dataset.command

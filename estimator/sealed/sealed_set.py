@@ -33,14 +33,14 @@ from phibench.datasets.recipe.load import RECIPES, load_recipe
 from phibench.datasets.recipe.tables import Recipe
 from phibench.datasets.store.checksums import checksums_text, read_checksums
 from phibench.datasets.store.documents import to_json
-from phibench.datasets.store.files import WriteError, read_rows, sha256, write_bytes, write_text
+from phibench.datasets.store.files import WriteError, read_rows, sha256, write_bytes, write_secret, write_text
 from phibench.datasets.store.leftovers import OwnedFolder, folder_for_work
 from phibench.datasets.store.schema import SEALED_TRUTH, Document
 from phibench.estimator.benchmark.dataset_pairs import TASK_VERSION, DatasetPairs, dataset_pairs
 from phibench.estimator.interface import Box, Pair
 from phibench.estimator.sealed.truth_file import MOST_PAIRS, Digest, truth_text
 from phibench.scenes.camera import LARGEST_SIDE_PX
-from phibench.scenes.random_streams import generator
+from phibench.scenes.random_streams import LEAST_SECRET_SEED, generator
 
 SEAL, PAIRS, FRAMES, CHECKSUMS = "seal.json", "pairs.jsonl", "frames", "SHA256SUMS"
 FORMAT = "phibench sealed set 1"
@@ -140,7 +140,6 @@ def read_pairs(folder: Path) -> list[PublicPair]:
 _FILE_TIME_S = 315532800  # 1980-01-01: a file's own time would tell the order of the work
 _SALT_BYTES = 32
 _TRUTH_FILE = "seal_{}" + SEALED_TRUTH
-_SEED_BITS = 56
 
 
 @dataclass(frozen=True)
@@ -232,12 +231,12 @@ def seed_warnings(name: str, seed: int) -> tuple[str, ...]:
     if (RECIPES / f"{name}.toml").is_file() and load_recipe(name).dataset.seed == seed:
         return (
             f"seed {seed} is that of the shipped recipe '{name}': whoever has phibench can render the same truth, so "
-            "seal a set that was made with --seed and a secret number",
+            "seal a set that was made with --secret-seed FILE",
         )
-    if seed < 2**_SEED_BITS:
+    if seed < LEAST_SECRET_SEED:
         return (
             f"seed {seed} is short: the rigs in {PAIRS} show which seed they were drawn from to whoever tries all, so "
-            f"seal a set that was made with a random --seed above 2^{_SEED_BITS}",
+            "seal a set that was made with --secret-seed FILE, which has 128 bits of the system",
         )
     return ()
 
@@ -267,7 +266,7 @@ def _seal(pairs: DatasetPairs, folder: Path, work: Path, public: Path, console: 
     write_text(work / SEAL, json.dumps(document.model_dump(mode="json"), indent=1) + "\n")
     write_text(work / CHECKSUMS, checksums_text(_hashes(work)))
     warnings = earlier_warnings(folder)
-    truth_file = write_text(folder / _TRUTH_FILE.format(document.id), text)  # first: no seal without its truth
+    truth_file = write_secret(folder / _TRUTH_FILE.format(document.id), text)  # first: no seal without its truth
     _publish(work, public)
     name, recipe = pairs.dataset.info.name, pairs.dataset.recipe
     warnings += (

@@ -24,7 +24,7 @@ from phibench.estimator.cli.main import main
 from phibench.estimator.sealed.sealed_set import seal
 
 ROOT = Path(__file__).parents[3]
-SECRET = 2**62 + 12345
+SECRET = 2**128 + 12345
 
 
 # The frozen recipes.
@@ -210,7 +210,8 @@ def test_folders_and_seeds_that_will_not_do(made: Made, tmp_path: Path, smallest
     for number, mode, expected in (
         (SECRET, 0o600, "seed is not the one"),
         (SECRET, 0o644, "chmod 600"),
-        (7, 0o600, "2^56"),
+        (2**64, 0o600, "2^128"),
+        (2**129, 0o600, "2^128"),
     ):
         (tmp_path / "seed").write_text(f"{number}\n")
         (tmp_path / "seed").chmod(mode)

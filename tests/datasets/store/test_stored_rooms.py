@@ -192,9 +192,9 @@ def test_another_source_than_the_recipes_is_found(one: Path) -> None:
     assert "rooms.jsonl: room is not the room that the recipe gives" in faults
 
 
-@pytest.mark.parametrize(("number", "is_read"), [(2**62 + 12345, True), (2**63 - 1, True), (2**63, False)])
+@pytest.mark.parametrize(("number", "is_read"), [(2**62 + 12345, True), (2**129 - 1, True), (2**129, False)])
 def test_rooms_of_secret_seeds_are_read(number: int, is_read: bool) -> None:
-    """A seed of 62 bits stands in the name of a generated room's streams; it was refused, and such sets with it."""
+    """A secret seed stands in the name of a generated room's streams; it was refused, and such sets with it."""
     recipe = load_recipe("bench-test")
     source = next(iter(draw_rooms(recipe).values()))
     document = to_json(source)

@@ -6,6 +6,7 @@ import hashlib
 import json
 import math
 import shutil
+import stat
 from pathlib import Path
 from typing import Any
 
@@ -94,6 +95,7 @@ def test_no_public_file_holds_a_number_of_the_truth(bench_dataset: Path, sealed:
             assert [text for texts in secret for text in texts if text.encode() in content] == [], path.name
             checked += 1
     assert checked == 15
+    assert stat.S_IMODE(sealed.truth_file.stat().st_mode) == 0o600
     found = sealed.truth_file.read_text()
     assert [texts for texts in secret if not any(text in found for text in texts)] == []  # it finds them where they are
 
@@ -185,7 +187,8 @@ def test_seeds_that_can_be_found_are_warned_of() -> None:
     assert "seed 1 is that of the shipped recipe 'bench-test'" in known
     [short] = seed_warnings("bench-test", 123456)
     assert "seed 123456 is short" in short
-    assert seed_warnings("bench-test", 2**62 + 12345) == ()
+    assert seed_warnings("bench-test", 2**128 + 12345) == ()
+    assert "128 bits" in seed_warnings("bench-test", 2**127)[0]
     assert "short" in seed_warnings("mine", 0)[0]
 
 
