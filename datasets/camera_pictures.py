@@ -12,6 +12,7 @@ Pictures are turned upright as their EXIF orientation says. Other formats are re
 from __future__ import annotations
 
 import re
+import warnings
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -77,7 +78,11 @@ def read_camera_picture(file: InputFile, data: bytes | None = None) -> CameraPic
     if data[:2] == b"P5":
         return CameraPicture(_sealed(_pgm(file, data)), "raw")
     picture = file.picture(FORMATS, data)
-    with file.decoding("is a damaged picture"):  # what a decoder has not looked at yet: texts, tags and tables
+    with (
+        file.decoding("is a damaged picture"),
+        warnings.catch_warnings(),
+    ):  # what a decoder has not looked at yet: texts, tags and tables
+        warnings.simplefilter("ignore", UserWarning)  # of damaged tags, without the name of the file
         return _of_decoded(file, picture)
 
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.film.film_read import Film, open_films
 from phibench.datasets.parallel import parallel_map
-from phibench.datasets.store.files import write_atomic
+from phibench.datasets.store.files import require_file, write_atomic
 from phibench.scenes.validation import printable_line
 
 Codec = Literal["mjpeg", "yuyv"]
@@ -79,11 +79,12 @@ def read_frames(path: Path) -> Iterator[bytes]:
     """
     av = _av()
     try:
-        with av.open(str(path)) as container:
+        # as a file: a pipe would be waited for, and a name may be an address to the library
+        with require_file(path).open("rb") as file, av.open(file) as container:
             for packet in container.demux(video=0):
                 if packet.size:
                     yield bytes(packet)
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, LookupError, RuntimeError) as error:
         raise DatasetError(f"{path} is no video that can be read: {printable_line(str(error))}") from error
 
 

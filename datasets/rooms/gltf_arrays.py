@@ -50,6 +50,7 @@ class GltfDocument:
         if not str(version).startswith("2."):
             raise file.fault(f"is glTF {printable_line(str(version), 10)}: 2.0 is read")
         self._buffers: dict[int, bytes] = {}
+        self._rows: dict[str, list[dict[str, Any]]] = {}
         self._read = 0
 
     def _chunks(self, data: bytes) -> tuple[bytes, bytes]:
@@ -70,10 +71,12 @@ class GltfDocument:
 
     def rows(self, key: str) -> list[dict[str, Any]]:
         """List of tables at the root."""
-        found = self.tree.get(key, [])
-        if not isinstance(found, list) or not all(isinstance(one, dict) for one in found):
-            raise self.file.fault(f"is damaged: '{key}' is not a list of tables")
-        return found
+        if key not in self._rows:  # looked at once: a thousand nodes ask for it a thousand times
+            found = self.tree.get(key, [])
+            if not isinstance(found, list) or not all(isinstance(one, dict) for one in found):
+                raise self.file.fault(f"is damaged: '{key}' is not a list of tables")
+            self._rows[key] = found
+        return self._rows[key]
 
     def row(self, key: str, number: Any) -> dict[str, Any]:
         """Table by its number in a list at the root."""

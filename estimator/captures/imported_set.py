@@ -26,7 +26,7 @@ from phibench.datasets.camera_pictures import read_camera_picture
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.frames.frame_files import png_bytes
 from phibench.datasets.frames.sensor_card import SensorCard
-from phibench.datasets.input_files import SETTINGS_BYTES, FileName, InputFile, Name
+from phibench.datasets.input_files import SETTINGS_BYTES, FileName, InputFile, Name, below
 from phibench.datasets.store.checksums import checksums_text, read_checksums
 from phibench.datasets.store.documents import from_json, to_json
 from phibench.datasets.store.files import WriteError, read_rows, sha256, write_bytes, write_text
@@ -109,6 +109,8 @@ def import_pairs(folder: Path, out: Path, rig: Path | None = None, sensor: Path 
     """
     setting = read_setting(rig or folder / RIG_FILE, None, sensor or _there(folder / SENSOR_FILE))
     listed = read_pair_list(folder)
+    for name in {name for row in listed for names in row.files.values() for name in names}:
+        below(folder, name)  # what a link leads to elsewhere would be given away with the set
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise DatasetError(f"{out} exists and is not an empty folder; give a new one, --out")
     try:

@@ -18,7 +18,7 @@ from functools import partial
 from pathlib import Path
 
 from phibench.datasets.errors import DatasetError
-from phibench.datasets.input_files import FILE_NAME, MIB, InputFile, below
+from phibench.datasets.input_files import FILE_NAME, MIB, InputFile
 from phibench.datasets.shown_text import csv_text
 from phibench.datasets.store.files import write_text
 from phibench.datasets.store.schema import TruthFile
@@ -139,10 +139,10 @@ def photos_of(folder: Path, row: ListedPair, setting: Setting) -> PairPhotos:
     Raises
     ------
     DatasetError
-        As `read_photo` and `PairPhotos`, or if a link leads out of the folder.
+        As `read_photo` and `PairPhotos`.
     """
     groups = {
-        key: tuple(read_photo(below(folder, name), setting.known.rig, setting.sensor) for name in names)
+        key: tuple(read_photo(folder / name, setting.known.rig, setting.sensor) for name in names)
         for key, names in row.files.items()
     }
     return PairPhotos(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import json
 import os
 import resource
@@ -26,9 +27,9 @@ from phibench.datasets.input_files import InputFile
 from phibench.datasets.rooms.mesh_files import read_mesh
 from phibench.datasets.rooms.panorama_files import read_light
 from phibench.datasets.rooms.room_files import RoomFiles, checked_data
-from phibench.estimator.captures.pair_list import ListedPair, photos_of, read_pair_list
+from phibench.estimator.captures.imported_set import import_pairs
+from phibench.estimator.captures.pair_list import read_pair_list
 from phibench.estimator.sensor_fit.capture_folder import read_header
-from phibench.scenes.rig import Rig
 
 SOON_S = 10.0  # of a processor: the machine may have other work
 
@@ -210,20 +211,19 @@ def test_a_list_of_a_hundred_thousand_names_one_twice(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("link", ["file", "folder"])
-def test_links_out_of_a_folder_of_pairs(link: str, tmp_path: Path) -> None:
+def test_links_out_of_a_folder_that_becomes_a_data_set(link: str, tmp_path: Path) -> None:
     """What they lead to would become part of a data set that is given away."""
-    from phibench.estimator.captures.measure import Setting
-    from phibench.estimator.captures.rig_file import MeasuredRig
-
     folder, outside = tmp_path / "pairs", tmp_path / "private"
     for path in (folder, outside):
         path.mkdir()
         (path / "up.png").write_bytes(png())
     (outside / "down.png").write_bytes(png())
+    (folder / "rig.toml").write_text("[rig]\nfx_px = 1430.0\n")
     name = "down.png" if link == "file" else "inside/down.png"
     (folder / name.split("/")[0]).symlink_to(outside / "down.png" if link == "file" else outside)
-    row = ListedPair("a", {"down": (name,), "up": ("up.png",), "down_off": (), "up_off": ()}, 0.3)
-    assert "leads out of" in refusal(lambda: photos_of(folder, row, Setting(MeasuredRig(Rig(), None))))
+    (folder / "pairs.csv").write_text(f"name,down,up,stroke_m\na,{name},up.png,0.3\n")
+    assert "leads out of" in refusal(lambda: import_pairs(folder, tmp_path / "out"))
+    assert not (tmp_path / "out").exists()
     with pytest.raises(DatasetError, match="leads out of"):
         checked_data(folder, name, "0" * 64)
     with pytest.raises(DatasetError, match="leads out of"):
@@ -238,7 +238,8 @@ def test_links_within_a_folder_are_followed(tmp_path: Path) -> None:
 
 def test_pipes_in_an_export_are_faults(tmp_path: Path) -> None:
     (tmp_path / "export.json").write_text("{}")
-    (tmp_path / "SHA256SUMS").write_text(f"{'0' * 64}  pairs.parquet\n")
+    listed = {"export.json": hashlib.sha256(b"{}").hexdigest(), "pairs.parquet": "0" * 64}
+    (tmp_path / "SHA256SUMS").write_text("".join(f"{digest}  {name}\n" for name, digest in listed.items()))
     os.mkfifo(tmp_path / "pairs.parquet")
     os.mkfifo(tmp_path / "more")
     (tmp_path / "nowhere").symlink_to("gone")

@@ -1,0 +1,104 @@
+"""Every function that reads a file has a fuzz target: the modules are walked, and the targets are watched."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from attack.test_fuzz_readers import FEW, MANY, fuzz_a_file, outcome, read_dataset
+from attack.test_fuzz_rooms import as_room, written
+from helpers.fuzz_targets import ALWAYS_READ, ROOT, further_kinds, readers
+from helpers.valid_files import Kind, kinds, read_sealed, write_sealed
+
+from phibench.datasets.rooms.panorama_files import read_light
+
+NAMES = (
+    *("done.json", "spots.npz", "film.parquet", "film.avi", "MANIFEST.json", "set.part/fetch.json", "seed.txt"),
+    *("SHA256SUMS", "sensor.toml", "tables.jpg", "limit.txt", "pairs.csv", "rig.toml", "photo.raw", "capture.toml"),
+    *("frame.png", "descriptor.txt", "method.py", "network.onnx", "linear.hdr", "room.glb"),
+)
+OF_WRITERS = {
+    "datasets/film/film_video.py write": "encodes a film; it reads nothing",
+    "datasets/film/film_video.py write_frames": "the same",
+    "datasets/film/film_video.py write_mp4": "the same",
+    "datasets/store/layers.py _write": "writes a layer",
+}
+STILL_OPEN: set[str] = set()
+"""Readers without a target of their own yet; a new one must not join them."""
+
+
+@contextmanager
+def watched(seen: set[str]) -> Iterator[None]:
+    """Names of our functions that are entered meanwhile, as `readers` has them."""
+    places: dict[str, str] = {}
+
+    def enter(frame: object, event: str, _: object) -> None:
+        code = frame.f_code  # type: ignore[attr-defined]
+        if event == "call":
+            name = code.co_filename
+            if name not in places:
+                path = Path(name).resolve()
+                places[name] = path.relative_to(ROOT).as_posix() if path.is_relative_to(ROOT) else ""
+            seen.add(f"{places[name]} {code.co_name}")
+
+    before = sys.getprofile()
+    sys.setprofile(enter)
+    try:
+        yield
+    finally:
+        sys.setprofile(before)
+
+
+@pytest.fixture(scope="module")
+def further(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Kind]:
+    return further_kinds(tmp_path_factory.mktemp("further"))
+
+
+def test_every_reader_has_a_target(
+    further: dict[str, Kind], tmp_path: Path, smallest_dataset: Path, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    """Each target reads its valid file; the functions that it enters are those that it fuzzes."""
+    seen: set[str] = set()
+    reads: list[tuple[Callable[[Path], object], Path]] = []
+    for kind in (*kinds(tmp_path_factory.mktemp("valid")).values(), *further.values()):
+        path = tmp_path / kind.name.replace("/", "-of-") / kind.name
+        path.parent.mkdir(parents=True)
+        path.write_bytes(kind.data)
+        reads.append((kind.read, path))
+    for name in ("glb", "ply", "obj", "hdr", "exr"):
+        (tmp_path / f"of-{name}").mkdir()
+        reads.append((as_room if name in ("glb", "ply", "obj") else read_light, written(tmp_path / f"of-{name}", name)))
+    reads += [(read_sealed, write_sealed(tmp_path / "sealed")), (read_dataset, smallest_dataset)]
+    for read, path in reads:
+        with watched(seen):
+            assert outcome(read, path) == "read" or path.name == "room.glb", path
+    every = set(readers(ROOT))
+    assert len(every) > 60
+    assert sorted(every - seen - set(OF_WRITERS) - STILL_OPEN) == []
+    assert set(OF_WRITERS) | STILL_OPEN <= every
+    assert not STILL_OPEN & seen  # else it needs no excuse
+
+
+def test_a_new_reader_without_a_target_is_seen(tmp_path: Path) -> None:
+    for folder in ("scenes", "render", "datasets", "estimator"):
+        (tmp_path / folder).mkdir()
+    (tmp_path / "datasets" / "a.py").write_text("def read_it(path):\n    return InputFile(path, '').json()\n")
+    (tmp_path / "render" / "b.py").write_text(
+        "def f(p):\n    return Image.open(p)\n\ndef g(p):\n    return open_it(p)\n"
+    )
+    assert list(readers(tmp_path)) == ["render/b.py f", "datasets/a.py read_it"]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_damaged_file_is_read_or_refused(name: str, further: dict[str, Kind], tmp_path: Path) -> None:
+    assert set(further) == set(NAMES)
+    fuzz_a_file(further[name], tmp_path, FEW, always_read=name in ALWAYS_READ)
+
+
+@pytest.mark.study
+@pytest.mark.parametrize("name", NAMES)
+def test_hundreds_of_damaged_files_are_read_or_refused(name: str, further: dict[str, Kind], tmp_path: Path) -> None:
+    fuzz_a_file(further[name], tmp_path, MANY, always_read=name in ALWAYS_READ)
