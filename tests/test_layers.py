@@ -30,7 +30,7 @@ render/setup
 render/room
 render/plugins
 datasets/errors
-datasets/parallel datasets/progress datasets/input_files datasets/version
+datasets/parallel datasets/progress datasets/input_files datasets/version datasets/shown_text
 datasets/camera_pictures
 datasets/rooms
 datasets/recipe

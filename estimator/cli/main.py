@@ -247,7 +247,16 @@ def _is_users(error: Exception) -> bool:
 
     known = (SceneError, DatasetError, MethodError, OSError, MemoryError)
     # errors of the renderer's own (sensor, variant, LLVM) are sentences too; scoring does not import the renderer
-    return isinstance(error, known) or type(error).__module__.startswith("phibench.render.")
+    return isinstance(error, known) or _lacks_memory(error) or type(error).__module__.startswith("phibench.render.")
+
+
+_NO_MEMORY = ("failed to map segment", "annot allocate memory", "can't start new thread")
+
+
+def _lacks_memory(error: Exception) -> bool:
+    """True if memory or the address space (`ulimit -v`) has ended, also where a library is loaded late."""
+    late = isinstance(error, (ImportError, RuntimeError)) and any(words in str(error) for words in _NO_MEMORY)
+    return late or isinstance(error, MemoryError)
 
 
 def _sentence(error: Exception) -> str:
@@ -255,7 +264,7 @@ def _sentence(error: Exception) -> str:
     text = str(error)
     if isinstance(error, OSError) and error.strerror and type(error).__module__ == "builtins":
         text = f"{error.strerror}: {error.filename}" if error.filename else str(error.strerror)
-    if isinstance(error, MemoryError):
+    if _lacks_memory(error):
         text = f"out of memory; free some, or take less at a time {f'({text})' if text else ''}".rstrip()
     lines = text[:_MOST].splitlines()
     return "\n".join("".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in x) for x in lines)
