@@ -77,9 +77,11 @@ def _found(mi: ModuleType, surfaces: Surfaces, texels: Texels, rays: int, seed: 
         some = rays * min(each, len(texels) - first)
         lane = dr.arange(mi.UInt32, some) + dr.opaque(mi.UInt32, first * rays)
         texel = lane // count
-        local = mi.warp.square_to_cosine_hemisphere(mi.Point2f(*points(mi, shifts(mi, texel, 2, key), lane % count)))
+        x = points(mi, shifts(mi, texel, 2 if texels.spread is None else 3, key), lane % count)
+        local = mi.warp.square_to_cosine_hemisphere(mi.Point2f(x[0], x[1]))
         way = mi.Frame3f(dr.gather(mi.Vector3f, texels.normals, texel)).to_world(local)
-        ray = mi.Ray3f(dr.gather(mi.Point3f, texels.points, texel), way)
+        start = dr.gather(mi.Point3f, texels.points, texel)
+        ray = mi.Ray3f(start if texels.spread is None else texels.spread.start(mi, start, texel, x[2]), way)
         t, patch, valid = surfaces.hit(ray, coherent=False)
         met = _Met(patch, ray(t), way, valid, mi.Bool(False), mi.Float(1.0))
         if surfaces.has_coats:

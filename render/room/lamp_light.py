@@ -131,23 +131,26 @@ def _lamp_rays(
     numbers = [dr.opaque(mi.Float, float(value)) for value in lamp]
     is_screen = bool(surfaces.table.is_radiance[int(lamp[13])])
     count, key, patch = (dr.opaque(mi.UInt32, value) for value in (rays, seed, int(lamp[13])))
-    shift = shifts(mi, lanes, 2, key)
+    spread = texels.spread
+    shift = shifts(mi, lanes, 2 if spread is None else 3, key)
     dr.eval(shift)
 
     def body(i: Any, total: Any, weights: Any, seen: Any) -> tuple[Any, Any, Any, Any]:
-        a, b = (x - 0.5 for x in points(mi, shift, i))
+        x = points(mi, shift, i)
+        a, b = x[0] - 0.5, x[1] - 0.5
+        start = point if spread is None else spread.start(mi, point, lanes, x[2])
         place = mi.Point3f(*(numbers[k] + a * numbers[3 + k] + b * numbers[6 + k] for k in range(3)))
-        way = place - point
+        way = place - start
         r2 = dr.squared_norm(way)
         r = dr.sqrt(r2)
         way /= r
         cos_here, cos_lamp = dr.dot(way, normal), -dr.dot(way, mi.Vector3f(*numbers[9:12]))
         faces = (cos_here > 0.0) & (cos_lamp > 0.0)
-        ray = mi.Ray3f(point, way)
+        ray = mi.Ray3f(start, way)
         ray.maxt = r - _LAMP_GAP_MM
         free = faces & ~surfaces.scene.ray_test(ray, coherent=True, active=faces)
         if mirror is not None:
-            free &= ~mirror.meets(point, way)[0]  # lamps are never nearer than the mirror
+            free &= ~mirror.meets(start, way)[0]  # lamps are never nearer than the mirror
         weight = dr.select(faces, cos_here * cos_lamp / r2, 0.0)
         arrives = mi.Float(1.0) if coat is None else transmitted(surfaces, coat, cos_here)
         part = dr.select(free, weight * arrives, 0.0)

@@ -2,6 +2,7 @@
 
 First what comes from lamps and the sun (`lamp_light`), then the bounces over a coarse grid (`bounced_light`). Last a
 gather over the fine grid from the full map, in two independent halves; what both agree on is smoothed (`smoothed`).
+Rays start all over a texel: it holds the mean of the light on what is free of it, and a shadow's edge moves by nothing.
 The mirror ball itself (12 cm), its holder and the carriage are left out of the room's light. Carriage and holder are
 lit by the map when a view is rendered.
 
@@ -33,7 +34,7 @@ from phibench.render.room.lamp_light import direct_light
 from phibench.render.room.mirror_light import mirror_body, mirror_light
 from phibench.render.room.surfaces import Surfaces
 from phibench.render.room.texel_grid import TexelGrid
-from phibench.render.room.texel_points import Texels, covered_texels, filled
+from phibench.render.room.texel_points import Texels, covered_texels, filled, spread_out
 from phibench.render.setup.variant import activate
 from phibench.scenes.faces import face_table
 from phibench.scenes.frames import Array, BoolArray
@@ -99,8 +100,7 @@ def bake(view: View, room: Room, settings: BakeSettings) -> LightMap:
     if not grid.count:  # all surfaces shine by themselves
         none = np.zeros((0, 3), dtype=np.float32)
         return LightMap(none, none, np.zeros(0, dtype=bool))
-    fine = Texels.of(mi, surfaces, grid)
-    covered = covered_texels(mi, surfaces, fine, settings.texel_m)
+    fine, covered = _spread_texels(mi, surfaces, grid, settings.texel_m)
     surfaces.set_light(fine.grid, np.zeros((len(fine), 3)))
     direct = direct_light(mi, surfaces, fine, room.sun, settings.lamp_rays, _SEED)
     one, other = (filled(half, covered, fine.grid) for half in direct)
@@ -115,14 +115,22 @@ def bake(view: View, room: Room, settings: BakeSettings) -> LightMap:
     return LightMap(total.astype(np.float32), np.hypot(noise, sigma).astype(np.float32), covered)
 
 
+def _spread_texels(mi: ModuleType, surfaces: Surfaces, grid: TexelGrid, near_m: float) -> tuple[Texels, BoolArray]:
+    """Texels whose values are means over what is free of them, and which of them are covered."""
+    texels = Texels.of(mi, surfaces, grid)
+    spread = spread_out(mi, surfaces, texels)
+    assert spread.spread is not None
+    return spread, covered_texels(mi, surfaces, texels, near_m) & spread.spread.hidden
+
+
 def _indirect(
     mi: ModuleType, surfaces: Surfaces, fine: Texels, covered: BoolArray, settings: BakeSettings
 ) -> tuple[Array, Array]:
     """Irradiance by all surfaces, from the present map, and its standard error, shape (texels, 3) each."""
     texels, hidden = fine, covered
     if settings.indirect_texel_m > settings.texel_m:
-        texels = Texels.of(mi, surfaces, TexelGrid.of(surfaces.table, settings.indirect_texel_m))
-        hidden = covered_texels(mi, surfaces, texels, settings.texel_m)
+        grid = TexelGrid.of(surfaces.table, settings.indirect_texel_m)
+        texels, hidden = _spread_texels(mi, surfaces, grid, settings.texel_m)
     # two independent halves: half their difference is the standard error of their mean
     halves = [
         filled(gathered(mi, surfaces, texels, settings.final_rays, 2 + 2 * i), hidden, texels.grid) for i in (0, 1)

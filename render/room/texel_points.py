@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import ModuleType
 from typing import Any
 
@@ -17,9 +17,53 @@ from phibench.scenes.frames import Array, BoolArray
 _LIFT_MM = 0.05  # rays start this far in front of their surface
 
 
+_SIDE = 4  # places along a texel's side
+_PLACES = _SIDE * _SIDE
+# numbers of places along a curve that fills the texel: neighbours on it are neighbours there
+_CURVE = np.array([0, 1, 5, 4, 8, 12, 13, 9, 10, 14, 15, 11, 7, 6, 2, 3])
+_CLEAR = 0.25  # texels: what is nearer stands against the place
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Places all over texels from which rays start, so that what they gather is a mean over what is free of a texel.
+
+    Attributes
+    ----------
+    across, up : Dr.Jit
+        Sides of the texels, mm.
+    places, free : Dr.Jit
+        Numbers of the places of each texel, 16 for each, those that are free first; and how many these are.
+    hidden : bool array, shape (texels,)
+        Where no place is free.
+    """
+
+    across: Any
+    up: Any
+    places: Any
+    free: Any
+    hidden: BoolArray
+
+    def start(self, mi: ModuleType, middle: Any, texel: Any, x: Any) -> Any:
+        """Starts of rays of texels with these middles, by uniform deviates; the middles where no place is free."""
+        import drjit as dr
+
+        free = dr.gather(mi.Float, self.free, texel)
+        number = mi.UInt32(dr.minimum(x * free, dr.maximum(free - 1.0, 0.0)))
+        place = dr.gather(mi.UInt32, self.places, texel * _PLACES + number)
+        across, up = (dr.gather(mi.Vector3f, side, texel) for side in (self.across, self.up))
+        return middle + dr.select(free > 0.0, _offset(mi, place, across, up), 0.0)
+
+
+def _offset(mi: ModuleType, place: Any, across: Any, up: Any) -> Any:
+    """Ways from the middle of texels to places on them."""
+    a, b = ((mi.Float(k) + 0.5) / _SIDE - 0.5 for k in (place % _SIDE, place // _SIDE))
+    return a * across + b * up
+
+
 @dataclass(frozen=True)
 class Texels:
-    """Points just in front of texels, and normals: Dr.Jit arrays and NumPy's (mm)."""
+    """Points just in front of texels, and normals: Dr.Jit arrays and NumPy's (mm); places on them, or middles alone."""
 
     grid: TexelGrid
     points: Any
@@ -27,6 +71,7 @@ class Texels:
     points_mm: Array
     normals_world: Array
     coat: Any
+    spread: Spread | None = None
 
     @staticmethod
     def of(mi: ModuleType, surfaces: Surfaces, grid: TexelGrid, first: int = 0) -> Texels:
@@ -52,6 +97,38 @@ def covered_texels(mi: ModuleType, surfaces: Surfaces, texels: Texels, texel_m: 
     outward = np.einsum("ni,ni->n", normal, texels.normals_world) > 0.0
     # what is nearer than half a texel stands against this one
     return np.asarray(~valid | (outward & ~two_sided) | near)
+
+
+def spread_out(mi: ModuleType, surfaces: Surfaces, texels: Texels) -> Texels:
+    """Texels whose rays start all over them, but not below what stands there, nor beyond the patch's outline."""
+    import drjit as dr
+
+    grid, table, (patch, _) = texels.grid, surfaces.table, texels.grid.patch()
+    sides = MM_PER_M * table.size_m[patch] / np.stack([grid.columns, grid.rows], axis=1)[patch]
+    across, up = (_vector(mi, sides[:, [k]] * axis[patch]) for k, axis in enumerate((table.x_axis, table.y_axis)))
+    lane = dr.arange(mi.UInt32, len(texels) * _PLACES)
+    texel = lane // _PLACES
+    way, over, aside = (dr.gather(mi.Vector3f, one, texel) for one in (texels.normals, across, up))
+    start = dr.gather(mi.Point3f, texels.points, texel) + _offset(mi, lane % _PLACES, over, aside)
+    down = mi.Ray3f(start, -way)
+    down.maxt = 3.0 * _LIFT_MM
+    _, below, on_face = surfaces.hit(down)
+    own = dr.gather(mi.UInt32, mi.UInt32(aligned(patch, np.uint32)), texel)
+    t, above, met = surfaces.hit(mi.Ray3f(start, way))
+    # the back of a face that has one side alone is seen from inside a solid
+    outward = dr.dot(dr.gather(mi.Vector3f, _vector(mi, table.normal), above, met), way) > 0.0
+    inside = outward & (dr.gather(mi.Float, mi.Float(aligned(table.two_sided)), above, met) == 0.0)
+    clear = t > dr.gather(mi.Float, mi.Float(aligned(_CLEAR * sides.min(axis=1))), texel)
+    found = on_face & (below == own) & met & ~inside & clear
+    dr.eval(found)
+    free = np.array(found, dtype=bool).reshape(-1, _PLACES)[:, _CURVE]
+    count, order = free.sum(axis=1), _CURVE[np.argsort(~free, axis=1, kind="stable")]
+    places = mi.UInt32(aligned(order, np.uint32))
+    return replace(texels, spread=Spread(across, up, places, mi.Float(aligned(count)), count == 0))
+
+
+def _vector(mi: ModuleType, values: Array) -> Any:
+    return mi.Vector3f(*(mi.Float(aligned(values[:, i])) for i in range(3)))
 
 
 def filled(values: Array, covered: BoolArray, grid: TexelGrid) -> Array:

@@ -29,7 +29,7 @@ ROOM, RIG = lab(TARGETS), default_rig()
 SETTINGS = BakeSettings(texel_m=0.5, indirect_texel_m=1.0, lamp_rays=16, bounces=2, bounce_rays=8, final_rays=16)
 LAMPS = sum(isinstance(one, Rectangle) and one.emits for one in ROOM.surfaces)
 A_LAMP = 3  # its first rays, then those of both halves
-GRIDS = 3  # of lamps, bounces and surfaces: which of their texels are covered
+GRIDS = 3 + 2  # of lamps, bounces and surfaces: which of their texels are covered; and where two of them are free
 GATHERS = 3  # of the bounces, and of two halves; each fits into the memory at once here
 
 
