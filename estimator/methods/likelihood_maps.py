@@ -114,6 +114,12 @@ def _median(values: Array) -> float:
     return float(np.median(values)) if values.size else 0.0
 
 
+def place_covariance(one: SpotLikelihood) -> Array:
+    """Covariance of the place, shape (2, 2), pixels squared, by the curvature at the best hypothesis."""
+    _, _, fisher = one.scores(one.theta[None], 0)
+    return covariance_bound(fisher[0]) * one.excess
+
+
 def likelihood_map(one: SpotLikelihood) -> LikelihoodMap | None:
     """Map of all places near the fit whose misfit is within the range of the least; None if the fit has no place."""
     misfit, _, fisher = (part[0] for part in one.scores(one.theta[None], 0))

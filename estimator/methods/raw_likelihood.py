@@ -31,7 +31,7 @@ from phibench.estimator.geometry.status import Status, describe
 from phibench.estimator.interface import Answer, Image, Matrix2, Pair, Spot
 from phibench.estimator.methods.chain_fit import chain_fit, spot_likelihood
 from phibench.estimator.methods.fit_place import at_detection, kept
-from phibench.estimator.methods.likelihood_maps import SpotLikelihood, likelihood_map, of_pixels
+from phibench.estimator.methods.likelihood_maps import SpotLikelihood, likelihood_map, of_pixels, place_covariance
 from phibench.estimator.methods.locate import (
     SearchRegion,
     SharedPair,
@@ -140,6 +140,7 @@ def _fitted_spot(fit: SpotFit, count: int) -> Spot:
 
 
 _SIDE_PX = {True: 15, False: 9}  # with a laser-off frame, and without: a level is flat over a few pixels only
+_OTHER_SHAPE = 4.0  # by which a claim's variance exceeds the model's own where the light is not the model's
 _MOST_CHI2 = 24.0  # of one degree of freedom: 1e-6 by chance
 
 _each = each_spot_twice(raw_maximum_likelihood)
@@ -218,7 +219,10 @@ def _raw(pair: Pair, separate: Answer) -> Answer:
     starts = [np.array([spot.uv_px], float) for spot in (separate.down, separate.up)]
     depth_m = seen_depth_m(pair, separate)
     down, up = (raw_spot_data(pair, p, start[0], depth_m) for p, start in zip(POSITIONS, starts, strict=True))
-    found = _posterior(pair, [of_pixels(one, start[0]) for one, start in zip((down, up), starts, strict=True)])
+    likelihoods = [of_pixels(one, start[0]) for one, start in zip((down, up), starts, strict=True)]
+    if any(_of_other_shape(getattr(separate, p), one) for p, one in zip(POSITIONS, likelihoods, strict=True)):
+        return _combined(pair, separate)
+    found = _posterior(pair, likelihoods)
     if found is not None and found.status == Status.OK:
         return separate if not found.misfit < _MOST_CHI2 else _posterior_answer(found)
     return _answer(fit_joint(pair.rig, pair.stroke_m, down, up, *starts), separate)
@@ -229,6 +233,16 @@ def _processed(pair: Pair, separate: Answer) -> Answer:
     found = _posterior(pair, [spot_likelihood(pair, p, getattr(separate, p), depth_m) for p in POSITIONS])
     if found is not None and found.status == Status.OK:
         return separate if not found.misfit < _MOST_CHI2 else _posterior_answer(found)
+    return _combined(pair, separate)
+
+
+def _of_other_shape(spot: Spot, one: SpotLikelihood) -> bool:
+    """True if a fit claims far more than the model's likelihood: its light has another shape, as on an edge."""
+    return bool(np.trace(np.array(spot.covariance_px2)) > _OTHER_SHAPE * np.trace(place_covariance(one)))
+
+
+def _combined(pair: Pair, separate: Answer) -> Answer:
+    """Answer from both positions and their claims, pixels left aside."""
     (uv1, C1), (uv2, C2) = (
         (np.array([spot.uv_px], float), np.array([spot.covariance_px2], float)) for spot in (separate.down, separate.up)
     )

@@ -168,6 +168,30 @@ def test_rows_of_packages_see_the_laser_alone(name: str) -> None:
     assert beside == pytest.approx(plain, abs=1e-6)
 
 
+def test_the_joint_fit_believes_both_claims_where_the_light_has_another_shape() -> None:
+    """A beam on an edge, two halves 2 px apart: the model's own sigma is 0.007 px, the separate fits claim the shape.
+
+    One epipolar constraint adds to four coordinates, so that it takes at most the variance of one of two in an image.
+    """
+    pair, truth = easy("mono-raw", 1), EasyPairs("mono-raw").truth(1)
+    torn = {}
+    for name in ("down", "up"):
+        on, off = (getattr(pair, key).astype(float) for key in (name, f"{name}_off"))
+        torn[name] = np.rint(off + 0.5 * (on - off + np.roll(on - off, 2, axis=0))).astype(np.uint16)
+    both = replace(pair, **torn)
+    alone, joint = KNOWN["raw_maximum_likelihood"](both), KNOWN["joint_fit"](both)
+    for name in ("down", "up"):
+        claimed, mine = (np.array(getattr(one, name).covariance_px2) for one in (alone, joint))
+        assert math.sqrt(np.trace(claimed)) > 0.1
+        assert np.linalg.eigvalsh(mine)[1] > 0.2 * np.linalg.eigvalsh(claimed)[1]
+        u, v = getattr(truth, name).uv_px
+        off_px = np.array(getattr(joint, name).uv_px) - (u, v + 1.0)
+        assert off_px @ np.linalg.solve(mine, off_px) < 18.4  # chi2 of two, chance 1e-4
+    plain = KNOWN["joint_fit"](pair)
+    assert plain.down.covariance_px2 is not None
+    assert math.sqrt(np.trace(plain.down.covariance_px2)) < 0.05
+
+
 # -- refusals ---------------------------------------------------------------------------------------------------------
 
 
