@@ -221,7 +221,10 @@ def _in_stratum(one: ScoreDocument, wanted: StratumScore) -> str:
     for stratum in one.strata:
         if (stratum.by, stratum.label) == (wanted.by, wanted.label):
             found, _ = shown_parts("detection_rate", stratum.metrics["detection_rate"])
-            return f"{found}; {_cut(' '.join(shown_parts('median_px', stratum.metrics['median_px'])))}"
+            median = cell_parts(
+                stratum.metrics["median_px"].estimate, METRICS["median_px"].shown[0], 2, significant=True
+            )
+            return f"{found}; {_cut(' '.join(median))}"
     return ""
 
 
@@ -261,7 +264,8 @@ def results_page(parts: Sequence[Part], by: str = "phi") -> str:
 def _titled(grid: Grid) -> str:
     """Table in Markdown below its title in bold."""
     _, _, rest = markdown(grid).partition("\n\n")
-    return f"**{markdown_text(grid.title)}**\n\n{rest}"
+    lines = [line if line.startswith("|") else textwrap.fill(line, 120) for line in rest.split("\n")]
+    return "\n".join([f"**{markdown_text(grid.title)}**", "", *lines])
 
 
 def _item(note: str) -> str:

@@ -25,7 +25,7 @@ from rich.text import Text
 from phibench.datasets.shown_text import csv_text, latex_text, markdown_cell, markdown_text
 from phibench.estimator.benchmark.causes import CAUSES, KINDS, NOISE, TAKEN_FOR
 from phibench.estimator.benchmark.compare import Difference
-from phibench.estimator.benchmark.document import ScoreDocument, Value
+from phibench.estimator.benchmark.document import ScoreDocument, Spread, Value
 from phibench.estimator.benchmark.intervals import Estimate
 from phibench.estimator.benchmark.metrics import CHOSEN, METRICS, RANKS, applies
 from phibench.estimator.methods.registry import REFUSED
@@ -218,15 +218,20 @@ def frames_line(document: ScoreDocument) -> str:
 
 
 def light_line(document: ScoreDocument) -> str:
-    """Sentence on how far the light, to which a score refers, lies from the beam's axis; "" where nobody knows."""
+    """Sentences on how far the light, to which a score refers, lies from the beam's axis; "" where nobody knows."""
     shift, depth = (document.light.get(name) for name in ("shift_px", "depth_m"))
     if shift is None:
         return ""
-    of_depth = "" if depth is None else f"; D of the two differs by {1e3 * depth.median:.2g} mm, {1e3 * depth.high:.2g}"
-    return (
-        f"Scores refer to the centre of the light: {1e3 * shift.median:.2g} mpx from the beam's axis (median), "
-        f"{1e3 * shift.high:.2g} mpx at worst{of_depth}{' mm at worst' * (depth is not None)}."
+    text = (
+        f"Scores refer to the centre of the light. It is {_median_and_most(shift)} mpx at worst from the beam's axis."
     )
+    return text if depth is None else f"{text} D of the two differs by {_median_and_most(depth)} mm at worst."
+
+
+def _median_and_most(spread: Spread) -> str:
+    """Median and largest value of a spread, in thousandths, two digits."""
+    median, most = (f"{float(f'{1e3 * x:.2g}'):g}" for x in (spread.median, spread.high))
+    return f"{median} (median) and {most}"
 
 
 # -- lines beside the tables ---------------------------------------------------------------------------------------
