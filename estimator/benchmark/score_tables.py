@@ -203,7 +203,7 @@ def _pairs_in_words(document: ScoreDocument) -> str:
 
 
 def frames_line(document: ScoreDocument) -> str:
-    """Sentence on how the frames of a score were taken; "" where nobody knows."""
+    """Sentences on how the frames of a score were taken; "" where nobody knows."""
     shown = {
         "exposure_s": ("exposure", 1e3, "ms"),
         "analogue_gain": ("gain", 1.0, ""),
@@ -212,9 +212,12 @@ def frames_line(document: ScoreDocument) -> str:
         "lamp_level": ("lamps", 1.0, ""),
     }
     there = {name: spread for name in shown if (spread := document.frames.get(name)) is not None}
-    words = [f"{shown[name][0]} {spread.text(*shown[name][1:])}" for name, spread in there.items()]
+    words = {name: f"{shown[name][0]} {spread.text(*shown[name][1:])}" for name, spread in there.items()}
+    levels = [words.pop(name) for name in ("laser_level", "lamp_level") if name in words]
     draws = f"{document.draws} draw{'s' * (document.draws != 1)} of the noise"
-    return f"Frames: {', '.join([*words, draws])}." if "exposure_s" in there else ""
+    return (
+        f"Frames: {', '.join(words.values())}. Light: {', '.join([*levels, draws])}." if "exposure_s" in there else ""
+    )
 
 
 def light_line(document: ScoreDocument) -> str:
