@@ -23,6 +23,7 @@ from phibench.render.optics.room_tracer import RoomGeometry, room_geometry
 from phibench.render.optics.truth import spot_truth
 from phibench.render.plugins.plugin_tree import Picture, Plugin, Rgb, Value
 from phibench.render.plugins.room_plugins import diffuse, placed
+from phibench.scenes.faces import FaceTable, IntArray
 from phibench.scenes.frames import Array, Pose, Vector, as_matrix, as_vector
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.rig import View
@@ -109,12 +110,27 @@ def _on_faces(spot: LaserSpot, geometry: RoomGeometry, mirror_m: Array) -> list[
     steps = _reach(spot) * np.linspace(-1.0, 1.0, _PROBES)
     disc = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
     met = deposit(spot, geometry, disc)
-    patches = np.unique(met.patch[met.lit])
-    return [_on_face(spot, geometry, int(patch), mirror_m) for patch in patches]
+    planes = _planes(geometry.without_robot.table, np.unique(met.patch[met.lit]))
+    return [_on_plane(spot, geometry, patches, mirror_m) for patches in planes]
 
 
-def _on_face(spot: LaserSpot, geometry: RoomGeometry, patch: int, mirror_m: Array) -> Lit:
-    beam, table = np.array(spot.beam_direction_world), geometry.without_robot.table
+def _planes(table: FaceTable, patches: IntArray) -> list[list[int]]:
+    """Faces by their planes: triangles of a wall share a rectangle, two at one place would hide each other."""
+    planes: list[list[int]] = []
+    for patch in map(int, patches):
+        normal, centre = table.normal[patch], table.centre_m[patch]
+        for plane in planes:
+            apart = abs((table.centre_m[plane[0]] - centre) @ normal)
+            if normal @ table.normal[plane[0]] > 1.0 - 1e-9 and apart < 1e-5:
+                plane.append(patch)
+                break
+        else:
+            planes.append([patch])
+    return planes
+
+
+def _on_plane(spot: LaserSpot, geometry: RoomGeometry, patches: list[int], mirror_m: Array) -> Lit:
+    beam, table, patch = np.array(spot.beam_direction_world), geometry.without_robot.table, patches[0]
     normal = table.normal[patch]
     normal = -normal if normal @ beam > 0.0 else normal
     cos = float(-normal @ beam)
@@ -129,10 +145,10 @@ def _on_face(spot: LaserSpot, geometry: RoomGeometry, patch: int, mirror_m: Arra
     points = centre + x[..., None] * axes[:, 0] + y[..., None] * axes[:, 1]
     disc = (points - np.array(spot.position_world_m)) @ np.stack(spot.across_beam(), axis=1)
     light = deposit(spot, geometry, disc.reshape(-1, 2) / spot.scale_m)
-    here = (light.patch == patch).reshape(x.shape)
+    here = np.isin(light.patch, patches).reshape(x.shape)
     radius = np.linalg.norm(disc, axis=-1)
     strength = np.where(here, light.strength.reshape(x.shape), 0.0)
-    coat = float(light.coat[light.patch == patch].max(initial=0.0))
+    coat = float(light.coat[here.ravel()].max(initial=0.0))
     if coat > 0.0:
         towards = (mirror_m - points) / np.linalg.norm(mirror_m - points, axis=-1, keepdims=True)
         strength = strength * transmittance(np.maximum(towards @ normal, 0.0), np.full(x.shape, coat))

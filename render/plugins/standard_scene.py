@@ -20,7 +20,9 @@ from phibench.scenes.rig import View
 from phibench.scenes.room import MIRROR_NAME, Room
 
 Light = Literal["all", "ambient", "spot"]
-_SPOT_DEPTH = 2  # over the mirror: the layer has none of the light that the room sends back
+_SPOT_DEPTH = (
+    4  # over the mirror, and through what a mask leaves open: the layer has none of the light that the room sends back
+)
 LIGHTS: tuple[Light, ...] = ("all", "ambient", "spot")
 
 
