@@ -166,6 +166,7 @@ def main(tokens: Sequence[str] | None = None) -> int:
         os.environ.setdefault(name, value)
     try:
         _refuse_strange(sys.argv[1:] if tokens is None else tokens)
+        _refuse_little_memory(sys.argv[1:] if tokens is None else tokens)
         with _orderly_stop(), _told(sys.argv[1:] if tokens is None else tokens):
             return int(app(tokens, exit_on_error=False) or 0)
     except CycloptsError:
@@ -232,6 +233,21 @@ def _refuse_strange(tokens: Sequence[str]) -> None:
     for token in tokens:
         if "\0" in token or any("\ud800" <= c <= "\udfff" for c in token):
             raise DatasetError(f"the argument {token!r} is not UTF-8, or has a zero byte; give another name")
+
+
+LEAST_ADDRESSES = 800 << 20
+"""Bytes of address space; with less, the library of linear algebra asks for memory again and again, or ends."""
+
+
+def _refuse_little_memory(tokens: Sequence[str]) -> None:
+    """Refuse to start where `ulimit -v` leaves too little."""
+    if sys.platform == "win32" or not set(tokens) - {"--version", "--help"}:
+        return
+    import resource
+
+    limit, _ = resource.getrlimit(resource.RLIMIT_AS)
+    if 0 <= limit < LEAST_ADDRESSES:
+        raise MemoryError(f"`ulimit -v` allows {limit >> 20} MB of addresses, {LEAST_ADDRESSES >> 20} MB are needed")
 
 
 def _is_incomplete(error: Exception) -> bool:
