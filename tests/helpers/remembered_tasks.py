@@ -1,4 +1,4 @@
-"""Tasks that a test process has done before: their files and results, by the task's key.
+"""Tasks that a test process has done before: their files and results, by the task's name and key.
 
 A task is a pure function of its key, which `test_two_runs_are_byte_identical_whatever_the_number_of_workers` and the
 tests of workers and kills show by rendering again. Tests of journals, orders, refusals and repairs need not.
@@ -19,7 +19,7 @@ _CODE = re.compile(
     r"phibench\.(scenes|render)\.|phibench\.datasets\.(rooms\.|build\.\w+_task$|store\.(layers|pictures)$)"
 )
 _MOST_BYTES = 200_000_000
-_KEPT: dict[tuple[str, int], tuple[Made, dict[str, bytes]]] = {}
+_KEPT: dict[tuple[str, str, int], tuple[Made, dict[str, bytes]]] = {}
 _STATES: list[list[Any]] = []  # they hold what they name, so that no address is given twice
 
 
@@ -36,13 +36,15 @@ def _state() -> int:
 
 @dataclass(frozen=True)
 class Remembered:
-    """Function of a task that is called once for each key."""
+    """Function of a task that is called once for each name and key."""
 
     task: Task
 
     def __call__(self, out: Path, *arguments: Any) -> Made:
         """Write the files that the task wrote before, or do it."""
-        if known := _KEPT.get((self.task.key, _state())):
+        if not self.task.key:  # an export of a room: what it depends on stands in no key
+            return self.task.function(out, *arguments)
+        if known := _KEPT.get((self.task.name, self.task.key, _state())):
             made, files = known
             for name, data in files.items():
                 write_bytes(out / name, data)
@@ -50,5 +52,5 @@ class Remembered:
         made = self.task.function(out, *arguments)
         files = {name: (out / name).read_bytes() for name in made.files}
         if sum(len(data) for _, held in _KEPT.values() for data in held.values()) < _MOST_BYTES:
-            _KEPT[self.task.key, _state()] = made, files  # after it: it may have imported modules
+            _KEPT[self.task.name, self.task.key, _state()] = made, files  # after it: it may have imported modules
         return made

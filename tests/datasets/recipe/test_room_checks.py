@@ -43,7 +43,7 @@ FAULTS: dict[str, tuple[dict[str, Any], str]] = {
     "two geometries": (panorama(mesh=GEOMETRY), "rooms.panoramas[0]: state the geometry by box_m or by mesh"),
     "robot outside": (
         panorama(box_m=[0.1, 4.0, -2.0, 2.0, 2.6]),
-        "rooms.panoramas[0].box_m: (0.1, 4.0, -2.0, 2.0, 2.6): the robot, x -0.45 to 0.44 m",
+        "rooms.panoramas[0].box_m: (0.1, 4.0, -2.0, 2.0, 2.6): the robot, x -0.45 to 0.45 m",
     ),
     "a box too small": (panorama(box_m=[-0.9, 0.9, -2.0, 2.0, 2.6]), "rooms.panoramas[0].box_m: (-0.9, 0.9, -2.0, 2"),
     "a low box": (panorama(box_m=LOW, stroke_m=1.3), "rooms.panoramas[0].box_m: (-2.5, 2.5, -2.0, 2.0, 2.05): the c"),

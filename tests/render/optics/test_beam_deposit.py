@@ -8,12 +8,11 @@ import math
 import numpy as np
 import pytest
 
-from phibench.datasets.build.spot_task import SpotAnswer
 from phibench.render.optics.beam_deposit import deposit, inside_reflectance, transmittance
 from phibench.render.optics.certificate import CENTROID_TOLERANCE_PX, FLUX_TOLERANCE, _differences, certify
 from phibench.render.optics.ray_tracer import trace_pixels
 from phibench.render.optics.room_tracer import RoomGeometry
-from phibench.render.optics.spot_layer import spot_layer
+from phibench.render.optics.spot_layer import spot_layer, spot_light
 from phibench.render.optics.spot_samples import disc_nodes
 from phibench.render.optics.truth import spot_truth
 from phibench.scenes.catalog import default_rig
@@ -132,7 +131,7 @@ def test_place_of_a_torn_spot_on_the_wall_and_in_the_image() -> None:
     assert certificate.place_tolerance_m == pytest.approx(5e-3 * 1.25e-3 * math.sqrt(2.0), rel=0.2)
     on_the_axis = dataclasses.replace(layer, place_m=np.array(spot.position_world_m))
     assert not certify(VIEW, spot, geometry, truth, on_the_axis).passed
-    light = SpotAnswer(truth, layer, certificate, True).light(VIEW)
+    light = spot_light(VIEW, layer)
     assert light is not None
     chief = spot_truth(VIEW, dataclasses.replace(spot, position_world_m=tuple(layer.place_m)), ())
     assert math.hypot(light.u_px - truth.u_px, light.v_px - truth.v_px) > 0.04
