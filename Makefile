@@ -11,7 +11,7 @@ STUDIES ?= out/studies
 STUDIES_ALL := noise misalignment baseline cause isotropy stroke mirror loop
 # Environment without Mitsuba, and what is tested in it.
 BASE := out/base-env
-BASE_TESTS := tests/scenes tests/estimator/geometry tests/estimator/sandbox tests/test_package.py
+BASE_TESTS := tests/scenes tests/estimator/geometry tests/benchmark/isolation tests/test_package.py
 # Where proofs are: reading all other test files takes as long as ten of them.
 PROOFS = tests/accuracy $(shell grep -rl --include='test_*.py' 'def test_.*accuracy' tests/[b-z]* | xargs grep -l mark.slow)
 # Which Python makes the environment: `make setup PYTHON=python3.13`. Without it the first that is new enough.
@@ -91,7 +91,7 @@ studies: $(READY)
 	done
 	$(BIN)/phibench report --study $(addprefix $(STUDIES)/,$(STUDIES_ALL)) --out $(STUDIES)/report.html
 
-# Hours. The documents beside the pages are replaced; tests/estimator/studies/test_study_pages.py then names every
+# Hours. The documents beside the pages are replaced; tests/studies/test_study_pages.py then names every
 # number of a page that has to be edited.
 studies-full: $(READY)
 	@set -e; for name in $(STUDIES_ALL); do \
@@ -150,4 +150,4 @@ lint: $(READY)
 
 clean:
 	rm -rf build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .benchmarks
-	find phibench .paths scenes render datasets estimator tests -name __pycache__ -type d -prune -exec rm -rf {} +
+	find phibench scenes render datasets estimator calibration benchmark robot studies tests -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -18,9 +18,6 @@ from phibench.datasets.build.light_map_cache import light_map
 from phibench.datasets.store.pictures import display_exposure_s, to_srgb
 from phibench.estimator.geometry.mirror_image import image_of
 from phibench.estimator.geometry.triangulate import depth_exact
-from phibench.estimator.studies.isotropy.binocular import Binocular, Laws, tried
-from phibench.estimator.studies.isotropy.noise import sideways
-from phibench.estimator.studies.misaligned_rigs import spot_of
 from phibench.render.optics.room_tracer import room_geometry
 from phibench.render.optics.spot_layer import spot_layer
 from phibench.render.room.ambient import render_ambient
@@ -29,6 +26,9 @@ from phibench.render.sensor.settings import sensor
 from phibench.scenes.catalog import Target, lab
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import Rig
+from phibench.studies.isotropy.binocular import Binocular, Laws, tried
+from phibench.studies.isotropy.noise import sideways
+from phibench.studies.misaligned_rigs import spot_of
 
 APART_M, DEPTH_M, HEIGHT_M, AZIMUTH_DEG = 0.425, 2.5, 0.50, 105.0
 HEIGHTS_M, LIGHT_E_PER_S = (0.50, 0.65, 0.71, 0.80), (3e4, 3e4, 2e4)

@@ -31,13 +31,13 @@ import matplotlib.pyplot as plt
 import numpy as np
 import polars as pl
 
+from phibench.benchmark.scores.intervals import clopper_pearson
 from phibench.datasets.exposures.pair_draws import CachedSample, PairDraw, pair_draws
 from phibench.datasets.frames.request import FrameOptions
 from phibench.datasets.frames.sensor_card import card_of
 from phibench.datasets.frames.source import frame_stream
 from phibench.datasets.read import open_finished
 from phibench.datasets.training import CropSettings, SpotCrops
-from phibench.estimator.benchmark.intervals import clopper_pearson
 from phibench.estimator.learned.crop_training import CROP_SETTINGS, Answers, TrainingSettings, crops_of, rooms_of
 from phibench.estimator.learned.network_input import SIDE_PX, crop_input, crop_origin, cut
 from phibench.estimator.learned.networks import CROP, Network, covariances

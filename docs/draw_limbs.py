@@ -19,11 +19,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from phibench.calibration.outline.ball_circle import BallCircle, find_circle, shrunk
+from phibench.calibration.outline.edge_ring import TURNS, EdgeRing
+from phibench.calibration.rig.from_dataset import photograph
 from phibench.datasets.read import open_dataset
 from phibench.datasets.rooms.panorama_files import read_light
-from phibench.estimator.calibration.from_dataset import photograph
-from phibench.estimator.outline.ball_circle import BallCircle, find_circle, shrunk
-from phibench.estimator.outline.edge_ring import TURNS, EdgeRing
 from phibench.estimator.spots.camera_codes import light_of, rgb_picture
 from phibench.estimator.spots.image_planes import ImageError
 

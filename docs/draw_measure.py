@@ -12,12 +12,12 @@ from pathlib import Path
 
 from PIL import Image
 
+from phibench.calibration.captures.measure import PairPhotos, PositionPhotos, Setting, measure
+from phibench.calibration.captures.measure_picture import draw_measurement
+from phibench.calibration.captures.picture_files import read_photo
+from phibench.calibration.captures.rig_file import MeasuredRig
 from phibench.datasets.frames.frame_files import png_bytes
 from phibench.datasets.read import open_dataset
-from phibench.estimator.captures.measure import PairPhotos, PositionPhotos, Setting, measure
-from phibench.estimator.captures.measure_picture import draw_measurement
-from phibench.estimator.captures.picture_files import read_photo
-from phibench.estimator.captures.rig_file import MeasuredRig
 from phibench.estimator.draw_pairs import pairs_of
 from phibench.scenes.catalog import default_rig
 

@@ -29,10 +29,10 @@ from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
 from scipy.optimize import least_squares
 from scipy.special import ndtr
 
-from phibench.estimator.sensor_fit.edge_spread import Edge, edges_of, measure
-from phibench.estimator.sensor_fit.fit import fit_sensor
-from phibench.estimator.sensor_fit.lens_fit import LensFit
-from phibench.estimator.sensor_fit.tone_curve import decoded_by
+from phibench.calibration.sensor_fit.edge_spread import Edge, edges_of, measure
+from phibench.calibration.sensor_fit.fit import fit_sensor
+from phibench.calibration.sensor_fit.lens_fit import LensFit
+from phibench.calibration.sensor_fit.tone_curve import decoded_by
 from phibench.render.sensor.camera_chain import Chain
 from phibench.render.sensor.light import Light
 from phibench.render.sensor.noise_tiles import NoiseStream

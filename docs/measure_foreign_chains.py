@@ -23,11 +23,11 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from phibench.calibration.captures.measure import Measurement, measure, read_setting
+from phibench.calibration.captures.pair_photos import PairPhotos, PositionPhotos
+from phibench.calibration.captures.picture_files import read_photo
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.read import Sample, open_dataset
-from phibench.estimator.captures.measure import Measurement, measure, read_setting
-from phibench.estimator.captures.pair_photos import PairPhotos, PositionPhotos
-from phibench.estimator.captures.picture_files import read_photo
 
 SAMPLES = (
     "table1-d2.180-h1.000",

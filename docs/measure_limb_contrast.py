@@ -16,7 +16,7 @@ import numpy as np
 from PIL import Image
 from scipy import ndimage
 
-from phibench.estimator.outline.ball_circle import BallCircle, find_circle
+from phibench.calibration.outline.ball_circle import BallCircle, find_circle
 from phibench.estimator.spots.image_planes import ImageError
 from phibench.render.sensor.srgb import srgb_decoded
 from phibench.scenes.frames import Array

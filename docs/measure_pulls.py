@@ -20,10 +20,10 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
-from phibench.estimator.benchmark.answer_errors import whitened
-from phibench.estimator.benchmark.document import read_records, read_score
-from phibench.estimator.benchmark.metrics import FAR_SIGMAS
-from phibench.estimator.benchmark.strata import light_shift
+from phibench.benchmark.scores.answer_errors import whitened
+from phibench.benchmark.scores.document import read_records, read_score
+from phibench.benchmark.scores.metrics import FAR_SIGMAS
+from phibench.benchmark.scores.strata import light_shift
 
 LEAST = 30
 RESAMPLES = 1999

@@ -29,7 +29,7 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT / "docs"))
 from run_notebook import executed  # noqa: E402
 
-FOLDERS = ("scenes", "render", "datasets", "estimator")
+FOLDERS = ("scenes", "render", "datasets", "estimator", "calibration", "benchmark", "robot", "studies")
 TUTORIALS = ("own_method", "own_rig", "real_frames")
 PAGES = {
     "README.md": "index.md",
@@ -64,14 +64,14 @@ REFERENCE = {
     ),
     "Training and export": (
         "phibench.datasets.training",
-        "phibench.datasets.export.export_make",
-        "phibench.datasets.export.pair_rows",
+        "phibench.benchmark.export.export_make",
+        "phibench.benchmark.export.pair_rows",
     ),
     "Films and loop": (
         "phibench.datasets.film.film_read",
-        "phibench.estimator.film.film_estimates",
-        "phibench.estimator.loop.environment",
-        "phibench.estimator.loop.simulator",
+        "phibench.robot.film.film_estimates",
+        "phibench.robot.loop.environment",
+        "phibench.robot.loop.simulator",
     ),
 }
 FONTS = {

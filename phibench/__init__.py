@@ -11,20 +11,19 @@ imported by their full names, ``from phibench.scenes.rig import Rig``.
 from __future__ import annotations
 
 from importlib import import_module
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from phibench.benchmark.isolation.easy_pairs import EasyPairs
+    from phibench.benchmark.scored_dataset import open_dataset
+    from phibench.benchmark.scores.score import score
     from phibench.datasets.scene.scene_export import mitsuba_scene
     from phibench.datasets.training import PairDataset
-    from phibench.estimator.benchmark.score import score
     from phibench.estimator.geometry.phi import phi
     from phibench.estimator.geometry.triangulate import depth_exact
     from phibench.estimator.interface import Answer, Pair, Spot
-    from phibench.estimator.paper.sensitivity_table import make
-    from phibench.estimator.sandbox.easy_pairs import EasyPairs
-    from phibench.estimator.scored_dataset import open_dataset
     from phibench.estimator.spots.simple_spots import find_spot
+    from phibench.studies.paper.sensitivity_table import make
 
     __version__: str
 
@@ -46,24 +45,18 @@ __all__ = [
 
 _HOMES = {
     "Answer": "phibench.estimator.interface",
-    "EasyPairs": "phibench.estimator.sandbox.easy_pairs",
+    "EasyPairs": "phibench.benchmark.isolation.easy_pairs",
     "Pair": "phibench.estimator.interface",
     "PairDataset": "phibench.datasets.training",
     "Spot": "phibench.estimator.interface",
     "depth_exact": "phibench.estimator.geometry.triangulate",
     "find_spot": "phibench.estimator.spots.simple_spots",
-    "make": "phibench.estimator.paper.sensitivity_table",
+    "make": "phibench.studies.paper.sensitivity_table",
     "mitsuba_scene": "phibench.datasets.scene.scene_export",
-    "open_dataset": "phibench.estimator.scored_dataset",
+    "open_dataset": "phibench.benchmark.scored_dataset",
     "phi": "phibench.estimator.geometry.phi",
-    "score": "phibench.estimator.benchmark.score",
+    "score": "phibench.benchmark.scores.score",
 }
-
-# In a checkout the four folders lie beside this one, in an installed package inside it. Python looks for
-# `phibench.scenes` in every folder of `__path__`.
-_FOLDER = Path(__file__).parent
-if not (_FOLDER / "scenes").is_dir():
-    __path__.append(str(_FOLDER.parent))
 
 
 def __getattr__(name: str) -> Any:

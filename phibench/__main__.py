@@ -2,7 +2,7 @@
 
 import sys
 
-from phibench.estimator.cli.main import main
+from phibench.cli.main import main
 
 if __name__ == "__main__":
     sys.exit(main())

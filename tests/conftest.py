@@ -220,7 +220,7 @@ def sealed(bench_dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Any
     """Sealed set of 3 pairs, one of each sample, with its truth. Read only: copy it to change it."""
     from rich.console import Console
 
-    from phibench.estimator.sealed.sealed_set import seal
+    from phibench.benchmark.sealed.sealed_set import seal
 
     folder = tmp_path_factory.mktemp("private")
     shutil.copytree(bench_dataset, folder / "set")
@@ -230,7 +230,7 @@ def sealed(bench_dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Any
 @pytest.fixture(scope="session")
 def submitted(sealed: Any, method: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Submission of `method` to `sealed`."""
-    from phibench.estimator.sealed.submission import submit
+    from phibench.benchmark.sealed.submission import submit
 
     out = tmp_path_factory.mktemp("submission") / "submission.json"
     done = submit(sealed.public, method, out)

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from phibench.estimator.sensor_fit.capture_folder import open_capture
-from phibench.estimator.sensor_fit.fit import fit_sensor
+from phibench.calibration.sensor_fit.capture_folder import open_capture
+from phibench.calibration.sensor_fit.fit import fit_sensor
 
 SIZE = (64, 48)
 NAMES = (

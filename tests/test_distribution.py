@@ -21,13 +21,14 @@ from typing import Any
 
 import pytest
 import yaml
+from helpers.districts import DISTRICTS
 from helpers.small_release import ask, part_of
 
-from phibench.datasets.release.release_make import release
-from phibench.estimator.sealed.sealed_set import seal
+from phibench.benchmark.release.release_make import release
+from phibench.benchmark.sealed.sealed_set import seal
 
 ROOT = Path(__file__).resolve().parent.parent
-FOLDERS = ("phibench", "scenes", "render", "datasets", "estimator")
+FOLDERS = ("phibench", *DISTRICTS)
 WORKFLOW = ROOT / ".github" / "workflows" / "checks.yml"
 
 
@@ -49,26 +50,12 @@ def place(file: Path) -> str:
 
 
 def test_the_wheel_takes_every_file_of_the_package() -> None:
-    """Data beside the code (templates, recipes, tables, weights) belongs to a package and fits one of its patterns."""
-    setuptools = project()["tool"]["setuptools"]
-    patterns, folders = setuptools["package-data"], setuptools["package-dir"]
-    left_out, kinds = [], set()
-    for file in shipped():
-        if file.suffix == ".py":
-            continue
-        package = next((name for name, folder in folders.items() if Path(folder) == file.parent), "")
-        kinds.add(file.suffix)
-        if not any(fnmatch(file.name, pattern) for pattern in [*patterns["*"], *patterns.get(package, ())]):
-            left_out.append(file.as_posix())
-        assert package in setuptools["packages"], f"{file.parent} is no package of pyproject.toml"
-    assert {".toml", ".j2", ".csv", ".md", ".typed"} <= kinds
-    assert left_out == []
-
-
-def test_every_folder_with_code_is_typed() -> None:
-    folders = {file.parent for file in shipped() if file.suffix == ".py"}
-    assert len(folders) > 30
-    assert [folder.as_posix() for folder in sorted(folders) if not (ROOT / folder / "py.typed").is_file()] == []
+    """Data beside the code (templates, recipes, tables, weights) fits one of the patterns."""
+    patterns = project()["tool"]["setuptools"]["package-data"]["*"]
+    data = [file for file in shipped() if file.suffix != ".py"]
+    assert {".toml", ".j2", ".csv", ".md", ".typed"} <= {file.suffix for file in data}
+    assert [file.as_posix() for file in data if not any(fnmatch(file.name, pattern) for pattern in patterns)] == []
+    assert (ROOT / "phibench" / "py.typed").is_file()
 
 
 def requirements(lines: list[str]) -> dict[str, str]:

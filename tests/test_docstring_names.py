@@ -9,21 +9,21 @@ from functools import cache
 from pathlib import Path
 
 import pytest
+from helpers.districts import DISTRICTS
 
 ROOT = Path(__file__).resolve().parent.parent
-FOLDERS = ("scenes", "render", "datasets", "estimator")
 NAME = re.compile(r"`((?:phibench\.)?[a-z_]+(?:\.[A-Za-z_]\w*)+)(?:\(.*?\))?`")
 ROOMS: dict[str, list[Path]] = {}
-for _room in (room for top in FOLDERS for room in [ROOT / top, *(ROOT / top).rglob("*")] if room.is_dir()):
+for _room in (room for top in DISTRICTS for room in [ROOT / top, *(ROOT / top).rglob("*")] if room.is_dir()):
     ROOMS.setdefault(_room.name, []).append(_room)
 # folders whose name is that of an argument as well: `frames.down`, `sensor.output`, a recipe's `mirror.form`
-ARGUMENTS = {"frames", "limits", "mirror", "misalignment", "room", "sensor"}
+ARGUMENTS = {"frames", "limits", "mirror", "misalignment", "rig", "room", "sensor"}
 OLD = {"phibench.estimator.seat.pair"}
 FILE_ENDS = {"py", "toml", "json", "jsonl", "md", "html", "js", "exr", "npz", "parquet", "png", "csv", "yuyv"}
 
 
 def sources() -> list[Path]:
-    return sorted(file for folder in FOLDERS for file in (ROOT / folder).rglob("*.py"))
+    return sorted(file for folder in DISTRICTS for file in (ROOT / folder).rglob("*.py"))
 
 
 @cache
@@ -42,7 +42,7 @@ def named(file: Path) -> Iterator[str]:
 def exists(name: str) -> bool:
     """True if a folder of the first part's name, or the library, holds what the other parts say."""
     parts = name.removeprefix("phibench.").split(".")
-    if parts[0] in FOLDERS:
+    if parts[0] in DISTRICTS:
         return holds(ROOT, parts)
     return any(holds(room, parts[1:]) for room in ROOMS[parts[0]])
 

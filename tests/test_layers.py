@@ -1,10 +1,11 @@
-"""The architecture: data flows scenes -> render -> datasets -> estimator, and only render knows Mitsuba.
+"""The architecture: the order of the districts and of their folders, and only render knows Mitsuba.
 
-The package's own two files, in `phibench/`, stand last: they may import everything, and nothing imports them.
+The package's own files, in `phibench/`, stand last: they may import everything, and nothing imports them.
 """
 
 import ast
 import graphlib
+import importlib
 import subprocess
 import tomllib
 from collections import Counter
@@ -13,11 +14,11 @@ from fnmatch import fnmatch
 from pathlib import Path
 
 import pytest
+from helpers.districts import DISTRICTS
 
 Python = Callable[..., subprocess.CompletedProcess[str]]
 
 ROOT = Path(__file__).resolve().parent.parent
-FOLDERS = ("scenes", "render", "datasets", "estimator")
 PACKAGE = "phibench"
 # Every unit may import itself and the units on the lines above its own; a single file counts as a unit.
 ORDER = """
@@ -42,29 +43,31 @@ datasets/exposures
 datasets/build
 datasets/make
 datasets/scene
-datasets/film datasets/export
+datasets/film
 datasets/show datasets/sample_page datasets/verify datasets/merge_repair datasets/training
-datasets/release
 estimator/interface
 estimator/pair_set
 estimator/geometry
 estimator/spots
 estimator/processed
-estimator/sensor_fit
-estimator/outline
 estimator/learned
-estimator/film estimator/limits estimator/methods
+estimator/limits estimator/methods
 estimator/draw_pairs
-estimator/calibration
-estimator/sandbox
-estimator/loop
-estimator/captures
-estimator/benchmark
-estimator/scored_dataset
-estimator/sealed
-estimator/paper
-estimator/studies
-estimator/cli
+calibration/sensor_fit
+calibration/outline
+calibration/rig
+calibration/captures
+benchmark/export
+benchmark/release
+benchmark/isolation
+benchmark/scores
+benchmark/scored_dataset
+benchmark/sealed
+robot/film
+robot/loop
+studies/paper
+studies
+phibench/cli
 estimator/seat
 phibench
 """
@@ -73,11 +76,11 @@ QUESTION_WORDS = {"What", "Where", "How", "Whether", "Which", "That"}
 RENDERERS = {"mitsuba", "drjit"}
 MAY_IMPORT_RENDERERS = ("render/room", "render/setup")
 # The simulator and the estimator share numbers, not mathematics; only studies render.
-RENDERS = ("render", "datasets", "estimator/studies", PACKAGE)
+RENDERS = ("render", "datasets", "benchmark/export", "benchmark/release", "studies", "phibench/__")
 
 
 def sources(root: Path) -> list[Path]:
-    return sorted(file for folder in (*FOLDERS, PACKAGE) for file in (root / folder).rglob("*.py"))
+    return sorted(file for folder in (*DISTRICTS, PACKAGE) for file in (root / folder).rglob("*.py"))
 
 
 def module_name(root: Path, file: Path) -> str:
@@ -115,13 +118,13 @@ def faults_of(root: Path, file: Path) -> Iterator[str]:
         return
     for level, name in imports(file):
         parts = tuple(name.split("."))
-        if level or parts[0] in FOLDERS:
+        if level or parts[0] in DISTRICTS:
             yield f"{here}: relative or unqualified import of {name or '.'}"
         elif parts[0] == "tests":
             yield f"{here}: imports the tests"
         elif parts[0] in RENDERERS and unit_of(own) not in MAY_IMPORT_RENDERERS:
             yield f"{here}: imports {parts[0]} outside {' and '.join(MAY_IMPORT_RENDERERS)}"
-        elif parts[0] == PACKAGE and (len(parts) < 3 or not may_import(own, parts[1:])):
+        elif parts[0] == PACKAGE and (len(parts) < 3 or not may_import(own, parts[parts[1] in DISTRICTS :])):
             yield f"{here}: may not import {name}"
 
 
@@ -148,7 +151,7 @@ def faults(root: Path) -> list[str]:
     found = [fault for file in sources(root) for fault in faults_of(root, file)]
     paths = [file.relative_to(root) for file in sources(root)]
     found += [
-        f"{path}: no __init__.py here" for path in paths if path.name == "__init__.py" and path.parts[0] in FOLDERS
+        f"{path}: no __init__.py here" for path in paths if path.name == "__init__.py" and path.parts[0] in DISTRICTS
     ]
     if loop := cycle(root):
         found.append(f"cycle: {loop}")
@@ -198,7 +201,7 @@ def test_the_tree_obeys_every_rule() -> None:
         ),
         ("estimator/limits/a.py", "from phibench.estimator.methods import simple", "may not import phibench.estimator"),
         ("datasets/read.py", "def f():\n    import mitsuba as mi", "imports mitsuba outside"),
-        ("estimator/studies/a.py", "from drjit.llvm import Float", "imports drjit outside"),
+        ("studies/a.py", "from drjit.llvm import Float", "imports drjit outside"),
         ("scenes/a.py", "from . import rig", "relative or unqualified import"),
         ("scenes/a.py", "from .rig import Rig", "relative or unqualified import"),
         ("scenes/a.py", "from scenes.rig import Rig", "relative or unqualified import"),
@@ -206,9 +209,9 @@ def test_the_tree_obeys_every_rule() -> None:
         ("datasets/shed.py", "", "has no place in the order"),
         ("estimator/shed/a.py", "", "has no place in the order"),
         ("datasets/store/__init__.py", "", "no __init__.py here"),
-        ("estimator/cli/a.py", "from phibench import open_dataset", "may not import phibench.open_dataset"),
-        ("estimator/cli/a.py", "import phibench.__main__", "may not import phibench.__main__"),
-        ("estimator/studies/a.py", "from phibench.estimator.seat import pair", "may not import phibench.estimator"),
+        ("phibench/cli/a.py", "from phibench import open_dataset", "may not import phibench.open_dataset"),
+        ("phibench/cli/a.py", "import phibench.__main__", "may not import phibench.__main__"),
+        ("studies/a.py", "from phibench.estimator.seat import pair", "may not import phibench.estimator"),
         ("phibench/__init__.py", "import mitsuba", "imports mitsuba outside"),
         ("estimator/methods/__init__.py", "", "no __init__.py here"),
     ],
@@ -226,10 +229,10 @@ def test_each_rule_catches_what_it_forbids(tmp_path: Path, path: str, source: st
         ("render/room/a.py", "import mitsuba\nfrom drjit.llvm import Float\nfrom phibench.scenes.rig import Rig"),
         ("datasets/build/a.py", "from phibench.render.optics.truth import truth\nfrom phibench.scenes import rig"),
         ("estimator/interface.py", "import numpy\nfrom phibench.datasets.read import read\nimport phibench.scenes.rig"),
-        ("estimator/studies/a.py", "from phibench.render.optics.truth import truth"),
+        ("studies/a.py", "from phibench.render.optics.truth import truth"),
         (
             "phibench/__init__.py",
-            "from phibench.estimator.cli.main import main\nfrom phibench.datasets.read import read",
+            "from phibench.cli.main import main\nfrom phibench.datasets.read import read",
         ),
     ],
 )
@@ -275,8 +278,8 @@ def test_the_tree_has_few_large_rooms() -> None:
     assert len(files) <= 420
     folders = Counter(file.parent for file in files)
     assert {str(folder): n for folder, n in folders.items() if n > 16} == {}
-    stems = Counter(file.stem for file in files if file.parts[1] not in ("studies", "cli"))
-    assert {file.stem for file in files if file.parts[0] == PACKAGE} == {"__init__", "__main__"}
+    stems = Counter(file.stem for file in files if file.parts[0] != "studies" and "cli" not in file.parts)
+    assert {file.stem for file in files if file.parent == Path(PACKAGE)} == {"__init__", "__main__"}
     assert [stem for stem, n in stems.items() if n > 1] == []
 
 
@@ -314,7 +317,7 @@ def test_importing_a_module_does_not_import_mitsuba(python: Python) -> None:
     assert child.stdout.strip() == "False"
 
 
-@pytest.mark.parametrize("folder", FOLDERS)
+@pytest.mark.parametrize("folder", DISTRICTS)
 def test_our_folders_shadow_nobody_from_the_checkout(folder: str, tmp_path: Path, python: Python) -> None:
     """A folder without __init__.py gives way to a package of that name, even to one later on the path."""
     write(tmp_path, f"{folder}/__init__.py", "whose = 'theirs'")
@@ -323,13 +326,16 @@ def test_our_folders_shadow_nobody_from_the_checkout(folder: str, tmp_path: Path
 
 
 def test_every_folder_with_code_is_packaged() -> None:
-    listed = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["setuptools"]["packages"]
-    folders = {file.relative_to(ROOT).parent.parts for file in sources(ROOT)}
-    needed = {".".join(parts if parts == (PACKAGE,) else (PACKAGE, *parts)) for parts in folders}
-    assert needed - set(listed) == set()
-    assert [name for name in listed if not (ROOT / name.removeprefix("phibench.").replace(".", "/")).is_dir()] == []
-    needed_links = {*FOLDERS, "__init__.py", "__main__.py"}  # for tools that cannot see the mapping
-    assert {path.name for path in (ROOT / ".paths" / PACKAGE).iterdir()} - {"__pycache__"} == needed_links
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    find = project["tool"]["setuptools"]["packages"]["find"]
+    assert find == {"include": ["phibench", "phibench.*"], "namespaces": True}
+    links = {path.name: path.resolve() for path in (ROOT / PACKAGE).iterdir() if path.is_symlink()}
+    assert links == {name: ROOT / name for name in DISTRICTS}
+
+
+def test_tests_are_no_part_of_the_package() -> None:
+    with pytest.raises(ModuleNotFoundError):
+        importlib.import_module("phibench.tests")
 
 
 def test_the_pins_name_no_place() -> None:

@@ -16,10 +16,10 @@ import pytest
 import yaml
 
 import phibench
+from phibench.benchmark.isolation.resolve import MethodError
+from phibench.benchmark.isolation.runner import asked_here
 from phibench.datasets.errors import DatasetError
 from phibench.estimator import interface
-from phibench.estimator.sandbox.resolve import MethodError
-from phibench.estimator.sandbox.runner import asked_here
 from phibench.scenes.rig import Rig
 from phibench.scenes.validation import SceneError
 
@@ -83,7 +83,7 @@ def test_no_public_name_loads_the_renderer(python: Python) -> None:
 def test_the_version_is_that_of_the_checkout(python: Python) -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     assert phibench.__version__ == project["version"]
-    said = python("from phibench.estimator.cli.main import main; main(['--version'])").stdout.strip()
+    said = python("from phibench.cli.main import main; main(['--version'])").stdout.strip()
     assert re.fullmatch(rf"phibench {project['version']}( \(commit [0-9a-f]{{10}}(, changed since)?\))?", said)
     assert ("commit" in said) == (ROOT / ".git").exists()
 

@@ -8,9 +8,10 @@ from functools import cache
 from pathlib import Path
 
 import pytest
+from helpers.districts import DISTRICTS
 
+from phibench.cli.main import app
 from phibench.datasets.read import open_dataset
-from phibench.estimator.cli.main import app
 from phibench.scenes.catalog import default_rig
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -284,7 +285,7 @@ def test_pages_that_are_excused_exist():
 
 def test_nothing_is_named_that_only_the_authors_have():
     suffixes = {".py", ".md", ".toml", ".csv", ".json", ".ini", ".cff", ""}
-    folders = ("scenes", "render", "datasets", "estimator", "tests", "docs")
+    folders = (*DISTRICTS, "phibench", "tests", "docs")
     files = [f for folder in folders for f in (ROOT / folder).rglob("*") if f.is_file() and f.suffix in suffixes]
     assert len(files) > 300
     found = [

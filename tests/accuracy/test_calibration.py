@@ -12,13 +12,13 @@ import pytest
 from helpers.calibration_cases import apparent
 from scipy import stats
 
+from phibench.calibration.outline.limb_image import Measured
+from phibench.calibration.rig.bundle import KnownSpot, calibrate
+from phibench.calibration.rig.vertical_edges import vertical_of
 from phibench.datasets.parallel import parallel_map
-from phibench.estimator.calibration.bundle import KnownSpot, calibrate
-from phibench.estimator.calibration.vertical_edges import vertical_of
 from phibench.estimator.geometry.least_squares_depth import depth_general
 from phibench.estimator.geometry.rig_parameters import PARAMETERS, changed, prior_sigmas, stroke_of
 from phibench.estimator.geometry.triangulate import depth_exact
-from phibench.estimator.outline.limb_image import Measured
 from phibench.render.optics.truth import spot_truth
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.random_streams import generator
@@ -240,5 +240,5 @@ def test_accuracy_of_depth_with_a_vertical(monkeypatch: pytest.MonkeyPatch) -> N
     print("pull", pull)
     assert 0.56 < pull < 1.44
     assert rms < 0.0015
-    monkeypatch.setattr("phibench.estimator.calibration.bundle.vertical_by_principal_point", lambda _: np.zeros((2, 2)))
+    monkeypatch.setattr("phibench.calibration.rig.bundle.vertical_by_principal_point", lambda _: np.zeros((2, 2)))
     assert pull_with_vertical(20)[0] > 1.8

@@ -12,8 +12,8 @@ from scipy import stats
 
 from phibench.datasets.read import Dataset, open_finished
 from phibench.datasets.recipe.load import RECIPES
-from phibench.estimator.paper.experiment_bounds import budget
-from phibench.estimator.paper.experiment_tables import Procedure, run_experiments
+from phibench.studies.paper.experiment_bounds import budget
+from phibench.studies.paper.experiment_tables import Procedure, run_experiments
 
 KEPT = {"table1": [0.80], "table2": [0.425], "table4": [0.425]}
 DRAWS = 3

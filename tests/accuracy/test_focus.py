@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from phibench.calibration.outline.outline_start import rig_circle
+from phibench.calibration.rig.align import sharpness
 from phibench.datasets.build.light_map_cache import light_map
 from phibench.datasets.frames.sensor_card import sensor_card
-from phibench.estimator.calibration.align import sharpness
-from phibench.estimator.outline.outline_start import rig_circle
 from phibench.render.room.ambient import render_ambient
 from phibench.render.room.light_map import BakeSettings
 from phibench.render.sensor.camera_chain import Chain

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from helpers.inline_workers import make_inline
 
+from phibench.cli.main import main
 from phibench.datasets.read import Dataset, open_dataset
 from phibench.datasets.recipe.load import find_recipe
 from phibench.datasets.verify import verify
-from phibench.estimator.cli.main import main
-from phibench.estimator.paper.paper_tables import Score, score, summarise
+from phibench.studies.paper.paper_tables import Score, score, summarise
 
 
 @pytest.fixture(scope="module")

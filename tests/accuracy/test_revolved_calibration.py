@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from scipy import optimize
 
+from phibench.calibration.outline.limb_image import Measured
+from phibench.calibration.rig.bundle import KnownSpot, apparent_outline, calibrate
 from phibench.datasets.recipe.build import build_rig
 from phibench.datasets.recipe.tables import RigTable
-from phibench.estimator.calibration.bundle import KnownSpot, apparent_outline, calibrate
 from phibench.estimator.geometry.least_squares_depth import depth_general
 from phibench.estimator.geometry.rig_parameters import PARAMETERS, changed, prior_sigmas
 from phibench.estimator.geometry.triangulate import depth_exact
-from phibench.estimator.outline.limb_image import Measured
 from phibench.render.optics.reflection_point import mirror_points
 from phibench.scenes.frames import Array
 from phibench.scenes.random_streams import generator

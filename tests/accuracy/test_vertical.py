@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from helpers.limb_frames import drawn_rig
 
+from phibench.calibration.rig.vertical_edges import find_vertical
 from phibench.datasets.build.light_map_cache import light_map
 from phibench.datasets.frames.sensor_card import sensor_card
-from phibench.estimator.calibration.vertical_edges import find_vertical
 from phibench.render.room.ambient import render_ambient
 from phibench.render.room.light_map import BakeSettings
 from phibench.render.sensor.camera_chain import Chain

@@ -29,24 +29,24 @@ OF_WRITERS = {
 STILL_OPEN = {
     "datasets/build/kept_draws.py read_draws",
     "datasets/build/run_tasks.py held_head",
-    "datasets/export/export_make.py _claim",
-    "datasets/export/export_make.py _finish",
+    "benchmark/export/export_make.py _claim",
+    "benchmark/export/export_make.py _finish",
     "datasets/film/moving_camera.py _read",
     "datasets/film/moving_camera.py open_baked_rooms",
     "datasets/frames/frame_files.py claim",
     "datasets/make.py _info_text",
-    "datasets/release/release_make.py _dataset",
-    "datasets/release/release_make.py _misfit",
-    "datasets/release/release_make.py _sample_count",
-    "estimator/captures/imported_set.py _image",
-    "estimator/captures/imported_set.py _stored",
-    "estimator/captures/imported_set.py open_imported",
-    "estimator/sealed/rebuilt_score.py _pixels",
-    "estimator/sealed/score_check.py _of_release",
-    "estimator/sensor_fit/capture_folder.py _tables_of",
-    "estimator/sensor_fit/capture_folder.py read_header",
-    "estimator/sensor_fit/fit.py _take_jpeg",
-    "estimator/studies/run.py section",
+    "benchmark/release/release_make.py _dataset",
+    "benchmark/release/release_make.py _misfit",
+    "benchmark/release/release_make.py _sample_count",
+    "calibration/captures/imported_set.py _image",
+    "calibration/captures/imported_set.py _stored",
+    "calibration/captures/imported_set.py open_imported",
+    "benchmark/sealed/rebuilt_score.py _pixels",
+    "benchmark/sealed/score_check.py _of_release",
+    "calibration/sensor_fit/capture_folder.py _tables_of",
+    "calibration/sensor_fit/capture_folder.py read_header",
+    "calibration/sensor_fit/fit.py _take_jpeg",
+    "studies/run.py section",
     "render/sensor/processing.py decoded",
 }
 """Readers without a target of their own yet; a new one must not join them."""
@@ -104,7 +104,7 @@ def test_every_reader_has_a_target(
 
 
 def test_a_new_reader_without_a_target_is_seen(tmp_path: Path) -> None:
-    for folder in ("scenes", "render", "datasets", "estimator"):
+    for folder in ("render", "datasets"):
         (tmp_path / folder).mkdir()
     (tmp_path / "datasets" / "a.py").write_text("def read_it(path):\n    return InputFile(path, '').json()\n")
     (tmp_path / "render" / "b.py").write_text(

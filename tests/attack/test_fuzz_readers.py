@@ -31,11 +31,11 @@ from helpers.valid_files import (
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from phibench.cli.main import main
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.read import open_finished
 from phibench.datasets.store.checksums import checksums_text, read_checksums
 from phibench.datasets.store.documents import differences
-from phibench.estimator.cli.main import main
 
 PATIENCE_S = 60  # far above the slowest case, 0.3 s, on a machine with other work
 KINDS = (

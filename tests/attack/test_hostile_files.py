@@ -16,6 +16,13 @@ import pytest
 from helpers.bench_cases import cases, outcomes, truth_itself
 from helpers.valid_files import NASTY_TEXTS, compact, digest, nested, png, public_rows, read_sealed, write_sealed
 
+from phibench.benchmark.isolation.resolve import MethodError, Reference, resolve
+from phibench.benchmark.sealed.sealed_set import read_seal
+from phibench.benchmark.sealed.submission import SealedPairs, outcomes_of, read_submission, submission
+from phibench.calibration.captures.picture_files import read_picture
+from phibench.calibration.rig.bundle import Bundle
+from phibench.calibration.rig.file import read_calibration, write_calibration
+from phibench.cli.main import main
 from phibench.datasets.build.journal import Entry, FolderHead, Journal
 from phibench.datasets.build.run_tasks import held_head, refuse_other
 from phibench.datasets.errors import DatasetError
@@ -25,15 +32,8 @@ from phibench.datasets.recipe.load import load_recipe
 from phibench.datasets.store.checksums import read_checksums
 from phibench.datasets.store.documents import from_json, read_rigs, to_json
 from phibench.datasets.store.layers import read_exr, write_exr
-from phibench.estimator.calibration.bundle import Bundle
-from phibench.estimator.calibration.file import read_calibration, write_calibration
-from phibench.estimator.captures.picture_files import read_picture
-from phibench.estimator.cli.main import main
 from phibench.estimator.geometry.rig_parameters import PARAMETERS
 from phibench.estimator.interface import Outcome
-from phibench.estimator.sandbox.resolve import MethodError, Reference, resolve
-from phibench.estimator.sealed.sealed_set import read_seal
-from phibench.estimator.sealed.submission import SealedPairs, outcomes_of, read_submission, submission
 from phibench.scenes.rig import Rig
 from phibench.scenes.validation import nearest
 

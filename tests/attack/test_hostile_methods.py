@@ -20,14 +20,14 @@ from helpers.hostile_methods import ALL, BAD, HEADER
 from helpers.processes import processes_under
 from helpers.sandbox_pairs import SmallPairs, method_file
 
-from phibench.estimator.benchmark.answer_errors import Rules
-from phibench.estimator.benchmark.document import MethodCard
-from phibench.estimator.benchmark.report import write_report
-from phibench.estimator.benchmark.score import Scored, saved, score_outcomes
-from phibench.estimator.benchmark.score_tables import print_scores
+from phibench.benchmark.isolation.resolve import RunLimits
+from phibench.benchmark.isolation.runner import run_method
+from phibench.benchmark.scores.answer_errors import Rules
+from phibench.benchmark.scores.document import MethodCard
+from phibench.benchmark.scores.report import write_report
+from phibench.benchmark.scores.score import Scored, saved, score_outcomes
+from phibench.benchmark.scores.score_tables import print_scores
 from phibench.estimator.interface import Outcome
-from phibench.estimator.sandbox.resolve import RunLimits
-from phibench.estimator.sandbox.runner import run_method
 
 pytestmark = pytest.mark.slow
 LIMITS = RunLimits(seconds=6.0, memory_mb=1000.0)

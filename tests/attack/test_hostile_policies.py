@@ -10,17 +10,18 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from helpers.districts import DISTRICTS
 from helpers.hostile_policies import DEEDS, HEADER, REACHES, deeds
 from helpers.listeners import accepting
 from helpers.processes import processes_under
 
-from phibench.estimator.loop.episodes import LOST, Episode, run_foreign
-from phibench.estimator.loop.foreign_policies import PolicyFile, _action
-from phibench.estimator.loop.simulator import Action, Setup, Task
-from phibench.estimator.sandbox.resolve import RunLimits
+from phibench.benchmark.isolation.resolve import RunLimits
+from phibench.robot.loop.episodes import LOST, Episode, run_foreign
+from phibench.robot.loop.foreign_policies import PolicyFile, _action
+from phibench.robot.loop.simulator import Action, Setup, Task
 from phibench.scenes.validation import SceneError
 
-ROOT, SOURCES = Path(__file__).resolve().parents[2], ("scenes", "render", "datasets", "estimator")
+ROOT, SOURCES = Path(__file__).resolve().parents[2], DISTRICTS
 SHORT = Setup(task=Task(longest_s=0.5, lights=0))
 ANSWER_S = 2.0
 
@@ -104,9 +105,9 @@ def test_a_hostile_policy_loses_its_episode_and_leaves_nothing(
 
 UNPICKLED = {
     "datasets/build/workers.py": "workers of ours",
-    "estimator/sandbox/pairs_ahead.py": "processes of ours that draw pairs",
-    "estimator/sandbox/transport.py": "pairs of ours, in the process of a method",
-    "estimator/loop/foreign_policies.py": "what is known and observed, in the process of a policy",
+    "benchmark/isolation/pairs_ahead.py": "processes of ours that draw pairs",
+    "benchmark/isolation/transport.py": "pairs of ours, in the process of a method",
+    "robot/loop/foreign_policies.py": "what is known and observed, in the process of a policy",
 }
 """Modules that open pickles, and whose: none is of a method or a policy."""
 

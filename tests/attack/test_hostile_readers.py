@@ -20,16 +20,16 @@ import numpy as np
 import pytest
 from helpers.valid_files import png
 
+from phibench.benchmark.export.export_make import verify_export
+from phibench.calibration.captures.imported_set import import_pairs
+from phibench.calibration.captures.pair_list import read_pair_list
+from phibench.calibration.sensor_fit.capture_folder import read_header
 from phibench.datasets.camera_pictures import read_camera_picture
 from phibench.datasets.errors import DatasetError
-from phibench.datasets.export.export_make import verify_export
 from phibench.datasets.input_files import InputFile
 from phibench.datasets.rooms.mesh_files import read_mesh
 from phibench.datasets.rooms.panorama_files import read_light
 from phibench.datasets.rooms.room_files import RoomFiles, checked_data
-from phibench.estimator.captures.imported_set import import_pairs
-from phibench.estimator.captures.pair_list import read_pair_list
-from phibench.estimator.sensor_fit.capture_folder import read_header
 
 SOON_S = 10.0  # of a processor: the machine may have other work
 

@@ -26,10 +26,10 @@ from helpers.strange_releases import (
     trickle,
 )
 
+from phibench.benchmark.release.fetch import fetch
+from phibench.benchmark.release.paced_http import Patience
+from phibench.cli.main import main
 from phibench.datasets.errors import DatasetError
-from phibench.datasets.release.fetch import fetch
-from phibench.datasets.release.paced_http import Patience
-from phibench.estimator.cli.main import main
 
 SOON = Patience(answer_s=0.4, document_s=0.4, window_s=0.4)
 MIB = 1 << 20

@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from phibench.benchmark.release.secret_seed import secret_seed
+from phibench.cli.main import main
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.frames.request import FrameOptions
 from phibench.datasets.frames.sample_request import sample_request
 from phibench.datasets.recipe.load import load_recipe, parse_recipe, with_numbers
-from phibench.datasets.release.secret_seed import secret_seed
 from phibench.datasets.store.files import write_secret
-from phibench.estimator.cli.main import main
 from phibench.render.sensor.electrons import fixed_pattern
 from phibench.render.sensor.light import Region
 from phibench.render.sensor.settings import sensor

@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 from helpers.sandbox_pairs import GOOD, SmallPairs, method_file
 
+from phibench.benchmark.isolation.process import MethodProcess
+from phibench.benchmark.isolation.resolve import RunLimits, resolve
+from phibench.benchmark.isolation.transport import Connection, MemoryFile, SharedPages, pack, unpack
 from phibench.estimator.interface import Pair
-from phibench.estimator.sandbox.process import MethodProcess
-from phibench.estimator.sandbox.resolve import RunLimits, resolve
-from phibench.estimator.sandbox.transport import Connection, MemoryFile, SharedPages, pack, unpack
 
 
 def large() -> Pair:
@@ -69,7 +69,7 @@ def test_benchmark_isolation(benchmark, tmp_path: Path) -> None:
 
     By turns, and the shortest of each is compared: what else the machine does is longer than the difference.
     """
-    text = "from phibench.estimator.sandbox.isolation import *\nif {}: assert isolate(Access()).complete"
+    text = "from phibench.benchmark.isolation.isolation import *\nif {}: assert isolate(Access()).complete"
     seconds: dict[bool, list[float]] = {False: [], True: []}
 
     def start(isolated: bool) -> None:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from helpers.bench_cases import cases, outcomes, sampler, shifted
 
-from phibench.estimator.benchmark.answer_errors import Rules
-from phibench.estimator.benchmark.document import MethodCard
-from phibench.estimator.benchmark.score import score_outcomes
+from phibench.benchmark.scores.answer_errors import Rules
+from phibench.benchmark.scores.document import MethodCard
+from phibench.benchmark.scores.score import score_outcomes
 
 
 def test_score_of_500_pairs_and_8_methods(benchmark):

@@ -18,10 +18,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from phibench.cli.main import main
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.read import Sample, open_dataset
 from phibench.datasets.sample_page import STEPS, epipolar_line, page_data, sample_of, sample_page, write_sample_page
-from phibench.estimator.cli.main import main
 from phibench.render.optics.ray_tracer import trace_pixels
 from phibench.scenes.rig import POSITIONS
 

@@ -38,7 +38,7 @@ from phibench.datasets.store.layers import (
 )
 from phibench.datasets.store.pictures import Picture
 from phibench.datasets.verify import Report, file_faults, verify
-from phibench.estimator.paper.sensitivity_table import keep_sensitivities
+from phibench.studies.paper.sensitivity_table import keep_sensitivities
 
 PREVIEW = schema.preview_file("seen-near-h0.500")
 

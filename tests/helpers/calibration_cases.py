@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import optimize
 
-from phibench.estimator.outline.limb_image import Measured
+from phibench.calibration.outline.limb_image import Measured
 from phibench.scenes.rig import Rig
 
 RIG, STROKE = Rig(), 0.5

@@ -12,11 +12,11 @@ from pathlib import Path
 import numpy as np
 from helpers.further_spots import with_further_spots
 
+from phibench.benchmark.scores.answer_errors import MATCH_PX, Rules
+from phibench.benchmark.scores.dataset_pairs import dataset_pairs
+from phibench.benchmark.scores.intervals import Clusters, Estimate, rate
+from phibench.benchmark.scores.strata import CLEAR_SIGMAS
 from phibench.datasets.read import Dataset, open_dataset
-from phibench.estimator.benchmark.answer_errors import MATCH_PX, Rules
-from phibench.estimator.benchmark.dataset_pairs import dataset_pairs
-from phibench.estimator.benchmark.intervals import Clusters, Estimate, rate
-from phibench.estimator.benchmark.strata import CLEAR_SIGMAS
 from phibench.estimator.spots.detect import detect
 
 PRESETS = ("bayer-raw", "srgb8", "mjpeg")

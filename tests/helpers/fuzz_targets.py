@@ -15,33 +15,34 @@ from pathlib import Path
 
 import numpy as np
 import polars as pl
+from helpers.districts import DISTRICTS
 from helpers.strange_releases import TITLE, tiny_release
 from helpers.valid_files import ROOT, TEXT, Kind, compact, digest, png
 from PIL import Image
 
+from phibench.benchmark.isolation.resolve import MethodError, resolve
+from phibench.benchmark.release import fetch
+from phibench.benchmark.release.benchmark import read_manifest_file
+from phibench.benchmark.release.secret_seed import secret_seed
+from phibench.calibration.captures.pair_list import read_pair_list
+from phibench.calibration.captures.picture_files import read_photo
+from phibench.calibration.captures.rig_file import read_rig_file
+from phibench.calibration.sensor_fit.capture_folder import CaptureNotes, read_frame, read_notes
+from phibench.calibration.sensor_fit.emva_descriptor import open_descriptor
 from phibench.datasets.build.light_map_cache import cache_limit_mb
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.film.film_store import FilmInfo, read_document, read_spots, read_table, write_spots
 from phibench.datasets.film.film_video import read_frames, write_frames
 from phibench.datasets.frames.request import jpeg_tables
 from phibench.datasets.frames.sensor_file import SensorFile, read_sensor_file
-from phibench.datasets.release import fetch
-from phibench.datasets.release.benchmark import read_manifest_file
-from phibench.datasets.release.secret_seed import secret_seed
 from phibench.datasets.rooms.panorama_files import is_linear
 from phibench.datasets.rooms.room_files import RoomFiles
 from phibench.datasets.store.checksums import read_checksums
-from phibench.estimator.captures.pair_list import read_pair_list
-from phibench.estimator.captures.picture_files import read_photo
-from phibench.estimator.captures.rig_file import read_rig_file
 from phibench.estimator.learned.networks import CROP, Network
-from phibench.estimator.sandbox.resolve import MethodError, resolve
-from phibench.estimator.sensor_fit.capture_folder import CaptureNotes, read_frame, read_notes
-from phibench.estimator.sensor_fit.emva_descriptor import open_descriptor
 from phibench.render.film.moving_rows import RowsImage
 from phibench.scenes.rig import Rig
 
-FOLDERS = ("scenes", "render", "datasets", "estimator")
+FOLDERS = (*DISTRICTS, "phibench")
 _DECODERS = {("OpenEXR", "File"), ("av", "open"), ("Image", "open"), ("polars", "read_parquet"), ("pl", "read_parquet")}
 
 

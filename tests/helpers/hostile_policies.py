@@ -3,7 +3,7 @@
 HEADER = """
 import glob, json, os, pickle, signal, socket, struct, subprocess, sys, time
 
-from phibench.estimator.loop.simulator import Action
+from phibench.robot.loop.simulator import Action
 
 def line():
     # the socket to whoever judges

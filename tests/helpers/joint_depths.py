@@ -22,8 +22,8 @@ from phibench.estimator.limits.off_frame_bound import FrameCounts
 from phibench.estimator.methods.chain_fit import chain_fit
 from phibench.estimator.methods.locate import each_spot_twice
 from phibench.estimator.methods.raw_likelihood import joint_of, raw_maximum_likelihood
-from phibench.estimator.paper.experiment_bounds import spot_bounds
 from phibench.render.sensor.light import Region
+from phibench.studies.paper.experiment_bounds import spot_bounds
 
 _AROUND_PX = 64
 _NORMAL_95 = 1.959964

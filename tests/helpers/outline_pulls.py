@@ -8,12 +8,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from helpers.limb_frames import drawn_revolved, drawn_rig, drawn_room, drawn_tint, limb_light
 
+from phibench.calibration.outline.contour import place_of_rig
+from phibench.calibration.outline.limb_image import planes_of
+from phibench.calibration.outline.rim_outline import fit_rim
+from phibench.calibration.outline.sphere_outline import find_sphere_outline as find_outline
+from phibench.calibration.outline.sphere_outline import fit_outline
 from phibench.datasets.frames.sensor_card import sensor_card
-from phibench.estimator.outline.contour import place_of_rig
-from phibench.estimator.outline.limb_image import planes_of
-from phibench.estimator.outline.rim_outline import fit_rim
-from phibench.estimator.outline.sphere_outline import find_sphere_outline as find_outline
-from phibench.estimator.outline.sphere_outline import fit_outline
 from phibench.estimator.spots.image_planes import ImageError
 from phibench.render.sensor.camera_chain import Chain
 from phibench.render.sensor.light import Light

@@ -15,10 +15,10 @@ from pathlib import Path
 
 import numpy as np
 
+from phibench.calibration.outline.outline import find_outline
+from phibench.calibration.rig.align import alignment
+from phibench.calibration.rig.from_dataset import photograph
 from phibench.datasets.read import Dataset, Sample, open_dataset
-from phibench.estimator.calibration.align import alignment
-from phibench.estimator.calibration.from_dataset import photograph
-from phibench.estimator.outline.outline import find_outline
 from phibench.estimator.spots.image_planes import ImageError
 from phibench.scenes.rig import POSITIONS
 

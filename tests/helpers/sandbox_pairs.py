@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from phibench.benchmark.isolation.easy_pairs import EasyPairs
 from phibench.datasets.frames.sensor_card import sensor_card
 from phibench.estimator.interface import Box, Pair
 from phibench.estimator.pair_set import PairTruth
-from phibench.estimator.sandbox.easy_pairs import EasyPairs
 from phibench.scenes.rig import Rig
 
 SHAPE = (48, 64)

@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
+from phibench.benchmark.sealed.submission import unseal
 from phibench.datasets.errors import DatasetError
-from phibench.estimator.sealed.submission import unseal
 
 METHOD = """\
 import numpy as np

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from phibench.datasets.release.benchmark import Part, content_sha256
-from phibench.datasets.release.release_make import Released, ReleaseRequest
+from phibench.benchmark.release.benchmark import Part, content_sha256
+from phibench.benchmark.release.release_make import Released, ReleaseRequest
 
 ROOT = Path(__file__).parents[2]
 

@@ -6,8 +6,8 @@ from functools import cache
 
 import numpy as np
 
-from phibench.estimator.film.film_positions import FilmPositions
 from phibench.render.film.moving_rows import chief_uv_px
+from phibench.robot.film.film_positions import FilmPositions
 from phibench.scenes.frames import Array
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.motion.carriage import Carriage

@@ -11,9 +11,9 @@ import numpy as np
 
 from phibench.estimator.geometry.rig_parameters import PARAMETERS, PRIOR_SIGMA, RIG_PARAMETERS, RigBias
 from phibench.estimator.geometry.sphere_image import SphereImager
-from phibench.estimator.loop.belief import Belief, TargetPrior
-from phibench.estimator.loop.sensing import SEEN, Direction, Light, Reading, Sensing, direction_of
-from phibench.estimator.loop.smoothing import belief_of
+from phibench.robot.loop.belief import Belief, TargetPrior
+from phibench.robot.loop.sensing import SEEN, Direction, Light, Reading, Sensing, direction_of
+from phibench.robot.loop.smoothing import belief_of
 from phibench.scenes.motion.vehicle import PlanarPose, Stance, Vehicle, rig_placement, stance
 from phibench.scenes.random_streams import generator
 from phibench.scenes.rig import Rig

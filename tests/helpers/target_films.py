@@ -27,8 +27,6 @@ from phibench.datasets.frames.sensor_card import card_of
 from phibench.datasets.plan.plan import Plan
 from phibench.datasets.recipe.load import parse_recipe
 from phibench.datasets.recipe.spot_placement import by_ray
-from phibench.estimator.film.blink_identity import TargetCode, TargetTracker
-from phibench.estimator.film.simple_targets import ColourIdentity, NearestBlob, red_blobs
 from phibench.estimator.spots.detect import mirror_box, outline_mask
 from phibench.render.film.key_views import PoseParts, blended
 from phibench.render.film.moving_rows import RowsImage, chief_uv_px, spot_time_s
@@ -40,6 +38,8 @@ from phibench.render.sensor.electrons import mosaic
 from phibench.render.sensor.light import Light, Region
 from phibench.render.sensor.noise_tiles import NoiseStream
 from phibench.render.sensor.settings import sensor
+from phibench.robot.film.blink_identity import TargetCode, TargetTracker
+from phibench.robot.film.simple_targets import ColourIdentity, NearestBlob, red_blobs
 from phibench.scenes.frames import Array
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.motion.carriage import Carriage

@@ -22,6 +22,22 @@ import polars as pl
 from helpers.bench_cases import cases, outcomes, truth_itself
 from PIL import Image
 
+from phibench.benchmark.isolation.resolve import Reference
+from phibench.benchmark.scores.answer_errors import Rules
+from phibench.benchmark.scores.document import MethodCard, read_records, read_score, write_score
+from phibench.benchmark.scores.score import score_outcomes
+from phibench.benchmark.sealed.sealed_set import (
+    FORMAT,
+    PAIRS,
+    SEAL,
+    public_sha256,
+    seal_id,
+)
+from phibench.benchmark.sealed.submission import SealedPairs, outcomes_of, read_submission, submission
+from phibench.benchmark.sealed.truth_file import read_truth_file, truth_text
+from phibench.calibration.captures.picture_files import read_picture
+from phibench.calibration.rig.bundle import Bundle
+from phibench.calibration.rig.file import read_calibration, write_calibration
 from phibench.datasets.build import light_map_cache
 from phibench.datasets.build.bake_task import read_light_map
 from phibench.datasets.build.journal import Entry, FolderHead, Journal
@@ -33,27 +49,11 @@ from phibench.datasets.store import documents, schema
 from phibench.datasets.store.checksums import checksums_text
 from phibench.datasets.store.documents import read_sensitivities, to_json
 from phibench.datasets.store.layers import read_layer, write_exr
-from phibench.estimator.benchmark.answer_errors import Rules
-from phibench.estimator.benchmark.document import MethodCard, read_records, read_score, write_score
-from phibench.estimator.benchmark.score import score_outcomes
-from phibench.estimator.calibration.bundle import Bundle
-from phibench.estimator.calibration.file import read_calibration, write_calibration
-from phibench.estimator.captures.picture_files import read_picture
 from phibench.estimator.geometry.rig_parameters import PARAMETERS
-from phibench.estimator.sandbox.resolve import Reference
-from phibench.estimator.sealed.sealed_set import (
-    FORMAT,
-    PAIRS,
-    SEAL,
-    public_sha256,
-    seal_id,
-)
-from phibench.estimator.sealed.submission import SealedPairs, outcomes_of, read_submission, submission
-from phibench.estimator.sealed.truth_file import read_truth_file, truth_text
-from phibench.estimator.studies.framework import read_settings
-from phibench.estimator.studies.run import find_study, read_study
 from phibench.render.room.light_map import LightMap, encoded
 from phibench.scenes.rig import Rig
+from phibench.studies.framework import read_settings
+from phibench.studies.run import find_study, read_study
 
 ROOT = Path(__file__).resolve().parents[2]
 TEXT = "0123456789abcdef" * 4  # a digest
@@ -189,7 +189,7 @@ def kinds(folder: Path) -> dict[str, Kind]:
 
 
 def settings_bytes() -> bytes:
-    return (ROOT / "estimator" / "studies" / "noise" / "settings.toml").read_bytes()
+    return (ROOT / "studies" / "noise" / "settings.toml").read_bytes()
 
 
 def _submission(path: Path) -> object:

@@ -70,7 +70,7 @@ def copy_of_checkout(folder: Path) -> Path:
 
 def pytest(root: Path, tests: Sequence[str]) -> int:
     """Exit code of a run on the package below `root`, which the path puts before an installed one."""
-    environment = {**os.environ, "PYTHONPATH": str(root / ".paths"), "PYTHONDONTWRITEBYTECODE": "1"}
+    environment = {**os.environ, "PYTHONPATH": str(root), "PYTHONDONTWRITEBYTECODE": "1"}
     command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", *tests]
     try:
         done = subprocess.run(command, cwd=root, env=environment, capture_output=True, timeout=TIMEOUT_S, check=False)

@@ -26,7 +26,6 @@ from phibench.datasets.store.documents import from_json, to_json
 from phibench.datasets.store.layers import read_ambient, read_truth
 from phibench.datasets.verify import verify
 from phibench.estimator.geometry.triangulate import depth_exact
-from phibench.estimator.paper.paper_tables import score
 from phibench.render.sensor.rolling_shutter import spot_velocity_px_per_s
 from phibench.scenes.catalog import c310_rig, default_rig
 from phibench.scenes.frames import Pose
@@ -36,6 +35,7 @@ from phibench.scenes.misalignment import OF_REVOLVED, PARAMETERS, Misalignment, 
 from phibench.scenes.rig import Rig
 from phibench.scenes.room import carriage
 from phibench.scenes.validation import SceneError
+from phibench.studies.paper.paper_tables import score
 
 EPS = 1e-14  # metres or cosines: a few roundings of numbers of order 1
 

@@ -14,12 +14,14 @@ from helpers.folders import contents
 from helpers.inline_workers import make_inline
 from helpers.processes import SMALLEST, quiet
 
+from phibench.benchmark.export.export_make import export
+from phibench.benchmark.export.pair_rows import ExportRequest
+from phibench.benchmark.sealed.sealed_set import seal
+from phibench.cli.main import main
 from phibench.datasets.build import sample_task, spot_task, tasks, workers
 from phibench.datasets.build.journal import Journal
 from phibench.datasets.build.tasks import Done, Failed, Task
 from phibench.datasets.errors import DatasetError, IncompleteError
-from phibench.datasets.export.export_make import export
-from phibench.datasets.export.pair_rows import ExportRequest
 from phibench.datasets.frames.request import FrameOptions
 from phibench.datasets.make import dry_run, make
 from phibench.datasets.merge_repair import merge, repair
@@ -31,8 +33,6 @@ from phibench.datasets.show import summary
 from phibench.datasets.store import schema
 from phibench.datasets.store.checksums import write_checksums
 from phibench.datasets.verify import verify
-from phibench.estimator.cli.main import main
-from phibench.estimator.sealed.sealed_set import seal
 from phibench.render.optics.certificate import certify
 
 # every sample has its own rig and views, which go with it; numbers 1 and 3 are refused below

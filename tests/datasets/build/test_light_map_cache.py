@@ -14,9 +14,9 @@ import pytest
 from filelock import FileLock
 from helpers.processes import within
 
+from phibench.cli.main import main
 from phibench.datasets.build import light_map_cache as cache
 from phibench.datasets.errors import DatasetError
-from phibench.estimator.cli.main import main
 from phibench.render.room.light_map import BakeSettings, LightMap, texel_count
 from phibench.scenes.catalog import default_rig
 from phibench.scenes.room import Room, Sun

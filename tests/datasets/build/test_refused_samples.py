@@ -12,6 +12,7 @@ from helpers.inline_workers import make_inline
 from helpers.processes import SMALLEST, quiet
 from helpers.refusing_workers import REFUSED
 
+from phibench.cli.main import main
 from phibench.datasets.build import spot_task, tasks, workers
 from phibench.datasets.build.journal import Journal
 from phibench.datasets.errors import DatasetError, IncompleteError, RecipeError
@@ -21,7 +22,6 @@ from phibench.datasets.plan.plan import make_plan, shard_plan
 from phibench.datasets.recipe.load import load_recipe
 from phibench.datasets.store import schema
 from phibench.datasets.verify import verify
-from phibench.estimator.cli.main import main
 from phibench.render.optics import certificate, spot_samples
 from phibench.scenes.catalog import default_rig
 from phibench.scenes.laser import LaserSpot

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from helpers.processes import SMALLEST
 
+from phibench.cli.main import main
 from phibench.datasets.build.room_export import bounds_m, export_mesh, export_panorama, export_room
 from phibench.datasets.recipe.build import build_rig
 from phibench.datasets.recipe.load import load_recipe
 from phibench.datasets.recipe.room_tables import MeshTable, PanoramaTable
 from phibench.datasets.rooms.mesh_room import mesh_room
 from phibench.datasets.rooms.panorama_room import panorama_room
-from phibench.estimator.cli.main import main
 from phibench.render.optics.room_tracer import own_geometry
 from phibench.render.room.ambient import render_ambient
 from phibench.render.room.light_map import BakeSettings, bake

@@ -147,7 +147,7 @@ import sys
 from pathlib import Path
 from phibench.datasets.build.tasks import Made, Task
 from phibench.datasets.build.workers import local_workers
-from phibench.estimator.cli import main as cli
+from phibench.cli import main as cli
 
 def start() -> None:
     with local_workers(2, Path(sys.argv[1])) as pool:
@@ -203,7 +203,7 @@ def commands(mark: str, folder: Path, tls: bool = False) -> list[list[str]]:
     words = {"smoke": str(SMALLEST), "dask": str(BIN / "dask")}
     found = []
     for line in lines:
-        program = [sys.executable, "-m", "phibench.estimator.cli.main"] if line[0] == "phibench" else [words[line[0]]]
+        program = [sys.executable, "-m", "phibench.cli.main"] if line[0] == "phibench" else [words[line[0]]]
         found.append([*program, *(words.get(word, re.sub("^out(?=/)", str(folder), word)) for word in line[1:])])
     return found
 

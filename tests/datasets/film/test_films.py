@@ -22,12 +22,12 @@ from phibench.datasets.film.film_store import verify
 from phibench.datasets.film.film_video import read_frames, write_frames, write_mp4, write_videos
 from phibench.datasets.recipe.load import parse_recipe
 from phibench.datasets.store.layers import read_exr, write_exr
-from phibench.estimator.film.film_frames import film_frames
 from phibench.render.film.key_views import PoseParts
 from phibench.render.optics.spot_layer import spot_layer
 from phibench.render.optics.truth import spot_truth
 from phibench.render.sensor.camera_chain import Chain
 from phibench.render.sensor.noise_tiles import NoiseStream
+from phibench.robot.film.film_frames import film_frames
 
 TEXT = (ROOT / "tests" / "films.toml").read_text(encoding="utf-8")
 FILM = "seen-near-h0.300"

@@ -13,6 +13,7 @@ import polars
 import pytest
 from PIL import Image
 
+from phibench.cli import main as cli
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.exposures.draw import Drawn, draw_frames
 from phibench.datasets.frames.frame_files import (
@@ -30,7 +31,6 @@ from phibench.datasets.frames.source import Frame
 from phibench.datasets.read import open_dataset
 from phibench.datasets.store.checksums import damaged, strays
 from phibench.datasets.store.layers import read_exr
-from phibench.estimator.cli import main as cli
 from phibench.render.sensor.light import Region
 
 SEEN, HALF = "seen-near-h0.500", "half-hidden-h1.400"

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from phibench.cli.main import main
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.exposures.pair_draws import pair_draws
 from phibench.datasets.frames.sensor_card import sensor_card
@@ -20,7 +21,6 @@ from phibench.datasets.frames.sensor_file import (
     write_sensor_file,
 )
 from phibench.datasets.read import open_dataset
-from phibench.estimator.cli.main import main
 
 CAMERA = SensorFile(
     "bayer-raw",

@@ -30,9 +30,9 @@ from phibench.datasets.store.checksums import write_checksums
 from phibench.datasets.store.documents import read_manifest, write_manifest
 from phibench.datasets.store.layers import read_exr
 from phibench.datasets.verify import verify
-from phibench.estimator.paper.paper_tables import score
 from phibench.render.optics.truth import spot_truth
 from phibench.scenes.rig import POSITIONS
+from phibench.studies.paper.paper_tables import score
 
 TINY = Path(__file__).resolve().parents[2] / "tiny_random.toml"
 

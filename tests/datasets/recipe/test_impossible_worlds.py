@@ -14,12 +14,12 @@ import numpy as np
 import pytest
 from helpers.proof_rooms import generated, mesh_settings, panorama_settings
 
+from phibench.cli import main as cli
 from phibench.datasets.plan import sampling
 from phibench.datasets.recipe.spot_placement import by_ray
 from phibench.datasets.recipe.tables import LaserTable
 from phibench.datasets.rooms.panorama_room import panorama_room
 from phibench.datasets.rooms.panorama_settings import PanoramaSettings
-from phibench.estimator.cli import main as cli
 from phibench.render.optics.truth import spot_truth
 from phibench.scenes.catalog import default_rig
 from phibench.scenes.frames import as_vector

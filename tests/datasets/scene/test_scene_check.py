@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
+from phibench.cli.main import main
 from phibench.datasets.read import Sample, open_dataset
 from phibench.datasets.scene import scene_check
 from phibench.datasets.scene.scene_check import Checked, Difference, check_view, chosen_samples
-from phibench.estimator.cli.main import main
 from phibench.scenes.mirror import ReflectanceTable
 
 

@@ -14,10 +14,10 @@ import pytest
 import trimesh
 
 import phibench
+from phibench.cli.main import main
 from phibench.datasets.read import Sample, open_dataset
 from phibench.datasets.scene.scene_export import expected_radiance, export_scene
 from phibench.datasets.store.layers import read_exr
-from phibench.estimator.cli.main import main
 from phibench.render.setup.variant import activate
 
 # A process without phibench: the import is refused. Its variant needs no LLVM.

@@ -17,15 +17,15 @@ from helpers.valid_files import sensitivity_table
 from rich.console import Console
 
 import phibench
+from phibench.cli.main import main
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.read import open_finished
 from phibench.datasets.store import schema
 from phibench.datasets.store.checksums import strays
 from phibench.datasets.store.documents import read_sensitivities, sensitivity_bytes, sensitivity_fault
 from phibench.datasets.verify import verify
-from phibench.estimator.cli.main import main
 from phibench.estimator.geometry.estimators import ESTIMATORS
-from phibench.estimator.paper.sensitivity_table import columns, keep_sensitivities
+from phibench.studies.paper.sensitivity_table import columns, keep_sensitivities
 
 
 @pytest.fixture

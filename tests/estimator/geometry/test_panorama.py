@@ -11,9 +11,9 @@ import pytest
 from helpers.revolved_rigs import revolved
 from PIL import Image
 
+from phibench.cli.main import main
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.read import open_dataset
-from phibench.estimator.cli.main import main
 from phibench.estimator.geometry.panorama import (
     Grid,
     RoomEdge,

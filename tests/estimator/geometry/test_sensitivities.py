@@ -13,8 +13,8 @@ import polars
 import pytest
 from helpers.misaligned_cases import Case, draw_case
 
+from phibench.cli.main import main
 from phibench.datasets.read import open_finished
-from phibench.estimator.cli.main import main
 from phibench.estimator.geometry.estimators import ESTIMATORS
 from phibench.estimator.geometry.mirror_image import image_of
 from phibench.estimator.geometry.paper_depth import paper_gradient
@@ -28,7 +28,6 @@ from phibench.estimator.geometry.sensitivities import (
     truth_gradient,
 )
 from phibench.estimator.geometry.triangulate import depth_exact, exact_gradient
-from phibench.estimator.paper.sensitivity_table import TRUTH, columns
 from phibench.render.optics.certificate import pixel_centroid
 from phibench.render.optics.spot_layer import spot_layer
 from phibench.render.optics.truth import depth_m, spot_truth
@@ -38,6 +37,7 @@ from phibench.scenes.laser import LaserSpot
 from phibench.scenes.misalignment import PARAMETERS as MISALIGNMENT
 from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.rig import POSITIONS, Rig, View
+from phibench.studies.paper.sensitivity_table import TRUTH, columns
 
 Pixels = tuple[np.ndarray, np.ndarray]
 STILL = dict.fromkeys(("roll_rad", "pitch_rad", "yaw_rad", "shift_x_m", "shift_y_m", "shift_z_m"), 0.0)
@@ -342,7 +342,7 @@ def test_the_table_of_a_data_set(misaligned_dataset: Path, tmp_path: Path, capsy
 
 
 def test_a_hidden_spot_is_a_row_of_nulls_with_its_cause(misaligned_dataset: Path) -> None:
-    from phibench.estimator.paper.sensitivity_table import sensitivity_rows
+    from phibench.studies.paper.sensitivity_table import sensitivity_rows
 
     sample = open_finished(misaligned_dataset).samples[0]
     nowhere = sample.row.up.model_copy(update={"visible": False, "cause": "occluded:crate"})

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from phibench.benchmark.isolation.easy_pairs import EasyPairs
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.frames.sensor_card import sensor_card
 from phibench.estimator.learned import crop_training, frame_training, networks
@@ -34,7 +35,6 @@ from phibench.estimator.learned.networks import (
     shipped,
 )
 from phibench.estimator.methods.registry import METHODS
-from phibench.estimator.sandbox.easy_pairs import EasyPairs
 from phibench.scenes.random_streams import generator
 
 FOLDER = Path(networks.__file__).parent

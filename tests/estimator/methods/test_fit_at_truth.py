@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from helpers.bench_cases import cases
 
-from phibench.estimator.benchmark.answer_errors import MATCH_PX, Rules
-from phibench.estimator.benchmark.causes import Case, cause_of
+from phibench.benchmark.isolation.easy_pairs import EasyPairs
+from phibench.benchmark.scores.answer_errors import MATCH_PX, Rules
+from phibench.benchmark.scores.causes import Case, cause_of
 from phibench.estimator.interface import Answer, Spot
 from phibench.estimator.methods.fit_at_truth import KeptFits, fit_at_truth, reaches_bound
-from phibench.estimator.sandbox.easy_pairs import EasyPairs
 
 PAIRS = cases(2)
 TRUTH = PAIRS.truths[0]

@@ -9,10 +9,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from phibench.benchmark.isolation.easy_pairs import EasyPairs
+from phibench.benchmark.isolation.example_method import extract
 from phibench.estimator.interface import Pair
 from phibench.estimator.methods.pair_light import lamp_mask, laser_light, mirror_mask, noise_of
-from phibench.estimator.sandbox.easy_pairs import EasyPairs
-from phibench.estimator.sandbox.example_method import extract
 from phibench.scenes.frames import BoolArray
 
 

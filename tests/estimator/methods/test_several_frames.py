@@ -9,23 +9,23 @@ import pytest
 from helpers.chain_scenes import COLLECTED, ROOM
 from helpers.sensor_light import spot_at
 
+from phibench.benchmark.isolation.example_method import extract
 from phibench.datasets.frames.sensor_card import card_of
 from phibench.estimator.interface import Box, Pair, Spot
 from phibench.estimator.methods.chain_fit import chain_fit
 from phibench.estimator.methods.locate import each_spot_twice
 from phibench.estimator.methods.raw_likelihood import raw_maximum_likelihood
 from phibench.estimator.processed.quasi_score import shared_covariance
-from phibench.estimator.sandbox.example_method import extract
 from phibench.estimator.spots.detect import detect
 from phibench.estimator.spots.raw_pixels import GaussLaw, PixelNoise
 from phibench.estimator.spots.spot_prediction import spot_blur
-from phibench.estimator.studies.image_cutout import cut_region, cut_rig
 from phibench.render.sensor.camera_chain import Chain
 from phibench.render.sensor.light import Light
 from phibench.render.sensor.noise_tiles import NoiseStream
 from phibench.render.sensor.settings import sensor
 from phibench.scenes.random_streams import generator
 from phibench.scenes.rig import Rig
+from phibench.studies.image_cutout import cut_region, cut_rig
 
 PART = cut_region([(430.3, 300.2), (470.6, 320.8)], (720, 1280), 48)
 RIG = cut_rig(Rig(), PART)

@@ -11,8 +11,8 @@ import pytest
 from helpers.chain_scenes import COLLECTED, FITS, MIDDLE, ROOM, SQUARE, UNITS, scene
 from PIL import Image
 
+from phibench.calibration.captures.picture_files import read_picture, sensor_choice
 from phibench.datasets.frames.sensor_card import card_of
-from phibench.estimator.captures.picture_files import read_picture, sensor_choice
 from phibench.estimator.geometry.status import Status
 from phibench.estimator.limits.processed_bound import chain_limit
 from phibench.estimator.processed.chain_model import chain_model, codes

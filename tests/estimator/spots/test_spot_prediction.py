@@ -18,12 +18,12 @@ from phibench.estimator.spots.fit_raw import fit_law
 from phibench.estimator.spots.gaussian_spot import SpotBlur
 from phibench.estimator.spots.raw_pixels import GaussLaw, bayer_filters, noise_of, spot_regions
 from phibench.estimator.spots.spot_prediction import spot_blur
-from phibench.estimator.studies.image_cutout import Shot, SpotPair, cut_region, cut_rig, drawn_pair, without_off
 from phibench.render.optics.spot_layer import SpotLayer, spot_layer
 from phibench.render.sensor.settings import sensor
 from phibench.scenes.laser import Beam, LaserSpot, beam_diameter_m
 from phibench.scenes.rig import Rig
 from phibench.scenes.room import Room
+from phibench.studies.image_cutout import Shot, SpotPair, cut_region, cut_rig, drawn_pair, without_off
 
 
 @pytest.mark.parametrize("depth_m", [1.0, 1.98, 3.97])

@@ -165,9 +165,7 @@ def test_roll_counts_with_the_left_side_up() -> None:
 def test_every_number_is_declared_with_a_range_and_is_used() -> None:
     assert all(entry.low < entry.high and entry.unit and entry.meaning for entry in PARAMETERS.values())
     root = Path(__file__).parents[3]
-    files = [
-        file for folder in ("scenes", "estimator/loop", "estimator/film") for file in (root / folder).rglob("*.py")
-    ]
+    files = [file for folder in ("scenes", "robot/loop", "robot/film") for file in (root / folder).rglob("*.py")]
     read = {node.attr for file in files for node in ast.walk(ast.parse(file.read_text(encoding="utf-8")))
             if isinstance(node, ast.Attribute)}  # fmt: skip
     assert set(PARAMETERS) - read == set()

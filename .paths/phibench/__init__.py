@@ -1,1 +1,0 @@
-../../phibench/__init__.py

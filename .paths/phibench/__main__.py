@@ -1,1 +1,0 @@
-../../phibench/__main__.py

@@ -1,0 +1,284 @@
+"""Export of a data set's pairs in the formats of other tools, with index, card, licence and hashes.
+
+A shard is known by the hash of all that it depends on. `export.jsonl` has a line for each that is finished, so that a
+run that ended early goes on where it was.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from phibench.benchmark.export.containers import NEEDS_PYARROW, image_name, shard_name, write_shard
+from phibench.benchmark.export.dataset_card import card, croissant
+from phibench.benchmark.export.pair_rows import INDEX, SPLITS, ExportRequest, drawn_pair, pair_key, pair_table, splits
+from phibench.datasets.errors import DatasetError
+from phibench.datasets.exposures.draw import require_outside, sample_key
+from phibench.datasets.frames.request import whole_number
+from phibench.datasets.frames.source import FrameSource, has_place
+from phibench.datasets.input_files import InputFile
+from phibench.datasets.parallel import parallel_map
+from phibench.datasets.progress import Steps, progress_console
+from phibench.datasets.read import Dataset, open_dataset, open_finished
+from phibench.datasets.store import schema
+from phibench.datasets.store.checksums import checksums_text, differing_files, read_checksums
+from phibench.datasets.store.croissant import LICENSE_TEXT
+from phibench.datasets.store.documents import parquet_bytes
+from phibench.datasets.store.files import (
+    WriteError,
+    only_run,
+    read_rows,
+    remove_temporary,
+    sha256,
+    working,
+    write_bytes,
+    write_text,
+)
+from phibench.datasets.store.leftovers import folder_for_work
+from phibench.datasets.store.provenance import code_behind
+from phibench.datasets.store.schema import Document, described
+from phibench.scenes.rig import POSITIONS
+
+INFO = schema.TruthFolder.EXPORT.value
+SHARDS = schema.TruthFile.SHARDS.value
+_COPIED = (schema.RIGS, schema.ROOMS, schema.RECIPE)
+_AGAIN = "run the same `phibench export` again"
+
+
+class ShardRow(Document):
+    """One line of `export.jsonl`: a finished shard."""
+
+    name: str = described("-", "shard")
+    key: str = described("-", "hash of all that it depends on")
+    files: dict[str, str] = described("-", "SHA-256 by file")
+    drawn: list[tuple[str, dict[str, Any]]] = described("-", "sample id, and what its draw adds, in order")
+
+
+@dataclass(frozen=True)
+class Shard:
+    """One shard to be made: its pairs, as (sample id, draw), in order."""
+
+    dataset: Path
+    out: Path
+    request: ExportRequest
+    split: str
+    name: str
+    pairs: tuple[tuple[str, int], ...]
+    known: Mapping[str, ShardRow] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Exported:
+    """Outcome: the folder, pairs by split, shards written and kept, and notes on what was left out."""
+
+    folder: Path
+    pairs: Mapping[str, int]
+    made: int
+    kept: int
+    notes: tuple[str, ...]
+
+
+def export(
+    folder: str | Path,
+    request: ExportRequest,
+    out: str | Path,
+    *,
+    workers: int | None = None,
+    console: Console | None = None,
+) -> Exported:
+    """Write the pairs of a data set for other tools; what is there and undamaged is kept.
+
+    Raises
+    ------
+    DatasetError
+        If the data set, the request or the folder will not do, or the disk is full; in one sentence.
+    """
+    dataset, console, out = open_finished(folder), console or progress_console(), Path(out)
+    count = whole_number("workers", os.cpu_count() or 1 if workers is None else workers, 1)
+    _check_folder(out, Path(folder))
+    _versions(request)  # a missing package is said before anything is written
+    try:
+        with folder_for_work(out), only_run(out):
+            remove_temporary(out)
+            return _export(dataset, request, out, count, console)
+    except OSError as error:
+        text = str(error) if isinstance(error, WriteError) else f"could not write to {out}: {error}"
+        raise DatasetError(f"{text}; then run the same command again") from error
+
+
+def _export(dataset: Dataset, request: ExportRequest, out: Path, workers: int, console: Console) -> Exported:
+    _claim(out, dataset, request)
+    shards, notes = _shards(dataset, request, out)
+    known = {row.name: row for row in read_rows(out / SHARDS, ShardRow)} if (out / SHARDS).is_file() else {}
+    rows: dict[str, ShardRow] = {}
+    made = 0
+    (out / schema.CHECKSUMS).unlink(missing_ok=True)  # until all is there the export is not finished
+    with Steps(console, "shards", len(shards)) as steps:
+        jobs = [Shard(**{**shard.__dict__, "known": _one(known, shard.name)}) for shard in shards]
+        for row, new in parallel_map(perform, jobs, workers, in_order=False):
+            rows[row.name], made = row, made + new
+            if new:
+                _write_rows(out, {**known, **rows}.values())
+            steps.advance()
+    _write_rows(out, rows.values())
+    _finish(dataset, request, out, shards, rows)
+    counts = {name: sum(len(shard.pairs) for shard in shards if shard.split == name) for name in SPLITS}
+    return Exported(out, counts, made, len(shards) - made, tuple(notes))
+
+
+def perform(shard: Shard) -> tuple[ShardRow, bool]:
+    """Make one shard, or keep the one that is there; True if it was written."""
+    dataset = open_dataset(shard.dataset)
+    key = _key(dataset, shard)
+    if (held := shard.known.get(shard.name)) and held.key == key and not differing_files(shard.out, held.files):
+        return held, False
+    pairs, source, last = [], None, ""
+    for sample_id, draw in shard.pairs:
+        sample = dataset[sample_id]
+        if source is None or sample_id != last:
+            source, last = FrameSource.from_request(sample, sample.frame_request(shard.request.frames)), sample_id
+        pairs.append(drawn_pair(source, sample.row, draw, shard.request))
+    drawn = [(pair.sample_id, {"key": pair.key, "split": shard.split, **pair.added}) for pair in pairs]
+    with working(shard.out):
+        files = write_shard(shard.out, shard.name, shard.request, pairs, pair_table(dataset.rows, drawn))
+    return ShardRow(
+        name=shard.name, key=key, files={name: sha256(shard.out / name) for name in files}, drawn=drawn
+    ), True
+
+
+def verify_export(folder: str | Path) -> list[str]:
+    """One sentence per fault of an export: files that are missing, changed or not listed.
+
+    Raises
+    ------
+    DatasetError
+        If the folder is no export, or one that was not finished.
+    """
+    folder = Path(folder)
+    if not (folder / INFO).is_file():
+        raise DatasetError(f"{folder} is no export: it has no {INFO}")
+    if not (folder / schema.CHECKSUMS).is_file():
+        raise DatasetError(f"{folder} has no {schema.CHECKSUMS}: it was not finished; {_AGAIN}")
+    listed = read_checksums(folder)
+    found = (path for path in folder.rglob("*") if path.is_symlink() or not path.is_dir())  # pipes and sockets, too
+    there = {path.relative_to(folder).as_posix() for path in found}
+    strange = sorted(there - set(listed) - {schema.CHECKSUMS, SHARDS, schema.LOCK})
+    return differing_files(folder, listed) + [f"{name} is not of the export" for name in strange]
+
+
+def _shards(dataset: Dataset, request: ExportRequest, out: Path) -> tuple[list[Shard], list[str]]:
+    split_of, notes, shards = splits(dataset, request), [], []
+    for split in SPLITS:
+        pairs = []
+        for sample in dataset.samples:
+            if split_of[sample.row.sample_id] != split:
+                continue
+            size = sample.rig.camera.height_px, sample.rig.camera.width_px
+            if request.frames.region is not None and not all(has_place(sample.truth_row(p), size) for p in POSITIONS):
+                notes.append(f"{sample.row.sample_id} is left out: no image of the spot to put a region around")
+            else:
+                pairs += [(sample.row.sample_id, draw) for draw in range(request.draws)]
+        parts = [pairs[k : k + request.pairs_per_shard] for k in range(0, len(pairs), request.pairs_per_shard)]
+        for number, part in enumerate(parts):
+            name = shard_name(request.form, split, number, len(parts))
+            shards.append(Shard(dataset.folder, out, request, split, name, tuple(part)))
+    return shards, notes
+
+
+def _key(dataset: Dataset, shard: Shard) -> str:
+    samples = dict.fromkeys(sample_id for sample_id, _ in shard.pairs)
+    keys = [sample_key(dataset[sample_id], shard.request.frames) for sample_id in samples]
+    code = [code_behind(f"phibench.benchmark.export.{name}") for name in ("pair_rows", "containers")]
+    parts = [shard.name, shard.split, shard.pairs, shard.request.document(), keys, code, _versions(shard.request)]
+    return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
+
+
+def _versions(request: ExportRequest) -> list[str]:
+    """Packages that the bytes depend on.
+
+    Raises
+    ------
+    DatasetError
+        If Parquet files are wanted and pyarrow is not installed.
+    """
+    from importlib.metadata import PackageNotFoundError, version
+
+    if request.form != "parquet":
+        return []
+    try:
+        return [f"pyarrow {version('pyarrow')}"]
+    except PackageNotFoundError as error:
+        raise DatasetError(NEEDS_PYARROW) from error
+
+
+def _one(known: Mapping[str, ShardRow], name: str) -> Mapping[str, ShardRow]:
+    return {name: known[name]} if name in known else {}
+
+
+def _write_rows(out: Path, rows: Iterable[ShardRow]) -> None:
+    ordered = sorted(rows, key=lambda row: row.name)
+    write_text(out / SHARDS, "".join(json.dumps(row.model_dump(mode="json")) + "\n" for row in ordered))
+
+
+def _check_folder(out: Path, dataset: Path) -> None:
+    require_outside(out, dataset)
+    if out.is_dir() and not (out / INFO).is_file() and any(not path.name.startswith(".") for path in out.iterdir()):
+        raise DatasetError(f"{out} holds other files: give an empty folder, `--out FOLDER`")
+
+
+def _claim(out: Path, dataset: Dataset, request: ExportRequest) -> None:
+    """Write down what the folder is for; refuse one that has an export of something else."""
+    meant = {
+        "dataset": dataset.info.name,
+        "dataset_sha256": sha256(dataset.folder / schema.CHECKSUMS),
+        **request.document(),
+    }
+    path = out / INFO
+    if path.is_file():
+        held = InputFile(path, "give another folder, `--out FOLDER`").json()
+        words = {"form": "--to"}
+        if other := [words.get(name, name) for name in meant if held.get(name) != meant[name]]:
+            raise DatasetError(
+                f"{out} holds an export that differs in {', '.join(other)}: give another folder, `--out FOLDER`"
+            )
+        return
+    write_text(path, json.dumps(meant, indent=1, allow_nan=False) + "\n")
+
+
+def _finish(
+    dataset: Dataset, request: ExportRequest, out: Path, shards: Sequence[Shard], rows: Mapping[str, ShardRow]
+) -> None:
+    """Write index, card, Croissant and hashes; files of an older run that belong to no shard go."""
+    ordered = [entry for shard in shards for entry in rows[shard.name].drawn]
+    table = pair_table(dataset.rows, ordered)
+    for column, _, _ in request.images:
+        table = table.with_columns(_names(request, shards, column))
+    write_bytes(out / INDEX, parquet_bytes(table))
+    for name in _COPIED:
+        write_bytes(out / name, InputFile(dataset.folder / name, "run `phibench dataset repair`").read())
+    write_text(out / "LICENSE", LICENSE_TEXT)
+    hashes = {name: digest for shard in shards for name, digest in rows[shard.name].files.items()}
+    write_text(out / schema.CROISSANT, croissant(dataset, request, table, out, hashes))
+    write_text(out / "README.md", card(dataset, request, table))
+    for name in (INFO, INDEX, schema.CROISSANT, "README.md", "LICENSE", *_COPIED):
+        hashes[name] = sha256(out / name)
+    write_text(out / schema.CHECKSUMS, checksums_text(hashes))
+
+
+def _names(request: ExportRequest, shards: Sequence[Shard], column: str) -> Any:
+    """Column with the place of every image: a file, or shard and member."""
+    import polars
+
+    places = [
+        f"{shard.name}/{image_name(request, pair_key(sample_id, draw), column)}"
+        for shard in shards
+        for sample_id, draw in shard.pairs
+    ]
+    return polars.Series(column, places)

@@ -1,0 +1,543 @@
+"""Process of code of others: started, asked, ended; and what it prints. Of a method: asked for pairs.
+
+The process gets a short environment, in which no data set's path stands, and an empty working directory. It stays warm
+from pair to pair. After a failure it is killed with all that it started, and the next pair gets a new one.
+
+Nothing that comes back is trusted: replies that repeat another nonce are dropped, texts are escaped and cut.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import os
+import re
+import secrets
+import select
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import IO, Any
+
+from phibench.benchmark.isolation.answers import AnswerError, checked
+from phibench.benchmark.isolation.isolation import Access, Isolation
+from phibench.benchmark.isolation.loaded_packages import MOST_NAMES
+from phibench.benchmark.isolation.opened_files import OpenedFiles
+from phibench.benchmark.isolation.readable_files import access_of
+from phibench.benchmark.isolation.resolve import MethodError, Reference, RunLimits
+from phibench.benchmark.isolation.supervisor import HUNG_UP, KILL_SECONDS, processes_in
+from phibench.benchmark.isolation.transport import (
+    LEAST_BYTES,
+    Connection,
+    MemoryFile,
+    TransportError,
+    again,
+    needed_bytes,
+    pack,
+)
+from phibench.benchmark.isolation.worker import lacks_memory
+from phibench.datasets.parallel import ONE_THREAD
+from phibench.datasets.store.leftovers import OwnedFolder
+from phibench.estimator.interface import FAILURES, Outcome, Pair
+from phibench.scenes.validation import printable_line
+
+_KEPT_BYTES = 65536
+_NO_PAIR: Pair | None = None
+_READS = 16  # of 64 kB at a time
+_LOOK_MS = 500  # between looks at whether anybody listens
+_LINES, _LINE_LENGTH = 20, 200  # of the output that an outcome keeps
+# Python 3.14 prints a stack of C functions after that of Python
+_STACK = re.compile(r"(?<!C stack trace )\(most recent call first\)")
+_FRAME = re.compile(r'^  File "(.+)", line (\d+) in (.+)$')
+
+
+class OutputTail:
+    """The end of what a process prints; its pipe is emptied all the time, so that the process never waits.
+
+    Parameters
+    ----------
+    pipe : binary file
+        Standard output and error of the process.
+    """
+
+    def __init__(self, pipe: IO[bytes]) -> None:
+        self._pipe, self._tail, self._count, self._ended = pipe, b"", 0, False
+        self._lock = threading.Lock()
+        os.set_blocking(pipe.fileno(), False)
+        self._thread = threading.Thread(target=self._drain, daemon=True)
+        self._thread.start()
+
+    def text(self, wait_s: float = 0.0, since: int = 0) -> str:
+        """Text after the first `since` bytes, 64 kB at most; waits so long for the pipe to end."""
+        self._thread.join(wait_s)
+        with self._lock:
+            self._take()
+            new = min(self._count - since, len(self._tail))
+            return self._tail[len(self._tail) - new :].decode(errors="replace")
+
+    def count(self) -> int:
+        """Bytes that were printed so far."""
+        with self._lock:
+            self._take()
+            return self._count
+
+    def close(self) -> None:
+        """Listen no more, even if a process that could not be ended holds the pipe."""
+        with self._lock:
+            self._ended = True
+
+    def _drain(self) -> None:
+        with self._pipe:
+            events = select.poll()  # `select.select` knows the first 1024 files only
+            events.register(self._pipe, select.POLLIN)
+            while not self._ended:
+                events.poll(_LOOK_MS)
+                with self._lock:
+                    self._take()
+
+    def _take(self) -> None:
+        """Read what is in the pipe; not for ever from a process that prints without end."""
+        for _ in range(_READS):
+            if self._ended:
+                return
+            try:
+                part = os.read(self._pipe.fileno(), _KEPT_BYTES)
+            except BlockingIOError:
+                return
+            self._ended = not part
+            self._count += len(part)
+            self._tail = (self._tail + part)[-_KEPT_BYTES:]
+
+
+def last_lines(text: str) -> str:
+    """Last lines of an output, without the stack that a fatal signal prints."""
+    own = text.partition("Fatal Python error:")[0].rstrip()
+    return "\n".join(_cleaned(line) for line in own.splitlines()[-_LINES:])
+
+
+def _cleaned(line: str) -> str:
+    """A line with its indentation, and without what a terminal would obey."""
+    text = line.replace("\t", "    ")
+    return " " * (min(len(text) - len(text.lstrip(" ")), 40)) + printable_line(text, _LINE_LENGTH - 40)
+
+
+def stack_place(text: str, file: str = "") -> str:
+    """Place "my_phi.py, line 12, in f" in the last stack that faulthandler printed; of `file` if it is in there."""
+    frames = list(_last_stack(text))
+    own = [frame for frame in frames if frame[0] == file] or frames[:1]
+    return f"{Path(own[0][0]).name}, line {own[0][1]}, in {own[0][2]}" if own else ""
+
+
+def _last_stack(text: str) -> Iterator[tuple[str, str, str]]:
+    """Frames (file, line, function), the innermost first."""
+    starts = [match.start() for match in _STACK.finditer(text)] or [0]
+    for line in text[starts[-1] :].splitlines():
+        if match := _FRAME.match(line):
+            yield match[1], match[2], match[3]
+
+
+_KEPT = re.compile(
+    r"PATH|HOME|USER|LOGNAME|SHELL|LANG|LC_\w+|TZ|VIRTUAL_ENV|PYTHONHOME|LD_LIBRARY_PATH|DYLD_LIBRARY_PATH|XDG_CACHE_HOME"
+    r"|(OMP|MKL|OPENBLAS|NUMBA|CUDA|NVIDIA|TORCH|TF|JAX|XLA)_\w+"
+)
+
+
+def environment(folder: str, inherited: Mapping[str, str]) -> dict[str, str]:
+    """Environment of a method's process: names that libraries need, and a folder of its own for temporary files.
+
+    Parameters
+    ----------
+    folder : str
+        The working directory.
+    inherited : mapping
+        The parent's environment.
+    """
+    kept = {name: value for name, value in inherited.items() if _KEPT.fullmatch(name)}
+    paths = [str(Path(part).absolute()) for part in inherited.get("PYTHONPATH", "").split(os.pathsep) if part]
+    if paths:
+        kept["PYTHONPATH"] = os.pathsep.join(paths)
+    python = {"PYTHONDONTWRITEBYTECODE": "1", "PYTHONUNBUFFERED": "1"}  # what it prints is read before it dies
+    caches = {"MPLCONFIGDIR": folder, "NUMBA_CACHE_DIR": folder}  # Matplotlib and Numba raise if they cannot write
+    return {**ONE_THREAD, **kept, "PWD": folder, "TMPDIR": folder, **caches, **python}
+
+
+_SUPERVISOR = "phibench.benchmark.isolation.supervisor"
+_REPLY_BYTES = 1 << 20
+_MOST_STALE = 64  # replies to other questions that are dropped before the process is given up
+_END_SECONDS = KILL_SECONDS + 1.0
+_MESSAGE_LENGTH = 400
+_STACK_SECONDS = 0.3  # for a stack to be printed, and for the pipe to end
+_NOT_RESTARTED = ("", "invalid")  # the process is as sound as before
+
+
+_OUT_OF_REACH = re.compile(r"PermissionError|permission denied|system error number 13\b|errno 13\b", re.IGNORECASE)
+"""Words of Python and of libraries in other languages about a file that cannot be opened."""
+_UNREAD = "can't open/read file"  # printed by OpenCV, which then gives None and raises nothing
+
+
+def advised(message: str, isolation: Isolation, output: str = "", hidden: Sequence[str] = ()) -> str:
+    """A message with what helps, if the rules of the isolation are what it or the printed lines may be about.
+
+    A hidden place is empty for the process where the system allows that: its files "do not exist" then.
+    """
+    denied = _OUT_OF_REACH.search(message) or _UNREAD in output or any(place in message for place in hidden)
+    if not isolation.files or not denied:
+        return message
+    return f"{message}; a method reads its own folder and has no network: --allow PATH lets it read more"
+
+
+class MethodProcess:
+    """A method that is kept warm between pairs, and started anew after a failure; or several built-in ones.
+
+    Built-in methods may have one process together. They get a pair once and share what they begin with
+    (`locate.SharedWork`). A method of another's has its process alone: nothing that it does reaches others.
+
+    Parameters
+    ----------
+    reference : Reference
+    limits : RunLimits
+    hidden : sequence of Path
+        Folders with the truth, which the method cannot read.
+    others : sequence of Reference
+        Further methods of the process, built-in like the first.
+
+    Raises
+    ------
+    MethodError
+        If the method lies in one of them, or a path that is allowed does; or if methods of others would share it.
+    """
+
+    def __init__(
+        self, reference: Reference, limits: RunLimits, hidden: Sequence[Path] = (), others: Sequence[Reference] = ()
+    ) -> None:
+        self._reference, self._references, self._limits = reference, (reference, *others), limits
+        if others and any(one.kind != "built-in" for one in self._references):
+            raise MethodError("built-in methods alone share a process: ask methods of your own one by one")
+        self.stages: dict[str, float] = {}
+        self.loaded = set[str]()
+        """Names of modules that the process has told of: `loaded_packages.loaded_names`."""
+        self._access, self._isolation = access_of(reference, limits, hidden), Isolation(reason="it did not start")
+        self._lock, self._closed = threading.Lock(), False
+        self._process: GuestProcess | None = None
+
+    @property
+    def reference(self) -> Reference:
+        """The method, or the first of several."""
+        return self._reference
+
+    @property
+    def isolation(self) -> Isolation:
+        """Isolation of the process that was started last."""
+        return self._isolation
+
+    def start(self, size: int = 0) -> None:
+        """Start the process and import the method, unless it is there already.
+
+        Parameters
+        ----------
+        size : int
+            Bytes that the images of a pair take.
+
+        Raises
+        ------
+        MethodError
+            If the method cannot be imported or its process does not start in time.
+        """
+        if self._process is not None:
+            return
+        with self._lock:
+            if self._closed:
+                raise MethodError(f"method '{self._reference.name}' was stopped")
+            process = self._process = GuestProcess(max(2 * size, LEAST_BYTES), self._access)
+        try:
+            self._isolation = process.load(self._references, self._limits)
+        except BaseException:
+            self.end()
+            raise
+        self.loaded |= process.loaded
+
+    def watch(self) -> OpenedFiles:
+        """Watch over the files that the method may read and that no package holds, from now on."""
+        places = [(f"allow: {Path(name).absolute().name}", Path(name)) for name in self._limits.allow]
+        if self._reference.kind == "file":
+            places.insert(0, ("", Path(self._reference.place).parent))
+        return OpenedFiles(places, [Path(path) for path in self._access.hidden])
+
+    def ask(self, pair: Pair, method: int = 0) -> Outcome:
+        """Give a method one pair; never raises for what the method does."""
+        try:
+            outcome = self._asked(pair, method)
+        except Exception as error:  # one pair must never end a run, whatever was not thought of
+            text = f"{type(error).__name__}: {error}"
+            outcome = Outcome(pair.number, None, math.nan, "crash", f"the method's process cannot be used: {text}")
+        if self._limits.fresh or outcome.failure not in _NOT_RESTARTED:
+            self.end()
+        message = printable_line(outcome.message, _MESSAGE_LENGTH)
+        if outcome.failure == "error":
+            message = advised(message, self._isolation, outcome.output, self._access.hidden)
+        return replace(outcome, message=message)
+
+    def ask_each(self, pair: Pair) -> tuple[Outcome, ...]:
+        """Give one pair to the methods, one after the other."""
+        return tuple(self.ask(pair, method) for method in range(len(self._references)))
+
+    def _asked(self, pair: Pair, method: int) -> Outcome:
+        size = needed_bytes(pair)
+        if self._process is not None and not self._process.is_ready(size):
+            self.end()
+        try:
+            self.start(size)
+        except MethodError as error:
+            return Outcome(pair.number, None, math.nan, "crash", f"the method's process did not start again: {error}")
+        process = self._process
+        if process is None:  # ended by `close` in between
+            return Outcome(pair.number, None, math.nan, "crash", "the run was stopped")
+        file = self._reference.place if self._reference.kind == "file" else ""
+        outcome = process.ask(pair, self._limits, file, method)
+        if len(self.loaded) < MOST_NAMES:
+            self.loaded |= process.loaded
+        if len(self._references) > 1:
+            self._add(process.stages, self._references[method].name)
+        return outcome
+
+    def _add(self, stages: dict[str, float], name: str) -> None:
+        for stage, seconds in stages.items():
+            stage = stage or name
+            self.stages[stage] = self.stages.get(stage, 0.0) + seconds
+
+    def end(self) -> None:
+        """Kill the process with all that it started; the next question starts another."""
+        with self._lock:
+            process, self._process = self._process, None
+            if process is not None:
+                process.kill()
+
+    def close(self) -> None:
+        """End for good."""
+        with self._lock:
+            self._closed = True
+        self.end()
+
+
+class GuestProcess:
+    """A process that runs, under a supervisor and isolated: of methods, or of a policy.
+
+    What comes back is JSON of bounded size, and has a deadline for the whole message; none of it is unpickled.
+
+    Parameters
+    ----------
+    size : int
+        Bytes for the images of a pair.
+    access : Access
+        Files that it may read.
+    serves : str
+        Module of ours whose `serve` answers in the process; "" for the one of methods.
+    """
+
+    def __init__(self, size: int, access: Access, serves: str = "") -> None:
+        self._serves, self._kind = serves, "policy" if serves else "method"
+        if os.name != "posix":
+            raise MethodError("code of others runs in processes of its own on Linux and macOS only")
+        ours, theirs = socket.socketpair()
+        self._connection, self._memory = Connection(ours), MemoryFile(size)
+        self._shares, self._held, self.stages = False, _NO_PAIR, dict[str, float]()
+        self.loaded = frozenset[str]()
+        self._owned = OwnedFolder("method")
+        self._folder = str(self._owned.path)
+        try:
+            with theirs:
+                self._process = self._started(access, theirs.fileno(), self._memory.reader)
+        except OSError as error:
+            self._give_back()
+            raise MethodError(f"no process can be started for a {self._kind}: {error.strerror or error}") from error
+        assert self._process.stdout is not None
+        self._output = OutputTail(self._process.stdout)
+
+    def _started(self, access: Access, *handles: int) -> subprocess.Popen[bytes]:
+        process = subprocess.Popen(
+            [sys.executable, "-m", _SUPERVISOR, *map(str, handles)],
+            pass_fds=handles,
+            cwd=self._folder,
+            env=environment(self._folder, os.environ),
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,  # not hit by Ctrl-C
+        )
+        assert process.stdin is not None
+        with contextlib.suppress(BrokenPipeError), process.stdin as pipe:
+            pipe.write(access.text().encode())
+        return process
+
+    def _give_back(self) -> None:
+        self._connection.close()
+        self._memory.close()
+        self._owned.close()
+
+    def load(self, references: Sequence[Reference], limits: RunLimits) -> Isolation:
+        """Let the process import its methods; its isolation, which it tells before any code of a method runs."""
+        nonce, end, reference = secrets.token_hex(8), time.monotonic() + limits.start_seconds, references[0]
+        self._shares = len(references) > 1
+        order = {
+            "nonce": nonce,
+            "references": [asdict(one) for one in references],
+            "memory_mb": limits.memory_mb,
+            "serves": self._serves,
+        }
+        try:
+            isolation = Isolation(**json.loads(self._connection.receive(limits.start_seconds)))
+            self._connection.send(json.dumps(order).encode(), limits.start_seconds)
+            reply = self._reply(nonce, end)
+            fault = reply.get("fault")
+        except TimeoutError:
+            place = self._place(reference.place)
+            raise MethodError(
+                f"{self._kind} '{reference.name}' is not imported after {limits.start_seconds:g} s{place}: "
+                "do the work in the function, not at import"
+            ) from None
+        except TransportError:
+            why = f"{self.death(reference.place)}{self._last_line()}"
+            raise MethodError(f"{self._kind} '{reference.name}' cannot be imported: {why}") from None
+        if fault != "":
+            raise MethodError(advised(printable_line(str(fault), _MESSAGE_LENGTH), isolation))
+        self.loaded = _names(reply)
+        return isolation
+
+    def is_ready(self, size: int) -> bool:
+        """Tell that a pair of so many bytes can be asked, and that nothing is left of the one before."""
+        return size <= self._memory.size and self._connection.is_silent()
+
+    def ask(self, pair: Pair, limits: RunLimits, file: str, method: int = 0) -> Outcome:
+        """Answer or failure of a method for one pair."""
+        nonce, before, self.stages = secrets.token_hex(8), self._output.count(), {}
+        message = again(nonce, method) if self._held is pair else pack(pair, self._memory, nonce, method)
+        self._held = pair if self._shares else _NO_PAIR
+        start = time.monotonic()  # by this clock alone: the method's process could tell any time
+        try:
+            reply = self.exchange(message, nonce, pair.number, limits.seconds)
+        except TimeoutError:
+            output = last_lines(self._output.text(since=before))  # before the stack is printed, too
+            late = f"no answer after {limits.seconds:g} s{self._place(file)}"
+            return Outcome(pair.number, None, math.nan, "timeout", late, output)
+        except TransportError:
+            return self._dead(pair, limits, file, before)
+        seconds = time.monotonic() - start
+        self.loaded = _names(reply) or self.loaded
+        if self._shares:  # built-in methods tell the truth; of others nothing but the answer counts
+            seconds += reply["reused_seconds"]
+            self.stages = {**reply["stages"], "": reply["own_seconds"]}
+        outcome = outcome_of(pair, reply, seconds)
+        return replace(outcome, output=last_lines(self._output.text(since=before)))
+
+    def exchange(self, message: bytes, nonce: str, number: int, seconds: float) -> dict[str, Any]:
+        """Reply to a message that repeats its nonce and number, within so many seconds; raises as `_reply`."""
+        end = time.monotonic() + seconds
+        self._connection.send(message, seconds)
+        return self._reply(nonce, end, number)
+
+    def kill(self) -> None:
+        """End the process with all that it started and give back what it held; never raises."""
+        self._connection.hang_up()  # the supervisor then kills what there is
+        try:
+            self._process.wait(_END_SECONDS)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        if self._process.returncode == -signal.SIGKILL:  # perhaps before it had killed what was below it
+            for pid in processes_in(self._folder):
+                with contextlib.suppress(OSError):
+                    os.kill(pid, signal.SIGKILL)
+        self._output.close()
+        self._give_back()
+
+    def _reply(self, nonce: str, end: float, number: int | None = None) -> dict[str, Any]:
+        """Reply to a question; what else comes on the line is dropped.
+
+        Raises
+        ------
+        TimeoutError
+            If there is none at `end`, a time of the monotonic clock.
+        TransportError
+            If the other side is gone or sends anything but the reply.
+        """
+        for _ in range(_MOST_STALE):
+            left = max(end - time.monotonic(), 1e-3)
+            try:
+                reply = json.loads(self._connection.receive(left, _REPLY_BYTES))
+            except (ValueError, RecursionError):  # no JSON, or brackets without end
+                continue
+            if isinstance(reply, dict) and (reply.get("nonce"), reply.get("number")) == (nonce, number):
+                return reply
+        raise TransportError("too many replies that belong to no question")
+
+    def _dead(self, pair: Pair, limits: RunLimits, file: str, before: int) -> Outcome:
+        failure, message = "crash", self.death(file)
+        text = self._output.text(since=before)
+        if lacks_memory(text):
+            failure, message = "memory", limits.memory_sentence(message)
+        return Outcome(pair.number, None, math.nan, failure, message, last_lines(text))
+
+    def death(self, file: str) -> str:
+        """The end of the process in a few words."""
+        text = self._output.text(_STACK_SECONDS)
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self._process.wait(_STACK_SECONDS)
+        code = self._process.poll()
+        if code is None:
+            return "the process broke its connection to the runner"
+        if code == HUNG_UP:
+            return "the process broke its connection to the runner"
+        if code >= 0:
+            return f"the process left with exit code {code}, without an answer"
+        place = stack_place(text, file)
+        return f"the process died of {_signal_name(-code)}" + (f" at {place}" if place else "")
+
+    def _place(self, file: str) -> str:
+        """The line at which a process is that still runs."""
+        with contextlib.suppress(ProcessLookupError):
+            self._process.send_signal(signal.SIGUSR1)
+        place = stack_place(self._output.text(_STACK_SECONDS), file)
+        return f", at {place}" if place else ""
+
+    def _last_line(self) -> str:
+        lines = self._output.text().strip().splitlines()
+        return f"; its last words: {lines[-1]}" if lines else ""
+
+
+def _names(reply: dict[str, Any]) -> frozenset[str]:
+    """Modules that a reply tells of; empty if it tells of none, or not in the form of names."""
+    told = reply.get("loaded")
+    names = told[:MOST_NAMES] if isinstance(told, list) else []
+    return frozenset(name for name in names if isinstance(name, str) and name == printable_line(name))
+
+
+def outcome_of(pair: Pair, reply: dict[str, Any], seconds: float) -> Outcome:
+    """Outcome of a pair from the reply of `worker.reply_of`; what is no answer is the failure "invalid"."""
+    failure, message = reply.get("failure"), reply.get("message", "")
+    if failure in FAILURES and isinstance(message, str):
+        return Outcome(pair.number, None, seconds, failure, printable_line(message, _MESSAGE_LENGTH))
+    try:
+        return Outcome(pair.number, checked(reply["answer"]), seconds)
+    except (AnswerError, KeyError) as error:
+        text = str(error) if isinstance(error, AnswerError) else "the reply holds neither answer nor failure"
+        return Outcome(pair.number, None, seconds, "invalid", text)
+
+
+def _signal_name(number: int) -> str:
+    try:
+        name = signal.Signals(number).name
+    except ValueError:  # a real-time signal between the first and the last has no name
+        return f"signal {number}"
+    meaning = {
+        "SIGSEGV": "a fault in compiled code",
+        "SIGABRT": "compiled code gave up",
+        "SIGKILL": "killed from outside, perhaps by the system for want of memory",
+    }
+    return f"{name} ({meaning[name]})" if name in meaning else name

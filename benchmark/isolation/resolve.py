@@ -1,0 +1,275 @@
+"""References to methods, and the limits under which methods run.
+
+A reference is ``my_phi.py:extract`` (a file and a function in it), the name of a built-in method, or the name under
+which an installed package registers a method (entry-point group ``phibench.methods``). It is resolved without running
+any code of the method, because the process that resolves it knows the truth.
+
+A method's file comes with the modules beside it that it imports, as the source says: what is imported by a name that
+is computed is not among them.
+"""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+import inspect
+import math
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from phibench.benchmark.isolation.loaded_packages import package_sha256
+from phibench.datasets.input_files import MIB, InputFile
+from phibench.datasets.store.files import sha256
+from phibench.datasets.store.provenance import code_behind
+from phibench.scenes.validation import close_names, printable_line
+
+if TYPE_CHECKING:
+    from phibench.estimator.methods.registry import BuiltIn
+
+
+class MethodError(ValueError):
+    """A method that cannot be found, loaded or started; one sentence."""
+
+
+@dataclass(frozen=True)
+class Reference:
+    """A method that is there.
+
+    Attributes
+    ----------
+    name : str
+        Of the method: what a score is filed under.
+    kind : "file", "built-in" or "package"
+    place : str
+        Absolute path of the file; module of the built-in registry; ``module:function`` of an entry point.
+    function : str
+        Function in the file; "" otherwise.
+    sha256 : str or None
+        Of the file, of the code behind the built-in methods, or of a package's files: `package_sha256`.
+    version : str or None
+        Distribution and version of a package.
+    modules : tuple of (path, SHA-256)
+        Files beside the method's that it imports, relative to its folder.
+    sees : "image", "pair" or ""
+        Whether a built-in method takes each image by itself or both as one point; "" of others: nobody knows.
+    """
+
+    name: str
+    kind: Literal["file", "built-in", "package"]
+    place: str
+    function: str = ""
+    sha256: str | None = None
+    version: str | None = None
+    modules: tuple[tuple[str, str], ...] = ()
+    sees: Literal["image", "pair", ""] = ""
+
+    def document(self) -> dict[str, Any]:
+        """Provenance, as JSON can hold it; of a file its name alone, not where it lies."""
+        place = printable_line(Path(self.place).name) if self.kind == "file" else self.place
+        return {**asdict(self), "place": place, "modules": dict(self.modules)}
+
+    @classmethod
+    def of(cls, fields: dict[str, Any]) -> Reference:
+        """From its fields as JSON has them."""
+        return cls(**{**fields, "modules": tuple((name, hashed) for name, hashed in fields["modules"])})
+
+    def files(self) -> list[Path]:
+        """The method's file and the modules beside it; none of a method that is no file."""
+        path = Path(self.place)
+        return [path, *(path.parent / name for name, _ in self.modules)] if self.kind == "file" else []
+
+    def changed(self) -> str:
+        """Name of the first file of the method that is not as it was when it was looked up; "" if all are."""
+        hashes = (self.sha256, *(hashed for _, hashed in self.modules))
+        files = zip(self.files(), hashes, strict=False)
+        return next((file.name for file, hashed in files if not file.is_file() or sha256(file) != hashed), "")
+
+
+GROUP = "phibench.methods"
+
+
+def resolve(reference: str) -> Reference:
+    """Find a method.
+
+    Raises
+    ------
+    MethodError
+        If the file or its function is missing, the file is not Python, the name is unknown, or two methods share it.
+    """
+    if reference.endswith(".py") or ".py:" in reference:
+        return _of_file(reference)
+    from phibench.estimator.methods.registry import KNOWN  # a second of imports that a method in a file does not need
+
+    found = [point for point in installed() if point.name == reference]
+    if reference in KNOWN:
+        if found:
+            raise MethodError(f"method '{reference}' is built in, and {_owner(found[0])} registers another")
+        return _built_in(KNOWN[reference])
+    if len(found) > 1:
+        raise MethodError(f"method '{reference}' is registered by {' and by '.join(map(_owner, found))}: remove one")
+    if not found:
+        raise MethodError(_unknown(reference, list(KNOWN)))
+    hashed = package_sha256(found[0].dist, found[0].module)
+    return Reference(reference, "package", found[0].value, sha256=hashed, version=_owner(found[0]))
+
+
+def installed() -> tuple[EntryPoint, ...]:
+    """Entry points of installed packages, by name; none of them is imported."""
+    return tuple(sorted(entry_points(group=GROUP), key=lambda point: point.name))
+
+
+def _built_in(method: BuiltIn) -> Reference:
+    if not method.installed:
+        raise MethodError(f"method '{method.name}' needs {method.package}: pip install {method.package}")
+    module = "phibench.estimator.methods.registry"
+    return Reference(
+        method.name, "built-in", module, sha256=code_behind(module), sees="pair" if method.joint else "image"
+    )
+
+
+def _of_file(reference: str) -> Reference:
+    text, colon, function = reference.rpartition(":")
+    if not colon or not function.isidentifier():
+        file = Path(text if colon else reference).name
+        raise MethodError(f"method '{reference}': say which function is meant, such as {file}:extract")
+    path = Path(text).absolute()
+    if not path.is_file():
+        advice = f"`phibench method new {text}` writes an example"
+        what = "is a folder" if path.is_dir() else "is not there"
+        raise MethodError(f"method '{reference}': the file {path} {what}; {advice}")
+    if path.name != printable_line(path.name):
+        raise MethodError(f"method '{printable_line(path.name)}': give the file a name of at most 200 printable signs")
+    _require_python(path)
+    hashed, modules = sha256(path), tuple((name, sha256(path.parent / name)) for name in modules_beside(path))
+    # names of files may hold bytes that are no text, and what a terminal obeys
+    return Reference(f"{printable_line(path.stem)}:{function}", "file", str(path), function, hashed, modules=modules)
+
+
+def code_of_function(function: Any) -> dict[str, Any]:
+    """Hashes of a function's file and of the modules beside it, as `Reference` has them; of a cell that of its source.
+
+    The values are None and empty where Python cannot tell the source.
+    """
+    code = function if inspect.isroutine(function) else type(function)
+    try:
+        path = Path(inspect.getsourcefile(code) or "")
+        if path.is_file():
+            return {
+                "sha256": sha256(path),
+                "modules": {name: sha256(path.parent / name) for name in modules_beside(path)},
+            }
+        return {"sha256": hashlib.sha256(inspect.getsource(code).encode()).hexdigest()}
+    except (OSError, TypeError):
+        return {"sha256": None}
+
+
+def modules_beside(path: Path) -> list[str]:
+    """Files in the folder of a Python file that it imports, and that these import: paths from there, sorted."""
+    folder, found, waiting = path.parent, set[Path](), [path]
+    while waiting:
+        for file in _imported(waiting.pop(), folder):
+            if file != path and file not in found:
+                found.add(file)
+                waiting.append(file)
+    return sorted(file.relative_to(folder).as_posix() for file in found)
+
+
+def _imported(file: Path, folder: Path) -> Iterator[Path]:
+    """Files below a folder that a file imports, packages with their `__init__.py`."""
+    try:
+        nodes = list(ast.walk(ast.parse(file.read_bytes())))
+    except (SyntaxError, ValueError, RecursionError, MemoryError, OSError):
+        return  # the worker says what is wrong with it
+    package = file.parent.relative_to(folder).parts
+    for node in nodes:
+        if isinstance(node, ast.Import):
+            names = [tuple(alias.name.split(".")) for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            above = package[: max(len(package) + 1 - node.level, 0)] if node.level else ()
+            base = (*above, *(node.module.split(".") if node.module else ()))
+            names = [(*base, alias.name) for alias in node.names] or [base]
+        else:
+            continue
+        for name in names:
+            yield from _files_of(name, folder)
+
+
+def _files_of(name: tuple[str, ...], folder: Path) -> Iterator[Path]:
+    """Files that an import of a dotted name runs; the last part may be a name in a module."""
+    for count in range(1, len(name) + 1):
+        place = folder.joinpath(*name[:count])
+        for file in (place / "__init__.py", place.parent / f"{place.name}.py"):
+            if file.is_file():
+                yield file
+                break
+
+
+_MOST_BYTES = 16 * MIB  # of a method's file
+
+
+def _require_python(path: Path) -> None:
+    """Compile the file, which runs nothing of it."""
+    try:
+        compile(InputFile(path, "give a Python file", limit_bytes=_MOST_BYTES).read(), str(path), "exec", 0, True)
+    except SyntaxError as error:
+        line = "" if error.lineno is None else f", line {error.lineno}"
+        raise MethodError(f"{path.name}{line}: {error.msg}: Python cannot read the file") from error
+    except (RecursionError, MemoryError) as error:
+        raise MethodError(f"{path.name}: an expression is nested too deeply: Python cannot read the file") from error
+    except ValueError as error:
+        raise MethodError(f"{path.name}: {error}: Python cannot read the file") from error
+
+
+def _owner(point: EntryPoint) -> str:
+    return "an unknown package" if point.dist is None else f"{point.dist.name} {point.dist.version}"
+
+
+def _unknown(name: str, built_in: list[str]) -> str:
+    known = [*built_in, *(point.name for point in installed())]
+    guess = close_names(name, known)
+    advice = f"did you mean '{guess[0]}'?" if guess else "`phibench method list` lists what there is."
+    return f"no method '{name}': {advice} A method of your own is given as file and function, my_phi.py:extract"
+
+
+@dataclass(frozen=True)
+class RunLimits:
+    """Limits of one method; the same wherever methods run.
+
+    Parameters
+    ----------
+    seconds : float
+        Wall clock for one pair.
+    memory_mb : float
+        Address space (RLIMIT_AS) on top of what the process has after the method was imported, 1e6 bytes; each process
+        that the method starts has its own. Linux only: elsewhere the system does not keep it.
+    start_seconds : float
+        Wall clock for starting Python and importing the method.
+    fresh : bool
+        A process for each pair, instead of one for all.
+    allow : tuple of str
+        Files and folders that the method may read, besides the folder of its file.
+    """
+
+    seconds: float = 30.0
+    memory_mb: float = 4096.0
+    start_seconds: float = 120.0
+    fresh: bool = False
+    allow: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        for name in ("seconds", "memory_mb", "start_seconds"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0.0):
+                raise MethodError(f"limit {name} = {value}: must be a finite number above 0")
+
+    def document(self) -> dict[str, Any]:
+        """For the record; of what is allowed the last part of the path, not where it lies."""
+        return {**asdict(self), "allow": [Path(path).absolute().name for path in self.allow]}
+
+    def memory_sentence(self, detail: str) -> str:
+        """A failure for want of memory in one sentence, with the limit."""
+        limit = f"the limit of {self.memory_mb:g} MB of address space on top of the imports (--memory-mb)"
+        return f"more memory than {limit}: {detail}"

@@ -1,0 +1,439 @@
+"""Release of the benchmark: data sets made from the frozen recipes, as archives with a list of their hashes.
+
+Two folders are kept apart. `out` is public: archives, `MANIFEST.json`, `SHA256SUMS`, card, licence and Croissant.
+`work` is not: it holds the data sets as they are rendered, that of the sealed part with its truth.
+
+The same data sets give the same bytes: members of an archive are sorted, and have one time, one owner and one mode.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import os
+import stat
+import tarfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib.metadata import version
+from pathlib import Path
+from typing import IO
+
+from rich.console import Console
+
+from phibench.benchmark.release.benchmark import (
+    FORMAT,
+    MANIFEST,
+    VERSION,
+    Archive,
+    Digest,
+    Manifest,
+    Part,
+    ReleasedPart,
+    drawn_numbers,
+    read_manifest_file,
+    same_but_drawn,
+)
+from phibench.benchmark.release.secret_seed import secret_seed
+from phibench.datasets.build.forecast import megabytes
+from phibench.datasets.errors import DatasetError
+from phibench.datasets.film.film_forecast import films_forecast
+from phibench.datasets.film.film_make import make_films
+from phibench.datasets.film.film_plan import film_plans
+from phibench.datasets.film.film_store import INFO as FILM_INFO
+from phibench.datasets.input_files import InputFile
+from phibench.datasets.make import cost, make
+from phibench.datasets.progress import Steps, progress_console
+from phibench.datasets.recipe.load import parse_recipe, recipe_files, with_numbers
+from phibench.datasets.store import schema
+from phibench.datasets.store.checksums import checksums_text, read_checksums
+from phibench.datasets.store.croissant import LICENSE_TEXT, LICENSE_URL, croissant_text, file_object
+from phibench.datasets.store.documents import read_info
+from phibench.datasets.store.files import (
+    WriteError,
+    only_run,
+    read_rows,
+    remove_temporary,
+    sha256,
+    write_atomic,
+    write_text,
+)
+from phibench.datasets.store.leftovers import folder_for_work
+from phibench.datasets.store.schema import Document
+
+Seal = Callable[[Path, Path], object]
+"""Sealing of a data set: (folder, public folder); `benchmark.sealed.sealed_set.seal`."""
+ARCHIVE_BYTES = 500_000_000
+DIARY, README = "archives.jsonl", "README.md"
+_TIME_S = 315532800  # 1980-01-01, as all files of a sealed set have
+_SEAL = "seal.json"
+_IMAGE_BYTES, _IMAGES = 730_000, 4  # of a sealed pair at 1280 x 720; the mean of 40 pairs in three presets
+
+
+class ArchiveRow(Document):
+    """One line of `archives.jsonl`, the diary: an archive that is finished, and what it was packed from."""
+
+    name: str
+    key: Digest
+    size: int
+    sha256: Digest
+
+
+@dataclass(frozen=True)
+class ReleaseRequest:
+    """All that a release is made from.
+
+    Parameters
+    ----------
+    parts : parts to make; others that the folder holds stay
+    out, work : public folder, and folder of the data sets; neither inside the other
+    secret_seed : file with the seed of sealed parts, made if it is not there; None where none is made
+    samples : samples of each part that draws its samples, instead of the recipe's number
+    use : folders of finished data sets, each taken for the part that it fits
+    archive_bytes : an archive holds files up to this size, or one larger file
+    """
+
+    parts: Sequence[Part]
+    out: Path
+    work: Path
+    secret_seed: Path | None
+    samples: int | None = None
+    use: Sequence[Path] = ()
+    archive_bytes: int = ARCHIVE_BYTES
+    workers: int | None = None
+    console: Console = field(default_factory=progress_console)
+
+    def samples_of(self, part: Part) -> int | None:
+        """Samples to draw; None for a part that draws none."""
+        own = drawn_numbers(part.text())[1]
+        return own if own is None or self.samples is None else self.samples
+
+
+@dataclass(frozen=True)
+class Released:
+    """Outcome: the public folder, its manifest, archives written and kept."""
+
+    out: Path
+    manifest: Manifest
+    made: int
+    kept: int
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of `MANIFEST.json`, which vouches for all of it."""
+        return sha256(self.out / MANIFEST)
+
+
+def release(request: ReleaseRequest, seal: Seal) -> Released:
+    """Make data sets and archives; what is finished is kept, whatever ended the last run.
+
+    Raises
+    ------
+    DatasetError
+        If a recipe is not the frozen one, a folder will not do, a data set that is to be used fits no part or is
+        damaged, or the disk is full; in one sentence.
+    """
+    _check_folders(request)
+    used = _assigned(request)
+    out = request.out
+    try:
+        with folder_for_work(out), folder_for_work(request.work), only_run(out):
+            request.work.chmod(stat.S_IRWXU)  # it holds a secret
+            remove_temporary(out)
+            manifest = _claimed(out)
+            made = kept = 0
+            for part in request.parts:
+                folder = _dataset(request, part, used, seal)
+                manifest, new, old = _packed(request, part, folder, manifest)
+                made, kept = made + new, kept + old
+            _finish(out, manifest)
+    except OSError as error:
+        text = str(error) if isinstance(error, WriteError) else f"could not write to {out}: {error}"
+        raise DatasetError(f"{text}; then run the same command again") from error
+    return Released(out, manifest, made, kept)
+
+
+def dry_run(request: ReleaseRequest) -> Iterator[str]:
+    """Lines that say what a release takes and holds; nothing is rendered or written."""
+    _check_folders(request)
+    used = _assigned(request)
+    for part in request.parts:
+        done = used.get(part.title, request.work / part.title)
+        samples = request.samples_of(part)
+        count = "" if samples is None else f"{samples} samples, "
+        if (done / schema.CHECKSUMS).is_file() and part.kind != "sealed":
+            size = sum((done / name).stat().st_size for name in _members(part, done) if (done / name).is_file())
+            yield f"{part.title}: {count}{megabytes(size)}, from {done}"
+        elif part.kind == "films":
+            yield f"{part.title}: {_film_cost(part)}"
+        else:
+            forecast = cost(part.recipe, request.work / part.title, samples)
+            size = forecast.size if part.kind == "pairs" else (samples or 1) * _IMAGES * _IMAGE_BYTES
+            hours = 0.0 if part.title in used else forecast.cpu_s / 3600.0
+            rendered = f", rendered layers {megabytes(forecast.size)}" if part.kind == "sealed" else ""
+            yield f"{part.title}: {count}about {megabytes(size)}, {hours:.2g} CPU-hours{rendered}"
+
+
+def _film_cost(part: Part) -> str:
+    plan, films = film_plans(parse_recipe(part.text()), recipe_files(part.recipe))
+    forecast = films_forecast(plan, films)
+    hours = (forecast.cpu_s + sum(forecast.bakes)) / 3600.0
+    return f"{len(films)} films, about {megabytes(forecast.size)} or more, {hours:.2g} CPU-hours"
+
+
+# Folders, seed, and data sets that are there.
+
+
+def _check_folders(request: ReleaseRequest) -> None:
+    out, work = request.out.resolve(), request.work.resolve()
+    if out.is_relative_to(work) or work.is_relative_to(out):
+        raise DatasetError(
+            f"--out {out} and --work {work}: one lies in the other; {out} is to be published, so part them"
+        )
+    for part in request.parts:  # faults of a recipe or a number are said before a folder is made
+        if (samples := request.samples_of(part)) is not None:
+            parse_recipe(
+                with_numbers(part.text(), str(part.recipe), samples, None), str(part.recipe), recipe_files(part.recipe)
+            )
+    sealed = [part.name for part in request.parts if part.kind == "sealed"]
+    if request.secret_seed is None and sealed:
+        raise DatasetError(f"part {sealed[0]} is sealed: give --secret-seed FILE, which is made if it is not there")
+    if request.secret_seed is not None and (seed := request.secret_seed.resolve()).is_relative_to(out):
+        raise DatasetError(f"--secret-seed {seed} lies in {out}, which is to be published; give a file elsewhere")
+    if out.is_dir() and not (out / MANIFEST).is_file() and any(not path.name.startswith(".") for path in out.iterdir()):
+        raise DatasetError(f"{out} holds other files: give an empty folder, `--out FOLDER`")
+    for folder in request.use:
+        if folder.resolve().is_relative_to(out):
+            raise DatasetError(f"--use {folder} lies in {out}, which is to be published; move it")
+
+
+def _claimed(out: Path) -> Manifest:
+    """Manifest of what the folder holds; an empty one says at least what the folder is for."""
+    if not (out / MANIFEST).is_file():
+        manifest = Manifest(format=FORMAT, benchmark=VERSION, phibench=version("phibench"), parts={})
+        write_text(out / MANIFEST, manifest.text())
+        return manifest
+    manifest = read_manifest_file(out / MANIFEST, "give another folder, `--out FOLDER`")
+    if manifest.benchmark != VERSION:
+        held = f"{out} holds version {manifest.benchmark} of the benchmark, and this phibench makes {VERSION}"
+        raise DatasetError(f"{held}; give another folder, `--out FOLDER`")
+    return manifest.model_copy(update={"phibench": version("phibench")})
+
+
+def _seed(request: ReleaseRequest, part: Part, make_it: bool = True) -> int | None:
+    """Seed of a part: the recipe's, or the secret one. None if that is still to be drawn."""
+    if part.kind != "sealed":
+        return drawn_numbers(part.text())[0]
+    assert request.secret_seed is not None  # `_check_folders`
+    return secret_seed(request.secret_seed, make_it)
+
+
+def _assigned(request: ReleaseRequest) -> dict[str, Path]:
+    """Folder by title of the part that it fits."""
+    found: dict[str, Path] = {}
+    for folder in request.use:
+        reasons = {part.title: _misfit(request, part, folder) for part in request.parts}
+        fitting = [title for title, reason in reasons.items() if not reason]
+        if not fitting:
+            told = [reason for reason in reasons.values() if reason != _OTHER] or [_OTHER]
+            raise DatasetError(f"--use {folder}: {told[0]}; leave it out, and it is rendered")
+        found[fitting[0]] = folder
+    return found
+
+
+_OTHER = "it is no data set of a recipe that is to be released"
+
+
+def _misfit(request: ReleaseRequest, part: Part, folder: Path) -> str:
+    """Reason why a folder does not do for a part; empty if it does."""
+    info = FILM_INFO if part.kind == "films" else schema.INFO
+    if not (folder / info).is_file() or not (folder / schema.RECIPE).is_file():
+        return _OTHER
+    text = InputFile(folder / schema.RECIPE, "mend it").text()
+    if not same_but_drawn(text, part.text()):
+        return _OTHER
+    if not (folder / schema.CHECKSUMS).is_file():
+        return "it was not finished; run its `phibench dataset make` again"
+    if part.kind != "films" and (left_out := read_info(folder).left_out):
+        refused = f"{len(left_out)} of its samples are refused and left out, such as {left_out[0].sample_id}"
+        return f"{refused}, and a release has all samples of its recipe"
+    seed, samples = drawn_numbers(text)
+    wanted = request.samples_of(part)
+    if samples != wanted:
+        return f"it has {samples} samples, and {part.title} is to have {wanted} (--samples)"
+    if seed != (meant := _seed(request, part, make_it=False)):
+        secret = f"the one in {request.secret_seed}" if part.kind == "sealed" else str(meant)
+        return f"its seed is not {secret}, which {part.title} needs"
+    return ""
+
+
+def _dataset(request: ReleaseRequest, part: Part, used: Mapping[str, Path], seal: Seal) -> Path:
+    """Folder whose files are to be packed: made, if need be, or used."""
+    folder = used.get(part.title, request.work / part.title)
+    if part.title not in used:
+        part.text()  # the frozen one, or an error
+        if part.kind == "films":
+            make_films(part.recipe, folder, request.workers, request.console)
+        else:
+            samples, seed = request.samples_of(part), _seed(request, part)
+            make(part.recipe, folder, request.workers, request.console, samples=samples, seed=seed)
+    if part.kind != "sealed":
+        return folder
+    public = request.work / f"{part.title}-public"
+    if (public / _SEAL).is_file():
+        number = InputFile(public / _SEAL, "remove the folder").json().get("id")
+        if (folder / f"seal_{number}.truth.json").is_file():
+            return public
+        raise DatasetError(
+            f"{public} is sealed with a truth that {folder} does not have; remove one of the two folders"
+        )
+    seal(folder, public)
+    return public
+
+
+# Archives.
+
+
+def _packed(request: ReleaseRequest, part: Part, folder: Path, manifest: Manifest) -> tuple[Manifest, int, int]:
+    """Archives of one part, and the manifest with it; numbers of archives written and kept."""
+    out = request.out
+    members, title = _members(part, folder), part.title
+    shares = list(_shares(folder, members, request.archive_bytes))
+    diary = request.work / DIARY
+    rows = {row.name: row for row in read_rows(diary, ArchiveRow)} if diary.is_file() else {}
+    parts = dict(manifest.parts)
+    if parts.pop(title, None) is not None:
+        write_text(out / MANIFEST, manifest.model_copy(update={"parts": parts}).text())
+    (out / schema.CHECKSUMS).unlink(missing_ok=True)  # until all is there the release is not finished
+    archives, made = [], 0
+    with Steps(request.console, title, len(shares)) as steps:
+        for number, names in enumerate(shares):
+            name = f"{title}-{number:03d}.tar"
+            key = hashlib.sha256(json.dumps([title, [(one, members[one]) for one in names]]).encode()).hexdigest()
+            if not _is_there(out / name, rows.get(name), key):
+                write_atomic(out / name, lambda path, names=names: _write_tar(path, title, folder, names, members))  # type: ignore[misc]
+                rows[name] = ArchiveRow(name=name, key=key, size=(out / name).stat().st_size, sha256=sha256(out / name))
+                write_text(diary, "".join(rows[one].model_dump_json() + "\n" for one in sorted(rows)))
+                made += 1
+            row = rows[name]
+            archives.append(Archive(name=name, size=row.size, sha256=row.sha256))
+            steps.advance()
+    for path in out.glob(f"{title}-[0-9][0-9][0-9].tar"):
+        if path.name not in {archive.name for archive in archives}:
+            path.unlink()  # of an earlier release with more files
+    count = _sample_count(part, folder)
+    parts[title] = ReleasedPart(
+        kind=part.kind,
+        recipe_sha256=part.sha256,
+        samples=count,
+        recipe_samples=drawn_numbers(part.text())[1],
+        files=len(members),
+        size=sum((folder / name).stat().st_size for name in members),
+        sums_sha256=sha256(folder / schema.CHECKSUMS),
+        archives=tuple(archives),
+    )
+    manifest = manifest.model_copy(update={"parts": parts})
+    write_text(out / MANIFEST, manifest.text())
+    return manifest, made, len(shares) - made
+
+
+def _members(part: Part, folder: Path) -> dict[str, str]:
+    """Files to be packed with their SHA-256, sorted by name: what SHA256SUMS lists, itself, and the journal."""
+    listed = read_checksums(folder)
+    extra = [schema.CHECKSUMS, *([schema.JOURNAL] if part.kind == "pairs" else [])]
+    found = listed | {name: sha256(folder / name) for name in extra if (folder / name).is_file()}
+    return dict(sorted(found.items()))
+
+
+def _shares(folder: Path, members: Mapping[str, str], most: int) -> Iterator[list[str]]:
+    """Members of each archive, in their order."""
+    share: list[str] = []
+    size = 0
+    for name in members:
+        path = folder / name
+        if not path.is_file():
+            raise DatasetError(f"{folder}: {name} is missing; run `phibench dataset verify` to see all faults")
+        bytes_here = path.stat().st_size
+        if share and size + bytes_here > most:
+            yield share
+            share, size = [], 0
+        share.append(name)
+        size += bytes_here
+    if share:
+        yield share
+
+
+def _is_there(path: Path, row: ArchiveRow | None, key: str) -> bool:
+    """True if an archive of these members lies there, undamaged."""
+    known = row is not None and row.key == key and path.is_file() and path.stat().st_size == row.size
+    return known and row is not None and sha256(path) == row.sha256
+
+
+def _write_tar(path: Path, title: str, folder: Path, names: Sequence[str], members: Mapping[str, str]) -> None:
+    """Tar whose bytes depend on names and contents alone; every file is checked on its way."""
+    with path.open("wb") as file, tarfile.open(fileobj=file, mode="w", format=tarfile.USTAR_FORMAT) as tar:
+        for name in names:
+            with (folder / name).open("rb") as source:
+                entry = tarfile.TarInfo(f"{title}/{name}")
+                entry.size, entry.mtime, entry.mode = os.fstat(source.fileno()).st_size, _TIME_S, 0o644
+                reader = _Hashing(source)
+                tar.addfile(entry, reader)
+            if reader.digest.hexdigest() != members[name]:
+                what = f"{folder}: {name} is damaged: its SHA-256 is not the one in {schema.CHECKSUMS}"
+                raise DatasetError(f"{what}; run `phibench dataset repair {folder}`")
+
+
+class _Hashing(io.RawIOBase):
+    """File that is hashed while it is read."""
+
+    def __init__(self, file: IO[bytes]) -> None:
+        self._file, self.digest = file, hashlib.sha256()
+
+    def read(self, size: int = -1) -> bytes:
+        data = self._file.read(size)
+        self.digest.update(data)
+        return data
+
+
+def _sample_count(part: Part, folder: Path) -> int:
+    """Pairs of a data set or of a sealed one, or films."""
+    name, key = {"pairs": (schema.INFO, "samples"), "sealed": (_SEAL, "pairs"), "films": (FILM_INFO, "films")}[
+        part.kind
+    ]
+    value = InputFile(folder / name, "run `phibench dataset repair`").json()[key]
+    return len(value) if isinstance(value, list) else int(value)
+
+
+# What lies beside the archives.
+
+
+def _finish(out: Path, manifest: Manifest) -> None:
+    hashes = {archive.name: archive.sha256 for part in manifest.parts.values() for archive in part.archives}
+    title = f"phibench-v{VERSION.split('.')[0]}"
+    about = (
+        f"Benchmark of phibench, version {VERSION}: pairs and films of a laser spot in a mirror, with the exact truth, "
+        "and pairs whose truth is sealed. MANIFEST.json lists the parts."
+    )
+    objects = [file_object(name, "application/x-tar", hashes[name]) for name in sorted(hashes)]
+    objects.append(file_object(MANIFEST, "application/json", sha256(out / MANIFEST)))
+    write_text(out / schema.CROISSANT, croissant_text(title, about, f"{VERSION}.0", objects))
+    write_text(out / "LICENSE", LICENSE_TEXT)
+    write_text(out / README, _card(title, manifest))
+    for name in (MANIFEST, schema.CROISSANT, "LICENSE", README):
+        hashes[name] = sha256(out / name)
+    write_text(out / schema.CHECKSUMS, checksums_text(hashes))
+
+
+def _card(title: str, manifest: Manifest) -> str:
+    lines = ["---", "license: cc-by-4.0", f"pretty_name: {title}", "---", "", f"# {title}", ""]
+    lines += [f"Version {VERSION} of the benchmark of phibench, made with phibench {manifest.phibench}.", ""]
+    lines += ["    phibench fetch NAME --from PLACE-OF-THIS-FOLDER --out FOLDER", ""]
+    lines += ["| name | content | samples | files | unpacked | archives |", "|---|---|---|---|---|---|"]
+    kinds = {"pairs": "pairs with truth", "sealed": "pairs, truth sealed", "films": "films with truth"}
+    for name, part in sorted(manifest.parts.items()):
+        size = megabytes(part.size)
+        lines.append(
+            f"| `{name}` | {kinds[part.kind]} | {part.count_text} | {part.files} | {size} | {len(part.archives)} |"
+        )
+    return "\n".join([*lines, "", f"Licence: [CC BY 4.0]({LICENSE_URL}).", ""])

@@ -1,0 +1,70 @@
+"""Data set as `phibench.open_dataset` gives it: samples, and the pairs that a score shows a method.
+
+>>> import phibench
+>>> dataset = phibench.open_dataset("out/paper")  # doctest: +SKIP
+>>> pairs = dataset.pairs("mjpeg")  # doctest: +SKIP
+>>> pair, truth = pairs.pair(3), pairs.truth(3)  # doctest: +SKIP
+>>> pair = pairs.pair(pairs.number_of("table2-d3.180-h0.425"))  # doctest: +SKIP
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from phibench.datasets import read
+from phibench.datasets.frames.sensor_file import SensorFile
+
+if TYPE_CHECKING:
+    from phibench.benchmark.scores.dataset_pairs import DatasetPairs
+
+
+class ScoredDataset(read.Dataset):
+    """A `Dataset` that also gives its pairs as scores do."""
+
+    def pairs(
+        self,
+        preset: str | None = None,
+        draws: int | None = None,
+        *,
+        hints: bool = True,
+        boxes_px: int | None = None,
+        sensor: SensorFile | None = None,
+    ) -> DatasetPairs:
+        """Pairs with their truths: the same numbers and bytes as in `phibench score` with the same options.
+
+        Iterate for (pair, truth); `pair(k)` and `truth(k)` give one of each; `number_of` finds a pair by its sample.
+
+        Parameters
+        ----------
+        preset : str, optional
+            Sensor preset; those of the recipe's `[frames]` if not given.
+        draws : int, optional
+            Draws of the noise per sample and preset; the recipe's if not given.
+        hints : bool
+            Show the boxes of pairs that have some.
+        boxes_px : int, optional
+            Side of a box for every pair, pixels.
+        sensor : SensorFile, optional
+            Numbers of a measured camera.
+
+        Raises
+        ------
+        DatasetError
+            If neither recipe nor caller names a preset, or a number is out of its range.
+        """
+        from phibench.benchmark.scores.dataset_pairs import dataset_pairs
+
+        return dataset_pairs(self, preset, draws, hints=hints, boxes_px=boxes_px, sensor=sensor)
+
+
+def open_dataset(folder: str | Path) -> ScoredDataset:
+    """Open a data set; layers are read when they are asked for.
+
+    Raises
+    ------
+    DatasetError
+        If the folder is missing, not a data set, of another schema version, or its manifest or rigs are damaged.
+    """
+    opened = read.open_dataset(folder)
+    return ScoredDataset(opened.folder, opened.info, opened.rigs, opened.rooms, opened.rows)

@@ -1,0 +1,268 @@
+"""Comparison of two scores of the same pairs: paired differences with intervals over the samples that both have.
+
+Errors are compared over the images (or pairs) that both methods found. A method that skips the hard ones gains nothing
+from it. Rates, and figures that count missed spots, are compared over all visible spots.
+
+Both scores are resampled together, and every metric has its own interval. The verdict does not come from the intervals.
+It comes from an exact test (`intervals.exchange_chance`), corrected for the number of metrics (`intervals.holm`). Of
+two methods of the same law, any metric at all is called different in at most 1 - `confidence` of the comparisons.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import polars as pl
+
+from phibench.benchmark.scores.answer_errors import Rules
+from phibench.benchmark.scores.document import ScoreDocument, read_records, read_score
+from phibench.benchmark.scores.intervals import (
+    Clusters,
+    Estimate,
+    Statistic,
+    estimates,
+    exchange_chance,
+    holm,
+    mean_of,
+)
+from phibench.benchmark.scores.metrics import FAMILIES, METRICS, Metric, prepared, statistic_of, trusted
+from phibench.benchmark.scores.records import missed_relative, with_missed
+from phibench.datasets.errors import DatasetError
+from phibench.scenes.frames import Array
+from phibench.scenes.random_streams import Name, generator
+
+COMPARED = (
+    "rank_phi_rad",
+    "rank_depth",
+    "rms_counted_px",
+    "rms_px",
+    "median_px",
+    "p95_px",
+    "rms_radial_px",
+    "rms_phi_rad",
+    "rms_depth_counted",
+    "rms_depth_relative",
+    "median_depth_relative",
+    "p95_depth_relative",
+    "detection_rate",
+    "false_rate",
+    "depth_rate",
+    "seconds",
+)
+_KEY = ("number", "image")
+_TRUTH = ("sample_id", "draw", "depth_m", "u_true_px", "v_true_px", "visible")
+# of a pair set: how much of it was taken, with which versions
+_MAY_DIFFER = ("pairs", "samples", "hinted", "provenance")
+
+_TOLD = 3  # methods that a note names
+
+_NOTHING = Estimate(np.nan, np.nan, np.nan, "no record counts for both")
+
+Verdict = Literal["first", "second", "no difference shown", "too few samples"]
+
+
+@dataclass(frozen=True)
+class Difference:
+    """One metric of both scores and the second minus the first.
+
+    Attributes
+    ----------
+    name : key of `METRICS`
+    first, second : float
+        Values over the records that count for both.
+    difference : Estimate
+    n, samples : int
+    chance : float
+        Of a difference as large between two methods of the same law; not corrected for the number of metrics.
+    better : "first", "second", "no difference shown" or "too few samples"
+        Which is better, only if `chance` is small enough beside those of all metrics.
+    """
+
+    name: str
+    first: float
+    second: float
+    difference: Estimate
+    n: int
+    samples: int
+    chance: float
+    better: Verdict
+
+
+def compare(first: Path, second: Path, seed: int = 0) -> list[Difference]:
+    """Compare two scores on disk.
+
+    Raises
+    ------
+    DatasetError
+        If they were not taken on the same pairs by the same rules.
+    """
+    a, b = read_score(first), read_score(second)
+    refuse_different(a, b, str(first), str(second))
+    return compare_records(read_records(first, a), read_records(second, b), _rules(a.rules), "compare", seed)
+
+
+def compare_records(first: pl.DataFrame, second: pl.DataFrame, rules: Rules, *stream: Name) -> list[Difference]:
+    """Compare two tables of records over the pairs that both have.
+
+    Raises
+    ------
+    DatasetError
+        If they share no pair, or a pair's truth differs.
+    """
+    a, b = _common(first, second, rules)
+    found = [_difference(name, a, b, rules, *stream) for name in COMPARED]
+    shown = holm([item.chance for item in found], 1.0 - rules.confidence)
+    return [
+        replace(item, better=_verdict(item)) if is_shown else item for item, is_shown in zip(found, shown, strict=True)
+    ]
+
+
+def refuse_different(first: ScoreDocument, second: ScoreDocument, first_name: str, second_name: str) -> None:
+    """Raise `DatasetError` unless both scores were taken on the same pair set by the same rules."""
+    for what, a, b in (("pair sets", same_pairs(first), same_pairs(second)), ("rules", first.rules, second.rules)):
+        for key in sorted(set(a) | set(b)):
+            if a.get(key) != b.get(key):
+                raise DatasetError(
+                    f"{first_name} and {second_name} have different {what}: {key} is {_short(a.get(key))} and "
+                    f"{_short(b.get(key))}; score both methods on the same pairs"
+                )
+
+
+def note_on_size(differences: Sequence[Difference], rules: Mapping[str, float], samples: int) -> str:
+    """Sentence on what would give a verdict, if no metric can have one; empty if some can.
+
+    Parameters
+    ----------
+    differences : of `compare`
+    rules : of the scores
+    samples : that both scores have
+    """
+    if any(item.better != "too few samples" for item in differences):
+        return ""
+    least = int(rules["least_compared"])
+    if samples >= least:
+        return (
+            f"Too few samples for a verdict: every metric counts fewer than {least} of the {samples} that both have. "
+            "The methods find too few spots together: score them on easier pairs, or with --boxes 64."
+        )
+    return (
+        f"Too few samples for a verdict: both have {samples}, {least} are the least, and more draws of a sample do "
+        f"not count. Score both on a data set of {least} samples or more: `samples` of [random] in a recipe, or "
+        "bench-dev."
+    )
+
+
+def note_on_code(first: ScoreDocument, second: ScoreDocument) -> str:
+    """A warning if the code or the libraries that drew the frames differ between the runs; empty if not."""
+    a, b = (document.provenance for document in (first, second))
+    changed = [key for key in ("code_sha256", "packages") if a.get(key) != b.get(key)]
+    if not changed:
+        return ""
+    return (
+        f"the two runs differ in {' and '.join(changed)}: the frames may not be the same; score both again to be sure"
+    )
+
+
+def note_on_pairs(first: ScoreDocument, second: ScoreDocument, first_name: str, second_name: str) -> str:
+    """A warning if two scores count different numbers of the same set's pairs; empty if not."""
+    if first.pairs == second.pairs:
+        return ""
+    return (
+        f"{first_name} counts {first.pairs} pairs and {second_name} {second.pairs}: the differences are over the pairs "
+        "that both have"
+    )
+
+
+def note_on_others(mine: Sequence[ScoreDocument], every: Sequence[ScoreDocument]) -> str:
+    """A warning for scores that stand together if others of the same set count another number of pairs.
+
+    Parameters
+    ----------
+    mine : scores of the same pairs
+    every : these and all others
+    """
+    first = mine[0]
+    apart = [one for one in every if same_pairs(one) == same_pairs(first) and one.pairs != first.pairs]
+    if not apart:
+        return ""
+    told = ", ".join(f"{one.method.name} ({one.pairs})" for one in apart[:_TOLD])
+    more = f" and {len(apart) - _TOLD} more" if len(apart) > _TOLD else ""
+    return f"{first.pairs} pairs are counted here, other numbers elsewhere: {told}{more}; such scores do not compare"
+
+
+def same_pairs(document: ScoreDocument) -> dict[str, Any]:
+    """Entries of a score's pair set that must be equal for two scores to be of the same pairs."""
+    return {key: value for key, value in document.pair_set.items() if key not in _MAY_DIFFER}
+
+
+def _short(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def _rules(numbers: dict[str, float]) -> Rules:
+    whole = {name: int(numbers[name]) for name in ("resamples", "least_samples", "least_compared")}
+    return Rules(**{**numbers, **whole})  # type: ignore[arg-type]
+
+
+def _common(first: pl.DataFrame, second: pl.DataFrame, rules: Rules) -> tuple[pl.DataFrame, pl.DataFrame]:
+    """Both tables with the rows that both have, in the same order; a miss costs what these rows make of it."""
+    a, b = (x.join(y, on=_KEY, how="semi").sort(*_KEY) for x, y in ((first, second), (second, first)))
+    if not len(a):
+        raise DatasetError("the two scores have no pair in common: score both methods on the same pairs")
+    if not a.select(_TRUTH).equals(b.select(_TRUTH), null_equal=True):
+        raise DatasetError("the two scores have other truths for the same pairs: score both methods on the same pairs")
+    missed = missed_relative(a, rules)
+    return prepared(with_missed(a, missed)), prepared(with_missed(b, missed))
+
+
+def _difference(name: str, a: pl.DataFrame, b: pl.DataFrame, rules: Rules, *stream: Name) -> Difference:
+    metric = METRICS[name]
+    both = _flag(a, metric.family) & _flag(b, metric.family)
+    a, b = a.filter(both), b.filter(both)
+    clusters = Clusters.of(a["sample_code"].to_numpy())
+    if clusters.n == 0:
+        return Difference(name, np.nan, np.nan, _NOTHING, 0, 0, np.nan, "too few samples")
+    ours, theirs = (statistic_of(metric, clusters, table) for table in (a, b))
+    everything = np.ones((1, clusters.n))
+    (drawn,) = estimates([_minus(theirs, ours)], clusters.n, rules, generator(*stream, name))
+    difference = trusted(metric, drawn, clusters.n)
+    first, second = (float(statistic(everything)[0]) for statistic in (ours, theirs))
+    if clusters.n < rules.least_compared:
+        return Difference(name, first, second, difference, len(a), clusters.n, np.nan, "too few samples")
+    tested = _tested(metric, clusters, pl.concat([a, b], how="vertical_relaxed"))
+    chance = exchange_chance(tested, clusters.n, rules, generator(*stream, name, "exchange"))
+    return Difference(name, first, second, difference, len(a), clusters.n, chance, "no difference shown")
+
+
+def _tested(metric: Metric, clusters: Clusters, joined: pl.DataFrame) -> Statistic:
+    """Statistic that `exchange_chance` tests: the metric, or the share of records above the quantile of both methods.
+
+    Where two methods differ much, a quantile of exchanged answers is either method's by chance, and tells nothing. The
+    quantile of all answers stays as it is (A. M. Mood, Introduction to the Theory of Statistics, 1950, 16.5).
+    """
+    both = Clusters(np.concatenate([clusters.index, clusters.n + clusters.index]), 2 * clusters.n)
+    if metric.kind not in ("median", "p95"):
+        return statistic_of(metric, both, joined)
+    values = joined[metric.columns[0]].abs().to_numpy()
+    pooled = statistic_of(metric, both, joined)(np.ones((1, both.n)))[0]
+    return mean_of(both, np.heaviside(values - pooled, 0.5))
+
+
+def _flag(table: pl.DataFrame, family: str) -> pl.Series:
+    return table.with_columns(flag=FAMILIES[family])["flag"]
+
+
+def _minus(second: Statistic, first: Statistic) -> Statistic:
+    def difference(weights: Array) -> Array:
+        return second(weights) - first(weights)
+
+    return difference
+
+
+def _verdict(item: Difference) -> Verdict:
+    return "second" if (item.second < item.first) == (METRICS[item.name].better == "lower") else "first"

@@ -1,0 +1,408 @@
+"""Score document: one JSON file per run of one method, with its records beside it as Parquet under the same stem.
+
+The document names the SHA-256 of the records' file, and that of the results in them, which two equal runs share.
+Numbers are in SI units; null stands where there is no number.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+import polars as pl
+from pydantic import AfterValidator, Field, model_validator
+
+from phibench.benchmark.scores.answer_errors import Rules
+from phibench.benchmark.scores.causes import count, count_failures
+from phibench.benchmark.scores.intervals import Estimate
+from phibench.benchmark.scores.metrics import METRICS, Measured
+from phibench.benchmark.scores.records import COLUMN_TYPES
+from phibench.benchmark.scores.strata import Stratum, count_pairs, light_shift, measured, strata
+from phibench.datasets.errors import DatasetError
+from phibench.datasets.input_files import InputFile, Name
+from phibench.datasets.store.files import sha256, write_bytes, write_text
+from phibench.datasets.store.provenance import code_behind, provenance
+from phibench.datasets.store.schema import Document
+from phibench.datasets.version import program_version
+from phibench.estimator.limits.beyond_images import excesses
+from phibench.scenes.validation import printable_line
+
+KIND: Literal["phibench score"] = "phibench score"
+VERSION = 5
+SCORER = "phibench.benchmark.scores.score"
+"""Module whose code, with all that it imports, is behind a score."""
+
+
+class Value(Document):
+    """A metric: value and interval in the metric's unit; null where there is none, and `note` says why."""
+
+    value: float | None
+    low: float | None
+    high: float | None
+    n: int = Field(description="records")
+    samples: int = Field(description="samples that the interval resamples")
+    share: float | None = Field(description="of the visible spots, or pairs, that it rests on; null if on all of them")
+    note: str
+
+    @classmethod
+    def of(cls, measured: Measured, **fields: str) -> Self:
+        """From a measurement, and the fields that a subclass has besides."""
+        e = measured.estimate
+        numbers = {"value": finite(e.value), "low": finite(e.low), "high": finite(e.high)}
+        return cls.model_validate(
+            {
+                **numbers,
+                **fields,
+                "n": measured.n,
+                "samples": measured.samples,
+                "share": finite(measured.share),
+                "note": e.note,
+            }
+        )
+
+    @property
+    def estimate(self) -> Estimate:
+        """The same with NaN for null."""
+        value, low, high = (math.nan if x is None else x for x in (self.value, self.low, self.high))
+        return Estimate(value, low, high, self.note)
+
+
+class Metric(Value):
+    """A metric of the whole, with what it is; the unit is also in the metric's name."""
+
+    unit: str
+    better: Literal["lower", "higher", "none"]
+    text: str
+
+
+class StratumScore(Document):
+    """Metrics of one stratum; edges are null where the stratum is a value or open."""
+
+    by: str
+    label: str
+    low: float | None
+    high: float | None
+    mean: float | None = Field(description="of what the stratum is by, over its images")
+    images: int
+    pairs: int
+    metrics: Mapping[str, Value]
+
+
+class MethodCard(Document):
+    """Identity of a method: reference, place, hash of its code (null if it cannot be told), and what it ran with."""
+
+    reference: Name
+    name: Name = Field(default="", description="by default what follows the last slash of the reference")
+    kind: Name = ""
+    place: Name = ""
+    function: Name = ""
+    sha256: Name | None = None
+    version: Name | None = None
+    modules: dict[Name, Name] = Field(
+        default={}, description="SHA-256 of the files beside the method's that it imports"
+    )
+    packages: dict[Name, Name | None] = Field(
+        default={}, description="version of each package that its process loaded; null of a module of no package"
+    )
+    files: dict[Name, Name | None] = Field(
+        default={}, description="SHA-256 of further files opened in its folder and under --allow; null: not hashed"
+    )
+    files_complete: bool = Field(default=False, description="all files that were opened there are known")
+    sees: Literal["image", "pair", ""] = Field(
+        default="", description="each image by itself, or both as one point; empty if that is not known"
+    )
+
+    @classmethod
+    def of(cls, reference: str, **fields: Any) -> MethodCard:
+        """Of a reference and what is known of it."""
+        return cls.model_validate({**fields, "reference": reference})
+
+    @model_validator(mode="before")
+    @classmethod
+    def _name(cls, fields: Any) -> Any:
+        reference = fields.get("reference") if isinstance(fields, dict) else None
+        known = isinstance(reference, str) and reference and not fields.get("name")
+        return {**fields, "name": fields["reference"].rsplit("/", 1)[-1]} if known else fields
+
+
+class Flag(Document):
+    """A quantity that is better than the images allow, as `beyond_images.Excess`; null is an infinite ratio."""
+
+    quantity: str
+    part: str = Field(description="images or pairs that show it best")
+    ratio: float | None
+    pairs: int = Field(description="pairs, or images of one position")
+    chance: float
+
+    @property
+    def text(self) -> str:
+        """Sentence about it."""
+        often = self.quantity in ("exact answers", "faint spots")
+        better = "as often as the images allow" if often else "better than the images allow"
+        times = "without error" if self.ratio is None else f"{self.ratio:.3g} times {better}"
+        chance = f"below {1e-6:g}" if self.chance < 1e-6 else f"{self.chance:.1g}"
+        where = f"{self.part}, {self.pairs}"
+        return f"knows more than the images: {self.quantity} {times} ({where}; by chance {chance})"
+
+
+class Spread(Document):
+    """Least, median and greatest of a number over the pairs."""
+
+    low: float
+    median: float
+    high: float
+
+    @classmethod
+    def of(cls, values: pl.Series) -> Spread | None:
+        """Of the values that are known; None where there are none."""
+        known = values.drop_nulls().cast(pl.Float64)
+        if not len(known):
+            return None
+        return cls.model_validate({"low": known.min(), "median": known.median(), "high": known.max()})
+
+    def text(self, factor: float = 1.0, unit: str = "") -> str:
+        """Median, with the range where there is one."""
+        low, median, high = (f"{factor * x:.3g}" for x in (self.low, self.median, self.high))
+        end = f" {unit}" if unit else ""
+        return f"{median}{end}" if low == high else f"{median}{end} ({low} to {high})"
+
+
+FRAME_COLUMNS = ("exposure_s", "analogue_gain", "jpeg_quality", "laser_level", "lamp_level")
+"""Columns of the records that say how frames were taken."""
+
+
+def frame_numbers(records: pl.DataFrame) -> dict[str, Spread | None]:
+    """Numbers of a score's frames: each of `FRAME_COLUMNS` over its pairs."""
+    pairs = records.filter(pl.col("image") == "down")
+    return {name: Spread.of(pairs[name]) for name in FRAME_COLUMNS}
+
+
+def light_distances(records: pl.DataFrame) -> dict[str, Spread | None]:
+    """Distances of the light from the beam's axis: in visible images, pixels; of D, metres."""
+    seen = records.filter("visible").select(shift=light_shift())["shift"]
+    pairs = records.filter((pl.col("image") == "down") & pl.col("pair_visible"))
+    return {"shift_px": Spread.of(seen), "depth_m": Spread.of((pairs["depth_m"] - pairs["axis_depth_m"]).abs())}
+
+
+class EncodedPicture(Document):
+    """Part of a frame as a picture: (u, v) lies at ((u - first_u + 0.5) / step, ...) from its upper left corner."""
+
+    kind: Literal["png", "jpeg"]
+    first_px: Annotated[tuple[int, int], Field(strict=False)]
+    step_px: int = Field(description="pixels of the frame along a side of one of the picture")
+    size: Annotated[tuple[int, int], Field(strict=False)]
+    base64: str
+
+    def place(self, uv_px: tuple[float, float]) -> tuple[float, float]:
+        """Position in the picture, from its upper left corner."""
+        u, v = ((x - first + 0.5) / self.step_px for x, first in zip(uv_px, self.first_px, strict=True))
+        return u, v
+
+    def holds(self, uv_px: tuple[float, float]) -> bool:
+        """Tell whether a position of the frame lies in the picture."""
+        return all(0.0 <= x <= size for x, size in zip(self.place(uv_px), self.size, strict=True))
+
+
+class Worst(Document):
+    """One of the worst images; positions are those of the whole frame."""
+
+    number: int
+    sample_id: str
+    image: Literal["down", "up"]
+    depth_m: float
+    electrons: float
+    distance_px: float | None
+    status: str
+    cause: str | None
+    true_px: Annotated[tuple[float, float], Field(strict=False)]
+    answer_px: Annotated[tuple[float, float] | None, Field(strict=False)]
+    crop: EncodedPicture | None = Field(description="around the spot, stretched to its own range")
+    frame: EncodedPicture | None = Field(description="the whole; of the first ones only")
+
+
+def _beside(name: str) -> str:
+    if name != Path(name).name or not name.isprintable() or name.startswith(".."):
+        raise ValueError("the records lie beside the document: no folder in their name")
+    return name
+
+
+class ScoreDocument(Document):
+    """One run of one method on one pair set."""
+
+    kind: Literal["phibench score"]
+    version: int
+    method: MethodCard
+    pair_set: dict[str, Any]
+    pairs: int
+    images: int
+    samples: int
+    draws: int = Field(description="draws of the noise of a sample and preset, at most")
+    frames: dict[str, Spread | None] = Field(description="how they were taken; null where nobody knows")
+    light: dict[str, Spread | None] = Field(description="how far the light lies from the beam's axis")
+    seed: int
+    rules: dict[str, float]
+    limits: dict[str, Any]
+    isolation: Name = Field(default="", description="what the method could reach: `Isolation.sentence`")
+    provenance: dict[str, Any]
+    program: Name = Field(default="", description="that scored: version of phibench, commit of a checkout")
+    code_sha256: str = Field(description="of everything behind the score")
+    missed_relative: float = Field(description="relative error of D as which a missed pair counts")
+    flags: list[Flag] = Field(description="what the images cannot tell so well")
+    metrics: dict[str, Metric] = Field(description="of the whole: `jq .metrics.rms_px.value`")
+    strata: list[StratumScore] = Field(description="parts of the whole")
+    causes: dict[str, dict[str, int]] = Field(description="images by cause and kind")
+    failures: dict[str, int] = Field(description="pairs for which the method did not come back, by the harness's word")
+    worst: list[Worst]
+    records: Annotated[str, AfterValidator(_beside)] = Field(description="name of the Parquet file")
+    records_sha256: str
+    results_sha256: Name = Field(default="", description="of the records without times and messages: `results_sha256`")
+
+    @property
+    def whole(self) -> StratumScore:
+        """The whole as a stratum, for tables that begin with it."""
+        return StratumScore(
+            by="all",
+            label="all",
+            low=None,
+            high=None,
+            mean=None,
+            images=self.images,
+            pairs=self.pairs,
+            metrics=self.metrics,
+        )
+
+
+def document_of(
+    method: MethodCard,
+    pair_set: Mapping[str, Any],
+    table: pl.DataFrame,
+    rules: Rules,
+    seed: int,
+    limits: Mapping[str, Any],
+    missed: float,
+) -> ScoreDocument:
+    """Score of complete records, without its worst images, whose pictures the records do not hold."""
+    whole, *others = strata(table)
+    return ScoreDocument(
+        kind=KIND,
+        version=VERSION,
+        method=method,
+        pair_set=dict(pair_set),
+        pairs=table["number"].n_unique(),
+        images=len(table),
+        samples=table["sample_id"].n_unique(),
+        draws=table["draw"].n_unique(),
+        frames=frame_numbers(table),
+        light=light_distances(table),
+        seed=seed,
+        rules={name: float(value) for name, value in asdict(rules).items()},
+        limits=dict(limits),
+        provenance=dict(provenance()),
+        program=program_version(),
+        code_sha256=code_behind(SCORER),
+        missed_relative=missed,
+        flags=[Flag(**{**asdict(one), "ratio": finite(one.ratio)}) for one in excesses(whole.images)],
+        metrics={name: _metric(name, value) for name, value in measured(whole, rules, "score", seed).items()},
+        strata=[_stratum(stratum, rules, seed) for stratum in others],
+        causes=count(table),
+        failures=count_failures(table),
+        worst=[],
+        records="",
+        records_sha256="",
+        results_sha256=results_sha256(table),
+    )
+
+
+_NOT_RESULTS = ("seconds", "message")
+"""Columns that may differ between two runs that answer alike; a message can name the line at which time was up."""
+
+
+def results_sha256(records: pl.DataFrame) -> str:
+    """SHA-256 of the records without times and messages: of the JSON of [name, values] of every column, in order.
+
+    Two runs share it if every answer, truth and error is the same to the last bit.
+    """
+    columns = [[name, records[name].to_list()] for name in records.columns if name not in _NOT_RESULTS]
+    return hashlib.sha256(json.dumps(columns, separators=(",", ":")).encode()).hexdigest()
+
+
+def _metric(name: str, value: Measured) -> Metric:
+    metric = METRICS[name]
+    return Metric.of(value, unit=metric.unit, better=metric.better, text=metric.text)
+
+
+def _stratum(stratum: Stratum, rules: Rules, seed: int) -> StratumScore:
+    # the same stream for every method: on the same pairs they are resampled alike, so that their intervals compare
+    values = measured(stratum, rules, "score", seed)
+    return StratumScore(
+        by=stratum.by,
+        label=stratum.label,
+        low=finite(stratum.low),
+        high=finite(stratum.high),
+        mean=finite(stratum.mean),
+        images=len(stratum.images),
+        pairs=count_pairs(stratum),
+        metrics={name: Value.of(value) for name, value in values.items()},
+    )
+
+
+def finite(value: float | None) -> float | None:
+    """Value, or None where it is not finite."""
+    return value if value is not None and math.isfinite(value) else None
+
+
+def parquet_path(path: Path) -> Path:
+    """Path of the records of a score."""
+    return path.with_suffix(".parquet")
+
+
+def write_score(path: Path, document: ScoreDocument, records: pl.DataFrame) -> ScoreDocument:
+    """Write records, then the document that names their hash; both complete or not at all."""
+    if path.suffix != ".json":
+        raise DatasetError(f"{path}: a score is a JSON file; give a name that ends in .json")
+    buffer = io.BytesIO()
+    records.write_parquet(buffer)
+    target = write_bytes(parquet_path(path), buffer.getvalue())
+    complete = document.model_copy(update={"records": target.name, "records_sha256": sha256(target)})
+    write_text(path, json.dumps(complete.model_dump(mode="json"), indent=1, allow_nan=False) + "\n")
+    return complete
+
+
+def read_score(path: Path) -> ScoreDocument:
+    """Read a score.
+
+    Raises
+    ------
+    DatasetError
+        If the file is no score, or one of another version; in one sentence.
+    """
+    file = InputFile(path, "give a file that `phibench score --method ... --out` wrote")
+    raw = file.json()
+    if raw.get("kind") != KIND:
+        raise DatasetError(f"{path} is no score: give a JSON file that `phibench score --method ... --out` wrote")
+    if raw.get("version") != VERSION:
+        found = printable_line(str(raw.get("version")), 60)
+        raise DatasetError(f"{path} has version {found}, this program reads {VERSION}: score again")
+    return file.validated(ScoreDocument, raw)
+
+
+def read_records(path: Path, document: ScoreDocument) -> pl.DataFrame:
+    """Records of the score at `path`.
+
+    Raises
+    ------
+    DatasetError
+        If the Parquet file is not there or not the one that belongs to the score.
+    """
+    target = path.parent / document.records
+    if not target.is_file():
+        raise DatasetError(f"{target} is missing: it belongs to {path.name}; keep both together, or score again")
+    if sha256(target) != document.records_sha256:
+        raise DatasetError(f"{target} is not the file that {path.name} was written with: score again")
+    return InputFile(target, "score again").table(COLUMN_TYPES)

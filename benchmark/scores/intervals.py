@@ -1,0 +1,294 @@
+"""Confidence intervals over samples: BCa bootstrap for metrics, Clopper-Pearson for rates.
+
+Images of one sample share its errors. All noise realisations and both images of a sample are therefore resampled
+together. A resample is a weight per sample, its number of occurrences. Statistics take weights, shape (b, n), so that
+one matrix product gives b resampled sums. The BCa intervals are those of `scipy.stats.bootstrap` (B. Efron, J. Am.
+Stat. Assoc. 82, 171, 1987).
+
+BCa has no value in three cases:
+
+* fewer than `least_samples` samples: no interval;
+* no spread among the resamples (all errors equal): the interval is the value itself, and the note says so;
+* all resamples on one side of the value, which makes the bias correction infinite: the percentile interval, noted.
+
+A rate over images has the exact interval of C. J. Clopper and E. S. Pearson, Biometrika 26, 404 (1934), with beta
+quantiles. Its n is an effective one: that of a simple random sample whose rate would vary as the clustered one does
+(E. L. Korn, B. I. Graubard, Survey Methodology 24, 193, 1998). It is at most the number of images, and is reduced for
+the degrees of freedom. A rate of 0 or 1 shows no spread: images of one sample then count as always alike.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import beta, bootstrap, t
+
+from phibench.benchmark.scores.answer_errors import Rules
+from phibench.scenes.frames import Array
+
+Statistic = Callable[[Array], Array]
+"""Weights, shape (b, n samples), to values, shape (b,)."""
+
+EQUAL = "all resamples equal"
+FEW = "under {} samples"
+PERCENTILE = "BCa undefined: percentile interval"
+NOTHING = "nothing to compute it from"
+_AT_ONCE = 2**21  # weights held at a time: 16 MiB
+_NO_SPREAD = 1e-12  # of the value: rounding of sums
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A value with its interval; NaN where there is none, and `note` says why."""
+
+    value: float
+    low: float
+    high: float
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class Clusters:
+    """Sample that each of r records belongs to: `index`, shape (r,), values 0 to n - 1, each at least once.
+
+    `key` is equal for records of the same samples.
+    """
+
+    index: NDArray[np.int64]
+    n: int
+    key: bytes = b""
+
+    @classmethod
+    def of(cls, labels: Sequence[str] | NDArray[Any]) -> Clusters:
+        """From the labels of the records."""
+        names, index = np.unique(np.asarray(labels), return_inverse=True)
+        return cls(index, len(names), names.tobytes())
+
+    def sums(self, *columns: Array) -> Array:
+        """Sums per sample, shape (n, columns)."""
+        return np.stack([np.bincount(self.index, column, self.n) for column in columns], axis=-1)
+
+
+def mean_of(clusters: Clusters, values: Array) -> Statistic:
+    """Mean over records."""
+    table = clusters.sums(values, np.ones_like(values))
+    return lambda weights: _ratio(weights @ table)
+
+
+def rms_of(clusters: Clusters, squares: Array) -> Statistic:
+    """Root of the mean of squares."""
+    mean = mean_of(clusters, squares)
+    return lambda weights: np.sqrt(mean(weights))
+
+
+def rms_ratio_of(clusters: Clusters, above: Array, below: Array) -> Statistic:
+    """Root of the ratio of two sums of squares; infinite where only the lower one is 0."""
+    table = clusters.sums(above, below)
+    return lambda weights: np.sqrt(_ratio(weights @ table))
+
+
+def best_constant_of(clusters: Clusters, inverse: Array) -> Statistic:
+    """Relative rms error of the constant that is best for some values, from their inverses."""
+    table = clusters.sums(inverse, inverse**2, np.ones_like(inverse))
+
+    def error(weights: Array) -> Array:
+        first, second, n = np.moveaxis(weights @ table, -1, 0)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            return np.sqrt(np.maximum(1.0 - first**2 / (n * second), 0.0))
+
+    return error
+
+
+def deviation_of(clusters: Clusters, *columns: Array) -> Statistic:
+    """Standard deviation about each column's own mean, pooled over columns (division by the number of records)."""
+    table = clusters.sums(*columns, np.sum(np.square(columns), axis=0), np.ones_like(columns[0]))
+
+    def deviation(weights: Array) -> Array:
+        sums = weights @ table
+        with np.errstate(invalid="ignore"):
+            means, square = sums[..., :-2] / sums[..., -1:], sums[..., -2] / sums[..., -1]
+        return np.sqrt(np.maximum(square - np.sum(means**2, axis=-1), 0.0) / len(columns))
+
+    return deviation
+
+
+def quantile_of(clusters: Clusters, values: Array, share: Fraction) -> Statistic:
+    """Quantile of the records: where the empirical distribution steps over `share`, the mean of both sides at a step.
+
+    Definition 2 of R. J. Hyndman and Y. Fan, Am. Stat. 50, 361 (1996): the median as everybody knows it.
+    """
+    order = np.argsort(values, kind="stable")
+    ordered, index = values[order], clusters.index[order]
+
+    def quantile(weights: Array) -> Array:
+        rows = max(1, _AT_ONCE // len(ordered))
+        # records first, resamples last: running sums of whole rows are quick; counts are exact in 32 bits up to 2^24
+        counts = np.ascontiguousarray(weights.T, dtype=np.float32)
+        parts = [_quantile(counts[:, i : i + rows][index], ordered, share) for i in range(0, len(weights), rows)]
+        return np.concatenate(parts)
+
+    return quantile
+
+
+def exchange_chance(statistic: Statistic, n: int, rules: Rules, rng: np.random.Generator) -> float:
+    """Chance of a difference as large as that of two methods if nothing tells them apart; NaN where there is none.
+
+    The methods' answers on each of n samples are exchanged with a chance of one half, `Rules.resamples` times. The
+    share of differences at least as large, the observed one included, is the p-value of an exact test of the hypothesis
+    that both methods have the same law. It is below alpha with a chance of at most alpha, for every n and statistic
+    (E. J. G. Pitman, Suppl. J. R. Stat. Soc. 4, 119, 1937).
+
+    Parameters
+    ----------
+    statistic : of 2 n samples, the first method's n, then the second's
+    n : int
+    rules : Rules
+    """
+    stay = np.zeros((1, n))
+    first, second = _exchanged(statistic, stay)
+    observed = abs(float(second[0] - first[0]))
+    if not math.isfinite(observed):
+        return math.nan
+    # what differs by the rounding of sums alone is as large
+    least = observed - _NO_SPREAD * max(abs(float(first[0])), abs(float(second[0])))
+    rows, larger = max(1, _AT_ONCE // (2 * n)), 0
+    for start in range(0, rules.resamples, rows):
+        flips = rng.integers(0, 2, (min(rows, rules.resamples - start), n)).astype(float)
+        one, other = _exchanged(statistic, flips)
+        larger += int(np.count_nonzero(~(np.abs(other - one) < least)))  # one without a value counts as larger
+    return (1.0 + larger) / (1.0 + rules.resamples)
+
+
+def _exchanged(statistic: Statistic, flips: Array) -> tuple[Array, Array]:
+    """Values of both methods where the answers of samples, `flips` of shape (b, n), are exchanged."""
+    return statistic(np.hstack([1.0 - flips, flips])), statistic(np.hstack([flips, 1.0 - flips]))
+
+
+def holm(chances: Sequence[float], alpha: float) -> list[bool]:
+    """Rejections of several hypotheses, with a chance of at most alpha that any true one is rejected; NaN never is.
+
+    S. Holm, Scand. J. Stat. 6, 65 (1979): the smallest p-value against alpha / m, the next against alpha / (m - 1), and
+    so on until one is larger. The tests may depend on each other.
+    """
+    order = sorted((k for k, chance in enumerate(chances) if not math.isnan(chance)), key=lambda k: chances[k])
+    rejected = [False] * len(chances)
+    for left, k in zip(range(len(order), 0, -1), order, strict=True):
+        if chances[k] > alpha / left:
+            break
+        rejected[k] = True
+    return rejected
+
+
+def estimates(statistics: Sequence[Statistic], n: int, rules: Rules, rng: np.random.Generator) -> list[Estimate]:
+    """Values of statistics of n samples with intervals from one common set of resamples.
+
+    Returns
+    -------
+    list of Estimate, one per statistic
+    """
+    if n == 0:
+        return [Estimate(math.nan, math.nan, math.nan, NOTHING) for _ in statistics]
+    values = [float(statistic(np.ones((1, n)))[0]) for statistic in statistics]
+    if n < max(rules.least_samples, 2):
+        note = FEW.format(rules.least_samples)
+        return [Estimate(value, math.nan, math.nan, note) for value in values]
+    result = _bootstrap(statistics, n, rules, rng)
+    low, high = result.confidence_interval
+    drawn = result.bootstrap_distribution
+    return [_estimate(*row, rules.confidence) for row in zip(values, low, high, drawn, strict=True)]
+
+
+def _bootstrap(statistics: Sequence[Statistic], n: int, rules: Rules, rng: np.random.Generator) -> Any:
+    def all_of(index: NDArray[np.int64], axis: int = -1) -> Array:
+        weights = _weights(np.atleast_2d(index), n)
+        values = np.stack([statistic(weights) for statistic in statistics])
+        return values if index.ndim > 1 else values[:, 0]
+
+    with warnings.catch_warnings(), np.errstate(all="ignore"):
+        warnings.simplefilter("ignore")  # degenerate statistics come back NaN and are told apart below
+        return bootstrap(
+            (np.arange(n),),
+            all_of,
+            n_resamples=rules.resamples,
+            batch=max(1, _AT_ONCE // n),
+            confidence_level=rules.confidence,
+            method="BCa",
+            vectorized=True,
+            rng=rng,
+        )
+
+
+def _estimate(value: float, low: float, high: float, drawn: Array, confidence: float) -> Estimate:
+    if not math.isfinite(value):
+        return Estimate(value, math.nan, math.nan, "infinite" if math.isinf(value) else NOTHING)
+    drawn = drawn[np.isfinite(drawn)]
+    if drawn.size == 0 or np.ptp(drawn) <= _NO_SPREAD * max(abs(value), np.finfo(float).tiny):
+        return Estimate(value, value, value, EQUAL)
+    if math.isfinite(low) and math.isfinite(high):
+        return Estimate(value, float(low), float(high))
+    tail = (1.0 - confidence) / 2.0
+    low, high = np.quantile(drawn, [tail, 1.0 - tail])
+    return Estimate(value, float(low), float(high), PERCENTILE)
+
+
+def _weights(index: NDArray[np.int64], n: int) -> Array:
+    """Counts of each sample in each row of indices, shape (b, n); float, for the matrix products."""
+    rows = np.arange(len(index))[:, None] * n
+    return np.bincount((index + rows).ravel(), minlength=len(index) * n).reshape(-1, n).astype(float)
+
+
+def _ratio(sums: Array) -> Array:
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return sums[..., 0] / sums[..., 1]
+
+
+def _quantile(counts: NDArray[np.float32], ordered: Array, share: Fraction) -> Array:
+    """Quantiles of `ordered` under whole-number weights, shape (r, b); without fractions, so that a step is a step."""
+    below = np.cumsum(counts, axis=0, out=counts)
+    goal = below[-1] * np.float32(share.numerator)
+    below *= np.float32(share.denominator)
+    low, high = np.count_nonzero(below < goal, axis=0), np.count_nonzero(below <= goal, axis=0)
+    return 0.5 * (ordered[low] + ordered[np.minimum(high, len(ordered) - 1)])
+
+
+def rate(clusters: Clusters, hits: Array, rules: Rules) -> Estimate:
+    """Share of hits with its interval.
+
+    Parameters
+    ----------
+    clusters : samples of the records
+    hits : shape (r,), 0 or 1
+    rules : Rules
+    """
+    if clusters.n == 0:
+        return Estimate(math.nan, math.nan, math.nan, NOTHING)
+    found, tried = clusters.sums(hits, np.ones_like(hits)).T
+    value = float(found.sum() / tried.sum())
+    n = _effective_number(found, tried, value)
+    return Estimate(value, *clopper_pearson(value * n, n, rules.confidence))
+
+
+def clopper_pearson(hits: float, n: float, confidence: float) -> tuple[float, float]:
+    """Exact binomial interval; hits and n need not be whole."""
+    tail, misses = (1.0 - confidence) / 2.0, n - hits
+    low = 0.0 if hits <= 0.0 else float(beta.ppf(tail, hits, misses + 1.0))
+    high = 1.0 if misses <= 0.0 else float(beta.ppf(1.0 - tail, hits + 1.0, misses))
+    return low, high
+
+
+def _effective_number(found: Array, tried: Array, value: float) -> float:
+    m, images = len(found), float(tried.sum())
+    if m < 2 or value in (0.0, 1.0):
+        return float(m)
+    variance = m / (m - 1) * float(np.sum((found - value * tried) ** 2)) / images**2
+    if variance == 0.0:
+        return float(m)
+    reduction = (t.ppf(0.975, images - 1) / t.ppf(0.975, m - 1)) ** 2 if images > m else 1.0
+    return min(value * (1.0 - value) / variance * float(reduction), images)

@@ -1,0 +1,513 @@
+"""Table that every score is computed from, one row per image: answer, truth, errors, bound.
+
+A pair has two rows, "down" and "up"; columns of the pair are in both. Null where there is nothing: no answer, no
+truth (a spot without an image), no claimed covariance, no bound, or a ray that does not reach. Never NaN.
+`COLUMNS` says what each column is.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any
+
+import numpy as np
+import polars as pl
+
+from phibench.benchmark.scores.answer_errors import (
+    Rules,
+    best_constant,
+    from_centre_px,
+    in_ray_units,
+    kept,
+    phi_of,
+    phi_variance,
+    pixel_errors,
+    rank_squares,
+    usable_covariance,
+    whitened,
+)
+from phibench.benchmark.scores.pair_bounds import SpotBoundsOfImages, pair_bounds
+from phibench.datasets.errors import DatasetError
+from phibench.estimator.geometry.least_squares_depth import nominal_depth
+from phibench.estimator.geometry.phi import outline_circle
+from phibench.estimator.geometry.triangulate import depth_exact
+from phibench.estimator.interface import OK, Answer, Outcome, Spot
+from phibench.estimator.limits.beyond_images import searched_px2
+from phibench.estimator.pair_set import PairSet, PairTruth, SpotTruth
+from phibench.scenes.frames import Array
+from phibench.scenes.rig import POSITIONS, Rig
+
+WITHIN = 1.959963984540054
+"""Standard deviations of a normal error that hold 95 %."""
+_NO_MATRIX = np.full((2, 2), np.nan)
+_BAYER = {(0, 0): "red", (1, 0): "green in red row", (0, 1): "green in blue row", (1, 1): "blue"}
+
+COLUMNS: dict[str, str] = {
+    "number": "pair, as in the pair set",
+    "sample_id": "sample; intervals resample these",
+    "draw": "draw of the noise",
+    "image": "down or up",
+    "preset": "preset of the sensor",
+    "jpeg_quality": "libjpeg's quality; null unless MJPEG",
+    "exposure_s": "exposure time of both images",
+    "analogue_gain": "gain before the converter",
+    "laser_level": "factor of the laser's light",
+    "lamp_level": "factor of the room's light",
+    "hinted": "whether the method got boxes",
+    "depth_m": "D of the light",
+    "axis_depth_m": "D of the beam's axis",
+    "stroke_m": "h",
+    "azimuth_rad": "azimuth of the mirror's normal",
+    "electrons": "expected electrons of the spot",
+    "snr": "signal to noise of the light, place and room known (docs/limits.md)",
+    "saturated": "a pixel of the spot is expected above saturation",
+    "visible": "whether the chief ray reaches the sensor",
+    "unseen_because": "why not; none if visible",
+    "u_true_px": "centre of the light",
+    "v_true_px": "centre of the light",
+    "u_axis_px": "image of the beam's axis",
+    "v_axis_px": "image of the beam's axis",
+    "from_centre_px": "true distance from the image of the sphere centre",
+    "bayer": "2 x 2 cell's pixel that holds the true position",
+    "status": "ok, or the method's or the harness's word why there is no position",
+    "u_px": "answer",
+    "v_px": "answer",
+    "du_px": "answer - truth",
+    "dv_px": "answer - truth",
+    "distance_px": "hypot(du, dv)",
+    "radial_px": "error outwards from the image of the sphere centre",
+    "tangential_px": "error across it, u towards v",
+    "detected": "visible, and a position within match_px",
+    "missed": "visible and not detected",
+    "false_detection": "a position where the spot is not visible, or further than match_px from it",
+    "counted_px": "distance_px if detected, match_px if missed",
+    "phi_convention": "ray, normal, incidence or outline",
+    "phi_from": "method or pixels",
+    "phi_rad": "the method's, else estimator.geometry.phi of its pixel through the nominal rig",
+    "phi_true_rad": "truth in that convention; outline: estimator.geometry.phi of the true pixel through the true rig",
+    "phi_error_rad": "phi_rad - phi_true_rad, in units of phi_ray: times d phi_ray / d phi along the gradient",
+    "claimed_uu_px2": "claimed variance of u",
+    "claimed_uv_px2": "claimed covariance of u and v",
+    "claimed_vv_px2": "claimed variance of v",
+    "pull_u": "first component of L^-1 e, C = L L^T the claimed covariance",
+    "pull_v": "second component",
+    "mahalanobis2": "e^T C^-1 e",
+    "bound_px2": "trace of the bound (docs/limits.md): expected squared distance at it",
+    "bound_uu_px2": "the bound itself: variance of u",
+    "bound_uv_px2": "covariance of u and v",
+    "bound_vv_px2": "variance of v",
+    "raw_bound_px2": "as bound_px2, of the raw pixels behind the image",
+    "raw_bound_uu_px2": "that bound itself: variance of u",
+    "raw_bound_uv_px2": "covariance of u and v",
+    "raw_bound_vv_px2": "variance of v",
+    "bound_phi_rad2": "variance of phi at the bound",
+    "pair_bound_px2": "as bound_px2, of both images together: one point of the room",
+    "pair_bound_phi_rad2": "variance of phi at that bound",
+    "rank_phi2_rad2": "square that the rank by phi sums: error (of outline: of phi_ray), missed and false",
+    "pair_visible": "both spots are visible",
+    "pair_false": "a false detection in either image, or a D of the method's own where a spot is not visible",
+    "pair_electrons": "the fainter spot's electrons",
+    "depth_found": "both spots are found, and a finite depth above 0 follows",
+    "depth_from": "method or pixels",
+    "depth_estimate_m": "D of the answer",
+    "depth_error_m": "depth_estimate_m - depth_m",
+    "depth_relative": "depth_error_m / depth_m",
+    "depth_sigma_m": "claimed: the method's with its own depth, else from its covariances; with a calibration's part",
+    "claimed_sigma_m": "the method's sigma of its own D, without a calibration's part",
+    "claimed_low_m": "lower end of the method's 95 % interval of its own D",
+    "claimed_high_m": "upper end",
+    "depth_pull": "depth_error_m / depth_sigma_m; of real pairs the tape's standard deviation is added",
+    "depth_within": "D in the claimed 95 % interval: the method's own, widened as its sigma is, else |pull| <= 1.96",
+    "bound_depth_m2": "variance of D at the bounds of both spots, each by itself; without calibration",
+    "pair_bound_depth_m2": "the same of both images together",
+    "possible_position_chi2": "errors of the pair's positions over what is possible, squared; 3 degrees of freedom",
+    "possible_depth_m2": "smallest possible variance of D",
+    "possible_spot_px2": "trace of the smallest possible covariance of this position, at most 0.5 px^2 along any axis",
+    "possible_spot_chi2": "squared error of this position over that covariance; 2 degrees of freedom",
+    "possible_spot_phi_rad2": "smallest possible variance of this phi",
+    "searched_px2": "area in which a search has to look for the spot: its box, or a quarter of the mirror's disc",
+    "seconds": "inside the method",
+    "failure": "of the harness; empty if none",
+    "message": "about the failure",
+}
+COUNTED: dict[str, str] = {
+    "depth_counted": "|depth_relative|, at most what a miss costs; that too if not found; null unless pair_visible",
+    "rank_depth2": "square that the rank by D sums: relative error, missed and false detection",
+}
+"""Columns that follow from all pairs together: `with_missed`."""
+
+
+_OF_FRAMES = ("exposure_s", "analogue_gain", "laser_level", "lamp_level")
+_WHOLE = ("number", "draw", "jpeg_quality")
+_TEXTS = (
+    *("sample_id", "image", "preset", "unseen_because", "bayer"),
+    *("status", "phi_convention", "phi_from", "depth_from", "failure", "message"),
+)
+_TRUTH_VALUES = (
+    *("hinted", "saturated", "visible", "detected", "missed"),
+    *("false_detection", "pair_visible", "pair_false", "depth_found", "depth_within"),
+)
+_TYPES = {
+    **dict.fromkeys(_WHOLE, pl.Int64()),
+    **dict.fromkeys(_TEXTS, pl.String()),
+    **dict.fromkeys(_TRUTH_VALUES, pl.Boolean()),
+    **dict.fromkeys(_OF_FRAMES, pl.Float64()),
+}
+COLUMN_TYPES: dict[str, pl.DataType] = {name: _TYPES.get(name, pl.Float64()) for name in (*COLUMNS, *COUNTED)}
+"""Type of every column."""
+
+
+def records(pairs: PairSet, outcomes: Iterable[Outcome], rules: Rules) -> pl.DataFrame:
+    """Records of a run, `COLUMNS` and `COUNTED`, two rows per pair in the order of their numbers.
+
+    Parameters
+    ----------
+    pairs : PairSet
+        Truths are taken of the pairs that have an outcome.
+    outcomes : one per pair
+    rules : Rules
+
+    Raises
+    ------
+    DatasetError
+        If a pair has several outcomes, a number is none of the set, or the set is sealed.
+    """
+    ordered = in_order(outcomes, len(pairs))
+    table = record_table([pairs.truth(outcome.number) for outcome in ordered], ordered, rules)
+    return with_missed(table, missed_relative(table, rules))
+
+
+def missed_relative(table: pl.DataFrame, rules: Rules) -> float:
+    """Relative error of D as which a missed pair counts: that of the best constant answer, within the rules' limits."""
+    depths = table.filter((pl.col("image") == "down") & pl.col("pair_visible"))["depth_m"].to_numpy()
+    return min(rules.missed_relative, max(rules.least_missed_relative, best_constant(depths)))
+
+
+def with_missed(table: pl.DataFrame, missed: float) -> pl.DataFrame:
+    """Records with `COUNTED`, a missed pair counting as `missed`."""
+    relative = table["depth_relative"].fill_null(np.nan).to_numpy()
+    found, visible = (table[name].to_numpy() for name in ("depth_found", "pair_visible"))
+    counted = np.where(found, np.minimum(np.abs(relative), missed), missed)
+    squares = rank_squares(relative, found, visible, table["pair_false"].to_numpy(), missed)
+    return table.with_columns(
+        depth_counted=pl.Series(np.where(visible, counted, np.nan)).fill_nan(None), rank_depth2=pl.Series(squares)
+    )
+
+
+def record_table(truths: Sequence[PairTruth], outcomes: Sequence[Outcome], rules: Rules) -> pl.DataFrame:
+    """`COLUMNS` of truths and outcomes side by side."""
+    if not truths:
+        raise DatasetError("a score of no pairs: give at least one")
+    index: dict[tuple[Rig, Rig, int], list[int]] = {}
+    for i, truth in enumerate(truths):
+        # a calibration goes with its rig; its array is one object for all pairs, or rows that are equal stay apart
+        index.setdefault((truth.nominal_rig, truth.true_rig, id(truth.calibration_covariance)), []).append(i)
+    parts = [
+        part
+        for (nominal, true, _), rows in index.items()
+        for part in _of_rigs(nominal, true, [truths[i] for i in rows], [outcomes[i] for i in rows], rules)
+    ]
+    columns = {name: _joined([part[name] for part in parts]) for name in parts[0]}
+    table = pl.DataFrame(columns, schema_overrides=_TYPES).sort("number", pl.col("image") == "up")
+    return table.with_columns(pl.col(pl.Float64).fill_nan(None)).select(*COLUMNS)
+
+
+def in_order(outcomes: Iterable[Outcome], count: int) -> list[Outcome]:
+    """Outcomes by number.
+
+    Raises
+    ------
+    DatasetError
+        If a pair has several, or a number is not 0 to count - 1.
+    """
+    ordered = sorted(outcomes, key=lambda outcome: outcome.number)
+    numbers = [outcome.number for outcome in ordered]
+    if len(set(numbers)) != len(numbers):
+        twice = next(number for number in numbers if numbers.count(number) > 1)
+        raise DatasetError(f"pair {twice} has several outcomes: a score takes one of each pair")
+    if numbers and not (numbers[0] >= 0 and numbers[-1] < count):
+        raise DatasetError(f"outcomes of pairs {numbers[0]} to {numbers[-1]}, but the set has {count} pairs from 0 up")
+    return ordered
+
+
+def _joined(parts: list[Any]) -> Any:
+    """Parts of a column, all arrays or all lists, one after the other."""
+    return np.concatenate(parts) if isinstance(parts[0], np.ndarray) else [value for part in parts for value in part]
+
+
+def _of_rigs(
+    nominal: Rig, true: Rig, truths: list[PairTruth], outcomes: list[Outcome], rules: Rules
+) -> list[dict[str, Any]]:
+    """Columns of pairs that share their rigs, of each image: its own, then the pairs'."""
+    images = {p: _image_columns(p, nominal, true, truths, outcomes, rules) for p in POSITIONS}
+    pair = _pair_columns(nominal, truths, outcomes, images)
+    pair |= _joint_columns(nominal, truths, images, pair)
+    return [{**images[p], **pair} for p in POSITIONS]
+
+
+def _image_columns(
+    position: str, nominal: Rig, true: Rig, truths: list[PairTruth], outcomes: list[Outcome], rules: Rules
+) -> dict[str, Any]:
+    spots: list[SpotTruth] = [getattr(truth, position) for truth in truths]
+    answers = [_spot(outcome, position) for outcome in outcomes]
+    xy, uv = _stack(spot.uv_px for spot in spots), _stack(map(_position, answers))
+    error, phi = pixel_errors(true, xy, uv), _phi_columns(nominal, true, xy, uv, spots, answers)
+    given, visible = np.isfinite(uv).all(axis=1), np.array([spot.visible for spot in spots])
+    # of a real pair nobody knows the spot's place: any position counts as found, and D tells what it is worth
+    known = ~visible | np.isfinite(xy).all(axis=1)
+    near = error.distance_px <= rules.match_px  # False for NaN
+    detected = visible & np.where(known, near, given)
+    false = given & ~detected
+    claimed = usable_covariance(_claimed(answers))
+    pull = whitened(np.stack([error.du_px, error.dv_px], -1), claimed)
+    bound, raw = (_bounds(spots, name) for name in ("bound_px2", "raw_bound_px2"))
+    return {
+        "image": [position] * len(spots),
+        "azimuth_rad": [spot.azimuth_rad for spot in spots],
+        "electrons": [float(spot.electrons) for spot in spots],
+        "snr": [float(spot.snr) for spot in spots],
+        "saturated": [bool(spot.saturated) for spot in spots],
+        "visible": visible,
+        "unseen_because": [spot.cause for spot in spots],
+        "u_true_px": xy[:, 0],
+        "v_true_px": xy[:, 1],
+        **dict(zip(("u_axis_px", "v_axis_px"), _stack(spot.axis_px for spot in spots).T, strict=True)),
+        "from_centre_px": from_centre_px(true, xy),
+        "bayer": [_bayer(x) for x in xy],
+        "status": [_status(*both, position) for both in zip(answers, outcomes, strict=True)],
+        "u_px": uv[:, 0],
+        "v_px": uv[:, 1],
+        "du_px": error.du_px,
+        "dv_px": error.dv_px,
+        "distance_px": error.distance_px,
+        "radial_px": error.radial_px,
+        "tangential_px": error.tangential_px,
+        "detected": detected,
+        "missed": visible & ~detected,
+        "false_detection": false,
+        "counted_px": np.where(visible & known, np.where(detected, error.distance_px, rules.match_px), np.nan),
+        **phi,
+        **_parts("claimed", claimed),
+        "pull_u": pull[:, 0],
+        "pull_v": pull[:, 1],
+        "mahalanobis2": np.sum(pull**2, axis=-1),
+        "bound_px2": np.trace(bound, axis1=1, axis2=2),
+        **_parts("bound", bound),
+        "raw_bound_px2": np.trace(raw, axis1=1, axis2=2),
+        **_parts("raw_bound", raw),
+        "bound_phi_rad2": phi_variance(nominal, xy, bound),
+        "rank_phi2_rad2": np.where(
+            known,
+            rank_squares(_ranked_phi_error(nominal, spots, uv, phi), detected, visible, false, rules.missed_phi_rad),
+            np.nan,
+        ),
+    }
+
+
+def _parts(name: str, matrices: Array) -> dict[str, Array]:
+    """Columns of symmetric matrices of (u, v), shape (n, 2, 2)."""
+    places = {"uu": (0, 0), "uv": (0, 1), "vv": (1, 1)}
+    return {f"{name}_{part}_px2": matrices[:, i, j] for part, (i, j) in places.items()}
+
+
+def _ranked_phi_error(nominal: Rig, spots: list[SpotTruth], uv: Array, phi: dict[str, Any]) -> Array:
+    """Error of phi that ranks; of "outline" that of phi_ray at the answered pixel.
+
+    "outline" is a formula in the image, true of any rig: no error of the nominal rig would count.
+    """
+    truth = np.array([s.phi_rad.get("ray", np.nan) for s in spots])
+    formula = np.array([convention == "outline" for convention in phi["phi_convention"]])
+    return np.where(formula, phi_of("ray", nominal, uv) - truth, phi["phi_error_rad"])
+
+
+def _phi_columns(
+    nominal: Rig, true: Rig, xy: Array, uv: Array, spots: list[SpotTruth], answers: list[Spot | None]
+) -> dict[str, Any]:
+    own = np.array([_own_phi(answer) for answer in answers])
+    convention = [
+        a.phi_convention if a is not None and np.isfinite(x) else "ray" for a, x in zip(answers, own, strict=True)
+    ]
+    phi = np.where(np.isfinite(own), own, phi_of("ray", nominal, uv))
+    outline = _true_phi("outline", true, xy)
+    truth = np.array([s.phi_rad.get(c, o) for s, c, o in zip(spots, convention, outline, strict=True)])
+    return {
+        "phi_convention": [c if np.isfinite(x) else None for c, x in zip(convention, phi, strict=True)],
+        "phi_from": [_from(*x) for x in zip(np.isfinite(own), np.isfinite(phi), strict=True)],
+        "phi_rad": phi,
+        "phi_true_rad": truth,
+        "phi_error_rad": (phi - truth) * in_ray_units(true, xy, convention),
+    }
+
+
+def _joint_columns(
+    nominal: Rig, truths: list[PairTruth], images: dict[str, dict[str, Any]], pair: dict[str, Any]
+) -> dict[str, Any]:
+    """Columns of the bounds of both images together; those of single images are added to `images`."""
+    spots = {p: [getattr(t, p) for t in truths] for p in POSITIONS}
+    singles = [SpotBoundsOfImages(*(_bounds(spots[p], name) for name in _BOUND_NAMES)) for p in POSITIONS]
+    (xy1, e1), (xy2, e2) = (
+        [np.stack([images[p][u], images[p][v]], -1) for u, v in (_TRUE_PX, _ERROR_PX)] for p in POSITIONS
+    )
+    joint = pair_bounds(
+        nominal,
+        _nominal_stroke_m(truths),
+        pair["depth_m"],
+        (xy1, xy2),
+        (singles[0], singles[1]),
+        (e1, e2),
+    )
+    for position, uv, C in zip(POSITIONS, (xy1, xy2), (joint.down_px2, joint.up_px2), strict=True):
+        images[position]["pair_bound_px2"] = np.trace(C, axis1=1, axis2=2)
+        images[position]["pair_bound_phi_rad2"] = phi_variance(nominal, uv, C)
+    for place, position in enumerate(POSITIONS):
+        for name in ("possible_spot_px2", "possible_spot_chi2", "possible_spot_phi_rad2"):
+            images[position][name] = getattr(joint, name)[place]
+    return {
+        "pair_bound_depth_m2": joint.depth_m2,
+        "possible_position_chi2": joint.possible_position_chi2,
+        "possible_depth_m2": joint.possible_depth_m2,
+    }
+
+
+_BOUND_NAMES = ("bound_px2", "raw_bound_px2")
+_TRUE_PX, _ERROR_PX = ("u_true_px", "v_true_px"), ("du_px", "dv_px")
+
+
+def _searched_px2(nominal: Rig, truths: list[PairTruth]) -> Array:
+    radius = float(outline_circle(nominal)[1])
+    boxes = (t.box_px2 if t.hinted else None for t in truths)
+    return np.array([searched_px2(radius, box) for box in boxes])
+
+
+def _nominal_stroke_m(truths: list[PairTruth]) -> Array:
+    return np.array([t.stroke_m if t.nominal_stroke_m is None else t.nominal_stroke_m for t in truths], float)
+
+
+def _pair_columns(
+    nominal: Rig, truths: list[PairTruth], outcomes: list[Outcome], images: dict[str, dict[str, Any]]
+) -> dict[str, Any]:
+    down, up = (images[p] for p in POSITIONS)
+    bounds = [_bounds([getattr(t, p) for t in truths], "bound_px2") for p in POSITIONS]
+    claims = [usable_covariance(_claimed([_spot(o, p) for o in outcomes])) for p in POSITIONS]
+    true_m, h = (np.array([getattr(t, name) for t in truths], float) for name in ("depth_m", "stroke_m"))
+    true_sigma_m = np.array([t.depth_sigma_m for t in truths])
+    nominal_h = _nominal_stroke_m(truths)
+    answers, truth = (
+        [np.stack([i[u], i[v]], -1) for i in (down, up)] for u, v in (("u_px", "v_px"), ("u_true_px", "v_true_px"))
+    )
+    calibration = truths[0].calibration_covariance
+    found_m = nominal_depth(nominal, nominal_h, (answers[0], answers[1]), (claims[0], claims[1]), calibration)
+    own, own_sigma = (np.array([_own_depth(o.answer, name) for o in outcomes]) for name in ("depth_m", "sigma_depth_m"))
+    has_own = np.isfinite(own)
+    of_own = np.hypot(own_sigma, found_m.calibration_sigma_m)
+    depth, sigma = np.where(has_own, own, found_m.depth_m), np.where(has_own, of_own, found_m.sigma_m)
+    pull = (depth - true_m) / np.where(sigma > 0.0, np.hypot(sigma, true_sigma_m), np.nan)
+    intervals = np.array([_own_interval(o.answer) for o in outcomes])
+    within = _within(depth, true_m, pull, intervals, np.hypot(found_m.calibration_sigma_m, true_sigma_m))
+    both = down["visible"] & up["visible"]
+    false = down["false_detection"] | up["false_detection"] | (has_own & ~both)
+    found = down["detected"] & up["detected"] & (depth > 0.0)  # False for NaN
+    return {
+        "number": [t.number for t in truths],
+        "sample_id": [t.sample_id for t in truths],
+        "draw": [t.draw for t in truths],
+        "preset": [t.preset for t in truths],
+        "jpeg_quality": [t.jpeg_quality for t in truths],
+        **{name: [getattr(t, name) for t in truths] for name in _OF_FRAMES},
+        "hinted": [t.hinted for t in truths],
+        "searched_px2": _searched_px2(nominal, truths),
+        "depth_m": true_m,
+        "axis_depth_m": np.array([t.axis_depth_m for t in truths], float),
+        "stroke_m": h,
+        "pair_visible": both,
+        "pair_false": false,
+        "pair_electrons": np.minimum(down["electrons"], up["electrons"]),
+        "depth_found": found,
+        "depth_from": [_from(*x) for x in zip(has_own, np.isfinite(depth), strict=True)],
+        "depth_estimate_m": depth,
+        "depth_error_m": depth - true_m,
+        "depth_relative": depth / true_m - 1.0,
+        "depth_sigma_m": sigma,
+        "claimed_sigma_m": np.where(has_own, own_sigma, np.nan),
+        "claimed_low_m": intervals[:, 0],
+        "claimed_high_m": intervals[:, 1],
+        "depth_pull": pull,
+        "depth_within": within,
+        "bound_depth_m2": _bound_depth(nominal, nominal_h, *truth, *bounds).sigma_m ** 2,
+        "seconds": [float(o.seconds) for o in outcomes],
+        "failure": [o.failure for o in outcomes],
+        "message": [o.message for o in outcomes],
+    }
+
+
+_true_phi, _bound_depth = kept(phi_of), kept(depth_exact)
+
+
+def _spot(outcome: Outcome, position: str) -> Spot | None:
+    return None if outcome.answer is None else getattr(outcome.answer, position)
+
+
+def _position(spot: Spot | None) -> tuple[float, float]:
+    """(u, v), NaN where there is none; a status other than "ok" takes a position back."""
+    if spot is None or spot.status != OK or spot.uv_px is None or not np.isfinite(spot.uv_px).all():
+        return math.nan, math.nan
+    return spot.uv_px
+
+
+def _status(spot: Spot | None, outcome: Outcome, position: str) -> str:
+    if spot is None:
+        return outcome.failure or "no answer"
+    return spot.status if spot.status != OK or np.isfinite(_position(spot)).all() else "no position"
+
+
+def _claimed(spots: list[Spot | None]) -> Array:
+    claims = (None if spot is None else spot.covariance_px2 for spot in spots)
+    return np.stack([_NO_MATRIX if claim is None else np.asarray(claim, float) for claim in claims])
+
+
+def _own_phi(spot: Spot | None) -> float:
+    if spot is None or spot.phi_rad is None or not np.isfinite(_position(spot)).all():
+        return math.nan
+    return spot.phi_rad
+
+
+def _own_depth(answer: Answer | None, name: str) -> float:
+    value = None if answer is None else getattr(answer, name)
+    return math.nan if value is None else float(value)
+
+
+def _own_interval(answer: Answer | None) -> tuple[float, float]:
+    interval = None if answer is None or answer.depth_m is None else answer.interval_depth_m
+    return (math.nan, math.nan) if interval is None else interval
+
+
+def _within(depth: Array, true_m: Array, pull: Array, intervals: Array, added_m: Array) -> list[bool | None]:
+    """Truth of D in the claimed interval, None where none is claimed; `added_m` are errors that it leaves out."""
+    more = WITHIN * np.nan_to_num(added_m)
+    low, high = depth - np.hypot(depth - intervals[:, 0], more), depth + np.hypot(intervals[:, 1] - depth, more)
+    inside = np.where(np.isfinite(low), (low <= true_m) & (true_m <= high), np.abs(pull) <= WITHIN)
+    known = np.isfinite(true_m) & (np.isfinite(low) | np.isfinite(pull))
+    return [bool(x) if there else None for x, there in zip(inside, known, strict=True)]
+
+
+def _from(own: bool, there: bool) -> str | None:
+    if not there:
+        return None
+    return "method" if own else "pixels"
+
+
+def _bounds(spots: list[SpotTruth], name: str) -> Array:
+    matrices: Iterator[Array | None] = (getattr(spot, name) for spot in spots)
+    return np.stack([_NO_MATRIX if matrix is None else np.asarray(matrix, float) for matrix in matrices])
+
+
+def _bayer(uv_px: Array) -> str | None:
+    if not np.isfinite(uv_px).all():
+        return None
+    u, v = np.floor(uv_px + 0.5).astype(int) % 2
+    return _BAYER[int(u), int(v)]
+
+
+def _stack(points: Iterable[tuple[float, float]]) -> Array:
+    return np.array(list(points), float).reshape(-1, 2)

@@ -1,0 +1,332 @@
+"""Results of many methods on the presets of a data set: a page in Markdown, a page in HTML, and a JSON document.
+
+All three come from score files alone, and the same files give the same bytes. Scores of the same pairs make one part,
+usually one preset. Each part has the ranking with intervals, the paired differences against one method, strata and
+causes. Differences and their verdicts are those of `compare`.
+"""
+
+from __future__ import annotations
+
+import json
+import textwrap
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import polars as pl
+
+from phibench.benchmark.scores.answer_errors import Rules
+from phibench.benchmark.scores.compare import (
+    Difference,
+    compare_records,
+    note_on_code,
+    note_on_others,
+    same_pairs,
+)
+from phibench.benchmark.scores.document import ScoreDocument, StratumScore, read_records, read_score
+from phibench.benchmark.scores.metrics import METRICS, applies
+from phibench.benchmark.scores.report import Section, report_html
+from phibench.benchmark.scores.score_tables import (
+    DIGITS,
+    FLAGGED,
+    Grid,
+    cause_table,
+    cell_parts,
+    differences_json,
+    frames_line,
+    light_line,
+    markdown,
+    ranked,
+    refused,
+    shown_parts,
+)
+from phibench.datasets.errors import DatasetError
+from phibench.datasets.shown_text import markdown_cell, markdown_text
+from phibench.datasets.store.files import write_text
+
+AGAINST = "chain_fit"
+_BOARD = ("rank_phi_rad", "rank_depth", "detection_rate", "false_rate")
+_ERRORS = ("median_px", "rms_px", "median_depth_relative", "rms_depth_relative")
+_CLAIMS = ("efficiency_px", "efficiency_pair_px", "pull_deviation", "beyond_5_sigma", "coverage_depth")
+_DIFFERENCES = ("rank_phi_rad", "rank_depth", "detection_rate", "median_px", "rms_px")
+_STRATA = ("spot", "signal", "depth", "stroke", "hint", "quality")
+_SHOWN = 4
+"""Methods whose strata are shown: the best ones, and the one that the others are compared with."""
+_HEADS = {
+    "rank_phi_rad": "rank phi",
+    "rank_depth": "rank D",
+    "detection_rate": "found",
+    "false_rate": "false",
+    "median_px": "median",
+    "rms_px": "rms",
+    "median_depth_relative": "median D",
+    "rms_depth_relative": "rms D",
+    "efficiency_px": "efficiency",
+    "efficiency_pair_px": "efficiency, pair",
+    "pull_deviation": "pull",
+    "beyond_5_sigma": "beyond 5 sigma",
+    "coverage_depth": "coverage of D",
+}
+
+
+@dataclass(frozen=True)
+class Part:
+    """Scores of the same pairs, the best first, and their differences against one of them.
+
+    Attributes
+    ----------
+    title : str
+    scores : tuple of ScoreDocument
+    against : str
+        Name of the method that the others are compared with.
+    differences : dict of method to its differences
+    notes : tuple of str
+        What a reader of the numbers has to know.
+    """
+
+    title: str
+    scores: tuple[ScoreDocument, ...]
+    against: str
+    differences: Mapping[str, Sequence[Difference]]
+    notes: tuple[str, ...]
+
+
+def read_parts(files: Sequence[Path], against: str = AGAINST, by: str = "phi", seed: int = 0) -> list[Part]:
+    """Scores on disk by what they were taken on, in the order in which these come.
+
+    Parameters
+    ----------
+    files : JSON files of `score --out`, their Parquet files beside them
+    against : name of a method; where a part has none of it, its best
+    by : "phi" or "depth", for the rank
+    seed : of the bootstrap of differences
+
+    Raises
+    ------
+    DatasetError
+        If there is no score, one cannot be read, or a method has two scores of the same pairs.
+    """
+    if not files:
+        raise DatasetError("results of nothing: give the JSON files that `phibench score --out` wrote")
+    groups: dict[str, list[tuple[ScoreDocument, pl.DataFrame]]] = {}
+    for path in files:
+        document = read_score(path)
+        key = json.dumps([same_pairs(document), document.pairs, document.rules], sort_keys=True)
+        group = groups.setdefault(key, [])
+        if any(other.method.name == document.method.name for other, _ in group):
+            raise DatasetError(f"{path}: {document.method.name} has another score of the same pairs; give one of them")
+        group.append((document, read_records(path, document)))
+    every = [document for group in groups.values() for document, _ in group]
+    return [_part(group, every, against, by, seed) for group in groups.values()]
+
+
+def _part(
+    group: Sequence[tuple[ScoreDocument, pl.DataFrame]],
+    every: Sequence[ScoreDocument],
+    against: str,
+    by: str,
+    seed: int,
+) -> Part:
+    tables = {document.method.name: table for document, table in group}
+    refusals = {name: why for name, table in tables.items() if (why := refused(table))}
+    documents = [document for document, _ in group]
+    order = ranked([one for one in documents if one.method.name not in refusals] or documents, by)
+    base = next((one for one in order if one.method.name == against), order[0])
+    name = base.method.name
+    rules = Rules()
+    differences = {
+        one.method.name: compare_records(tables[name], tables[one.method.name], rules, "compare", seed)
+        for one in order
+        if one is not base
+    }
+    notes = [f"{one.method.name}: {flag.text}" for one in order for flag in one.flags]
+    notes += [f"{one.method.name}: {text}" for one in order if (text := note_on_code(base, one))]
+    notes += [f"{name} is not compared: it {why}" for name, why in refusals.items()]
+    title = ", ".join(base.pair_set.get("presets", ())) or "pairs"
+    if apart := note_on_others(order, every):
+        notes, title = [apart, *notes], f"{title}, {base.pairs} pairs"
+    return Part(title, tuple(order), name, differences, tuple(notes))
+
+
+# -- tables ------------------------------------------------------------------------------------------------------------
+
+
+def grids(part: Part) -> list[Grid]:
+    """Tables of a part: ranking, errors, claims, differences, strata, causes."""
+    causes = cause_table(part.scores)
+    if len(part.scores) == 1:
+        causes = Grid(causes.title, causes.heads[:-1], tuple(row[:-1] for row in causes.rows), causes.columns[:-1])
+    made = [
+        _board(part, "Ranking", _BOARD),
+        _board(part, "Errors of found spots and depths", _ERRORS),
+        _board(part, "Efficiency and claims", _CLAIMS),
+    ]
+    return [*made, *([_differences(part)] if part.differences else []), _strata(part), causes]
+
+
+def _head(name: str) -> str:
+    unit = METRICS[name].shown[1]
+    return _HEADS[name] if unit == "1" else f"{_HEADS[name]} / {unit}"
+
+
+def _board(part: Part, title: str, names: Sequence[str]) -> Grid:
+    rows = []
+    for one in part.scores:
+        cells = (" ".join(shown_parts(m, one.metrics[m])) if applies(m, one.method.sees) else "" for m in names)
+        rows.append((f"{one.method.name}{FLAGGED if one.flags else ''}", *(_cut(cell) for cell in cells)))
+    note = " ".join(filter(None, (frames_line(part.scores[0]), light_line(part.scores[0]))))
+    return Grid(title, ("method", *map(_head, names)), tuple(rows), "l" + "r" * len(names), note)
+
+
+def _cut(cell: str) -> str:
+    """Cell with a star in place of the reason why it has no interval."""
+    value, bracket, _ = cell.partition(" (")
+    return f"{value} *" if bracket else cell.strip()
+
+
+def _differences(part: Part) -> Grid:
+    rows = []
+    for name, found in part.differences.items():
+        by_name = {one.name: one for one in found}
+        cells = (_change(by_name[metric]) for metric in _DIFFERENCES)
+        rows.append((name, *cells))
+    heads = ("method", *map(_head, _DIFFERENCES))
+    return Grid(f"Method minus {part.against}", heads, tuple(rows), "l" + "r" * len(_DIFFERENCES))
+
+
+_SIGNS = {"second": " **", "first": " **", "no difference shown": "", "too few samples": ""}
+
+
+def _change(one: Difference) -> str:
+    factor = METRICS[one.name].shown[0]
+    return _cut(" ".join(cell_parts(one.difference, factor, DIGITS, significant=True))) + _SIGNS[one.better]
+
+
+def _strata(part: Part) -> Grid:
+    """Found spots and their median error in each stratum; of one method per column."""
+    order = [one for one in part.scores if one.method.name != part.against]
+    base = next(one for one in part.scores if one.method.name == part.against)
+    shown = [*order[: _SHOWN - 1], base]
+    rows = []
+    for stratum in base.strata:
+        if stratum.by in _STRATA:
+            cells = (_in_stratum(one, stratum) for one in shown)
+            rows.append((stratum.by, stratum.label, str(stratum.images), *cells))
+    heads = ("by", "stratum", "images", *(one.method.name for one in shown))
+    return Grid("Found / %; median error / px", heads, tuple(rows), "llr" + "r" * len(shown))
+
+
+def _in_stratum(one: ScoreDocument, wanted: StratumScore) -> str:
+    for stratum in one.strata:
+        if (stratum.by, stratum.label) == (wanted.by, wanted.label):
+            found, _ = shown_parts("detection_rate", stratum.metrics["detection_rate"])
+            median = cell_parts(
+                stratum.metrics["median_px"].estimate, METRICS["median_px"].shown[0], 2, significant=True
+            )
+            return f"{found}; {_cut(' '.join(median))}"
+    return ""
+
+
+# -- pages -------------------------------------------------------------------------------------------------------------
+
+_INTRODUCTION = """# Results
+
+`phibench results` writes this page from score files. Do not edit it by hand.
+[Scoring](scoring.md) defines every number; [how to add a result](submission.md) is a page of its own.
+"""
+_LEGEND = """Values have 95 % intervals over samples in brackets. A star: too few samples for an interval.
+A blank: the metric is not that method's. A dash: nothing to compute it from.
+
+| table | what it shows |
+|---|---|
+| Ranking | rms errors with missed spots and false detections counted, the best rank of {quantity} first; found, false |
+| Errors of found spots and depths | each method over what it has found itself: who finds less has easier spots |
+| Efficiency and claims | rms at the bound over rms; deviation of pulls, 1 is right; coverage of D, 95 is right |
+| the same: beyond 5 sigma | share of claims off by more than 5 sigma, 0 is right; pulls leave out errors of 3 px |
+| Method minus | paired differences on the same samples; two stars: shown by an exact test, Holm over 16 metrics |
+| Found; median error | strata, of the best methods and of the one that is compared with |
+| Images without a right position | counts by kind, and their most frequent causes |
+"""
+
+
+def results_page(parts: Sequence[Part], by: str = "phi") -> str:
+    """The page in Markdown."""
+    text = [_INTRODUCTION, _LEGEND.format(quantity={"phi": "phi", "depth": "D"}[by])]
+    text.append("## What was scored\n\n" + "\n".join(_sources(parts)) + "\n")
+    for part in parts:
+        text.append(f"## {markdown_text(part.title)}\n")
+        text += [_titled(grid) for grid in grids(part)]
+        text += ["".join(f"{_item(note)}\n" for note in part.notes)] * bool(part.notes)
+    return "\n".join(text)
+
+
+def _titled(grid: Grid) -> str:
+    """Table in Markdown below its title in bold."""
+    _, _, rest = markdown(grid).partition("\n\n")
+    lines = [line if line.startswith("|") else textwrap.fill(line, 120) for line in rest.split("\n")]
+    return "\n".join([f"**{markdown_text(grid.title)}**", "", *lines])
+
+
+def _item(note: str) -> str:
+    """Item of a list, a sentence in lines of at most 120 characters."""
+    text = markdown_text(note if note.endswith(".") else f"{note}.")
+    return textwrap.fill(f"* {text}", 120, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False)
+
+
+_SOURCE_HEADS = ("preset", "data set", "pairs", "samples", "task", "hash of the data set", "scored by")
+
+
+def _sources(parts: Sequence[Part]) -> Iterator[str]:
+    yield f"| {' | '.join(_SOURCE_HEADS)} |"
+    yield "|---" * len(_SOURCE_HEADS) + "|"
+    for row in _source_rows(parts):
+        yield f"| {' | '.join(map(markdown_cell, row))} |"
+
+
+def results_html(parts: Sequence[Part], by: str = "phi") -> str:
+    """The page in HTML: one file, nothing fetched, no script."""
+    intro = (
+        "Values have 95 % intervals over samples in brackets. A star: too few samples for an interval.",
+        "Two stars in a paired difference: shown by the test, corrected for 16 metrics.",
+        f"Methods are ordered by the rank of {by if by == 'phi' else 'D'}.",
+    )
+    sections = [Section("What was scored", intro, (), ((_SOURCE_HEADS, *_source_rows(parts)),), ("",))]
+    for part in parts:
+        made = grids(part)
+        tables = tuple((grid.heads, *grid.rows) for grid in made)
+        sections.append(Section(part.title, part.notes, (), tables, tuple(grid.title for grid in made)))
+    return report_html([], sections, by, title="phibench results")
+
+
+def _source_rows(parts: Sequence[Part]) -> Iterator[tuple[str, ...]]:
+    for part in parts:
+        first = part.scores[0]
+        programs = sorted({one.program or "not told" for one in part.scores})
+        digest = str(first.pair_set.get("dataset_sha256"))[:12]
+        cells = (part.title, first.pair_set.get("name"), first.pairs, first.samples, first.pair_set.get("task_version"))
+        yield (*map(str, cells), digest, ", ".join(programs))
+
+
+def results_document(parts: Sequence[Part]) -> dict[str, Any]:
+    """JSON document: per part the scores without pictures and the paired differences, SI units in full."""
+    return {
+        "kind": "phibench results",
+        "version": 1,
+        "parts": [
+            {
+                "title": part.title,
+                "against": part.against,
+                "scores": [one.model_copy(update={"worst": []}).model_dump(mode="json") for one in part.scores],
+                "differences": {name: json.loads(differences_json(found)) for name, found in part.differences.items()},
+                "notes": list(part.notes),
+            }
+            for part in parts
+        ],
+    }
+
+
+def write_results(parts: Sequence[Part], out: Path | None, html: Path | None, by: str = "phi") -> list[Path]:
+    """Write the pages that are wanted; their paths."""
+    made = ((out, results_page), (html, results_html))
+    return [write_text(path, page(parts, by)) for path, page in made if path is not None]

@@ -1,0 +1,561 @@
+"""Benchmark of methods on a pair set: run them, compare with the truth, name causes, keep the worst images.
+
+`score_methods` is for methods that are run, `score_outcomes` for answers that are there. `bench` runs every built-in
+or registered method on every preset of a data set that it takes, and writes one report.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+import webbrowser
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import polars as pl
+from rich.console import Console
+
+from phibench.benchmark.isolation.pairs_ahead import PairsAhead
+from phibench.benchmark.isolation.resolve import MethodError, RunLimits, code_of_function, installed, resolve
+from phibench.benchmark.isolation.runner import Harness, Ran, asked_here, function_name, ran_here
+from phibench.benchmark.scores.answer_errors import Rules
+from phibench.benchmark.scores.causes import with_causes
+from phibench.benchmark.scores.dataset_pairs import (
+    TASK_VERSION,
+    CalibratedPairs,
+    DatasetPairs,
+    dataset_pairs,
+    of_calibration,
+)
+from phibench.benchmark.scores.document import (
+    MethodCard,
+    ScoreDocument,
+    Worst,
+    document_of,
+    write_score,
+)
+from phibench.benchmark.scores.records import in_order, missed_relative, record_table, with_missed
+from phibench.benchmark.scores.report import time_section, write_report
+from phibench.benchmark.scores.score_tables import score_table, text_of
+from phibench.benchmark.scores.worst_images import worst, worst_of, worst_records
+from phibench.calibration.captures.imported_set import ImportedSet, imported_pairs, is_imported, open_imported
+from phibench.calibration.captures.spot_shape import with_shape
+from phibench.calibration.rig.file import read_calibration
+from phibench.datasets.errors import DatasetError
+from phibench.datasets.frames.sensor_file import read_sensor_file
+from phibench.datasets.progress import Steps, progress_console
+from phibench.datasets.read import Dataset, open_finished
+from phibench.datasets.store.files import require_writable
+from phibench.datasets.store.short_form import ShortForm
+from phibench.estimator.interface import Box, Method, Outcome
+from phibench.estimator.limits.off_frame_bound import FrameCounts
+from phibench.estimator.methods.fit_at_truth import KeptFits
+from phibench.estimator.methods.registry import METHODS, BuiltIn
+from phibench.estimator.pair_set import CachedPairs, PairSet, truth_folders
+
+Ask = Callable[[PairSet, Sequence[int]], Iterable[tuple[Outcome, ...]]]
+"""Pairs and numbers to the outcomes of every method: `sandbox.runner.Harness.outcomes`."""
+_LATE = "late"
+AT_ONCE = 16
+"""Pairs that are examined together; twice as many are in memory. One of MJPEG frames, on and off, takes 11 MB."""
+
+
+@dataclass(frozen=True, repr=False)
+class Scored(ShortForm):
+    """A score, the records that it was computed from, and what the method printed where it first failed.
+
+    Its `repr` is the table that `phibench score` prints first.
+    """
+
+    document: ScoreDocument
+    records: pl.DataFrame
+    output: str = ""
+
+    def __repr__(self) -> str:
+        return text_of(score_table(self.document))
+
+
+@dataclass(frozen=True)
+class Examined:
+    """Some pairs of one method: records with causes, and its worst images among them.
+
+    `leading` are the records of the worst images of these and all pairs before.
+    """
+
+    records: pl.DataFrame
+    worst: list[Worst]
+    leading: pl.DataFrame
+
+
+def score_methods(
+    methods: Sequence[MethodCard],
+    pairs: PairSet,
+    ask: Ask,
+    rules: Rules | None = None,
+    seed: int = 0,
+    limits: Mapping[str, Any] | None = None,
+    told: Callable[[int], None] = lambda done: None,
+    stages: dict[str, float] | None = None,
+) -> list[Scored]:
+    """Run methods on all pairs of a set and score them; each pair is simulated once for all of them.
+
+    Parameters
+    ----------
+    methods : MethodCards, in the order in which `ask` answers
+    pairs : PairSet
+    ask : Ask
+    rules : Rules, by default the usual ones
+    seed : int
+        Of the bootstrap; 0 or above.
+    limits : the harness's, for the record
+    told : callable
+        Given the number of pairs that are answered, after each.
+    stages : dict, optional
+        Gets the CPU-seconds of "bounds" and of "statistics", causes and worst images included.
+
+    Raises
+    ------
+    DatasetError
+        If the set is sealed or empty, or an outcome belongs to no pair.
+    """
+    rules = rules or Rules()
+    parts: list[list[Examined]] = [[] for _ in methods]
+    batches, answered = _asked(pairs, ask), 0
+    following = next(batches, None)
+    while following is not None:
+        # the next pairs are asked for first: methods work on them while these are examined
+        (held, asked), following = following, next(batches, None)
+        answers = []
+        for outcomes in asked:
+            answers.append(outcomes)
+            told(answered + len(answers))
+        answered += len(answers)
+        fits = KeptFits()
+        for part, outcomes in zip(parts, zip(*answers, strict=True), strict=True):
+            with _timed("statistics", stages):
+                part.append(examine(held, outcomes, rules, part[-1].leading if part else None, fits))
+        if stages is not None:
+            for stage, seconds in (("bounds", held.truth_seconds), (_LATE, held.late_seconds)):
+                stages[stage] = stages.get(stage, 0.0) + seconds
+    with _timed("statistics", stages):
+        return [
+            _scored(method, pairs, part, rules, seed, limits or {}) for method, part in zip(methods, parts, strict=True)
+        ]
+
+
+def _asked(pairs: PairSet, ask: Ask) -> Iterator[tuple[CachedPairs, Iterable[tuple[Outcome, ...]]]]:
+    """Some pairs of a set and their outcomes to come, then the next ones."""
+    held = None
+    for start in range(0, len(pairs), AT_ONCE):
+        held = CachedPairs(pairs, held)
+        yield held, ask(held, range(start, min(start + AT_ONCE, len(pairs))))
+
+
+@contextmanager
+def _timed(stage: str, stages: dict[str, float] | None) -> Iterator[None]:
+    start = time.thread_time()
+    yield
+    if stages is not None:
+        stages[stage] = stages.get(stage, 0.0) + time.thread_time() - start
+
+
+def score_outcomes(
+    method: MethodCard,
+    pairs: PairSet,
+    outcomes: Iterable[Outcome],
+    rules: Rules,
+    seed: int = 0,
+    limits: Mapping[str, Any] | None = None,
+    told: Callable[[int], None] = lambda done: None,
+) -> Scored:
+    """Score what a method has answered on all pairs; parameters as for `score_methods`."""
+    ordered = in_order(outcomes, len(pairs))
+    parts: list[Examined] = []
+    for i in range(0, max(len(ordered), 1), AT_ONCE):
+        leading = parts[-1].leading if parts else None
+        parts.append(examine(CachedPairs(pairs), ordered[i : i + AT_ONCE], rules, leading))
+        told(min(i + AT_ONCE, len(ordered)))
+    return _scored(method, pairs, parts, rules, seed, limits or {})
+
+
+def examine(
+    pairs: PairSet,
+    outcomes: Sequence[Outcome],
+    rules: Rules,
+    before: pl.DataFrame | None = None,
+    fits: KeptFits | None = None,
+) -> Examined:
+    """Join outcomes with truth and images.
+
+    Parameters
+    ----------
+    pairs : PairSet
+    outcomes : of some of the pairs
+    rules : Rules
+    before : optional
+        `Examined.leading` of the pairs before.
+    fits : KeptFits, optional
+        Fits at the truth of the same pairs, which methods share.
+    """
+    truths = [pairs.truth(outcome.number) for outcome in outcomes]
+    table = record_table(truths, outcomes, rules)
+    table = with_causes(table, pairs, rules, fits or KeptFits())
+    return Examined(table, worst(table, pairs, before=before), worst_records(table, before=before))
+
+
+def _scored(
+    method: MethodCard,
+    pairs: PairSet,
+    parts: Sequence[Examined],
+    rules: Rules,
+    seed: int,
+    limits: Mapping[str, Any],
+) -> Scored:
+    if not parts:
+        raise DatasetError("the pair set is empty: there is nothing to score")
+    table = pl.concat([part.records for part in parts])
+    missed = missed_relative(table, rules)
+    table = with_missed(table, missed)
+    document = document_of(method, pairs.document(), table, rules, seed, limits, missed)
+    entries = [entry for part in parts for entry in part.worst]
+    return Scored(document.model_copy(update={"worst": worst_of(table, entries)}), table)
+
+
+def score(
+    dataset: str | Path | Dataset,
+    method: str | Method,
+    preset: str | None = None,
+    *,
+    draws: int | None = None,
+    pairs: int | None = None,
+    hints: bool = True,
+    calibration: str | Path | None = None,
+    boxes_px: int | None = None,
+    sensor: str | Path | None = None,
+    frames: tuple[int, int] | None = None,
+    limits: RunLimits | None = None,
+    workers: int = 1,
+    seed: int = 0,
+    out: str | Path | None = None,
+    console: Console | None = None,
+) -> Scored:
+    """Score one method on the pairs of a data set: `phibench.score`.
+
+    Parameters
+    ----------
+    dataset : folder of a finished data set, or an opened one (also a slice of one)
+    method : str or function
+        Name of a built-in method, or "FILE.py:FUNCTION": it runs in a process of its own, with limits. A function runs
+        in this process: no limits, and it can be stopped with a debugger.
+    preset : str, optional
+        Preset of the sensor; by default those of the recipe's `[frames]`.
+    draws, pairs, hints, calibration, boxes_px, sensor, frames
+        As for `wanted_pairs`.
+    limits : RunLimits, optional
+        Of time and memory; not for a function.
+    workers : int
+        Pairs that are worked on at a time; 1 for a function.
+    seed : int
+        Of the bootstrap; 0 or above.
+    out : path, optional
+        JSON file to write, with its Parquet file beside it.
+    console : Console, optional
+        Where progress goes; by default the standard error.
+
+    Returns
+    -------
+    Scored
+        `document` as in the JSON file, `records` as a polars table: one row per image.
+
+    Raises
+    ------
+    DatasetError
+        If data set, preset or calibration will not do.
+    MethodError
+        If the method cannot be found or imported.
+    """
+    console = console or progress_console()
+    opened = dataset if isinstance(dataset, Dataset) else open_scored(dataset)
+    if out is not None:
+        require_writable(Path(out))
+    chosen = wanted_pairs(opened, preset, draws, pairs, hints, calibration, boxes_px, sensor, frames)
+    if isinstance(method, str):
+        (scored,) = run_and_score([method], chosen, workers, console, "pairs", seed, limits)
+    else:
+        if limits is not None or workers != 1:
+            raise MethodError("limits and workers are for methods in a process of their own: give FILE.py:FUNCTION")
+        with Steps(console, "pairs", len(chosen)) as steps:
+            card = MethodCard.of(function_name(method), kind="function", **code_of_function(method))
+            (scored,) = score_methods([card], chosen, asked_here(method), None, seed, None, steps.reach)
+        scored = ran_with(isolated(scored, "not isolated: a function runs in this process"), ran_here())
+    return scored if out is None else saved(scored, Path(out))
+
+
+def saved(scored: Scored, file: Path) -> Scored:
+    """The score, written with its records; its document then names their hash."""
+    return replace(scored, document=write_score(file, scored.document, scored.records))
+
+
+def saved_each(scores: Sequence[Scored], files: Sequence[Path]) -> list[Scored]:
+    """The scores, each written for itself: a file that cannot be written costs no other method its score.
+
+    Raises
+    ------
+    DatasetError
+        When all others are written, with the files that are not.
+    """
+    written, faults = [], []
+    for one, file in zip(scores, files, strict=True):
+        try:
+            written.append(saved(one, file))
+        except (DatasetError, OSError) as error:
+            faults.append(f"{file} could not be written: {error}")
+    if faults:
+        told = f"{len(written)} of {len(files)} scores are written" if written else "no score is written"
+        raise DatasetError(f"{'; '.join(faults)}; {told}")
+    return written
+
+
+PRESETS = ("bayer-raw", "srgb8", "mjpeg")
+"""Of a data set whose recipe has no `[frames]`."""
+REPORT = "report.html"
+_PROBE_BOX = Box(0, 0, 16, 16)  # a method that needs boxes takes the pairs that have some
+
+
+@dataclass(frozen=True)
+class Benched:
+    """Files of a run: the report and the scores. `notes` says which methods were left out, and why."""
+
+    report: Path
+    scores: tuple[Path, ...]
+    notes: tuple[str, ...]
+
+
+def bench(
+    folder: str | Path,
+    out: str | Path,
+    methods: Sequence[str] | None = None,
+    workers: int = 1,
+    pairs: int | None = None,
+    console: Console | None = None,
+    calibration: str | Path | None = None,
+    limits: RunLimits | None = None,
+) -> Benched:
+    """Run built-in methods and those of installed packages on all presets of a data set; write scores and a report.
+
+    Parameters
+    ----------
+    folder : finished data set
+    out : folder for `<preset>-<method>.json` and `report.html`
+    methods : names of methods that are built in or registered by a package; all by default
+    workers : pairs that are worked on at a time
+    pairs : the first so many of each preset; all by default
+    console : where progress goes; by default the standard error
+    calibration : file of `phibench calibrate`; the pairs are then those of its rig, with its numbers
+    limits : limits of every method for one pair
+
+    Raises
+    ------
+    DatasetError
+        If the data set will not do, or a method is unknown.
+    """
+    dataset, out = open_scored(folder), Path(out)
+    console = console or progress_console()
+    chosen = _chosen(list(dict.fromkeys([*METHODS, *(point.name for point in installed())])), methods)
+    if out.resolve() == dataset.folder.resolve() or dataset.folder.resolve() in out.resolve().parents:
+        raise DatasetError(f"{out} lies inside the data set, whose files are signed; give a folder outside, --out")
+    require_writable(out / REPORT)
+    scores, notes, times = [], [], dict[str, dict[str, float]]()
+    for preset in _presets(dataset):
+        taken = wanted_pairs(dataset, preset, pairs=pairs, calibration=calibration)
+        # what a package's method takes is known to nobody: it is asked, and its answers say so
+        refusals = {name: refusal(METHODS[name], taken) if name in METHODS else "" for name in chosen}
+        notes += [f"{name} is left out on {preset}: {why}" for name, why in refusals.items() if why]
+        names = [name for name, why in refusals.items() if not why]
+        stages: dict[str, float] = {}
+        done = run_and_score(names, taken, workers, console, preset, limits=limits, stages=stages)
+        times[preset] = {stage: seconds / len(taken) for stage, seconds in stages.items()}
+        paths = [out / f"{preset}-{name}.json" for name in names]
+        saved_each(done, paths)
+        scores += paths
+    if not scores:
+        raise DatasetError(f"none of {', '.join(chosen)} takes a preset of {folder}: give another --method")
+    return Benched(write_report(scores, out / REPORT, [time_section(times)]), tuple(scores), tuple(notes))
+
+
+def run_and_score(
+    references: Sequence[str],
+    pairs: PairSet,
+    workers: int,
+    console: Console,
+    title: str,
+    seed: int = 0,
+    limits: RunLimits | None = None,
+    stages: dict[str, float] | None = None,
+) -> list[Scored]:
+    """Score methods on the same pairs, built-in ones in one process, others in their own; parameters as for `bench`.
+
+    `stages` gets the CPU-seconds by stage: of all pairs together.
+
+    Raises
+    ------
+    MethodError
+        If a method cannot be found or imported.
+    """
+    found, limits = [resolve(reference) for reference in references], limits or RunLimits()
+    cards = [MethodCard.of(name, **method.document()) for name, method in zip(references, found, strict=True)]
+    if not cards:
+        return []
+    # the steps first: they tell of time that goes by while methods start
+    with (
+        Steps(console, title, len(pairs)) as steps,
+        _ahead(pairs, workers) as (made, making),
+        Harness(found, limits, workers, truth_folders(pairs)) as harness,
+    ):
+        scored = score_methods(cards, made, harness.outcomes, None, seed, limits.document(), steps.reach, stages)
+    if stages is not None:
+        stages.update(harness.stages)
+        # bounds are made in the turns of pairs, but for the late ones: `CachedPairs`
+        stages["draw"] -= stages["bounds"] - stages.pop(_LATE)
+        stages |= {stage: stages[stage] + seconds for stage, seconds in making.items()}
+    told = zip(scored, harness.failed_outputs, harness.isolations, harness.ran, strict=True)
+    return [replace(ran_with(isolated(one, isolation), ran), output=output) for one, output, isolation, ran in told]
+
+
+_WORTH_A_PROCESS = 40  # pairs; a process that makes them starts in 2 s
+
+
+@contextmanager
+def _ahead(pairs: PairSet, workers: int) -> Iterator[tuple[PairSet, dict[str, float]]]:
+    """Pairs of a data set made by as many processes as work on them, and their CPU-seconds by stage.
+
+    Few pairs, and those of other sets, are made here.
+    """
+    drawn = pairs.pairs if isinstance(pairs, CalibratedPairs) else pairs
+    if workers == 1 or len(pairs) < _WORTH_A_PROCESS or not isinstance(drawn, DatasetPairs):
+        yield pairs, {}
+        return
+    with PairsAhead(drawn, workers) as made:
+        yield CalibratedPairs(made, pairs.calibration) if isinstance(pairs, CalibratedPairs) else made, made.seconds
+
+
+def isolated(scored: Scored, isolation: str) -> Scored:
+    """The score with how its method was isolated."""
+    return replace(scored, document=scored.document.model_copy(update={"isolation": isolation}))
+
+
+def ran_with(scored: Scored, ran: Ran) -> Scored:
+    """The score with packages and files of its method."""
+    card = scored.document.method.model_copy(update=vars(ran))
+    return replace(scored, document=scored.document.model_copy(update={"method": card}))
+
+
+def open_scored(folder: str | Path) -> Dataset | ImportedSet:
+    """Finished data set, or a set of real pairs."""
+    return open_imported(folder) if is_imported(folder) else open_finished(folder)
+
+
+def wanted_pairs(
+    dataset: Dataset | ImportedSet,
+    preset: str | None,
+    draws: int | None = None,
+    pairs: int | None = None,
+    hints: bool = True,
+    calibration: str | Path | None = None,
+    boxes_px: int | None = None,
+    sensor: str | Path | None = None,
+    frames: tuple[int, int] | None = None,
+) -> PairSet:
+    """Pairs as of `dataset_pairs`; with a calibration file its rig's, with calibrated rig, stroke and covariance.
+
+    `sensor` is a sensor file; `frames` are the frames of each position with the laser on and off.
+
+    Raises
+    ------
+    DatasetError
+        As `dataset_pairs`, or if the calibration cannot be read or is that of another rig.
+    """
+    if isinstance(dataset, ImportedSet):
+        if boxes_px is not None or sensor is not None or frames is not None:
+            raise DatasetError(
+                f"{dataset.folder} holds pictures: their boxes are not known, and sensor and frames are those of the "
+                "import; leave --boxes, --sensor and --frames out"
+            )
+        return _real_pairs(dataset, preset, draws, pairs, calibration)
+    camera = None if sensor is None else read_sensor_file(sensor)
+    counts = None if frames is None else frame_counts(*frames)
+    if calibration is None:
+        return dataset_pairs(dataset, preset, draws, pairs, hints, boxes_px, camera, counts)
+    read = read_calibration(calibration)
+    of_rig = of_calibration(dataset, read)
+    return CalibratedPairs(dataset_pairs(of_rig, preset, draws, pairs, hints, boxes_px, camera, counts), read)
+
+
+MOST_FRAMES = 100
+"""Frames of a position: an image and the single frames are held at a time."""
+
+
+def frame_counts(on: int, off: int) -> FrameCounts:
+    """Frames of each position with the laser on and off.
+
+    Raises
+    ------
+    DatasetError
+        If there are too few or too many.
+    """
+    if not (1 <= on <= MOST_FRAMES and 1 <= off <= MOST_FRAMES):
+        raise DatasetError(
+            f"--frames {on} {off}: give the frames of a position with the laser on and off, 1 to {MOST_FRAMES} each, "
+            "such as --frames 6 6"
+        )
+    return FrameCounts(on, off)
+
+
+def _real_pairs(
+    imported: ImportedSet,
+    preset: str | None,
+    draws: int | None,
+    pairs: int | None,
+    calibration: str | Path | None,
+) -> PairSet:
+    if preset not in (None, imported.preset):
+        raise DatasetError(f"{imported.folder} holds pictures of the kind '{imported.preset}': leave --preset out")
+    found = imported_pairs(imported, TASK_VERSION, draws, pairs)
+    return (
+        found
+        if calibration is None
+        else CalibratedPairs(found, with_shape(read_calibration(calibration, imported.rig)))
+    )
+
+
+def refusal(method: BuiltIn, pairs: PairSet) -> str:
+    """Reason for which a built-in method cannot take the pairs of a preset; "" if it can."""
+    return method.refusal(replace(pairs.pair(0), box_down=_PROBE_BOX, box_up=_PROBE_BOX))
+
+
+def show(page: Path) -> bool:
+    """Open a page in a browser, where somebody sits before one; return whether it was opened."""
+    display = sys.platform in ("darwin", "win32") or any(
+        os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY")
+    )
+    return sys.stdout.isatty() and display and webbrowser.open(page.resolve().as_uri())
+
+
+def _presets(dataset: Dataset | ImportedSet) -> tuple[str, ...]:
+    if isinstance(dataset, ImportedSet):
+        return (dataset.preset,)
+    frames = dataset.recipe.frames
+    return PRESETS if frames is None else frames.presets
+
+
+def _chosen(known: Sequence[str], wanted: Sequence[str] | None) -> list[str]:
+    names = list(known) if wanted is None else list(dict.fromkeys(wanted))
+    if strange := [name for name in names if name not in known]:
+        raise DatasetError(
+            f"no method '{strange[0]}' is built in or registered by a package; known: {', '.join(known)}"
+        )
+    return names

@@ -1,0 +1,580 @@
+"""Tables of scores: for a terminal of 80 columns, or as CSV, Markdown, LaTeX and JSON.
+
+A `Grid` holds the cells of a table as text; `written` gives it one of the forms. Units are those of `Metric.shown`:
+mrad for phi, per cent for rates and relative errors. CSV and JSON hold the numbers of the files instead: SI, in full.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+import sys
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, Protocol
+
+import polars as pl
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from phibench.benchmark.scores.causes import CAUSES, KINDS, NOISE, TAKEN_FOR
+from phibench.benchmark.scores.compare import Difference
+from phibench.benchmark.scores.document import ScoreDocument, Spread, Value
+from phibench.benchmark.scores.intervals import Estimate
+from phibench.benchmark.scores.metrics import CHOSEN, METRICS, RANKS, applies
+from phibench.datasets.shown_text import csv_text, latex_text, markdown_cell, markdown_text
+from phibench.estimator.methods.registry import REFUSED
+from phibench.scenes.validation import printable_line
+
+Form = Literal["terminal", "csv", "markdown", "latex", "json"]
+
+HEADS = {
+    "rank_phi_rad": "rank phi",
+    "rank_depth": "rank D",
+    "detection_rate": "found",
+    "false_rate": "false",
+    "rms_px": "rms",
+    "rms_phi_rad": "rms phi",
+    "rms_depth_relative": "rms D",
+    "seconds": "time",
+    "rms_counted_px": "rms, missed counted",
+    "rms_depth_counted": "rms D, missed counted",
+    "efficiency_px": "efficiency",
+    "efficiency_pair_px": "efficiency, pair",
+    "pull_deviation": "pull",
+    "beyond_5_sigma": "beyond 5 sigma",
+}
+"""Metrics of a ranking with their heads; a narrow table has the first `NARROW` of them."""
+NARROW = 8
+DIGITS = 3
+"""Significant digits of a value in a table."""
+WIDE = 210
+"""Columns of a terminal for tables with every interval."""
+FULL_OF_FALSE = 0.2
+"""Share of false answers from which a line says what they are."""
+FLAGGED = " !"
+"""Mark behind the name of a method whose answers are better than the images allow."""
+_FLAG_NOTE = "!: knows more than the images"
+_MANY = 9  # columns that stand close together
+_STRATA = ("detection_rate", "false_rate", "rms_px", "rms_phi_rad", "rms_depth_relative", "efficiency_px")
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A table as text.
+
+    Attributes
+    ----------
+    title : str
+    heads : tuple of str
+        A line break parts a head from its unit.
+    rows : tuple of rows, each a tuple of str
+    columns : str
+        A letter each: "r" is a number, "l" a word, "L" a text that may go on on the next line.
+    note : str
+        A line below the table.
+    """
+
+    title: str
+    heads: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    columns: str
+    note: str = ""
+
+
+# -- scores --------------------------------------------------------------------------------------------------------
+
+
+def ranked(documents: Sequence[ScoreDocument], by: str = "phi") -> list[ScoreDocument]:
+    """Scores, the best first."""
+    return sorted(documents, key=lambda document: rank_key(document, by))
+
+
+def rank_key(document: ScoreDocument, by: str = "phi") -> float:
+    """Rms error of phi or of D with missed spots and false detections counted; lower is better.
+
+    Parameters
+    ----------
+    by : "phi" or "depth"
+    """
+    value = document.metrics[RANKS[by]].value
+    return math.inf if value is None else value
+
+
+def rank_words(by: str) -> str:
+    """Name of the rank that a table goes by, with its definition."""
+    what = {"phi": "phi: rms error of phi", "depth": "D: rms relative error of D"}[by]
+    return f"ranked by {what}, missed spots and false detections counted"
+
+
+def refused(records: pl.DataFrame) -> str:
+    """Reason for which a built-in method took none of the pairs, such as "takes srgb8, not bayer-raw"; "" if it did.
+
+    Parameters
+    ----------
+    records : as of `records.records`
+    """
+    said = set(records.select("failure", "status").rows())
+    ((failure, status),) = said if len(said) == 1 else (("", ""),)
+    return status if not failure and status.startswith(REFUSED) else ""
+
+
+def leaderboard(documents: Sequence[ScoreDocument], by: str = "phi", wide: bool = False) -> Grid:
+    """One row per method, the best first; `wide` adds intervals and the last columns."""
+    first, names = documents[0], tuple(HEADS)[: None if wide else NARROW]
+    rows = []
+    for document in ranked(documents, by):
+        sees = document.method.sees
+        cells = (_cell(name, document.metrics[name], wide) if applies(name, sees) else "" for name in names)
+        rows.append((f"{document.method.name}{FLAGGED if document.flags else ''}", *cells))
+    interval = f" {100 * first.rules['confidence']:g} % intervals over samples below the values." if wide else ""
+    title = f"{_pairs_in_words(first)}, {rank_words(by)}"
+    flagged = _FLAG_NOTE if any(document.flags for document in documents) else ""
+    note = " ".join(filter(None, (frames_line(first), light_line(first), interval.strip(), flagged)))
+    return Grid(title, ("method", *map(head, names)), tuple(rows), "L" + "r" * len(names), note)
+
+
+def score_table(document: ScoreDocument, by: str = "phi") -> Grid:
+    """One row per metric of one method, with its interval; of a method that finds nothing, rows with values alone."""
+    title = f"{document.method.name}: {_pairs_in_words(document)}, {rank_words(by)}"
+    there = [name for name in HEADS if applies(name, document.method.sees)]
+    order = sorted(there, key=lambda name: name != RANKS[by])
+    if not _finds(document):
+        order = [name for name in order if document.metrics[name].value is not None]
+    rows = ((METRICS[name].text, METRICS[name].shown[1], *_parts(name, document.metrics[name])) for name in order)
+    interval = f"{100 * document.rules['confidence']:g} % interval"
+    return Grid(
+        title,
+        ("metric", "unit", "value", interval),
+        tuple(rows),
+        "LlrL",
+        " ".join(filter(None, (frames_line(document), light_line(document)))),
+    )
+
+
+def strata_table(document: ScoreDocument, wide: bool = False) -> Grid:
+    """One row per stratum of one method."""
+    rows = []
+    for stratum in (document.whole, *document.strata):
+        there = ((name, stratum.metrics.get(name)) for name in _STRATA)
+        cells = ("" if value is None else _starred(name, value, wide) for name, value in there)
+        rows.append((stratum.by, stratum.label, str(stratum.images), *cells))
+    note = f"*: fewer than {document.rules['least_samples']:g} samples, no interval"
+    heads = ("by", "stratum", "images", *map(head, _STRATA))
+    return Grid(f"{document.method.name}: strata", heads, tuple(rows), "ll" + "r" * (1 + len(_STRATA)), note)
+
+
+def cause_table(documents: Sequence[ScoreDocument]) -> Grid:
+    """Images without a right position: of one method by cause, of several one row per method."""
+    title = "Images without a right position"
+    kinds = tuple(KINDS.values())
+    if len(documents) > 1:
+        rows = tuple((d.method.name, *_kind_totals(d), ", ".join(_most_frequent(d))) for d in documents)
+        return Grid(title, ("method", *kinds, "most frequent causes"), rows, "LrrrL")
+    (document,) = documents
+    counts = ((cause, document.causes[cause]) for cause in CAUSES)
+    rows = tuple((cause, *(str(kind[k]) for k in KINDS), CAUSES[cause]) for cause, kind in counts if any(kind.values()))
+    return Grid(title, ("cause", *kinds, "definition"), rows, "lrrrL")
+
+
+def _kind_totals(document: ScoreDocument) -> Iterator[str]:
+    return (str(sum(kinds[kind] for kinds in document.causes.values())) for kind in KINDS)
+
+
+def _most_frequent(document: ScoreDocument, count: int = 3) -> list[str]:
+    wrong = Counter({cause: kinds["missed"] + kinds["false"] for cause, kinds in document.causes.items()})
+    names = {"method": "the method's own"}  # it stands in a column of methods
+    return [f"{names.get(cause, cause)} {number}" for cause, number in wrong.most_common(count) if number]
+
+
+def _finds(document: ScoreDocument) -> bool:
+    """Tell whether a method has found a spot, so that there are errors to show."""
+    return bool(document.metrics["detection_rate"].value)
+
+
+def _pairs_in_words(document: ScoreDocument) -> str:
+    presets = ", ".join(document.pair_set.get("presets", ()))
+    return " ".join(filter(None, (f"{document.pairs} pairs", presets)))
+
+
+def frames_line(document: ScoreDocument) -> str:
+    """Sentences on how the frames of a score were taken; "" where nobody knows."""
+    shown = {
+        "exposure_s": ("exposure", 1e3, "ms"),
+        "analogue_gain": ("gain", 1.0, ""),
+        "jpeg_quality": ("JPEG quality", 1.0, ""),
+        "laser_level": ("laser", 1.0, ""),
+        "lamp_level": ("lamps", 1.0, ""),
+    }
+    there = {name: spread for name in shown if (spread := document.frames.get(name)) is not None}
+    words = {name: f"{shown[name][0]} {spread.text(*shown[name][1:])}" for name, spread in there.items()}
+    levels = [words.pop(name) for name in ("laser_level", "lamp_level") if name in words]
+    draws = f"{document.draws} draw{'s' * (document.draws != 1)} of the noise"
+    return (
+        f"Frames: {', '.join(words.values())}. Light: {', '.join([*levels, draws])}." if "exposure_s" in there else ""
+    )
+
+
+def light_line(document: ScoreDocument) -> str:
+    """Sentences on how far the light, to which a score refers, lies from the beam's axis; "" where nobody knows."""
+    shift, depth = (document.light.get(name) for name in ("shift_px", "depth_m"))
+    if shift is None:
+        return ""
+    text = (
+        f"Scores refer to the centre of the light. It is {_median_and_most(shift)} mpx at worst from the beam's axis."
+    )
+    return text if depth is None else f"{text} D of the two differs by {_median_and_most(depth)} mm at worst."
+
+
+def _median_and_most(spread: Spread) -> str:
+    """Median and largest value of a spread, in thousandths, two digits."""
+    median, most = (f"{float(f'{1e3 * x:.2g}'):g}" for x in (spread.median, spread.high))
+    return f"{median} (median) and {most}"
+
+
+# -- lines beside the tables ---------------------------------------------------------------------------------------
+
+
+def false_line(records: pl.DataFrame) -> str:
+    """Sentence on what the false answers are, with advice; "" unless a fifth of the answers are false.
+
+    Parameters
+    ----------
+    records : with causes
+    """
+    answers = records.filter(pl.col("u_px").is_not_null())
+    false = answers.filter("false_detection")
+    if not len(false) or len(false) < FULL_OF_FALSE * len(answers):
+        return ""
+    kinds = Counter(false["taken_for"].to_list())
+    ((kind, number),) = Counter(kind.removesuffix(NOISE) for kind in kinds.elements()).most_common(1)
+    # one place may look like either; a method subtracts the laser-off image everywhere or nowhere
+    bright = ("lamp", "region")
+    subtracts = sum(kinds[one + NOISE] for one in bright) > sum(kinds[one] for one in bright)
+    what, advice = TAKEN_FOR[kind + NOISE if kind in bright and subtracts else kind]
+    return f"{100 * number / len(answers):.0f} % of the answers are {what}: {advice}"
+
+
+def failure_line(records: pl.DataFrame) -> str:
+    """Sentence on a method that failed on every pair, with its most frequent failure; "" where an answer came back.
+
+    Parameters
+    ----------
+    records : as of `records.records`
+    """
+    asked = records.filter(pl.col("image") == "down")
+    said = Counter(asked.select("failure", "message").rows())
+    if not said or any(failure == "" for failure, _ in said):
+        return ""
+    ((failure, message), number) = min(said.items(), key=lambda item: (-item[1], item[0]))
+    often = "for example" if number == 1 else "each time" if number == len(asked) else f"{number} times"
+    pairs = "the only pair" if len(asked) == 1 else f"all {len(asked)} pairs, {often}"
+    first = asked.filter(failure=failure, message=message).row(0, named=True)
+    return f"failed on {pairs} with {': '.join(filter(None, (failure, message)))}; {pair_in_words(first)}"
+
+
+def pair_in_words(row: Mapping[str, Any]) -> str:
+    """Name of a pair: `dataset.pairs(preset).number_of` takes these words."""
+    return f"first pair: sample {row['sample_id']}, draw {row['draw']}, {row['preset']}"
+
+
+def _printed(one: HasScore) -> list[str]:
+    """Last lines that the method printed before it first failed; empty if there are none."""
+    return [f"printed for the first pair that failed:\n{one.output}"] if one.output else []
+
+
+def silences(records: pl.DataFrame, count: int = 3) -> list[str]:
+    """Most frequent messages of a method or of the sandbox for images without a position, one line each."""
+    words = pl.when(pl.col("message") != "").then(pl.col("failure") + ": " + pl.col("message"))
+    said = records.filter(pl.col("u_px").is_null()).with_columns(words=words.otherwise(pl.col("status")))
+    most = said.group_by("words").len().sort("len", "words", descending=[True, False]).head(count)
+    return [
+        f"{number} of {len(records)} images without a position: {text}; "
+        f"{pair_in_words(said.filter(words=text).row(0, named=True))}"
+        for text, number in most.rows()
+    ]
+
+
+def depth_line(document: ScoreDocument) -> str:
+    """Pull and coverage of D, the calibration's part included."""
+    pull, within = (document.metrics[name].estimate for name in ("pull_depth", "coverage_depth"))
+    share = one_line(within, 100.0, 1)
+    return f"{document.method.name}: pull of D {one_line(pull, 1.0, 3)}; within 1.96 sigma of D {share} %, 95 is right"
+
+
+# -- comparisons ---------------------------------------------------------------------------------------------------
+
+
+_BETTER = {"no difference shown": "not shown", "too few samples": "not shown"}
+
+
+def comparison(differences: Sequence[Difference], first: str, second: str, wide: bool = False) -> Grid:
+    """One row per metric: both values, second minus first with its interval, and which is better if that is shown."""
+    rows = []
+    for item in differences:
+        metric = METRICS[item.name]
+        factor, unit = metric.shown
+        values = (number(factor * x, DIGITS, significant=True) for x in (item.first, item.second))
+        change = cell_parts(item.difference, factor, DIGITS, significant=True)
+        counts = (str(item.n), str(item.samples), number(item.chance, 4)) if wide else ()
+        rows.append((metric.text, unit, *values, *change, *counts, _BETTER.get(item.better, item.better)))
+    counted = ("n", "samples", "chance") if wide else ()
+    heads = ("metric", "unit", "first", "second", "second\n- first", "interval", *counted, "better")
+    columns = "LlrrrL" + "r" * len(counted) + "L"
+    return Grid(f"Over what both have. First: {first}. Second: {second}", heads, tuple(rows), columns)
+
+
+# -- output --------------------------------------------------------------------------------------------------------
+
+
+class HasScore(Protocol):
+    """A score with its records, as `score.Scored`."""
+
+    @property
+    def document(self) -> ScoreDocument:
+        """The score."""
+
+    @property
+    def output(self) -> str:
+        """Last lines that the method printed before it first failed."""
+
+    @property
+    def records(self) -> pl.DataFrame:
+        """One row per image."""
+
+
+def print_scores(scored: Sequence[HasScore], form: str, by: str, wide: bool, calibrated: bool = False) -> None:
+    """Print scores of methods on the same pairs.
+
+    Parameters
+    ----------
+    scored : sequence of Scored
+    form : Form
+        "terminal" has further tables and lines; the others are one table, or one JSON object a line.
+    by : "phi" or "depth"
+    wide : bool
+        Show every interval.
+    calibrated : bool
+        Say how well the predicted error of D holds.
+    """
+    refusals = {id(one): f"not compared: it {why}" for one in scored if (why := refused(one.records))}
+    every = [one.document for one in scored]
+    documents = [one.document for one in scored if id(one) not in refusals] or every
+    board = leaderboard(documents, by, wide)
+    if form != "terminal":
+        table = {"markdown": markdown, "latex": latex}
+        whole = {"csv": scores_csv, "json": scores_json}
+        sys.stdout.write(table[form](board) if form in table else whole[form](every, by))
+        return
+    console = table_console(wide)
+    show_grid(console, board if wide or len(documents) > 1 else score_table(documents[0], by))
+    failed = {id(one): line for one in scored if (line := failure_line(one.records))}
+    failed |= refusals
+    for one in scored:
+        lines = [failed.get(id(one), ""), *(flag.text for flag in one.document.flags), false_line(one.records)]
+        for line in filter(None, lines):
+            _line(console, f"{one.document.method.name}: {line}")
+    missing = any(any(kind.values()) for document in documents for kind in document.causes.values())
+    if missing and (len(scored) > 1 or not failed):
+        show_grid(console, cause_table(documents))
+    for one in scored:
+        said = [] if id(one) in failed else silences(one.records)
+        lines = [*([depth_line(one.document)] if calibrated and _finds(one.document) else []), *said, *_printed(one)]
+        lines += [one.document.isolation] if one.document.isolation.startswith("not isolated") else []
+        for line in lines:
+            _line(console, f"{one.document.method.name}: {line}")
+    if len(documents) == 1 and _finds(documents[0]):
+        show_grid(console, strata_table(documents[0], wide))
+
+
+def print_comparison(differences: Sequence[Difference], first: str, second: str, form: str, wide: bool) -> None:
+    """Print a comparison; parameters as for `print_scores`."""
+    grid = comparison(differences, first, second, wide)
+    if form == "terminal":
+        show_grid(table_console(wide), grid)
+    else:
+        texts = {"csv": lambda: differences_csv(differences), "json": lambda: differences_json(differences)}
+        texts |= {"markdown": lambda: markdown(grid), "latex": lambda: latex(grid)}
+        sys.stdout.write(texts[form]())
+
+
+def table_console(wide: bool) -> Console:
+    """A console at least 80 columns wide; a wide one does not lose numbers in a narrow terminal or a pipe."""
+    console, least = Console(markup=False, emoji=False), WIDE if wide else 80
+    return console if console.width >= least else Console(width=least, markup=False, emoji=False)
+
+
+def _line(console: Console, text: str) -> None:
+    console.print(text, emoji=False, highlight=False, markup=False)
+
+
+# -- forms ---------------------------------------------------------------------------------------------------------
+
+
+def show_grid(console: Console, grid: Grid) -> None:
+    """Print a table to a terminal; text that is too long for it goes on below."""
+    gap = int(len(grid.heads) < _MANY)
+    table = Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, gap, 0, 0), show_edge=False)
+    for name, kind in zip(grid.heads, grid.columns, strict=True):
+        table.add_column(name, justify="right" if kind == "r" else "left", overflow="fold", no_wrap=kind != "L")
+    for row in grid.rows:
+        table.add_row(*map(Text, row))  # as it is: a string would be searched for markup and emoji
+    for part in (Text(grid.title, style="bold"), table, *([Text(grid.note)] if grid.note else [])):
+        console.print(part)
+    console.print()
+
+
+def text_of(grid: Grid) -> str:
+    """Table as a terminal of 80 columns shows it."""
+    console = Console(file=io.StringIO(), width=80, markup=False, emoji=False, color_system=None)
+    show_grid(console, grid)
+    shown = console.file.getvalue()  # type: ignore[attr-defined]
+    return "\n".join(line.rstrip() for line in shown.rstrip().split("\n"))
+
+
+def markdown(grid: Grid) -> str:
+    """Table in Markdown, a line of text before it."""
+    marks = ["--:" if kind == "r" else ":--" for kind in grid.columns]
+    lines = [_row(grid.heads), _row(marks), *map(_row, grid.rows)]
+    note = ("", markdown_text(grid.note)) if grid.note else ()
+    return "\n".join((f"{markdown_text(grid.title)}\n", *lines, *note)) + "\n"
+
+
+def latex(grid: Grid) -> str:
+    """Table in LaTeX, for the package booktabs."""
+    lines = [" & ".join(map(latex_text, row)) + r" \\" for row in (grid.heads, *grid.rows)]
+    body = [
+        rf"\begin{{tabular}}{{{grid.columns.lower()}}}",
+        r"\toprule",
+        lines[0],
+        r"\midrule",
+        *lines[1:],
+        r"\bottomrule",
+    ]
+    return "\n".join((f"% {printable_line(grid.title)}", *body, r"\end{tabular}")) + "\n"
+
+
+def scores_csv(documents: Sequence[ScoreDocument], by: str = "phi") -> str:
+    """One row per method: every metric with its interval, in the units of the files, in full."""
+    ends = {name: ("", "_low", "_high", *(("_share",) if METRICS[name].family in CHOSEN else ())) for name in METRICS}
+    names = [f"{name}{end}" for name in METRICS for end in ends[name]]
+    rows = []
+    for document in ranked(documents, by):
+        values = ((document.metrics[name], len(ends[name])) for name in METRICS)
+        numbers = [x for one, n in values for x in (one.value, one.low, one.high, one.share)[:n]]
+        flags = ", ".join(flag.quantity for flag in document.flags)
+        rows.append([document.method.name, document.pairs, document.images, document.samples, flags, *numbers])
+    return _csv(["method", "pairs", "images", "samples", "knows_more", *names], rows)
+
+
+def scores_json(documents: Sequence[ScoreDocument], by: str = "phi") -> str:
+    """One JSON object a line: a score without its pictures."""
+    bare = (d.model_copy(update={"worst": []}) for d in ranked(documents, by))
+    return "".join(json.dumps(d.model_dump(mode="json"), allow_nan=False) + "\n" for d in bare)
+
+
+def differences_csv(differences: Sequence[Difference]) -> str:
+    """One row per metric, in the units of the files, in full."""
+    return _csv(list(_difference_fields(differences[0])), [list(_difference_fields(d).values()) for d in differences])
+
+
+def differences_json(differences: Sequence[Difference]) -> str:
+    """One JSON object: metric to values and difference."""
+    found = {d.name: {key: x for key, x in _difference_fields(d).items() if key != "metric"} for d in differences}
+    return json.dumps(found, indent=1, allow_nan=False) + "\n"
+
+
+def _difference_fields(d: Difference) -> dict[str, str | float | int | None]:
+    numbers = {"first": d.first, "second": d.second, "difference": d.difference.value}
+    numbers |= {"low": d.difference.low, "high": d.difference.high}
+    finite = {name: x if math.isfinite(x) else None for name, x in numbers.items()}
+    return {
+        "metric": d.name,
+        "unit": METRICS[d.name].unit,
+        **finite,
+        "n": d.n,
+        "samples": d.samples,
+        "chance": d.chance if math.isfinite(d.chance) else None,
+        "better": d.better,
+    }
+
+
+def _csv(heads: list[str], rows: Sequence[Sequence[object]]) -> str:
+    buffer = io.StringIO()
+    writer = csv.writer(buffer, lineterminator="\n")
+    writer.writerows(
+        [heads, *(["" if x is None else csv_text(x) if isinstance(x, str) else x for x in row] for row in rows)]
+    )
+    return buffer.getvalue()
+
+
+def _row(cells: Sequence[str]) -> str:
+    return "| " + " | ".join(map(markdown_cell, cells)) + " |"
+
+
+# -- numbers -------------------------------------------------------------------------------------------------------
+
+
+def head(name: str) -> str:
+    """Head of a metric's column, its unit on the second line."""
+    unit = METRICS[name].shown[1]
+    text = "pull of D" if name == "pull_depth" else HEADS.get(name, METRICS[name].text)
+    return text if unit == "1" else f"{text}\n{unit}"
+
+
+def shown_parts(name: str, value: Value) -> tuple[str, str]:
+    """Value and interval of a metric in the unit of tables; an efficiency with the share of spots that it rests on."""
+    shown, interval = cell_parts(value.estimate, METRICS[name].shown[0], DIGITS, significant=True)
+    if METRICS[name].kind != "efficiency" or value.value is None or value.share is None:
+        return shown, interval
+    return f"{shown} of {100.0 * value.share:.0f} %", interval
+
+
+def _parts(name: str, value: Value) -> tuple[str, str]:
+    shown, interval = shown_parts(name, value)
+    return shown, interval or value.note
+
+
+def _cell(name: str, value: Value, wide: bool) -> str:
+    shown, interval = shown_parts(name, value)
+    return f"{shown}\n{interval}" if wide and interval else shown
+
+
+def _starred(name: str, value: Value, wide: bool) -> str:
+    """Value with a star where there are too few samples for an interval."""
+    shown, rest = shown_parts(name, value)
+    if rest.startswith("("):
+        return f"{shown} *"
+    return f"{shown} {rest}".strip() if wide else shown
+
+
+def one_line(estimate: Estimate, factor: float = 1.0, digits: int = 3, significant: bool = False) -> str:
+    """Value and interval on one line."""
+    return " ".join(part for part in cell_parts(estimate, factor, digits, significant) if part)
+
+
+def cell_parts(estimate: Estimate, factor: float, digits: int, significant: bool = False) -> tuple[str, str]:
+    """Value and interval, or value and why there is none; "-" alone where there is no value."""
+    if not math.isfinite(estimate.value):
+        return "-", ""
+    value = number(factor * estimate.value, digits, significant)
+    if not math.isfinite(estimate.low):
+        return value, f"({estimate.note})" if estimate.note else ""
+    low, high = (number(factor * x, digits, significant) for x in (estimate.low, estimate.high))
+    return value, f"[{low}, {high}]"
+
+
+def number(value: float, digits: int, significant: bool = False) -> str:
+    """A number, "-" where there is none; one below its last digit as a power of ten, not as 0."""
+    if not math.isfinite(value):
+        return "-"
+    if significant or 0.0 < abs(value) < 0.5 * 10.0**-digits:
+        if abs(value) >= 10.0**digits:
+            return f"{value:.0f}"
+        return f"{value:.{max(digits - 1, 0)}e}" if 0.0 < abs(value) < 1e-3 else f"{value:.{digits}g}"
+    return f"{value:.{digits}f}"

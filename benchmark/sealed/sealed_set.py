@@ -1,0 +1,329 @@
+"""Sealed set: a folder of frames without truth, the hidden truth file, and the command that makes both.
+
+seal.json       settings of the set, and the SHA-256 that the truth must have
+pairs.jsonl     per pair what a user knows: rig, stroke, sensor, boxes, files
+frames/         images: PNG of 8 or 16 bits, or the camera's JPEG
+SHA256SUMS      of everything above
+
+The truth stays with the organiser (`truth_file`), and its hash in the seal proves later which it was.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import secrets
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import Field, field_validator
+from rich.console import Console
+
+from phibench.benchmark.scores.dataset_pairs import TASK_VERSION, DatasetPairs, dataset_pairs
+from phibench.benchmark.sealed.truth_file import MOST_PAIRS, Digest, truth_text
+from phibench.datasets.errors import DatasetError
+from phibench.datasets.frames.frame_files import png_bytes
+from phibench.datasets.frames.source import Frames
+from phibench.datasets.input_files import SETTINGS_BYTES, FileName, InputFile, Name
+from phibench.datasets.progress import Steps, progress_console
+from phibench.datasets.read import open_finished
+from phibench.datasets.recipe.load import RECIPES, load_recipe
+from phibench.datasets.recipe.tables import Recipe
+from phibench.datasets.store.checksums import checksums_text, read_checksums
+from phibench.datasets.store.documents import to_json
+from phibench.datasets.store.files import WriteError, read_rows, sha256, write_bytes, write_secret, write_text
+from phibench.datasets.store.leftovers import OwnedFolder, folder_for_work
+from phibench.datasets.store.schema import SEALED_TRUTH, Document
+from phibench.estimator.interface import Box, Pair
+from phibench.scenes.camera import LARGEST_SIDE_PX
+from phibench.scenes.random_streams import LEAST_SECRET_SEED, generator
+
+SEAL, PAIRS, FRAMES, CHECKSUMS = "seal.json", "pairs.jsonl", "frames", "SHA256SUMS"
+FORMAT = "phibench sealed set 1"
+IMAGES = {"down", "up"}
+
+
+_Pixel = Annotated[int, Field(ge=-LARGEST_SIDE_PX, le=LARGEST_SIDE_PX)]
+_Side = Annotated[int, Field(ge=1, le=LARGEST_SIDE_PX)]
+
+
+class Seal(Document):
+    """`seal.json`.
+
+    `public_sha256` is the hash of the list of hashes of `pairs.jsonl` and of the frames, `truth_sha256` that of the
+    truth's file, which holds a random number of 256 bits, so that nobody can try out truths against it. The id follows
+    from both.
+    """
+
+    format: Name
+    id: Annotated[str, Field(pattern="^[0-9a-f]{16}$")]
+    task_version: Annotated[int, Field(ge=1, le=1000)]
+    pairs: Annotated[int, Field(ge=1, le=MOST_PAIRS)]
+    public_sha256: Digest
+    truth_sha256: Digest
+    phibench: Name | None
+
+
+class PublicBox(Document):
+    """A region hint, as `interface.Box`."""
+
+    u0_px: _Pixel
+    v0_px: _Pixel
+    width_px: _Side
+    height_px: _Side
+
+
+class PublicPair(Document):
+    """One line of `pairs.jsonl`; `files` by image name: "down", "up", and "down_off", "up_off" where they are."""
+
+    number: Annotated[int, Field(ge=0, lt=MOST_PAIRS)]
+    files: dict[str, FileName]
+    stroke_m: Annotated[float, Field(gt=0.0, le=1000.0)]
+    rig: dict[str, Any]
+    card: dict[str, Any]
+    box_down: PublicBox | None
+    box_up: PublicBox | None
+    beam: dict[str, Any] | None = None
+
+    @field_validator("files")
+    @classmethod
+    def _both_images(cls, files: dict[str, str]) -> dict[str, str]:
+        if set(files) not in (IMAGES, IMAGES | {"down_off", "up_off"}):
+            raise ValueError("the images down and up are needed, and down_off and up_off both or neither")
+        if strange := [name for name in files.values() if not name.startswith(f"{FRAMES}/")]:
+            raise ValueError(f"the image {strange[0]} does not lie in {FRAMES}/")
+        return files
+
+
+def seal_id(public_sha256: str, truth_sha256: str) -> str:
+    """Id of a seal."""
+    return hashlib.sha256(f"{public_sha256}\n{truth_sha256}\n".encode()).hexdigest()[:16]
+
+
+def public_sha256(hashes: Mapping[str, str]) -> str:
+    """Hash of what a method may see: pairs and frames, by relative name."""
+    content = {name: digest for name, digest in hashes.items() if name == PAIRS or name.startswith(f"{FRAMES}/")}
+    return hashlib.sha256(checksums_text(content).encode()).hexdigest()
+
+
+def read_seal(folder: Path) -> Seal:
+    """Read `seal.json` and check that it fits the folder's list of hashes.
+
+    Raises
+    ------
+    DatasetError
+        In one sentence: no sealed set, damaged, or changed.
+    """
+    path = folder / SEAL
+    if not path.is_file():
+        raise DatasetError(f"{folder} is no sealed set: it has no {SEAL}; give what `phibench seal make` wrote")
+    if not (folder / CHECKSUMS).is_file():
+        raise DatasetError(f"{folder / CHECKSUMS} is missing; download the set again")
+    seal = InputFile(path, "download the set again", limit_bytes=SETTINGS_BYTES).document(Seal)
+    listed = public_sha256(read_checksums(folder))
+    if seal.format != FORMAT or listed != seal.public_sha256 or seal.id != seal_id(listed, seal.truth_sha256):
+        raise DatasetError(
+            f"{folder}: {SEAL} and {CHECKSUMS} do not belong together, one was changed; download the set again"
+        )
+    return seal
+
+
+def read_pairs(folder: Path) -> list[PublicPair]:
+    """Lines of `pairs.jsonl`, by number."""
+    return read_rows(folder / PAIRS, PublicPair)
+
+
+_FILE_TIME_S = 315532800  # 1980-01-01: a file's own time would tell the order of the work
+_SALT_BYTES = 32
+_TRUTH_FILE = "seal_{}" + SEALED_TRUTH
+
+
+@dataclass(frozen=True)
+class Sealed:
+    """Result of sealing: the public folder, the truth's file, the seal, and warnings."""
+
+    public: Path
+    truth_file: Path
+    seal: Seal
+    warnings: tuple[str, ...]
+
+
+def seal(folder: str | Path, public: str | Path, preset: str | None = None, console: Console | None = None) -> Sealed:
+    """Seal one pair of each sample of a finished data set.
+
+    Several pairs of a sample, in other presets or draws of the noise, would help each other: a method that sees all of
+    them averages. Presets are dealt out evenly over the samples (`single_pairs`).
+
+    Parameters
+    ----------
+    folder : data set
+        The truth's file, `seal_<id>.truth.json`, is written into it.
+    public : folder to write; new or empty
+    preset : str, optional
+        One preset instead of those of the recipe's `[frames]`.
+    console : where progress goes; by default the standard error
+
+    Raises
+    ------
+    DatasetError
+        If the data set or the folder will not do; then nothing is left behind.
+    """
+    public, console = Path(public), console or progress_console()
+    pairs = single_pairs(dataset_pairs(open_finished(folder), preset))
+    _check_folder(public, Path(folder))
+    try:
+        with folder_for_work(public.parent), OwnedFolder("seal", public.parent) as work:
+            return _seal(pairs, Path(folder), work, public, console)
+    except OSError as error:
+        text = str(error) if isinstance(error, WriteError) else f"could not write to {public}: {error}"
+        raise DatasetError(f"{text}; then run the same command again") from error
+
+
+def single_pairs(pairs: DatasetPairs) -> DatasetPairs:
+    """One pair of each sample, in the drawn order: its first draw, in a preset that is drawn for the sample."""
+    dataset, draws = pairs.dataset, pairs.pair_draws
+    presets = sorted({draw.preset for draw in draws})
+    samples = sorted({draw.sample_id for draw in draws})
+    order = generator(dataset.info.name, dataset.info.recipe["dataset"]["seed"], "seal", "presets")
+    dealt = {samples[k]: presets[place % len(presets)] for place, k in enumerate(order.permutation(len(samples)))}
+    chosen = [draw for draw in draws if draw.draw == 0 and draw.preset == dealt[draw.sample_id]]
+    return DatasetPairs(dataset, tuple(replace(draw, number=number) for number, draw in enumerate(chosen)))
+
+
+def earlier_warnings(folder: Path) -> tuple[str, ...]:
+    """A sentence about earlier seals of a data set, whose pairs are of the same samples."""
+    earlier = sorted(path.name.split(".")[0] for path in folder.glob(_TRUTH_FILE.format("*")))
+    if not earlier:
+        return ()
+    return (
+        f"this data set was sealed before ({', '.join(earlier)}): pairs of the same samples in two published sets help "
+        "each other, so publish one of the sets, and make samples with another seed for a second one",
+    )
+
+
+def board_warnings(name: str, recipe: Recipe) -> tuple[str, ...]:
+    """A sentence about boards that everybody knows."""
+    known = recipe.targets and (RECIPES / f"{name}.toml").is_file()
+    if not known or load_recipe(name).targets != recipe.targets:
+        return ()
+    return (
+        f"the boards stand where the shipped recipe '{name}' puts them: whoever knows them gets D from the azimuth, "
+        "and phi better than from the images, so seal a set whose boards were moved in a secret copy of the recipe",
+    )
+
+
+def sequence_warnings(recipe: Recipe) -> tuple[str, ...]:
+    """A sentence about samples of which some tell where the others are."""
+    if recipe.random is None or recipe.random.sequence != "sobol":
+        return ()
+    return (
+        "the samples are of a Sobol sequence: whoever has located some spots finds the others from the public strokes, "
+        'so seal a set with sequence = "independent"',
+    )
+
+
+def seed_warnings(name: str, seed: int) -> tuple[str, ...]:
+    """Sentences about a seed that everybody knows or can find; none about a good one."""
+    if (RECIPES / f"{name}.toml").is_file() and load_recipe(name).dataset.seed == seed:
+        return (
+            f"seed {seed} is that of the shipped recipe '{name}': whoever has phibench can render the same truth, so "
+            "seal a set that was made with --secret-seed FILE",
+        )
+    if seed < LEAST_SECRET_SEED:
+        return (
+            f"seed {seed} is short: the rigs in {PAIRS} show which seed they were drawn from to whoever tries all, so "
+            "seal a set that was made with --secret-seed FILE, which has 128 bits of the system",
+        )
+    return ()
+
+
+def _seal(pairs: DatasetPairs, folder: Path, work: Path, public: Path, console: Console) -> Sealed:
+    rows = {}
+    with Steps(console, "pairs", len(pairs)) as steps:
+        for number in _by_sample(pairs):
+            rows[number] = _write_pair(work, *pairs.pair_and_frames(number))
+            steps.advance()
+    lines = (json.dumps(rows[k].model_dump(mode="json"), allow_nan=False) + "\n" for k in range(len(pairs)))
+    write_text(work / PAIRS, "".join(lines))
+    listed = _hashes(work)
+    content = public_sha256(listed)
+    # a secret is the one number that must not come from a named stream
+    text = truth_text([pairs.truth(k) for k in range(len(pairs))], secrets.token_hex(_SALT_BYTES), content)
+    truth_sha256 = hashlib.sha256(text.encode()).hexdigest()
+    document = Seal(
+        format=FORMAT,
+        id=seal_id(content, truth_sha256),
+        task_version=TASK_VERSION,
+        pairs=len(pairs),
+        public_sha256=content,
+        truth_sha256=truth_sha256,
+        phibench=version("phibench"),
+    )
+    write_text(work / SEAL, json.dumps(document.model_dump(mode="json"), indent=1) + "\n")
+    write_text(work / CHECKSUMS, checksums_text(_hashes(work)))
+    warnings = earlier_warnings(folder)
+    truth_file = write_secret(folder / _TRUTH_FILE.format(document.id), text)  # first: no seal without its truth
+    _publish(work, public)
+    name, recipe = pairs.dataset.info.name, pairs.dataset.recipe
+    warnings += (
+        *seed_warnings(name, recipe.dataset.seed),
+        *sequence_warnings(recipe),
+        *board_warnings(name, recipe),
+    )
+    return Sealed(public, truth_file, document, warnings)
+
+
+def _by_sample(pairs: DatasetPairs) -> list[int]:
+    """Numbers in the order in which layers are read once; the files' names and times do not show it."""
+    return sorted(range(len(pairs)), key=lambda number: pairs.pair_draws[number].sample_id)
+
+
+def _write_pair(work: Path, pair: Pair, frames: Frames) -> PublicPair:
+    files = {}
+    for name, frame in frames.by_name.items():
+        end = "png" if frame.jpeg is None else "jpg"
+        files[name] = f"{FRAMES}/{pair.number:06d}-{name}.{end}"
+        write_bytes(work / files[name], png_bytes(frame.image) if frame.jpeg is None else frame.jpeg)
+    return PublicPair(
+        number=pair.number,
+        files=files,
+        stroke_m=pair.stroke_m,
+        rig=to_json(pair.rig),
+        card=to_json(pair.card),
+        box_down=_public_box(pair.box_down),
+        box_up=_public_box(pair.box_up),
+        beam=None if pair.beam is None else to_json(pair.beam),
+    )
+
+
+def _public_box(box: Box | None) -> PublicBox | None:
+    return None if box is None else PublicBox(**asdict(box))
+
+
+def _hashes(folder: Path) -> dict[str, str]:
+    files = (path for path in folder.rglob("*") if path.is_file())
+    return {path.relative_to(folder).as_posix(): sha256(path) for path in files}
+
+
+def _check_folder(public: Path, folder: Path) -> None:
+    where = public.resolve()
+    if where == folder.resolve() or folder.resolve() in where.parents:
+        raise DatasetError(f"{public} lies inside the data set, which holds the truth; give a folder outside, --out")
+    if public.exists() and (not public.is_dir() or any(public.iterdir())):
+        raise DatasetError(f"{public} exists and is not an empty folder; give a new one, --out")
+
+
+def _publish(work: Path, public: Path) -> None:
+    """Give every file the same time, then the folder its name."""
+    umask = os.umask(0)
+    os.umask(umask)
+    work.chmod(0o777 & ~umask)
+    for path in (*work.rglob("*"), work):
+        os.utime(path, (_FILE_TIME_S, _FILE_TIME_S))
+    if public.exists():
+        public.rmdir()
+    work.replace(public)

@@ -1,0 +1,501 @@
+"""Measurement of D from a person's own pictures: spots, outline, rig, depth with its standard deviation, and a test.
+
+The rig is that of the rig file with the corrections of a calibration file. Without one, the mirror's outline in these
+very pictures corrects it, as far as an outline can, and the covariance is that of a rig measured by a ruler. Blur and
+filters at the laser's line are those of the calibration's spots, or are fitted to these spots (`spot_shape`).
+
+Several frames of a position are one pair of their means (`Pair.of_frames`). The fits weigh what the frames share: the
+fixed pattern, the room, the steps of JPEG. The outline is that of the mean of raw frames, and of the first JPEG.
+
+The test: both spots are images of one point. Four coordinates stand against three unknowns, so that the gap of the two
+rays over its standard deviation, rig included, is chi^2 of one degree of freedom.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from phibench.calibration.captures.pair_photos import (
+    LEAST_STROKE_M,
+    MOST_STROKE_M,
+    PairPhotos,
+    PositionPhotos,
+    contradiction,
+    frames_note,
+    moved_between,
+    moved_note,
+    nothing_found,
+    pair_of_photos,
+)
+from phibench.calibration.captures.picture_files import Photo, SensorChoice, require_colour, sensor_choice
+from phibench.calibration.captures.rig_file import MeasuredRig, read_rig_file, require_camera_size
+from phibench.calibration.captures.spot_shape import (
+    OUTLINE_SIGMA_PX,
+    PRIOR_SIGMA,
+    SHAPE,
+    UNLIKE,
+    SpotImage,
+    SpotShape,
+    fit_shape,
+    seen_through,
+    spot_images,
+)
+from phibench.calibration.captures.tested_chain import ChainTest, chain_test
+from phibench.calibration.outline.limb_image import Measured
+from phibench.calibration.outline.outline import find_outline
+from phibench.calibration.outline.outline_result import Outline, mean_outline
+from phibench.calibration.rig.bundle import calibrate
+from phibench.calibration.rig.file import Calibration, read_calibration
+from phibench.calibration.rig.spots import method_for
+from phibench.datasets.errors import DatasetError
+from phibench.datasets.frames.sensor_card import SensorCard
+from phibench.datasets.frames.sensor_file import SensorFile, read_sensor_file
+from phibench.estimator.geometry.least_squares_depth import GeneralDepth, depth_general
+from phibench.estimator.geometry.rig_parameters import PARAMETERS, prior_sigmas, stroke_of
+from phibench.estimator.geometry.status import Status, describe
+from phibench.estimator.interface import Answer, Image, Pair, Spot
+from phibench.estimator.methods.fit_place import kept
+from phibench.estimator.methods.locate import SharedPair
+from phibench.estimator.methods.raw_likelihood import with_posteriors
+from phibench.estimator.spots.detect import detect
+from phibench.estimator.spots.image_planes import ImageError
+from phibench.scenes.frames import Array
+from phibench.scenes.rig import POSITIONS, Rig
+
+DOUBTFUL_P = 1e-3
+"""Probability of the two rays' gap below which the two spots are not taken for one point."""
+
+
+@dataclass(frozen=True)
+class Setting:
+    """Numbers that are known beside the pictures.
+
+    Attributes
+    ----------
+    known : MeasuredRig
+    calibration : Calibration or None
+    sensor : SensorFile or None
+    stroke_sigma_m : float
+        Of a single stroke, besides what the calibration says of all strokes.
+    """
+
+    known: MeasuredRig
+    calibration: Calibration | None = None
+    sensor: SensorFile | None = None
+    stroke_sigma_m: float = 0.0
+
+
+def read_setting(
+    rig: Path, calibration: Path | None = None, sensor: Path | None = None, stroke_sigma_m: float = 0.0
+) -> Setting:
+    """Setting of files.
+
+    Raises
+    ------
+    DatasetError
+        If a file will not do, or the calibration began with another rig than the rig file's; in one sentence.
+    """
+    known = read_rig_file(rig)
+    held = None if calibration is None else read_calibration(calibration, known.rig)
+    if not 0.0 <= stroke_sigma_m <= MOST_STROKE_M:
+        raise DatasetError(f"the stroke's standard deviation is {stroke_sigma_m:g} m: must be 0 or above")
+    return Setting(known, held, None if sensor is None else read_sensor_file(sensor), stroke_sigma_m)
+
+
+@dataclass(frozen=True)
+class SeenSpot:
+    """Position of a spot in one image; pixels, covariance of (u, v), and how unlike a spot its light is (0 to 1)."""
+
+    uv_px: Array
+    covariance_px2: Array = field(repr=False)
+    unlike: float = 0.0
+
+    @property
+    def sigma_px(self) -> float:
+        """Root mean square of both coordinates' standard deviations."""
+        return math.sqrt(0.5 * float(np.trace(self.covariance_px2)))
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """Result for one pair.
+
+    Attributes
+    ----------
+    depth : GeneralDepth
+        Scalars: D, sigma, its parts, chi^2 and its probability.
+    down, up : SeenSpot
+    rig : Rig
+        The corrected one.
+    stroke_m : float
+        The corrected one.
+    outlines : tuple of Outline
+        Of these pictures, found with the nominal rig; none where none was found.
+    nominal : Rig
+        As in the rig file.
+    pair : Pair
+        With the corrected rig and stroke.
+    sensor : SensorChoice
+    notes : tuple of str
+        Sentences for the person: sensor, rig, frames, doubts.
+    """
+
+    depth: GeneralDepth
+    down: SeenSpot
+    up: SeenSpot
+    rig: Rig
+    stroke_m: float
+    outlines: tuple[Outline, ...] = field(repr=False)
+    nominal: Rig = field(repr=False)
+    pair: Pair = field(repr=False)
+    sensor: SensorChoice
+    notes: tuple[str, ...]
+
+    @property
+    def depth_m(self) -> float:
+        """D."""
+        return float(self.depth.depth_m)
+
+    @property
+    def sigma_m(self) -> float:
+        """Standard deviation of D, of all that is known to be uncertain."""
+        return float(self.depth.sigma_m)
+
+    @property
+    def one_point(self) -> bool:
+        """The spots can be images of one point."""
+        return bool(self.depth.p_value >= DOUBTFUL_P)
+
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """Sentences on why D may be wrong by far more than its sigma says; none of a sound pair."""
+        return tuple(note for note in self.notes if note.startswith(_DOUBTFUL_SPOTS))
+
+
+def measure(photos: PairPhotos, stroke_m: float, setting: Setting) -> Measurement:
+    """Measure D.
+
+    Parameters
+    ----------
+    photos : PairPhotos
+    stroke_m : float
+        As the person read it.
+    setting : Setting
+
+    Raises
+    ------
+    DatasetError
+        If a picture does not fit to the rig or the sensor, no spot is found, the positions are swapped, or the stroke
+        contradicts the pictures; in one sentence.
+    """
+    if not LEAST_STROKE_M <= stroke_m <= MOST_STROKE_M:
+        raise DatasetError(f"a stroke of {stroke_m:g} m: allowed is {LEAST_STROKE_M:g} to {MOST_STROKE_M:g} m, metres")
+    for photo in photos.all:
+        require_colour(photo)
+        require_camera_size(setting.known.rig, photo.size_px, str(photo.path))
+        sensor_choice(photo, setting.sensor)
+    test = chain_test(
+        photos,
+        lambda photo: sensor_choice(photo, setting.sensor).card,
+        lambda group, card: pair_of_photos(group, stroke_m, setting.known, card),
+    )
+    if photos.down.on[0].kind == "raw" and (corner := next(iter(test.phases))) != (0, 0):
+        return _shifted(measure(*_without(corner, photos, stroke_m, setting)), corner, photos, setting, test.note)
+    return _measured(test, stroke_m, setting)
+
+
+def _measured(test: ChainTest, stroke_m: float, setting: Setting) -> Measurement:
+    """Measurement with the phases of a test, which are in sigma where they are several."""
+    photos, chosen = test.photos, sensor_choice(test.photos.down.on[0], setting.sensor)
+    parts: list[tuple[_Fitted, float]] = []
+    faults: list[DatasetError] = []
+    for phase, chance in test.phases.items():
+        try:
+            card = replace(chosen.card, mosaic_phase=phase)
+            # the outline hardly knows of the phase: that of the first is every other's
+            seen = parts[0][0].limb if parts else None
+            parts.append((_fitted(photos, stroke_m, setting, card, seen), chance))
+        except DatasetError as error:
+            faults.append(error)
+    if not parts:
+        raise faults[0]
+    found = parts[0][0]
+    down, up = (_mixed([(one.spots[name], chance) for one, chance in parts], test.added_px) for name in POSITIONS)
+    depth = depth_general(
+        found.rig,
+        found.stroke_m,
+        down.uv_px,
+        up.uv_px,
+        down.covariance_px2,
+        up.covariance_px2,
+        found.covariance,
+        setting.stroke_sigma_m,
+    )
+    if int(depth.status) != Status.OK:
+        raise contradiction(found.pair, photos, describe(int(depth.status)))
+    tests = _doubt(depth), _torn(down, "down"), _torn(up, "up"), *_moved(found.pair, photos), _foreign(test)
+    notes = (chosen.note, test.note, *found.notes, frames_note(photos), *tests)
+    told = tuple(text for text in notes if text)
+    nominal = setting.known.rig
+    return Measurement(depth, down, up, found.rig, found.stroke_m, found.limb[0], nominal, found.pair, chosen, told)
+
+
+_Limb = tuple[tuple[Outline, ...], str]
+"""Outlines, and why there are none."""
+
+
+@dataclass(frozen=True)
+class _Fitted:
+    """Spots and rig under one chain: both positions, covariance of `PARAMETERS`, and sentences."""
+
+    pair: Pair
+    spots: dict[str, SeenSpot]
+    rig: Rig
+    covariance: Array
+    stroke_m: float
+    limb: _Limb
+    notes: tuple[str, ...]
+
+
+def _fitted(
+    photos: PairPhotos, stroke_m: float, setting: Setting, card: SensorCard, limb: _Limb | None = None
+) -> _Fitted:
+    """Fit both spots; outlines are looked for, or are those of `limb`, with why there are none."""
+    pair = pair_of_photos(photos, stroke_m, setting.known, card)
+    outlines, missing = limb = limb or _outlines(pair, setting.calibration is not None)
+    rig, covariance, values, note = _corrected(setting, outlines, missing)
+    stroke = float(stroke_of(np.array(stroke_m), values))
+    seen = replace(pair, rig=with_blur_of(rig, outlines), stroke_m=stroke)
+    images = seen_images(seen)
+    shape = _shape(setting, seen, images, outlines)
+    rig = shape.rig(rig)
+    ready = replace(pair, rig=rig, stroke_m=stroke)
+    spots = seen_spots(_answer(ready, photos))
+    wide = {name: widened_by_shape(spots[name], images.get(name), shape) for name in POSITIONS}
+    return _Fitted(ready, wide, rig, covariance, stroke, limb, (note, _shape_note(shape, setting)))
+
+
+def _mixed(parts: Sequence[tuple[SeenSpot, float]], added_px: float) -> SeenSpot:
+    """Spot of several hypotheses: mean and covariance of their mixture, and what the chain adds."""
+    weight = np.array([chance for _, chance in parts])
+    weight /= weight.sum()
+    places = np.array([spot.uv_px for spot, _ in parts])
+    mean = weight @ places
+    within = np.einsum("k,kij->ij", weight, np.array([spot.covariance_px2 for spot, _ in parts]))
+    between = np.einsum("k,ki,kj->ij", weight, places - mean, places - mean)
+    return SeenSpot(mean, within + between + added_px**2 * np.eye(2), parts[0][0].unlike)
+
+
+def _without(
+    corner: tuple[int, int], photos: PairPhotos, stroke_m: float, setting: Setting
+) -> tuple[PairPhotos, float, Setting]:
+    """Pictures of DN and setting without the first columns and rows, so that red comes first."""
+    du, dv = corner
+
+    def of(group: Sequence[Photo]) -> tuple[Photo, ...]:
+        return tuple(replace(photo, pixels=_cut(photo.pixels, du, dv)) for photo in group)
+
+    down, up = (PositionPhotos(of(one.on), of(one.off)) for one in (photos.down, photos.up))
+    known = replace(setting.known, rig=_rig_at(setting.known.rig, -du, -dv))
+    held = setting.calibration
+    held = None if held is None else replace(held, rig=_rig_at(held.rig, -du, -dv))
+    return PairPhotos(down, up), stroke_m, replace(setting, known=known, calibration=held)
+
+
+def _cut(pixels: Image, du: int, dv: int) -> Image:
+    """Pixels without the first `du` columns and `dv` rows, and without as many at the end as keep the size even."""
+    part = pixels[dv : pixels.shape[0] - dv, du : pixels.shape[1] - du].copy()
+    part.flags.writeable = False
+    return part
+
+
+def _rig_at(rig: Rig, du: int, dv: int) -> Rig:
+    """Rig whose picture begins `du` columns and `dv` rows further out, and ends as much."""
+    camera = rig.camera
+    width, height = camera.width_px + 2 * du, camera.height_px + 2 * dv
+    cx, cy = camera.cx_px + du, camera.cy_px + dv
+    return replace(rig, camera=replace(camera, width_px=width, height_px=height, cx_px=cx, cy_px=cy))
+
+
+def _shifted(
+    found: Measurement, corner: tuple[int, int], photos: PairPhotos, setting: Setting, note: str
+) -> Measurement:
+    """Measurement of cut pictures in the pixels of the whole ones."""
+    down, up = (replace(spot, uv_px=spot.uv_px + np.array(corner)) for spot in (found.down, found.up))
+    rig = _rig_at(found.rig, *corner)
+    pair = replace(pair_of_photos(photos, found.stroke_m, setting.known, found.pair.card), rig=rig)
+    notes = (found.notes[0], note, *found.notes[1:])
+    return replace(found, down=down, up=up, rig=rig, nominal=setting.known.rig, pair=pair, notes=notes)
+
+
+def _foreign(test: ChainTest) -> str:
+    return f"{_DOUBTFUL_SPOTS}s went through another chain than the file's: {test.doubt}" if test.doubt else ""
+
+
+# -- rig -------------------------------------------------------------------------------------------------------------
+
+
+def _outlines(pair: Pair, calibrated: bool) -> tuple[tuple[Outline, ...], str]:
+    """Outlines of both positions, laser off where there is such a picture; and why there is none.
+
+    With a calibration one is enough: it only tells whether the mirror is still there.
+    """
+    found, why = [], ""
+    for position in POSITIONS[: 1 if calibrated else 2]:
+        try:
+            found.append(find_outline(_picture(pair, position), pair.rig, pair.card))
+        except ImageError as error:
+            why = str(error)
+    return tuple(found), why
+
+
+def _picture(pair: Pair, position: str) -> Image:
+    """Picture of the mirror, laser off where there is one: the mean of raw frames, the first of others."""
+    name = f"{position}_off" if f"{position}_off" in pair.images else position
+    return pair.images[name] if pair.card.output == "raw" else pair.stack(name)[0]
+
+
+def _corrected(setting: Setting, outlines: Sequence[Outline], why: str) -> tuple[Rig, Array, Array, str]:
+    """Corrected rig, covariance and values of `PARAMETERS`, and a sentence."""
+    nominal = setting.known.rig
+    if setting.calibration is not None:
+        held = setting.calibration
+        return held.rig, held.covariance, held.values, _calibration_note(held, nominal, outlines)
+    if not outlines:
+        values, covariance = np.zeros(len(PARAMETERS)), np.diag(prior_sigmas() ** 2)
+        return nominal, covariance, values, f"rig: as in the rig file, with the errors of a ruler; no outline: {why}"
+    bundle = calibrate(nominal, outlines_as_one(outlines))
+    kind = ", by its edge alone" if any(one.by_edge for one in outlines) else ""
+    text = f"rig: corrected by the mirror's outline in these pictures{kind}; the rest has the errors of a ruler"
+    return bundle.rig, bundle.covariance, bundle.values, text
+
+
+def outlines_as_one(outlines: Sequence[Outline]) -> Measured:
+    """Weighted mean of outlines of one rig, with the covariance of a single one.
+
+    What an outline claims is mostly what all of them share: the lens's blur, where the limb lies in its edge, the
+    nominal camera. Ten outlines of a rig in ten rooms were all 0.4 to 0.6 mm short, each within its sigma.
+    """
+    mean = mean_outline(outlines)
+    return replace(mean, covariance=mean.covariance * len(outlines))
+
+
+_MOVED_SIGMAS = 5.0
+_GROWN = 0.003  # of the outline's size: one rig's outlines in ten rooms differ by less
+
+
+def _calibration_note(held: Calibration, nominal: Rig, outlines: Sequence[Outline]) -> str:
+    """Sentence on the calibration, and whether the mirror is still where it was."""
+    made, text = held.made_from.get("sphere_in_camera_m"), "rig: of the calibration file"
+    if not made or not outlines:
+        return text
+    sigmas = np.array(held.made_from["sigma_m"])
+    then = Measured(np.mean(made, axis=0), np.diag(np.mean(sigmas**2, axis=0)))
+    now = outlines_as_one(outlines)
+    across = (now.value - then.value)[:2]
+    off = float(np.sqrt(across @ np.linalg.solve((now.covariance + then.covariance)[:2, :2], across)))
+    if off > _MOVED_SIGMAS:
+        moved = 1e3 * float(np.linalg.norm(across))
+        return f"{text}; doubtful: the mirror has moved by {moved:.2f} mm ({off:.0f} sigma) since; calibrate again"
+    grown, sigma = (then.value - now.value)[2] / now.value[2], np.sqrt((now.covariance + then.covariance)[2, 2])
+    if abs(grown) > max(_GROWN, _MOVED_SIGMAS * float(sigma) / now.value[2]):
+        size = f"{100.0 * abs(grown):.1f} % {'larger' if grown > 0.0 else 'smaller'}"
+        return (
+            f"{text}; doubtful: the mirror's outline is {size} than then: the lens was refocused, or the mirror moved "
+            "along the axis; calibrate again"
+        )
+    return f"{text}; the mirror is still where it was"
+
+
+def with_blur_of(rig: Rig, outlines: Sequence[Outline]) -> Rig:
+    """Rig with the blur that the outlines' light has; as it is where none could be fitted."""
+    blurs = [one.blur_px for one in outlines if math.isfinite(one.blur_px)]
+    return replace(rig, camera=replace(rig.camera, blur_sigma_px=float(np.mean(blurs)))) if blurs else rig
+
+
+# -- spots -----------------------------------------------------------------------------------------------------------
+
+
+def seen_images(pair: Pair) -> dict[str, SpotImage]:
+    """Pictures of a pair, by position, in which `detect` sees the spot."""
+    found = detect(pair)
+    return spot_images(pair, *(Spot(None if one is None else one.uv_px) for one in (found.down, found.up)))
+
+
+def _shape(setting: Setting, pair: Pair, images: dict[str, SpotImage], outlines: Sequence[Outline]) -> SpotShape:
+    """Blur and filters: of the calibration's spots, or of these, about what outline and rig file say."""
+    held = setting.calibration
+    if held is not None and (document := held.made_from.get(SHAPE)) is not None:
+        return SpotShape.of_document(document)
+    return fit_shape(list(images.values()), shape_prior(pair.rig, outlines))
+
+
+def shape_prior(rig: Rig, outlines: Sequence[Outline]) -> SpotShape:
+    """Shape that a rig says, with the blur of outlines in it where their light could be fitted."""
+    by_light = any(math.isfinite(one.blur_px) for one in outlines)
+    return SpotShape.prior(rig, OUTLINE_SIGMA_PX if by_light else PRIOR_SIGMA[0])
+
+
+def widened_by_shape(spot: SeenSpot, image: SpotImage | None, shape: SpotShape) -> SeenSpot:
+    """Spot with what the uncertainty of blur and filters adds to its place, and how far its light is none."""
+    if image is None:
+        return spot
+    added, unlike = seen_through(image, shape)
+    return replace(spot, covariance_px2=spot.covariance_px2 + added, unlike=unlike)
+
+
+def _shape_note(shape: SpotShape, setting: Setting) -> str:
+    (blur, green, blue), (blur_sigma, *_) = shape.values, shape.sigmas
+    held = setting.calibration is not None and SHAPE in setting.calibration.made_from
+    source = "of the calibration" if held else "of these spots" if shape.images else "of the rig file"
+    return f"spots: blur {blur:.2f} +- {blur_sigma:.2f} px, filters 1 : {green:.2f} : {blue:.2f}, {source}"
+
+
+def _answer(pair: Pair, photos: PairPhotos) -> Answer:
+    pair = SharedPair.of(pair)
+    answer = method_for(pair.card)(pair)
+    if any(spot.uv_px is None or spot.covariance_px2 is None for spot in (answer.down, answer.up)):
+        raise nothing_found(pair, photos, answer)
+    return kept(pair, answer, with_posteriors(pair, answer))
+
+
+def seen_spots(answer: Answer) -> dict[str, SeenSpot]:
+    """Positions of an answer that has both, by position."""
+    both = dict(zip(POSITIONS, (answer.down, answer.up), strict=True))
+    return {name: SeenSpot(np.array(spot.uv_px), np.array(spot.covariance_px2)) for name, spot in both.items()}
+
+
+_DOUBTFUL_SPOTS = "doubtful: the spot"
+
+
+def _moved(pair: Pair, photos: PairPhotos) -> Iterator[str]:
+    """Sentences on laser-off pictures that are shifted: edges of the room then count as light of the spot."""
+    for position, shift in moved_between(pair):
+        yield f"{_DOUBTFUL_SPOTS} {position} lies on edges: {moved_note(photos, position, shift)}"
+
+
+def _torn(spot: SeenSpot, position: str) -> str:
+    """Sentence on a light that is no spot."""
+    if spot.unlike < UNLIKE:
+        return ""
+    u, v = spot.uv_px
+    return (
+        f"{_DOUBTFUL_SPOTS} {position} at ({u:.0f}, {v:.0f}) px has not the shape of one, {100.0 * spot.unlike:.0f} % "
+        "of its light do not fit; the beam may meet an edge or graze a surface, turn the laser a little"
+    )
+
+
+def _doubt(depth: GeneralDepth) -> str:
+    """Sentence on the test."""
+    p, chi2 = float(depth.p_value), float(depth.chi2)
+    if p >= DOUBTFUL_P:
+        return f"one point: chi^2 {chi2:.2f} for one degree of freedom (p = {p:.2g})"
+    return (
+        f"{_DOUBTFUL_SPOTS}s are not images of one point, chi^2 {chi2:.1f} for one degree of freedom (p = {p:.1e}); "
+        "one may be a reflection, the rig may have turned between the pictures, or the calibration is another rig's"
+    )

@@ -1,0 +1,282 @@
+"""Photographs of a pair, laser on and off, one or several of each; the pair made of them; mistakes that they show.
+
+Each mistake is tried on the pictures themselves: the spot is looked for as if it were mended. Only spots that are sure
+prove one, so that noise is never explained.
+
+A shift between laser on and off: both pictures lose what is wider than some pixels and are correlated over all shifts.
+The laser's spot is in one of them only, and counts as little as it has pixels.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import fft
+from scipy.ndimage import gaussian_filter
+
+from phibench.calibration.captures.picture_files import Photo, require_one_camera
+from phibench.calibration.captures.rig_file import MeasuredRig
+from phibench.datasets.errors import DatasetError
+from phibench.datasets.frames.sensor_card import SensorCard
+from phibench.estimator.geometry.reflection import reflect
+from phibench.estimator.geometry.triangulate import depth_exact
+from phibench.estimator.interface import Answer, Image, Pair
+from phibench.estimator.spots.detect import FARTHEST_M, NEAREST_M, PairDetection, detect
+from phibench.scenes.frames import Array
+from phibench.scenes.revolved_mirror import RevolvedMirror
+from phibench.scenes.rig import POSITIONS, Rig
+
+LEAST_STROKE_M, MOST_STROKE_M = 1e-3, 10.0
+_FACTORS = (0.1, 10.0, 0.3, 3.0, 0.01, 100.0, 0.001)  # of the stroke: units mistaken, and a few times too much
+_SURE_SIGMAS, _EACH_SIGMAS = 12.0, 9.0  # of both spots together and of each: a fainter one may be noise
+_OUTLINE_POINTS, _INSIDE = 24, 2e-3  # and the part of the mirror's size by which rays are traced inside its outline
+_ALIKE = 0.8  # of the difference of two rooms, below which pictures are of one position
+
+
+@dataclass(frozen=True)
+class PositionPhotos:
+    """Pictures of one stroke position: laser on, and laser off where there are any."""
+
+    on: tuple[Photo, ...]
+    off: tuple[Photo, ...] = ()
+
+
+@dataclass(frozen=True)
+class PairPhotos:
+    """Pictures of both positions.
+
+    Raises
+    ------
+    DatasetError
+        If the counts do not go together, or the pictures are of different cameras.
+    """
+
+    down: PositionPhotos
+    up: PositionPhotos
+
+    def __post_init__(self) -> None:
+        counts = {p: (len(getattr(self, p).on), len(getattr(self, p).off)) for p in POSITIONS}
+        if counts["down"] != counts["up"] or not counts["down"][0]:
+            (a, b), (c, d) = counts["down"], counts["up"]
+            raise DatasetError(
+                f"pictures with the laser on: {a} down and {c} up; with the laser off: {b} down and {d} up; give as "
+                "many of both positions"
+            )
+        if counts["down"][1] > counts["down"][0]:
+            raise DatasetError("more pictures with the laser off than on: give at most as many")
+        require_one_camera(self.all)
+
+    @property
+    def all(self) -> tuple[Photo, ...]:
+        """All pictures, those with the laser on first."""
+        return (*self.down.on, *self.up.on, *self.down.off, *self.up.off)
+
+
+def pair_of_photos(photos: PairPhotos, stroke_m: float, known: MeasuredRig, card: SensorCard) -> Pair:
+    """Pair of all frames; images of several are their means."""
+    groups = {"down": photos.down.on, "up": photos.up.on, "down_off": photos.down.off, "up_off": photos.up.off}
+    frames = {name: [photo.pixels for photo in group] for name, group in groups.items() if group}
+    return Pair.of_frames(0, frames, rig=known.rig, stroke_m=stroke_m, card=card, beam=known.beam)
+
+
+def frames_note(photos: PairPhotos) -> str:
+    """Sentence on how many frames are used; empty for one."""
+    count, offs = len(photos.down.on), len(photos.down.off)
+    if count == 1:
+        return ""
+    return f"frames: {count} of each position with the laser on, {offs} with it off, fitted together"
+
+
+# -- mistakes ----------------------------------------------------------------------------------------------------------
+
+
+def nothing_found(pair: Pair, photos: PairPhotos, answer: Answer) -> DatasetError:
+    """Error of a pair in which a spot lacks or cannot be fitted."""
+    if known := known_fault(pair, photos):
+        return known
+    lacking = [p for p in POSITIONS if getattr(answer, p).uv_px is None]
+    if not lacking:
+        unfit = next(p for p in POSITIONS if getattr(answer, p).covariance_px2 is None)
+        u, v = getattr(answer, unfit).uv_px
+        return DatasetError(
+            f"a light is seen in the picture {unfit} ({getattr(photos, unfit).on[0].path}) at ({u:.0f}, {v:.0f}) px, "
+            "but no fit of it holds, it is too faint or beside another light; give more frames, less light of the room "
+            "or more of the laser"
+        )
+    where = " and ".join(f"{p} ({getattr(photos, p).on[0].path})" for p in lacking)
+    advice = "" if pair.down_off is not None else "; give pictures with the laser off, too"
+    return DatasetError(
+        f"no laser spot in the picture {where}: {getattr(answer, lacking[0]).status}; look whether the laser is on and "
+        f"its spot is seen in the mirror{_highest_seen(pair.rig)}, whether it is overexposed, whether down and up are "
+        f"swapped, and whether the stroke is in metres{advice}"
+    )
+
+
+def _highest_seen(rig: Rig) -> str:
+    """Say how high above the horizon a mirror of revolution shows anything, by the rays of its outline."""
+    if not isinstance(rig.mirror, RevolvedMirror):
+        return ""
+    outline = rig.outline_px(_OUTLINE_POINTS)
+    middle = outline.mean(axis=0)
+    leaving = reflect(rig.at(0.0), middle + (1.0 - _INSIDE) * (outline - middle)).direction_world
+    highest = math.degrees(float(np.nanmax(np.arcsin(leaving[:, 2]))))
+    return f", whose rim hides what is more than about {highest:.0f} degrees above the horizon"
+
+
+def contradiction(pair: Pair, photos: PairPhotos, status: str) -> DatasetError:
+    """Error of two spots that no point of the room gives."""
+    return known_fault(pair, photos) or DatasetError(
+        f"the spots in {photos.down.on[0].path} and {photos.up.on[0].path} have no distance: their rays are {status}; "
+        "look whether both show the same spot, with camera and mirror moved together"
+    )
+
+
+def known_fault(pair: Pair, photos: PairPhotos) -> DatasetError | None:
+    """Error of a mistake that the pictures themselves show, if they show one."""
+    down, up = photos.down.on[0].path, photos.up.on[0].path
+    if _offs_exchanged(pair):
+        return DatasetError(
+            f"the pictures with the laser off are exchanged: {photos.up.off[0].path} shows what {down} does; give it "
+            "to --down-off, and the other to --up-off"
+        )
+    if moved := next(moved_between(pair), None):
+        return DatasetError(f"{moved_note(photos, *moved)}; take both again, with rig and camera at rest")
+    if _both(detect(replace(pair, down=pair.up, up=pair.down, down_off=pair.up_off, up_off=pair.down_off))):
+        return DatasetError(
+            f"down and up are swapped: the spot moves the wrong way from {down} to {up}, but the right one if they "
+            "change places; give them to --down and --up the other way round"
+        )
+    if (position := next(relit_between(pair), None)) is not None:
+        name, ratio = position
+        return DatasetError(
+            f"the light changed between laser on and off: {getattr(photos, name).off[0].path} has {ratio:.2f} times "
+            "the codes of the picture with the laser on; fix exposure and white balance, and leave the lamps alone"
+        )
+    if pair.down_off is not None and pair.up_off is not None:
+        other = replace(pair, down=pair.down_off, up=pair.up_off, down_off=pair.down, up_off=pair.up)
+        if _both(detect(other)):
+            return DatasetError(
+                f"laser on and off are exchanged: the spot is in {photos.down.off[0].path} and "
+                f"{photos.up.off[0].path}; give these to --down and --up, the others to --down-off and --up-off"
+            )
+    return next(_strokes_faults(pair), None)
+
+
+def moved_note(photos: PairPhotos, position: str, shift_px: float) -> str:
+    """Sentence on a camera that moved between laser on and off."""
+    group: PositionPhotos = getattr(photos, position)
+    files = f"from {group.on[0].path} to {group.off[0].path}"
+    return f"the camera moved between laser on and off, by {shift_px:.1f} px {files}"
+
+
+def _offs_exchanged(pair: Pair) -> bool:
+    """True where each laser-off picture is far more alike to the other position's picture."""
+    if pair.down_off is None or pair.up_off is None:
+        return False
+    images = {name: np.asarray(image, float) for name, image in pair.images.items()}
+
+    def off(a: str, b: str) -> float:
+        return float(np.sqrt(np.mean((images[a] - images[b]) ** 2)))
+
+    return all(off(a, f"{b}_off") < _ALIKE * off(a, f"{a}_off") for a, b in (POSITIONS, POSITIONS[::-1]))
+
+
+def _strokes_faults(pair: Pair) -> Iterator[DatasetError]:
+    """Errors of a stroke with which both spots are no point of a room, but are with another."""
+    for stroke in (factor * pair.stroke_m for factor in _FACTORS):
+        if not LEAST_STROKE_M <= stroke <= MOST_STROKE_M:
+            continue
+        found = detect(replace(pair, stroke_m=stroke))
+        if found.down is None or found.up is None or not _both(found):
+            continue
+        uv = np.array(found.down.uv_px), np.array(found.up.uv_px)
+        per_m = float(depth_exact(pair.rig, stroke, *uv).depth_m) / stroke  # D grows with the stroke
+        if not per_m > 0.0 or NEAREST_M <= per_m * pair.stroke_m <= FARTHEST_M:
+            continue  # the stroke is possible: something else is wrong
+        yield DatasetError(
+            f"the stroke contradicts the pictures: with {pair.stroke_m:.4g} m no point of a room, {NEAREST_M:g} to "
+            f"{FARTHEST_M:g} m away, is seen at both spots; a stroke of {NEAREST_M / per_m:.2g} to "
+            f"{FARTHEST_M / per_m:.2g} m is possible; give --stroke-m in metres"
+        )
+
+
+def _both(found: PairDetection) -> bool:
+    """True where both spots are sure."""
+    z = [one.significance for one in (found.down, found.up) if one is not None]
+    return len(z) == len(POSITIONS) and min(z) >= _EACH_SIGMAS and math.hypot(*z) >= math.sqrt(2.0) * _SURE_SIGMAS
+
+
+# -- between laser on and off -----------------------------------------------------------------------------------------
+
+MOVED_PX = 0.3
+"""Shift from which on a laser-off picture does not show what is behind the spot: edges leave a light of their own."""
+_NARROW_PX, _WIDE_PX = 0.7, 4.0
+_MOST_PX = 24  # larger ones are of another position, or no shift
+_CLEAR = 0.5  # correlation that a shift must have, over that of the picture with itself
+_RELIT = 0.05  # relative change of the room's light that is no drift of a lamp
+
+
+def shift_px(one: Image, other: Image) -> tuple[float, float] | None:
+    """Shift (u, v) of what both pictures show, pixels; None where they do not show the same.
+
+    Parameters
+    ----------
+    one, other : pictures of one kind, as `interface.Pair` has them
+    """
+    (a, block), (b, _) = _detail(one), _detail(other)
+    spectrum = fft.rfft2(b) * np.conj(fft.rfft2(a))
+    correlation = fft.fftshift(fft.irfft2(spectrum, a.shape)) / max(
+        math.sqrt(float(np.sum(a**2) * np.sum(b**2))), 1e-30
+    )
+    most, (v0, u0) = _MOST_PX // block, (a.shape[0] // 2, a.shape[1] // 2)
+    part = correlation[v0 - most : v0 + most + 1, u0 - most : u0 + most + 1]
+    v, u = np.unravel_index(int(np.argmax(part)), part.shape)
+    if part[v, u] < _CLEAR or min(v, u) == 0 or v == part.shape[0] - 1 or u == part.shape[1] - 1:
+        return None
+    dv, du = (_vertex(part[v - 1 : v + 2, u]), _vertex(part[v, u - 1 : u + 2]))
+    return block * (float(u) - most + du), block * (float(v) - most + dv)
+
+
+def moved_between(pair: Pair) -> Iterator[tuple[str, float]]:
+    """Positions whose laser-off picture is shifted, with the shift in pixels."""
+    for position in POSITIONS:
+        if f"{position}_off" not in pair.images:
+            continue
+        found = shift_px(pair.images[f"{position}_off"], pair.images[position])
+        if found is not None and math.hypot(*found) >= MOVED_PX:
+            yield position, math.hypot(*found)
+
+
+def relit_between(pair: Pair) -> Iterator[tuple[str, float]]:
+    """Positions whose laser-off picture is brighter or darker, with its codes over those with the laser on."""
+    for position in POSITIONS:
+        if f"{position}_off" in pair.images:
+            on, off = (np.asarray(pair.images[name], float) for name in (position, f"{position}_off"))
+            ratio = float(np.median(off) / max(np.median(on), 1e-9))
+            if abs(ratio - 1.0) > _RELIT:
+                yield position, ratio
+
+
+def _detail(image: Image) -> tuple[Array, int]:
+    """Luma without what is wide, and the side in pixels of its squares: 2 of a mosaic."""
+    x = np.asarray(image, float)
+    block = 1
+    if x.ndim == 2:
+        h, w = (size // 2 * 2 for size in x.shape)
+        x, block = x[:h, :w].reshape(h // 2, 2, w // 2, 2).mean(axis=(1, 3)), 2
+    elif x.shape[2] == 2:
+        x = x[..., 0]
+    else:
+        x = x.mean(axis=2)
+    fine = gaussian_filter(x, _NARROW_PX) - gaussian_filter(x, _WIDE_PX)
+    limit = 4.0 * float(np.sqrt(np.mean(fine**2)))
+    return np.clip(fine, -limit, limit), block
+
+
+def _vertex(three: Array) -> float:
+    """Place of the vertex of a parabola through three values at -1, 0, 1."""
+    bend = three[0] - 2.0 * three[1] + three[2]
+    return float(0.5 * (three[0] - three[2]) / bend) if bend < 0.0 else 0.0

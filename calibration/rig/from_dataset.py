@@ -1,0 +1,260 @@
+"""Calibration from the images of a data set: outlines, and on request upright edges and spots at known distances."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phibench.calibration.outline.limb_image import Measured
+from phibench.calibration.outline.outline import find_outline
+from phibench.calibration.outline.outline_result import Outline, mean_measured, mean_outline
+from phibench.calibration.rig.bundle import Bundle, KnownSpot, calibrate
+from phibench.calibration.rig.file import write_calibration
+from phibench.calibration.rig.outline_picture import write_overlay
+from phibench.calibration.rig.spots import Ruler, known_spot, measured_spot, method_for, one_per_pose
+from phibench.calibration.rig.verdict import Verdict, verdict_of
+from phibench.calibration.rig.vertical_edges import find_vertical
+from phibench.datasets.errors import DatasetError
+from phibench.datasets.frames.sensor_card import SensorCard
+from phibench.datasets.read import Dataset, Sample, open_dataset
+from phibench.datasets.store.files import require_writable
+from phibench.estimator.draw_pairs import pairs_of
+from phibench.estimator.geometry.rig_parameters import prior_sigmas
+from phibench.estimator.geometry.status import Status, describe
+from phibench.estimator.spots.simple_spots import find_spot
+from phibench.scenes.frames import Array
+from phibench.scenes.rig import POSITIONS, Rig
+
+LAYERS = "layers"
+SPOT_SIGMA_PX = 0.02
+"""Of the centroid in noise-free layers."""
+MOST_FOCAL_SIGMA = 0.2
+
+
+@dataclass(frozen=True)
+class Photograph:
+    """An image to calibrate with: pixels as `limb_image.planes_of` takes them, and the card of its preset."""
+
+    pixels: NDArray[Any]
+    card: SensorCard | None = None
+
+
+@dataclass(frozen=True)
+class DatasetCalibration:
+    """A calibration and the images that it was made from.
+
+    Attributes
+    ----------
+    bundle : Bundle
+    nominal : Rig
+    images, outlines : tuples that belong together
+    names : of the images
+    verdict : Verdict
+    prior_sigmas : shape (p,), of the nominal numbers
+    """
+
+    bundle: Bundle
+    nominal: Rig
+    images: tuple[Photograph, ...]
+    outlines: tuple[Outline, ...]
+    names: tuple[str, ...]
+    verdict: Verdict
+    prior_sigmas: Array
+
+    def write_picture(self, path: Path) -> Path:
+        """Overlay of the image whose outline fits worst, see `outline_picture.write_overlay`."""
+        worst = int(np.argmax([one.shift_rms_px for one in self.outlines]))
+        image, title = self.images[worst], self.names[worst]
+        return write_overlay(path, image.pixels, image.card, self.nominal, self.outlines[worst], title)
+
+
+def calibrate_dataset(
+    folder: Path,
+    out: Path,
+    samples: Sequence[str] = (),
+    preset: str = LAYERS,
+    spots: bool = False,
+    ruler: Ruler | None = None,
+    vertical: bool = False,
+    outline_sigma_factor: float = 1.0,
+    focal_sigma: float | None = None,
+) -> DatasetCalibration:
+    """Calibrate the rig of some samples and write the file.
+
+    Parameters
+    ----------
+    folder : Path
+        Data set; its nominal rig is corrected.
+    out : Path
+    samples : ids or numbers; the first of the data set by default
+    preset : str
+        "layers" for the noise-free layers, or a preset of the sensor whose frames are drawn, with the laser on and off.
+    spots : bool
+        Also use the samples' laser spots, at places that the ruler measures. In frames they are found by the built-in
+        method that comes closest to the bound there, which gives their covariance, too.
+    ruler : Ruler, optional
+        By default D is measured to 1 mm, height and azimuth not at all.
+    vertical : bool
+        Also use the room's vertical edges, see `find_vertical`; the room is to have some.
+    outline_sigma_factor : float
+        Widens the outlines' standard deviations, which were checked in the room `lab` and in rooms like it.
+    focal_sigma : float, optional
+        How well the nominal focal length is known, relative; see `sigmas_of`.
+
+    Raises
+    ------
+    DatasetError
+        If the samples have different rigs, an image has no whole mirror or too few upright edges, or a spot is lacking.
+    """
+    require_writable(out)
+    dataset, ruler = open_dataset(folder), ruler or Ruler()
+    chosen = dataset.chosen(samples or ["0"])
+    rig = _one_rig(chosen)
+    if preset == LAYERS:
+        images = [Photograph(s.ambient(p)) for s, p in one_per_pose(chosen)]
+        known = [_known_in_layers(sample, ruler) for sample in chosen] if spots else []
+    else:
+        images = [photograph(dataset, sample, position, preset) for sample, position in one_per_pose(chosen)]
+        known = frame_spots(dataset, chosen, preset, ruler) if spots else []
+    found = [find_outline(image.pixels, rig, image.card) for image in images]
+    outlines = [one.widened(outline_sigma_factor) for one in found]
+    upright = _vertical(images, outlines, rig) if vertical else None
+    sigmas = sigmas_of(focal_sigma)
+    bundle = calibrate(rig, mean_outline(outlines), known, upright, sigmas)
+    made_from = _made_from(dataset, chosen, preset, outlines, known, upright)
+    # in the order of the images, one per pose
+    names = [f"{sample.row.sample_id} {position}" for sample, position in one_per_pose(chosen)]
+    return write_bundle(out, bundle, rig, images, outlines, names, made_from, sigmas)
+
+
+def sigmas_of(focal_sigma: float | None) -> Array:
+    """Standard deviations of the nominal numbers, shape (p,); that of the focal length as stated, or 0.003.
+
+    A lens that was turned since its focal length was measured is known to 0.018 only: see docs/capture.md.
+
+    Raises
+    ------
+    DatasetError
+        If it is not above 0, or not below 0.2.
+    """
+    if focal_sigma is None:
+        return prior_sigmas()
+    if not 0.0 < focal_sigma < MOST_FOCAL_SIGMA:
+        raise DatasetError(
+            f"--focal-sigma {focal_sigma:g}: must be above 0 and below {MOST_FOCAL_SIGMA:g}, parts of the focal length"
+        )
+    return prior_sigmas({"focal_relative": focal_sigma})
+
+
+def write_bundle(
+    out: Path,
+    bundle: Bundle,
+    nominal: Rig,
+    images: Sequence[Photograph],
+    outlines: Sequence[Outline],
+    names: Sequence[str],
+    made_from: dict[str, Any],
+    sigmas: Array,
+) -> DatasetCalibration:
+    """Write a calibration and judge it; images, their outlines and names belong together."""
+    write_calibration(out, bundle, nominal, made_from)
+    verdict = verdict_of(bundle, sigmas, list(outlines))
+    return DatasetCalibration(bundle, nominal, tuple(images), tuple(outlines), tuple(names), verdict, sigmas)
+
+
+def frame_outline(dataset: Dataset, sample: Sample, position: str, preset: str, laser_off: bool = True) -> Outline:
+    """Outline in one simulated frame of a sample, with the nominal rig."""
+    image = photograph(dataset, sample, position, preset, laser_off)
+    return find_outline(image.pixels, sample.nominal_rig, image.card)
+
+
+def photograph(dataset: Dataset, sample: Sample, position: str, preset: str, laser_off: bool = True) -> Photograph:
+    """One simulated frame of a sample, in one noise realisation."""
+    pairs = pairs_of(dataset, [sample], preset, laser_off=laser_off)
+    return Photograph(pairs.image(0, position, not laser_off), pairs.card(0))
+
+
+def frame_spots(
+    dataset: Dataset,
+    samples: Sequence[Sample],
+    preset: str,
+    ruler: Ruler,
+    laser_off: bool = True,
+    least: int | None = None,
+) -> list[KnownSpot]:
+    """Calibration spots of simulated frames.
+
+    Parameters
+    ----------
+    dataset, samples, preset, ruler, laser_off
+    least : int, optional
+        So many spots are enough, and those that are not found are left out; by default all must be found.
+
+    Raises
+    ------
+    DatasetError
+        If too few spots were found; what it says is about the last one that was not.
+    """
+    pairs, found = pairs_of(dataset, samples, preset, laser_off=laser_off), []
+    fault: DatasetError | None = None  # the last one; raised if too few spots remain
+    for number, sample in enumerate(samples):
+        pair = pairs.pair(number)
+        try:
+            found.append(known_spot(sample, pair, method_for(pair.card)(pair), ruler))
+        except DatasetError as error:
+            fault = error
+    if fault is not None and len(found) < (len(samples) if least is None else least):
+        raise fault
+    return found
+
+
+def _vertical(images: Sequence[Photograph], outlines: Sequence[Outline], nominal: Rig) -> Measured:
+    """Mean vertical of images whose outlines are known."""
+    pairs = zip(images, outlines, strict=True)
+    return mean_measured([find_vertical(i.pixels, o.rig(nominal), i.card, o.covariance_m2) for i, o in pairs])
+
+
+def _one_rig(samples: Sequence[Sample]) -> Rig:
+    """Nominal rig of the samples; all must have one true rig."""
+    names = sorted({sample.row.rig for sample in samples})
+    if len(names) != 1:
+        raise DatasetError(f"the samples have {len(names)} rigs ({', '.join(names[:4])}, ...): calibrate one at a time")
+    return samples[0].nominal_rig
+
+
+def _known_in_layers(sample: Sample, ruler: Ruler) -> KnownSpot:
+    found = {
+        p: find_spot(sample.expected_image(p, laser=True), sample.expected_image(p, laser=False)) for p in POSITIONS
+    }
+    for position, spot in found.items():
+        if spot.status is not Status.OK:
+            raise DatasetError(f"{sample.row.sample_id} {position}: no spot to calibrate with: {describe(spot.status)}")
+    places = {position: spot.uv_px for position, spot in found.items()}
+    C = dict.fromkeys(POSITIONS, SPOT_SIGMA_PX**2 * np.eye(2))
+    return measured_spot(sample, places, C, sample.row.nominal_stroke_m, ruler)
+
+
+def _made_from(
+    dataset: Dataset,
+    samples: Sequence[Sample],
+    preset: str,
+    outlines: Sequence[Outline],
+    spots: Sequence[KnownSpot],
+    vertical: Measured | None,
+) -> dict[str, Any]:
+    return {
+        "dataset": dataset.info.name,
+        "samples": [sample.row.sample_id for sample in samples],
+        "preset": preset,
+        "spots": bool(spots),
+        "sphere_in_camera_m": [outline.sphere_in_camera_m.tolist() for outline in outlines],
+        "sigma_m": [outline.sigma_m.tolist() for outline in outlines],
+        "vertical_in_camera": None if vertical is None else vertical.value.tolist(),
+        "spot_uv_px": [[spot.uv_down_px.tolist(), spot.uv_up_px.tolist()] for spot in spots],
+        "spot_depth_m": [spot.depth_m for spot in spots],
+    }

@@ -1,0 +1,397 @@
+"""Photon transfer of raw frames: gain, noise, fixed pattern, dark current and full well, each with its sigma.
+
+Terms and equations are those of EMVA 1288, release 4.0. The variance from frame to frame of a level against its mean
+has the slope K. The variance from pixel to pixel of the mean frame is the fixed pattern, after what temporal noise adds
+has been taken off. Four things differ:
+
+* Whether the line is straight is asked, and a response that bends is fitted: see `response_fit`.
+* Rounding at a noise below half a code has its exact moments: see `block_sums`.
+* Shading of lamp and lens is removed by a mean over 5 x 5 pixels of one filter. Of white noise 24/25 of the variance
+  remain.
+* Sigmas come from a jackknife over blocks of pixels: everything is estimated again without one block.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtr
+
+from phibench.calibration.sensor_fit.block_sums import (
+    BlockSums,
+    CommonNoise,
+    before_rounding,
+    block_sums,
+    common_noise,
+    jackknife_sigma,
+)
+from phibench.calibration.sensor_fit.capture_folder import Capture, CaptureError, FrameGroup
+from phibench.calibration.sensor_fit.response_fit import LightLevel, NoiseOfLevel, Response, fit_linearity, fit_response
+from phibench.scenes.frames import Array
+
+_MARGIN_SIGMAS = 6.0  # a level is used if so many deviations of its noise lie below saturation
+_HIDDEN_DN = 0.15  # noise below it leaves too few codes to be told from rounding
+_CUT = 1e-3  # of dark values at the converter's lower end: below, their variance lacks less than 1 %
+_FAINT = 0.02  # of the range: below, a level's noise over its signal says nothing
+_BY_GAIN = ("gain_dn_per_e", "dark_e_per_s", "read_noise_e", "row_noise_e", "dsnu_e", "full_well_e")
+_SHAPE = "16 pixels or more of each filter along both sides are needed"
+
+
+@dataclass(frozen=True)
+class TransferPoint:
+    """One filter of one level, for the photon-transfer plot: signal and temporal variance less the dark's."""
+
+    level: str
+    site: str
+    signal_dn: float
+    variance_dn2: float
+    used: bool
+
+
+@dataclass(frozen=True)
+class TransferFit:
+    """Numbers of a raw sensor, by their names in `Sensor`, and for each of the others the reason.
+
+    Attributes
+    ----------
+    values, sigmas : mapping of str to float
+    reasons : mapping of str to str
+    points : tuple of TransferPoint
+    ratios : mean signal of R, G, B over that of G, of the flat's light; empty for pixels without filters
+    response : Response
+    measured : mapping of str to (value, sigma, unit)
+        Quantities that are no number of `Sensor`.
+    findings : mapping of str to str
+        Sentences about what does not agree with a straight sensor.
+    """
+
+    values: dict[str, float]
+    sigmas: dict[str, float]
+    reasons: dict[str, str]
+    points: tuple[TransferPoint, ...]
+    ratios: tuple[float, ...]
+    response: Response
+    measured: dict[str, tuple[float | list[float], float | list[float], str]]
+    findings: dict[str, str]
+
+
+@dataclass(frozen=True)
+class _Level:
+    name: str
+    site: str
+    sums: BlockSums
+    light: tuple[float, str] | None = None  # photons or seconds
+    seconds: float | None = None
+
+
+def fit_transfer(capture: Capture) -> TransferFit:
+    """Fit the raw frames of a capture.
+
+    Raises
+    ------
+    CaptureError
+        If there are no dark frames or no flat frames, or all levels are saturated.
+    """
+    if capture.dark is None:
+        raise CaptureError(f"{capture.folder} has no dark frames: cap the lens and put 16 frames or more into dark/")
+    if not capture.flats:
+        raise CaptureError(f"{capture.folder} has no flat frames: put frames of an even surface into flat/LEVEL/")
+    top = (1 << capture.notes.bits) - 1
+    dark_frames = _frames(capture, capture.dark, top)
+    levels = [one for group in capture.flats for one in _levels(capture, group, top)]
+    exposures = [one for group in capture.exposures if len(group.files) > 1 for one in _levels(capture, group, top)]
+    timed = [
+        (float(group.seconds or 0.0), block_sums(_frames(capture, group, top), top).jackknife())
+        for group in capture.dark_exposures
+    ]
+    dark = block_sums(dark_frames, top).jackknife()
+    return _Fit(capture, dark, levels, exposures, timed, common_noise(dark_frames), top).result()
+
+
+def _levels(capture: Capture, group: FrameGroup, top: int) -> list[_Level]:
+    """One level for each filter."""
+    light = (group.photons, "photons") if group.photons is not None else None
+    if group.name.startswith("exposure/"):
+        light = (group.seconds or 0.0, "seconds")
+    return [
+        _Level(group.name, site, block_sums(part, top).jackknife(), light, group.seconds)
+        for site, part in _sites(_frames(capture, group, top), capture.kind)
+    ]
+
+
+def _frames(capture: Capture, group: FrameGroup, top: int) -> NDArray[Any]:
+    frames = capture.stack(group)
+    if int(frames.max()) > top:
+        raise CaptureError(
+            f"{capture.folder / group.name} has the code {int(frames.max())}, and {capture.notes.bits} bits end at "
+            f"{top}: write `bits` into capture.toml, and give codes that are not scaled to 16 bits"
+        )
+    if min(frames.shape[1:]) < 32:
+        raise CaptureError(f"{capture.folder / group.name}: {frames.shape[2]} x {frames.shape[1]} pixels; {_SHAPE}")
+    return frames
+
+
+def _sites(frames: NDArray[Any], kind: str) -> list[tuple[str, NDArray[Any]]]:
+    """Pixels of each filter of an RGGB mosaic, or all of them."""
+    if kind == "mono-raw":
+        return [("mono", frames)]
+    names = (("R", 0, 0), ("G1", 0, 1), ("G2", 1, 0), ("B", 1, 1))
+    return [(name, frames[:, row::2, column::2]) for name, row, column in names]
+
+
+class _Fit:
+    """One fit; arrays have one entry for the whole and one for each block left out."""
+
+    def __init__(
+        self,
+        capture: Capture,
+        dark: BlockSums,
+        levels: list[_Level],
+        exposures: list[_Level],
+        timed: list[tuple[float, BlockSums]],
+        common: CommonNoise,
+        top: int,
+    ) -> None:
+        self.notes, self.folder, self.top = capture.notes, capture.folder, top
+        self.dark, self.levels, self.exposures = dark, levels, exposures
+        self.timed, self.common = timed, common
+        moments = before_rounding(dark, common.seen_frame_dn2)
+        self.black, self.dark_dn2, self.offset_dn2 = moments.T
+        self.values: dict[str, Array] = {}
+        self.extra: dict[str, float] = {}
+        self.reasons: dict[str, str] = {}
+        self.measured: dict[str, tuple[float | list[float], float | list[float], str]] = {}
+        self.findings: dict[str, str] = {}
+
+    def result(self) -> TransferFit:
+        used = self._usable()
+        response = self._response(used)
+        self.values["gain_dn_per_e"] = response.gain / self.notes.analogue_gain
+        dark_dn_per_s = self._dark_current(response.gain)
+        self._noise(response.gain, dark_dn_per_s / response.gain)
+        self._prnu(used, response)
+        self._full_well(response)
+        self._linearity(float(dark_dn_per_s[0]))
+        points = tuple(self._point(level, level in used) for level in self.levels)
+        values = {name: float(x[0]) for name, x in self.values.items()}
+        return TransferFit(
+            values,
+            {name: self._sigma(name, x, response) for name, x in self.values.items()},
+            self.reasons,
+            points,
+            self._ratios(used),
+            response,
+            self.measured,
+            self.findings,
+        )
+
+    def _sigma(self, name: str, x: Array, response: Response) -> float:
+        """Of the blocks, of what frames and rows have in common, and of the choice of the response."""
+        own = self.extra.get(name, 0.0)
+        by_gain = abs(float(x[0])) * response.spread / float(response.gain[0]) if name in _BY_GAIN else 0.0
+        return float(np.sqrt(jackknife_sigma(x) ** 2 + own**2 + by_gain**2))
+
+    def _usable(self) -> list[_Level]:
+        ceiling = self._ceiling()
+        used = [one for one in self.levels if self._reach(one) < ceiling and self._signal(one)[0] > 0.0]
+        if not used:
+            raise CaptureError(
+                f"{self.folder}: every level of flat/ is saturated or dark; take levels from 5 to 90 % of full scale"
+            )
+        return used
+
+    def _signal(self, one: _Level) -> Array:
+        return one.sums.mean_dn - self.dark.mean_dn
+
+    def _reach(self, one: _Level) -> float:
+        s = one.sums
+        return float(s.mean_dn[0] + _MARGIN_SIGMAS * np.sqrt(s.temporal_dn2[0] + max(s.spatial_dn2[0], 0.0)))
+
+    def _plateau(self) -> list[_Level]:
+        """Levels at which the wells are full: hardly more noise than in the dark, below the last code."""
+        if len(self.levels) < 2:
+            return []
+        bright = [one for one in self.levels if self._signal(one)[0] > _FAINT * self._range]
+        usual = max((self._excess(one) / float(self._signal(one)[0]) for one in bright), default=0.0)
+        return [
+            one for one in bright if self._excess(one) < 0.02 * usual * self._signal(one)[0] and one.sums.full == 0.0
+        ]
+
+    def _excess(self, one: _Level) -> float:
+        return float(one.sums.temporal_dn2[0] - self.dark.temporal_dn2[0])
+
+    @property
+    def _range(self) -> float:
+        """Codes from black to the last."""
+        return self.top - float(self.black[0])
+
+    def _ceiling(self) -> float:
+        flat = [float(one.sums.mean_dn[0]) for one in self._plateau()]
+        return min([float(self.top), *flat])
+
+    def _response(self, used: list[_Level]) -> Response:
+        """K with the response: the temporal variance against the mean, through the dark frames' point."""
+        levels = [
+            NoiseOfLevel(
+                one.name,
+                self._signal(one),
+                one.sums.temporal_dn2,
+                float(one.sums.mean_dn[0]),
+                float(np.sqrt(max(one.sums.spatial_dn2[0], 0.0))),
+                float(one.sums.pixels[0] * (one.sums.frames - 1)),
+            )
+            for one in used
+        ]
+        try:
+            found = fit_response(levels, self.dark_dn2, self._range)
+        except ValueError:
+            raise CaptureError(
+                f"{self.folder}: the noise of flat/ does not grow with its level; are these raw frames?"
+            ) from None
+        if (said := found.finding()) is not None:
+            self.findings["photon_transfer"] = said
+        if found.is_bent:
+            unit = f"x = y (1 + a1 u + a2 u^2 + a3 u^3), u = y / {self._range:.6g} DN"
+            a, sigma = found.coefficients[0].tolist(), found.coefficient_sigmas.tolist()
+            self.measured["response_coefficients"] = (a, sigma, unit)
+            self.measured["straight_gain_dn_per_e"] = (
+                found.straight_gain / self.notes.analogue_gain,
+                found.straight_sigma / self.notes.analogue_gain,
+                "DN per electron, of a straight line",
+            )
+        return found
+
+    def _dark_current(self, gain: Array) -> Array:
+        """Growth of the dark level, DN per second; 0 where no series tells."""
+        at = self.notes.exposure_s
+        self.values["black_level_dn"] = self.black
+        self.extra["black_level_dn"] = float(np.sqrt(self.common.level_dn2 / self.dark.frames))
+        times = [seconds for seconds, _ in self.timed] + ([at] if at is not None else [])
+        if len(set(times)) < 2:
+            self.reasons["dark_e_per_s"] = "needs dark-exposure/SECONDS with two exposure times or more"
+            return np.zeros_like(gain)
+        series = [before_rounding(sums) for _, sums in self.timed] + (
+            [np.stack([self.black, self.dark_dn2, self.offset_dn2], axis=1)] if at is not None else []
+        )
+        counts = [sums.pixels[0] * sums.frames for _, sums in self.timed] + [self.dark.pixels[0] * self.dark.frames]
+        weights = np.array([n / s[0, 1] for n, s in zip(counts, series, strict=False)])[:, None]
+        t, means = np.array(times)[:, None], np.stack([s[:, 0] for s in series])
+        centre = (weights * t).sum() / weights.sum()
+        slope = np.sum(weights * (t - centre) * means, axis=0) / np.sum(weights * (t - centre) * t)
+        black_share = (1.0 - (t - centre) * (weights * t).sum() / np.sum(weights * (t - centre) * t)) / weights.sum()
+        slope_share = (t - centre) / np.sum(weights * (t - centre) * t)
+        frames = np.array([sums.frames for _, sums in self.timed] + [self.dark.frames])[: len(t), None]
+        jitter2 = self.common.level_dn2 / frames  # of each level as a whole
+        slope_sigma = float(np.sqrt(np.sum((weights * slope_share) ** 2 * jitter2)))
+        self.extra["black_level_dn"] = float(np.sqrt(np.sum((weights * black_share) ** 2 * jitter2)))
+        self.values["black_level_dn"] = np.sum(weights * (means - slope * t), axis=0) / weights.sum()
+        if slope[0] > 0.0:
+            self.values["dark_e_per_s"] = slope / gain
+            self.extra["dark_e_per_s"] = slope_sigma / float(gain[0])
+        else:
+            sigma = float(np.hypot(jackknife_sigma(slope), slope_sigma) / gain[0])
+            self.reasons["dark_e_per_s"] = f"not above 0 in these frames, whose sigma is {sigma:.2g} electrons/s"
+        return np.asarray(slope)
+
+    def _noise(self, gain: Array, dark_rate: Array) -> None:
+        if self._cut_share() > _CUT:
+            reason = "dark frames are cut at code 0; raise the camera's offset (brightness)"
+            self.reasons |= {"read_noise_e": reason, "dsnu_e": reason, "row_noise_e": reason}
+            self.findings["dark"] = f"{reason}; the black level and all that is counted from it are too high by it"
+            return
+        if self.dark_dn2[0] < _HIDDEN_DN**2:
+            reason = f"below {_HIDDEN_DN} DN: rounding hides it; take dark frames at a higher gain"
+            self.reasons |= {"read_noise_e": reason, "dsnu_e": reason, "row_noise_e": reason}
+            return
+        share, row_sigma = self.common.seen_row_dn2, self.common.row_sigma_dn2
+        if self.common.seen_frame_dn2:
+            value = float(np.sqrt(self.common.seen_frame_dn2)) / float(gain[0])
+            freedom = 2.0 * (self.dark.frames - 1)
+            self.measured["frame_noise_e"] = (value, value / float(np.sqrt(freedom)), "electrons, of whole frames")
+        if share:
+            self.values["row_noise_e"] = np.sqrt(share) / gain
+            self.extra["row_noise_e"] = 0.5 * row_sigma / float(np.sqrt(share)) / float(gain[0])
+        seconds = self.notes.exposure_s or 0.0
+        square = (self.dark_dn2 - share) / gain**2 - dark_rate * seconds
+        self.values["read_noise_e"] = np.sqrt(np.maximum(square, 0.0))
+        pattern = self.offset_dn2 / gain**2
+        if pattern[0] > 3.0 * jackknife_sigma(pattern):
+            self.values["dsnu_e"] = np.sqrt(np.maximum(pattern, 0.0))
+        else:
+            self.reasons["dsnu_e"] = "lost in temporal noise and rounding: take more dark frames, at a higher gain"
+
+    def _cut_share(self) -> float:
+        """Share of the dark values below -0.5 DN, which a converter turns into 0; 1 where most values are 0."""
+        if self.dark.zero > 0.5:
+            return 1.0
+        spread = np.sqrt(max(float(self.dark_dn2[0] + self.offset_dn2[0]), 1e-6))
+        return float(ndtr((-0.5 - float(self.black[0])) / spread))
+
+    def _prnu(self, used: list[_Level], response: Response) -> None:
+        shown = np.stack([self._signal(one) for one in used])
+        signal = np.stack([response.linear(y) / response.slope(y) for y in shown])  # dy / y' is the change of x
+        pattern = np.stack([one.sums.spatial_dn2 for one in used]) - self.dark.spatial_dn2
+        temporal = np.array([one.sums.temporal_dn2[0] / one.sums.frames for one in used])
+        weights = (signal[:, 0] ** 2 / (np.maximum(pattern[:, 0], 0.0) + temporal)) ** 2
+        square = np.sum(weights[:, None] * pattern / signal**2, axis=0) / weights.sum()
+        if square[0] > 3.0 * jackknife_sigma(square):
+            self.values["prnu"] = np.sqrt(np.maximum(square, 0.0))
+        else:
+            self.reasons["prnu"] = "lost in temporal noise: take more frames of the brighter levels"
+
+    def _full_well(self, response: Response) -> None:
+        plateau = self._plateau()
+        if plateau:
+            level = np.mean([one.sums.mean_dn for one in plateau], axis=0)
+            self.values["full_well_e"] = response.linear(level - self.dark.mean_dn) / response.gain
+            return
+        gain = float(response.gain[0])
+        end_e = float(response.linear(np.asarray(self._range))) / gain
+        largest = max(float(response.linear(np.asarray(self._signal(one)[0]))) for one in self.levels) / gain
+        self.reasons["full_well_e"] = (
+            f"the converter ends first, at {end_e:.0f} electrons"
+            if any(one.sums.full > 0.0 for one in self.levels)
+            else f"no level of flat/ is saturated; above {largest:.0f} electrons"
+        )
+
+    def _linearity(self, dark_dn_per_s: float) -> None:
+        """Signal against stated light: of an exposure series, or of flat levels whose photons are known."""
+        ceiling, start = self._ceiling(), self.notes.exposure_s or 0.0
+        named = self.exposures or [one for one in self.levels if one.light is not None]
+        levels: dict[str, list[_Level]] = {}
+        for one in named:
+            levels.setdefault(one.name, []).append(one)
+        lights, unit = [], "seconds"
+        for sites in levels.values():
+            if any(self._reach(one) >= ceiling or one.light is None for one in sites):
+                continue
+            light, unit = sites[0].light or (0.0, unit)
+            dark = dark_dn_per_s * ((sites[0].seconds or start) - start)
+            signal = float(np.mean([self._signal(one)[0] for one in sites])) - dark
+            flicker = float(np.mean([s.sums.flicker_dn2 for s in sites])) + self.common.level_dn2 / self.dark.frames
+            lights.append(LightLevel(light, signal, float(np.sqrt(flicker))))
+        found = fit_linearity(lights, unit)
+        if found is None:
+            return
+        self.measured["linearity_error"] = (found.mean_percent, found.sigma_percent, f"percent, against {unit}")
+        if (said := found.finding()) is not None:
+            self.findings["linearity"] = said
+
+    def _ratios(self, used: list[_Level]) -> tuple[float, ...]:
+        of_site = {
+            site: [float(self._signal(one)[0]) for one in used if one.site == site] for site in ("R", "G1", "G2", "B")
+        }
+        names = {one.name for one in used}
+        whole = [n for n in names if sum(one.name == n for one in used) == len(of_site)]
+        if not whole:
+            return ()
+        best = max(whole, key=lambda n: sum(float(self._signal(one)[0]) for one in used if one.name == n))
+        level = {one.site: float(self._signal(one)[0]) for one in used if one.name == best}
+        green = 0.5 * (level["G1"] + level["G2"])
+        return level["R"] / green, 1.0, level["B"] / green
+
+    def _point(self, one: _Level, used: bool) -> TransferPoint:
+        return TransferPoint(one.name, one.site, float(self._signal(one)[0]), self._excess(one), used)

@@ -1,0 +1,221 @@
+"""Commands `phibench calibrate` and `phibench align`: fit a rig's corrections, or align the mirror under the camera."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from phibench.cli.options import DEFAULT_PRESET, Preset
+
+_LAB = (
+    "sigma of the outline: checked in the room `lab`; in a room with more lamps or edges widen it with "
+    "--outline-sigma-factor 2"
+)
+
+
+def calibrate(
+    directory: Path,
+    *,
+    out: Path,
+    sample: Annotated[tuple[str, ...], Parameter(consume_multiple=True, negative="")] = (),
+    preset: Preset = DEFAULT_PRESET,
+    spots: bool = False,
+    vertical: Annotated[bool, Parameter(negative="")] = False,
+    distance_sigma_m: float = 1e-3,
+    height_sigma_m: float = math.inf,
+    azimuth_sigma_deg: float = math.inf,
+    outline_sigma_factor: float = 1.0,
+    focal_sigma: float | None = None,
+    picture: Path | None = None,
+) -> int:
+    """Calibrate a rig from the images of a data set; write a calibration file and a picture.
+
+    Parameters
+    ----------
+    directory
+        Folder of a data set.
+    out
+        JSON file to write.
+    sample
+        Samples: numbers, counted from 0, or ids; the first one by default.
+    preset
+        Preset of the frames to draw: "mjpeg", "srgb8", "bayer-raw" or "mono-raw"; "layers" is noise-free.
+    spots
+        Also use the laser spots at their known distances.
+    vertical
+        Also use the room's vertical edges, which give the camera's tilt.
+    distance_sigma_m
+        How well the distance of each spot was measured, one standard deviation, metres.
+    height_sigma_m
+        The same of its height above the floor; not measured by default.
+    azimuth_sigma_deg
+        The same of its azimuth, degrees; not measured by default.
+    outline_sigma_factor
+        Widens the outline's standard deviation. 1 holds in the room `lab`; take 1.5 to 2 in a room with more lamps,
+        edges or patterns.
+    focal_sigma
+        How well the nominal focal length is known, relative: 0.003 by default. Give 0.018 for a lens that was turned
+        since it was measured.
+    picture
+        PNG to write: the outline on the frame, with its residuals enlarged; by default beside the calibration.
+    """
+    from phibench.calibration.captures.imported_calibration import calibrate_imported
+    from phibench.calibration.captures.imported_set import is_imported, open_imported
+    from phibench.calibration.rig.from_dataset import calibrate_dataset
+    from phibench.calibration.rig.spots import Ruler
+    from phibench.datasets.errors import DatasetError
+    from phibench.datasets.store.files import require_writable
+    from phibench.estimator.geometry.rig_parameters import PARAMETERS, has_effect
+    from phibench.scenes.misalignment import PARAMETERS as MISALIGNMENT
+
+    if not spots and (math.isfinite(height_sigma_m) or math.isfinite(azimuth_sigma_deg)):
+        raise DatasetError("--height-sigma-m and --azimuth-sigma-deg are about calibration spots: give --spots too")
+    ruler = Ruler(distance_sigma_m, height_sigma_m, math.radians(azimuth_sigma_deg))
+    require_writable(out)  # a folder such as "." has no name to which an ending could be given
+    picture = out.with_suffix(".png") if picture is None else picture
+    if is_imported(directory):
+        if ruler != Ruler() or preset not in (DEFAULT_PRESET, open_imported(directory).preset):
+            raise DatasetError(
+                f"{directory} holds pictures: their kind and the tape's standard deviation were imported with them; "
+                "leave --preset and the sigmas out"
+            )
+        found = calibrate_imported(directory, out, sample, spots, outline_sigma_factor, vertical, focal_sigma)
+    else:
+        more = vertical, outline_sigma_factor, focal_sigma
+        found = calibrate_dataset(directory, out, sample, preset, spots, ruler, *more)
+    print(f"{found.verdict}.")
+    print(f"{found.write_picture(picture)}: the outline on the frame that fits worst, residuals enlarged")
+    print(_LAB)
+    print(f"\n{'parameter':18s} {'unit':4s} {'correction':>11s} {'sigma':>8s} {'prior sigma':>11s}")
+    every = zip(PARAMETERS, found.bundle.values, found.prior_sigmas, has_effect(found.nominal), strict=True)
+    for name, value, prior in (row[:3] for row in every if row[3]):
+        unit = MISALIGNMENT[name].unit
+        print(f"{name:18s} {unit:4s} {value:+11.3e} {found.bundle.sigmas[name]:8.1e} {prior:11.1e}")
+    if found.bundle.undetermined:
+        print("\ncombinations that the data say little about (shares in prior sigmas):")
+        for weak in found.bundle.undetermined:
+            parts = ", ".join(f"{name} {share:+.2f}" for name, share in weak.parts.items())
+            print(f"  {parts} ({100.0 * weak.remaining:.0f} % of the prior sigma is left)")
+    print(f"\n{out}: calibration; use it with `phibench score --calibration {out}`")
+    return 0
+
+
+def align(
+    image: Path,
+    *,
+    out: Path | None = None,
+    rig: Path | None = None,
+    radius_mm: float | None = None,
+    distance_mm: float | None = None,
+    focal_px: float | None = None,
+    cx_px: float | None = None,
+    cy_px: float | None = None,
+    focus_mm: float | None = None,
+    tilt_sigma_deg: float = 0.1,
+    principal_point_sigma_px: float = 5.0,
+    mirror_tilt_sigma_deg: float = 0.5,
+    outline_sigma_factor: float = 1.0,
+    sensor: Path | None = None,
+    vertical: bool = True,
+) -> int:
+    """Print by how far and in which direction the mirror must move to be centred, and how sharp the picture is.
+
+    Vertical edges of the room make the paper's check: of an aligned rig they pass through the middle of the mirror's
+    image. Where the rig is known they also tell the camera's tilt, and the move becomes more certain.
+
+    A rig file says camera and mirror, of any shape. Without one the mirror is a sphere, and numbers say the rest. Of a
+    camera whose focal length is not stated, the circle of the mirror's outline is printed and drawn, in pixels.
+
+    Parameters
+    ----------
+    image
+        Frame of the camera: JPEG, PNG, TIFF, PPM or PGM; turned upright as its EXIF data say.
+    out
+        PNG to write: the outline and an arrow, 20 times as long as the move; by default `<image>-align.png` in
+        the current folder.
+    rig
+        TOML file with what is known of the rig, as for `phibench measure`; instead of the numbers of camera and mirror.
+    radius_mm
+        Radius of the mirror, a sphere; 60 by default.
+    distance_mm
+        Of the mirror's centre from the lens, roughly. For a frame of 1280 x 720 it is 260 by default; otherwise the
+        outline tells it.
+    focal_px
+        Focal length, pixels. For a whole frame of the C310, 1280 x 720, it is 1430 by default.
+    cx_px
+        Principal point, column, pixels. Left out only for a whole frame of the C310; otherwise it goes with --focal-px.
+    cy_px
+        Principal point, row, pixels. Left out only for a whole frame of the C310; otherwise it goes with --focal-px.
+    focus_mm
+        Distance of the plane of focus; by default on the virtual image, half a radius before the mirror's centre.
+    tilt_sigma_deg
+        How well the camera is known to be vertical.
+    principal_point_sigma_px
+        How well the principal point is known.
+    mirror_tilt_sigma_deg
+        How well the axis of a mirror that is no sphere is known to be upright.
+    outline_sigma_factor
+        As in `phibench calibrate`.
+    sensor
+        TOML file of the sensor; by default the preset of the kind of file is assumed.
+    vertical
+        Use the room's vertical edges, where three or more agree; --no-vertical leaves them out.
+    """
+    from phibench.calibration.captures.picture_files import read_picture, sensor_choice
+    from phibench.calibration.captures.rig_file import read_rig_file, require_camera_size
+    from phibench.calibration.outline.outline_start import rig_circle
+    from phibench.calibration.rig.align import (
+        Numbers,
+        alignment,
+        camera_in_words,
+        circle_in_words,
+        circle_of,
+        edges_in_words,
+        in_words,
+        meeting_of,
+        rig_of_numbers,
+        sharpness,
+        sharpness_in_words,
+        verdict,
+        write_alignment_picture,
+        write_circle_picture,
+    )
+    from phibench.datasets.errors import DatasetError
+    from phibench.datasets.frames.sensor_file import read_sensor_file
+
+    numbers = Numbers(radius_mm, distance_mm, focal_px, cx_px, cy_px, focus_mm)
+    numbers.require_sound()
+    given = numbers.given()
+    if rig is not None and given:
+        raise DatasetError(f"{next(iter(given))}: {rig} says what the rig is; write it there, and leave the option out")
+    known = None if rig is None else read_rig_file(rig).rig
+    photo = read_picture(image)
+    pixels, card = photo.pixels, sensor_choice(photo, None if sensor is None else read_sensor_file(sensor)).card
+    out = Path(f"{image.stem}-align.png") if out is None else out
+    if known is None:
+        known = rig_of_numbers(pixels, card, numbers)
+    else:
+        require_camera_size(known, (pixels.shape[1], pixels.shape[0]), str(image))
+    if known is None:
+        circle = circle_of(pixels, card)
+        meeting = meeting_of(pixels, card, circle) if vertical else None
+        print(circle_in_words(circle))
+        print(f"{write_circle_picture(out, pixels, card, circle, meeting)}: outline and vertical edges; look at it")
+        if vertical:
+            print(edges_in_words(meeting, float(circle.sigma_px[:2].max())))
+        print(sharpness_in_words(sharpness(pixels, card, circle.circle_px)))
+        return 0
+    doubts = math.radians(tilt_sigma_deg), principal_point_sigma_px, outline_sigma_factor
+    found = alignment(pixels, known, card, *doubts, math.radians(mirror_tilt_sigma_deg), vertical)
+    print(verdict(found))
+    print(f"{write_alignment_picture(out, pixels, known, found)}: outline, and the move drawn 20 times as long")
+    print(in_words(found))
+    if vertical:
+        print(edges_in_words(found.meeting))
+    print(camera_in_words(found))
+    print(sharpness_in_words(sharpness(pixels, card, rig_circle(found.outline.rig(known)))))
+    print(_LAB)
+    return 0

@@ -1,0 +1,100 @@
+"""Values that the Tab key completes: names of recipes, presets, methods, data sets, parts and policies.
+
+The shell starts `phibench` for them, so that nothing slow may be imported here. Names that stand in modules with NumPy
+stand here again; a test compares the two.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from cyclopts.completion import CompletionContext
+
+RECIPES = Path(__file__).parents[1] / "datasets" / "recipes"
+PRESETS = ("mjpeg", "yuyv", "srgb8", "bayer-raw", "mono-raw")
+BUILT_IN = (
+    "brightest_pixel",
+    "red_centroid",
+    "laplacian_blob",
+    "windowed_centroid",
+    "gaussian_least_squares",
+    "off_difference",
+    "raw_maximum_likelihood",
+    "chain_fit",
+    "joint_fit",
+    "detect",
+    "learned_crop",
+    "learned_detect",
+    "photutils_centroid_2dg",
+    "trackpy_refine",
+)
+PARTS = ("dev", "test", "paper", "mirrors", "films", "drives")
+TITLE = "phibench-v4-"
+POLICIES = ("paper", "greedy", "drive-only", "random", "oracle")
+METHOD_PACKAGES = "phibench.methods"
+_MOST_FILES = 200
+
+
+def presets(_: CompletionContext) -> tuple[str, ...]:
+    """Presets of the sensor."""
+    return PRESETS
+
+
+def pictures(_: CompletionContext) -> tuple[str, ...]:
+    """Pictures that `dataset panorama` unrolls: layers, and frames of two presets."""
+    return "layers", "mjpeg", "srgb8"
+
+
+def recipes(films: bool) -> Callable[[CompletionContext], Iterator[str]]:
+    """Completer of shipped recipes, those with films or the others, and of TOML files."""
+
+    def complete(context: CompletionContext) -> Iterator[str]:
+        for file in sorted(RECIPES.glob("*.toml")):
+            if ("\n[film]" in file.read_text(encoding="utf-8")) == films:
+                yield file.stem
+        yield from _files(context.incomplete, ".toml")
+
+    return complete
+
+
+def methods(context: CompletionContext) -> Iterator[str]:
+    """Built-in methods, those of installed packages, and Python files."""
+    from importlib.metadata import entry_points
+
+    yield from BUILT_IN
+    yield from (point.name for point in entry_points(group=METHOD_PACKAGES))
+    yield from _files(context.incomplete, ".py")
+
+
+def named_methods(_: CompletionContext) -> tuple[str, ...]:
+    """Built-in methods, for commands that take no file; names that packages register are not looked up."""
+    return BUILT_IN
+
+
+def released(_: CompletionContext) -> tuple[str, ...]:
+    """Released data sets, by their last words and by their titles."""
+    return *PARTS, *(f"{TITLE}{part}" for part in PARTS)
+
+
+def parts(_: CompletionContext) -> tuple[str, ...]:
+    """Parts of the frozen benchmark."""
+    return PARTS
+
+
+def policies(context: CompletionContext) -> Iterator[str]:
+    """Policies of the loop, and Python files."""
+    yield from POLICIES
+    yield from _files(context.incomplete, ".py")
+
+
+def _files(begun: str, suffix: str) -> Iterator[str]:
+    """Files with a suffix in the folder of what is typed, and in folders whose names begin so, as they are typed."""
+    typed = begun[: begun.rfind("/") + 1]
+    folder, word = Path(typed or "."), begun[len(typed) :]
+    patterns = (f"*{suffix}", f"*/*{suffix}") if word else (f"*{suffix}",)
+    found = {path.relative_to(folder).as_posix() for pattern in patterns for path in folder.glob(pattern)}
+    shown = sorted(name for name in found if name.startswith(word) and not name.startswith("."))
+    yield from (typed + name for name in shown[:_MOST_FILES])

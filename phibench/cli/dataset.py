@@ -1,0 +1,559 @@
+"""Commands `phibench dataset ...`: make, check and show data sets, and what follows from one without a method."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from cyclopts import App, Parameter
+
+from phibench.cli.completions import parts, pictures, recipes, released
+from phibench.cli.options import DATA, DEFAULT_PRESET, OwnOrPreset, Preset, Whole
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from phibench.datasets.frames.request import FrameOptions
+    from phibench.datasets.read import Sample
+
+dataset = App(name="dataset", group=DATA, help="Make, check and show data sets; draw frames and panoramas.")
+
+
+@dataset.command
+def make(
+    recipe: Annotated[str, Parameter(completer=recipes(films=False))],
+    *,
+    out: Path,
+    workers: Whole | None = None,
+    scheduler: str | None = None,
+    wait_for_workers: Whole | None = None,
+    shard: str | None = None,
+    samples: Whole | None = None,
+    seed: Whole | None = None,
+    secret_seed: Path | None = None,
+    replace: Annotated[bool, Parameter(negative="")] = False,
+    room_files: Path | None = None,
+    leave_out_refused: Annotated[bool, Parameter(negative="")] = False,
+    dry_run: bool = False,
+) -> int:
+    """Render a data set; what is finished already is kept. Sensitivities of D come last, sensitivities.parquet.
+
+    Parameters
+    ----------
+    recipe
+        TOML file, or the name of a shipped recipe ("paper", "paper-misaligned", "random", "smoke", ...).
+    out
+        Folder to write; one with finished work that would be lost is refused, and one with more samples keeps them.
+    workers
+        Number of processes; one for each core by default.
+    scheduler
+        Address or scheduler file of a running dask scheduler, to use its workers instead.
+    wait_for_workers
+        With --scheduler: wait so many seconds at most until its file is there and a worker has come.
+    shard
+        Part of the recipe for job arrays, such as 1/8; put the parts together with `merge`.
+    samples
+        How many samples to draw, instead of the recipe's number.
+    seed
+        Root of all random streams, instead of the recipe's. Other users of the machine see it in the list of processes.
+    secret_seed
+        File of a root of 128 bits, for a set that is to be sealed; it is drawn if the file is not there.
+    replace
+        Delete or make again finished work that does not fit, of another seed or recipe; what fits is kept.
+    room_files
+        Folder of the panoramas and meshes that the recipe names; the recipe's own by default.
+    leave_out_refused
+        Finish the data set without the samples that are refused; dataset.json lists them with their causes.
+    dry_run
+        Say what will be seen, where and why not, how many tasks, bytes and seconds it takes; render nothing.
+    """
+    given: Any = {"shard": shard, "samples": samples, "seed": seed, "replace": replace, "room_files": room_files}
+    given["leave_out_refused"] = leave_out_refused
+    if secret_seed is not None:
+        given["seed"] = _secret(secret_seed, seed, make_it=not dry_run)
+    if wait_for_workers is not None and scheduler is None:
+        from phibench.datasets.errors import DatasetError
+
+        raise DatasetError("--wait-for-workers is about workers of a scheduler: give --scheduler too")
+    if dry_run:
+        from phibench.datasets.make import dry_run as dry_run_text
+
+        print(dry_run_text(recipe, out, workers, **given))
+        return 0
+    from phibench.studies.paper.sensitivity_table import make as make_dataset
+
+    if wait_for_workers is not None and scheduler is not None:
+        from phibench.datasets.build.workers import wait_for_workers as wait
+
+        wait(scheduler, wait_for_workers)
+    make_dataset(recipe, out, workers, scheduler=scheduler, **given)
+    return 0
+
+
+def _secret(path: Path, seed: int | None, make_it: bool) -> int | None:
+    """Seed of a file; a dry run draws none, and takes the recipe's."""
+    from phibench.benchmark.release.secret_seed import secret_seed as seed_of
+    from phibench.datasets.errors import DatasetError
+
+    if seed is not None:
+        raise DatasetError("--seed and --secret-seed are two seeds: give one of them")
+    return seed_of(path, make_it)
+
+
+@dataset.command
+def repair(directory: Path, *, workers: Whole | None = None, scheduler: str | None = None) -> int:
+    """Render again what is damaged or missing in a data set.
+
+    Parameters
+    ----------
+    directory
+        Folder of a data set.
+    workers
+        Number of processes; one for each core by default.
+    scheduler
+        Address or scheduler file of a running dask scheduler, to use its workers instead.
+    """
+    from phibench.studies.paper.sensitivity_table import repair as repair_dataset
+
+    for name in repair_dataset(directory, workers, scheduler=scheduler):
+        print(f"made again: {name}")
+    return 0
+
+
+@dataset.command
+def merge(*shards: Path, out: Path) -> int:
+    """Put the shards of a data set together.
+
+    Parameters
+    ----------
+    shards
+        Folders of all shards.
+    out
+        Folder to write.
+    """
+    from phibench.studies.paper.sensitivity_table import merge as merge_shards
+
+    merge_shards(out, shards)
+    return 0
+
+
+@dataset.command
+def verify(
+    directory: Path,
+    *,
+    mitsuba: Whole | None = None,
+    json: Annotated[bool, Parameter(negative="", help="The outcome as one JSON document.")] = False,
+) -> int:
+    """Check every file, hash, row and certificate of a data set; exit code 1 if there is a fault.
+
+    Parameters
+    ----------
+    directory
+        Folder of a data set, or of an export.
+    mitsuba
+        Also compare so many samples with Mitsuba's path tracer: light, outline, and the spot's flux and centroid.
+    """
+    from dataclasses import replace
+    from json import dumps
+
+    from phibench.benchmark.export.export_make import INFO, verify_export
+    from phibench.datasets.verify import verify as verify_dataset
+
+    if (directory / INFO).is_file():
+        if mitsuba is not None:
+            from phibench.datasets.errors import DatasetError
+
+            raise DatasetError(
+                f"{directory} is an export: --mitsuba renders the samples of a data set; name its folder"
+            )
+        wrong = verify_export(directory)
+        closing = f"{directory}: {len(wrong)} fault{'s' * (len(wrong) != 1)}"
+        print(dumps({"faults": list(wrong), "valid": not wrong}) if json else "\n".join([*wrong, closing]))
+        return 1 if wrong else 0
+    report = verify_dataset(directory)
+    if mitsuba is not None and report.ok:
+        faults, notes = _by_mitsuba(directory, mitsuba, silent=json)
+        report = replace(report, faults=faults, notes=(*report.notes, *notes))
+    if json:
+        print(dumps({**vars(report), "valid": report.ok}))
+        return 0 if report.ok else 1
+    for fault in report.faults:
+        print(fault)
+    for note in report.notes:
+        print(f"note: {note}")
+    count = len(report.faults)
+    print(f"{directory}: {report.files} files, {report.samples} samples, {count} fault{'s' * (count != 1)}")
+    return 0 if report.ok else 1
+
+
+def _by_mitsuba(directory: Path, count: int, *, silent: bool) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Faults and notes by Mitsuba's path tracer; a line is printed for each view as it is done."""
+    from phibench.datasets.read import open_dataset
+    from phibench.datasets.scene.scene_check import check_sample, chosen_samples
+
+    faults, notes = list[str](), list[str]()
+    for sample in chosen_samples(open_dataset(directory), count):
+        for checked in check_sample(sample):
+            faults += checked.faults
+            notes.append(f"Mitsuba: {checked}")
+            if not silent:
+                print(checked, flush=True)
+    return tuple(faults), tuple(notes) if silent else ()
+
+
+@dataset.command
+def show(
+    directory: Path,
+    *,
+    out: Path | None = None,
+    sample: str | None = None,
+    html: Path | None = None,
+    json: Annotated[bool, Parameter(negative="", help="Numbers and rows as one JSON document; no sheet.")] = False,
+) -> int:
+    """Print a table of a data set and write its contact sheet; or write the interactive page of a sample.
+
+    Parameters
+    ----------
+    directory
+        Folder of a data set.
+    out
+        PNG file for the contact sheet; by default contact_sheet.png in the folder.
+    sample
+        Sample of the page: its number, counted from 0, or its id; the first one by default.
+    html
+        HTML file for the page of a sample: frames, truth of every pixel, epipolar lines, room and rays in 3-D. Nothing
+        else is done then.
+    """
+    from json import dumps
+
+    from phibench.datasets.errors import DatasetError
+    from phibench.datasets.show import show as show_dataset
+    from phibench.datasets.show import summary
+
+    if json:
+        if html is not None or sample is not None or out is not None:
+            raise DatasetError("--json prints the data set and writes no file: leave --out, --sample and --html out")
+        print(dumps(summary(directory), allow_nan=False))
+        return 0
+    if html is not None:
+        from phibench.datasets.read import open_finished
+        from phibench.datasets.sample_page import sample_of, write_sample_page
+
+        page = write_sample_page(sample_of(open_finished(directory), sample), html)
+        print(f"{page}: {page.stat().st_size / 1e6:.1f} MB; open it in a browser")
+        return 0
+    if sample is not None:
+        raise DatasetError("--sample is for the page of one sample: name its file too, for example --html sample.html")
+    show_dataset(directory, out=out)
+    return 0
+
+
+@dataset.command
+def frames(
+    directory: Path,
+    *,
+    preset: OwnOrPreset = None,
+    sensor: Path | None = None,
+    draws: Whole = 1,
+    out: Path | None = None,
+    sample: Annotated[tuple[str, ...], Parameter(consume_multiple=True, negative="")] = (),
+    laser_off: bool = False,
+    exposure: str | None = None,
+    region: Whole | None = None,
+    camera_seed: Whole | None = None,
+    workers: Whole | None = None,
+) -> int:
+    """Draw camera frames with noise, as PNG, JPEG or EXR files with an index; what is there already is kept.
+
+    Parameters
+    ----------
+    directory
+        Folder of a data set.
+    preset
+        Where the chain ends: "ideal" (EXR, expected electrons), "mono-raw", "bayer-raw" (PNG of 16 bits that holds
+        10-bit DN, not scaled), "srgb8" (PNG), "yuyv" (PNG of Y' and chroma) or "mjpeg" (JPEG; PNG with
+        --region). By default that of --sensor, or "mjpeg".
+    sensor
+        Sensor file of `phibench sensor fit`: its numbers stand for the preset's.
+    draws
+        Draws of every image.
+    out
+        Folder to write; by default beside the data set, with "-frames" added to its name.
+    sample
+        Samples: numbers, counted from 0, or ids; all by default.
+    laser_off
+        Also every image without the spot.
+    exposure
+        Seconds, "auto", or "preset" for the preset's time; by default that of the recipe's [frames], else "auto".
+    region
+        Side in pixels of a square around the spot, instead of the whole image.
+    camera_seed
+        Names the camera whose fixed pattern the frames share; by default the recipe's cameras.
+    workers
+        Number of processes; one for each core by default.
+    """
+    from phibench.datasets.exposures.draw import draw_frames
+    from phibench.datasets.frames.sensor_file import read_sensor_file
+
+    file = None if sensor is None else read_sensor_file(sensor)
+    preset = preset or (DEFAULT_PRESET if file is None else file.preset)
+    numbers = {} if file is None else dict(file.numbers)
+    options = _options(preset, exposure, region, camera_seed, numbers)
+    done = draw_frames(directory, options, draws, out=out, samples=sample or None, laser_off=laser_off, workers=workers)
+    for note in done.notes:
+        print(f"note: {note}")
+    print(f"{done.folder}: {done.made} files written, {done.kept} kept, index frames.jsonl and frames.parquet")
+    return 0
+
+
+def _options(
+    preset: str, exposure: str | None, region: int | None, camera_seed: int | None, numbers: dict[str, Any]
+) -> FrameOptions:
+    """Options of frames from a command's; what is not given is the recipe's."""
+    from phibench.datasets.frames.request import FrameOptions, exposure_of
+
+    asked: dict[str, Any] = {"region": region, "camera_seed": camera_seed}
+    given = {key: value for key, value in asked.items() if value is not None}
+    if exposure is not None:
+        given["exposure"] = exposure_of(exposure)
+    return FrameOptions(preset, {**numbers, **given})
+
+
+def export(
+    directory: Path,
+    *,
+    to: Literal["parquet", "webdataset", "frames"],
+    out: Path,
+    preset: Preset = DEFAULT_PRESET,
+    draws: Whole = 1,
+    laser_off: bool = False,
+    exposure: str | None = None,
+    region: Whole | None = None,
+    camera_seed: Whole | None = None,
+    split_by: Literal["both", "rig", "room"] = "both",
+    validation: float = 0.1,
+    test: float = 0.1,
+    pairs_per_shard: Whole = 64,
+    workers: Whole | None = None,
+) -> int:
+    """Write a data set's pairs for other tools, with truth, splits, card, licence and Croissant description.
+
+    What is finished already is kept. `phibench dataset verify` checks an export, too.
+
+    Parameters
+    ----------
+    directory
+        Folder of a data set.
+    to
+        "parquet" (read by `datasets`), "webdataset" (tar files) or "frames" (image files).
+    out
+        Folder to write.
+    preset
+        Where the camera's chain ends: "mono-raw", "bayer-raw", "srgb8", "yuyv" or "mjpeg" (the camera's own JPEG).
+    draws
+        Draws of the noise of every pair.
+    laser_off
+        Also every image without the spot.
+    exposure
+        As in `phibench dataset frames`.
+    region
+        Side in pixels of a square around the spot, instead of the whole image.
+    camera_seed
+        Names the camera whose fixed pattern the frames share; by default the recipe's cameras.
+    split_by
+        What no two splits share: "both" rig and room, or one of them.
+    validation
+        Share of the pairs, at most; a set of one rig or room is all for training.
+    test
+        Share of the pairs, at most; the rest is for training.
+    pairs_per_shard
+        Pairs in one file of Parquet or tar, or in one folder of image files.
+    workers
+        Number of processes; one for each core by default.
+    """
+    from phibench.benchmark.export.export_make import export as export_pairs
+    from phibench.benchmark.export.pair_rows import ExportRequest
+
+    options = _options(preset, exposure, region, camera_seed, {})
+    request = ExportRequest(to, options, draws, laser_off, split_by, validation, test, pairs_per_shard)
+    done = export_pairs(directory, request, out, workers=workers)
+    for note in done.notes:
+        print(f"note: {note}")
+    counts = ", ".join(f"{count} {name}" for name, count in done.pairs.items())
+    print(f"{done.folder}: pairs {counts}; {done.made} shards written, {done.kept} kept")
+    return 0
+
+
+def release(
+    *,
+    out: Path,
+    work: Path,
+    secret_seed: Path | None = None,
+    part: Annotated[tuple[str, ...], Parameter(negative="", completer=parts)] = (),
+    samples: Whole | None = None,
+    use: Annotated[tuple[Path, ...], Parameter(negative="")] = (),
+    workers: Whole | None = None,
+    dry_run: bool = False,
+) -> int:
+    """Make the frozen benchmark as archives to be published, with a list of their hashes.
+
+    What is finished already is kept, so that a run that ended early goes on.
+
+    Parameters
+    ----------
+    out
+        Folder to publish: archives, MANIFEST.json, SHA256SUMS, card, licence and Croissant.
+    work
+        Folder of the data sets, not to be published: it holds the truth of the sealed part.
+    secret_seed
+        File with the seed of the sealed part, outside --out; one is drawn if there is no such file. Other parts need
+        none.
+    part
+        "dev", "test", "paper", "mirrors", "films" or "drives". May be given several times; all by default.
+    samples
+        Samples of each part that draws its samples, instead of the recipe's number.
+    use
+        Folder of a finished data set of a part, to be packed in place of a rendered one. May be given several times.
+    workers
+        Number of processes; one for each core by default.
+    dry_run
+        Say how many samples, bytes and CPU-hours each part takes; render nothing.
+    """
+    from phibench.benchmark.release import release_make
+    from phibench.benchmark.release.benchmark import chosen_parts
+    from phibench.benchmark.sealed.sealed_set import seal
+
+    request = release_make.ReleaseRequest(chosen_parts(part), out, work, secret_seed, samples, use, workers=workers)
+    if dry_run:
+        for line in release_make.dry_run(request):
+            print(line)
+        return 0
+    done = release_make.release(request, seal)
+    for name, held in sorted(done.manifest.parts.items()):
+        print(f"{name}: {held.count_text} samples, {len(held.archives)} archives, {held.download / 1e6:.1f} MB")
+    print(f"{out}: {done.made} archives written, {done.kept} kept; SHA-256 of MANIFEST.json: {done.digest}")
+    return 0
+
+
+def fetch(
+    name: Annotated[str, Parameter(completer=released)],
+    *,
+    out: Path,
+    from_: Annotated[str | None, Parameter(name="--from")] = None,
+    manifest_sha256: str | None = None,
+) -> int:
+    """Fetch a released data set and check every file; what was fetched before a break is kept.
+
+    Parameters
+    ----------
+    name
+        "phibench-v4-dev", or its last word.
+    out
+        Folder that the data set will be. It has this name only when all of it is there.
+    from_
+        Folder of a release, or its address with http:// or https://; by default that in PHIBENCH_SOURCE.
+    manifest_sha256
+        SHA-256 that the release's MANIFEST.json must have.
+    """
+    from phibench.benchmark.release.fetch import fetch as fetch_set
+
+    done = fetch_set(name, out, from_, manifest_sha256=manifest_sha256)
+    what = f"{done.fetched} of {done.archives} archives fetched" if done.fetched else "there already"
+    print(f"{done.folder}: {done.title}, {what}; every file has its SHA-256")
+    return 0
+
+
+@dataset.command
+def panorama(
+    directory: Path,
+    *,
+    out: Path,
+    sample: str | None = None,
+    position: Literal["down", "up"] = "down",
+    by: Literal["model", "truth"] = "model",
+    width: Whole = 1440,
+    elevation_deg: tuple[float, float] = (-60.0, 30.0),
+    preset: Annotated[str, Parameter(completer=pictures)] = DEFAULT_PRESET,
+    image: Path | None = None,
+    distance_m: float | None = None,
+) -> int:
+    """Unroll a view of a data set: columns are azimuths, rows elevations of the rays that leave the mirror.
+
+    The middle is the robot's front (world x), left of it its left (world y). A pixel is the direction of a ray, or a
+    point at --distance-m: a sphere has no single viewpoint.
+
+    Parameters
+    ----------
+    directory
+        Folder of a data set.
+    out
+        PNG file to write.
+    sample
+        Sample: its number, counted from 0, or its id; the first one by default.
+    position
+        Which of its two views.
+    by
+        "model": closed form with the nominal rig. "truth": the truth layer of the true rig, no model of the mirror.
+    width
+        Columns for 360 degrees; rows are as far apart as columns are at the horizon.
+    elevation_deg
+        Lower and upper edge, degrees above the horizon.
+    preset
+        "layers" (noise-free), or the preset of a frame to draw: "mjpeg" or "srgb8".
+    image
+        PNG or JPEG to unroll in place of the sample's frame, taken with the same rig.
+    distance_m
+        Of the scene from the mirror's centre; by default far away.
+    """
+    from phibench.datasets.read import open_finished
+    from phibench.datasets.store.files import require_writable
+    from phibench.datasets.store.pictures import save_png
+    from phibench.estimator.geometry.panorama import FAR_M, Grid
+    from phibench.estimator.geometry.panorama import panorama as unroll
+
+    grid = Grid(width, *(math.radians(each) for each in elevation_deg))
+    dataset = open_finished(directory)
+    (chosen,) = dataset.chosen(["0" if sample is None else sample])
+    require_writable(out)
+    distance = FAR_M if distance_m is None else distance_m
+    result = unroll(chosen, position, grid, by, distance, _picture(chosen, position, preset, image))
+    save_png(out, result.pixels)
+    print(
+        f"{out}: {grid.width_px} x {grid.height_px} pixels of {360.0 / grid.width_px:g} degrees, "
+        f"{chosen.row.sample_id} {position}, by {by}; {100.0 * result.seen:.1f} % of it is in the image"
+    )
+    return 0
+
+
+@dataset.command
+def sensitivities(directory: Path, *, out: Path | None = None) -> int:
+    """Write dD/d(parameter) of every sample and estimator as a Parquet table.
+
+    The estimate is made with the nominal rig, the parameter is one of the true rig: docs/misalignment.md has them all.
+
+    Parameters
+    ----------
+    directory
+        Folder of a data set.
+    out
+        Parquet file to write; by default sensitivities.parquet in the folder, as `dataset make` does.
+    """
+    from phibench.datasets.read import open_finished
+    from phibench.datasets.store import schema
+    from phibench.estimator.geometry.estimators import ESTIMATORS
+    from phibench.studies.paper.sensitivity_table import columns, write_sensitivities
+
+    dataset = open_finished(directory)
+    out = directory / schema.SENSITIVITIES if out is None else out
+    write_sensitivities(dataset, out)
+    print(f"{out}: {len(dataset)} samples x {len(ESTIMATORS)} estimators, {len(columns())} columns")
+    return 0
+
+
+def _picture(sample: Sample, position: str, preset: str, file: Path | None) -> NDArray[Any]:
+    """Picture to unroll: a file's, or a frame of the sample."""
+    from phibench.calibration.captures.picture_files import read_picture
+    from phibench.estimator.geometry.panorama import frame
+
+    return frame(sample, position, preset) if file is None else read_picture(file).pixels

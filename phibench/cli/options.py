@@ -1,0 +1,157 @@
+"""Options that mean the same in every command, and the old spellings of commands and options.
+
+`--method` is repeated, `--sample` names one sample by its number or id, `--samples` is a count, `--out` is the file or
+folder to write. Wherever a method runs, `Limits` are its options.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Group, Parameter, Token
+
+from phibench.cli.completions import methods, named_methods, presets
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from phibench.benchmark.isolation.resolve import RunLimits
+
+DATA, METHODS, SENSOR, INSTALLATION = (
+    Group.create_ordered(name) for name in ("Data sets", "Methods", "Sensor and paper", "Installation")
+)
+DEFAULT_PRESET = "mjpeg"  # what the C310 delivers; a data set's own presets go before it
+SECONDS = 30.0  # of one pair; the same numbers as in `sandbox.resolve.RunLimits`, whose module is slow to import
+MEMORY_MB = 4096.0
+
+
+def _whole(_kind: object, tokens: Sequence[Token]) -> int:
+    """Convert a whole number as it is written: cyclopts would round 1.5 without a word."""
+    try:
+        return int(tokens[0].value)
+    except ValueError:
+        raise ValueError(f"{tokens[0].value!r} is not a whole number") from None
+
+
+def number(_kind: object, tokens: Sequence[Token]) -> float:
+    """Convert a number; one with a comma is refused with what to write instead."""
+    text = tokens[0].value
+    try:
+        return float(text)
+    except ValueError:
+        other = text.replace(",", ".")
+        hint = f"; write {other}" if text.count(",") == 1 and other.replace(".", "", 1).isdigit() else ""
+        raise ValueError(f"{text!r} is not a number{hint}") from None
+
+
+Whole = Annotated[int, Parameter(converter=_whole)]
+Preset = Annotated[str, Parameter(completer=presets)]
+OwnOrPreset = Annotated[str | None, Parameter(completer=presets)]
+Methods = Annotated[
+    list[str] | None,
+    Parameter(
+        name="--method",
+        negative="",
+        completer=methods,
+        help="A method: a name that `phibench method list` shows, or FILE.py:FUNCTION. May be given several times.",
+    ),
+]
+BuiltIn = Annotated[
+    list[str] | None,
+    Parameter(
+        name="--method",
+        negative="",
+        completer=named_methods,
+        help="A built-in or registered method, as `phibench method list` shows. May be repeated; all by default.",
+    ),
+]
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class Limits:
+    """Limits under which methods run."""
+
+    seconds: Annotated[float, Parameter(help="Time limit of a method for one pair, seconds.")] = SECONDS
+    memory_mb: Annotated[
+        float,
+        Parameter(help="Limit of a method's address space on top of what its imports take, 1e6 bytes. Linux only."),
+    ] = MEMORY_MB
+    fresh: Annotated[
+        bool, Parameter(negative="", help="A process for each pair: what a method keeps between pairs is lost.")
+    ] = False
+    allow: Annotated[
+        tuple[str, ...],
+        Parameter(negative="", help="A file or folder that methods may read, besides their own. May be given again."),
+    ] = ()
+
+    @property
+    def of_run(self) -> RunLimits:
+        """The same for the harness.
+
+        Raises
+        ------
+        MethodError
+            If a number is out of its range.
+        """
+        from phibench.benchmark.isolation.resolve import RunLimits
+
+        return RunLimits(self.seconds, self.memory_mb, fresh=self.fresh, allow=self.allow)
+
+
+LIMITS = Limits()
+
+
+def wide_console(width: int) -> Console:
+    """A console at least as wide as a table, which would lose numbers if it were cut off at the width of a pipe."""
+    from rich.console import Console
+
+    console = Console(markup=False, emoji=False)
+    return console if console.width >= width else Console(width=width, markup=False, emoji=False)
+
+
+OLD_COMMANDS = {
+    "new-method": "method new",
+    "methods": "method list",
+    "check": "method check",
+    "dataset seal": "seal make",
+    "submit": "seal submit",
+    "unseal": "seal open",
+    "experiments": "paper --misaligned",
+    "panorama": "dataset panorama",
+    "sensitivities": "dataset sensitivities",
+}
+"""New spelling of every command that had another one."""
+
+OLD_OPTIONS = {
+    ("score", "--seed"): "--bootstrap-seed",
+    ("compare", "--seed"): "--bootstrap-seed",
+    ("bench", "--methods"): "--method, once for each method",
+    ("dataset frames", "--samples"): "--sample, once for each",
+}
+"""New spelling of every option that had another one, by command and option."""
+
+OLD_POSITIONS = {("dataset merge", "--out"): "phibench dataset merge SHARD ... --out FOLDER"}
+"""Whole new spelling of every command in which an option was a position, by command and option."""
+
+
+def answer_to_old_spelling(tokens: Sequence[str]) -> str:
+    """One sentence with the new spelling of a command line; "" if nothing in it is old."""
+    for old, new in OLD_COMMANDS.items():
+        if _begins(tokens, old):
+            return f"`phibench {old}` is now `phibench {new}`; `phibench {new.split(' --')[0]} --help` has its options"
+    given = {token.partition("=")[0] for token in tokens}
+    for (command, option), new in OLD_OPTIONS.items():
+        if _begins(tokens, command) and option in given:
+            return f"`phibench {command} {option}` is now {new}"
+    for (command, option), new in OLD_POSITIONS.items():
+        if _begins(tokens, command) and not given & {option, "--help", "-h"}:
+            return f"`phibench {command}` needs {option}: `{new}`"
+    return ""
+
+
+def _begins(tokens: Sequence[str], command: str) -> bool:
+    words = command.split()
+    return list(tokens[: len(words)]) == words

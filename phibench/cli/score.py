@@ -1,0 +1,295 @@
+"""Commands `phibench score`, `bench`, `compare` and `report`: methods on the pairs of a data set."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from cyclopts import Parameter
+
+from phibench.cli.options import LIMITS, BuiltIn, Limits, Methods, OwnOrPreset, Whole
+
+if TYPE_CHECKING:
+    from phibench.benchmark.scores.document import MethodCard, ScoreDocument
+
+Rank = Literal["phi", "depth"]
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class Output:
+    """Form of the tables on the standard output."""
+
+    wide: Annotated[bool, Parameter(negative="", help="Every interval and metric, in 210 columns instead of 80.")] = (
+        False
+    )
+    csv: Annotated[bool, Parameter(negative="", help="Numbers as CSV: every metric with its interval, in full.")] = (
+        False
+    )
+    markdown: Annotated[bool, Parameter(negative="", help="The table in Markdown.")] = False
+    latex: Annotated[bool, Parameter(negative="", help="The table in LaTeX, for the package booktabs.")] = False
+    json: Annotated[bool, Parameter(negative="", help="The whole as JSON, one score a line: for jq.")] = False
+
+    @property
+    def form(self) -> str:
+        """Chosen form, "terminal" by default.
+
+        Raises
+        ------
+        DatasetError
+            If several are chosen.
+        """
+        from phibench.datasets.errors import DatasetError
+
+        chosen = [name for name in ("csv", "markdown", "latex", "json") if getattr(self, name)]
+        if len(chosen) > 1:
+            raise DatasetError(f"--{chosen[0]} and --{chosen[1]}: give one of them")
+        return chosen[0] if chosen else "terminal"
+
+
+_TABLES = Output()
+
+
+def score(
+    directory: Path,
+    *,
+    method: Methods = None,
+    preset: OwnOrPreset = None,
+    draws: Whole | None = None,
+    pairs: Whole | None = None,
+    hints: bool = True,
+    boxes: Whole | None = None,
+    rank: Rank = "phi",
+    bootstrap_seed: Whole = 0,
+    workers: Whole = 1,
+    calibration: Path | None = None,
+    sensor: Path | None = None,
+    frames: Annotated[tuple[Whole, Whole] | None, Parameter(negative="")] = None,
+    limits: Limits = LIMITS,
+    out: Path | None = None,
+    output: Output = _TABLES,
+) -> int:
+    """Score methods on the pairs of a data set.
+
+    Parameters
+    ----------
+    directory
+        Folder of a data set.
+    preset
+        Preset of the sensor; by default those of the data set's recipe.
+    draws
+        Draws of the noise per sample; by default the recipe's.
+    pairs
+        Only so many pairs.
+    hints
+        Show the boxes that pairs have; --no-hints leaves the method to search the whole image.
+    boxes
+        Give every pair boxes of so many pixels a side. The spot is anywhere in them: their centre tells nothing.
+    rank
+        Error that methods are ranked by, missed spots and false detections counted: phi, or depth for D.
+    bootstrap_seed
+        Seed of the bootstrap that makes the intervals.
+    workers
+        Pairs that are worked on at a time. From 2 on, as many further processes draw them, where they are 40 or more.
+    calibration
+        File of `phibench calibrate`: its rig's samples, with the calibrated rig, stroke and covariance.
+    sensor
+        Sensor file of `phibench sensor fit`: its numbers stand for the recipe's and the preset's.
+    frames
+        Frames of each position with the laser on and with it off, such as 6 6; one of each by default.
+    out
+        JSON file for the score, records beside it as Parquet; with several methods their names are added to it.
+    """
+    from phibench.benchmark.isolation.resolve import resolve
+    from phibench.benchmark.scores.document import MethodCard
+    from phibench.benchmark.scores.score import open_scored, run_and_score, saved_each, wanted_pairs
+    from phibench.benchmark.scores.score_tables import print_scores
+    from phibench.datasets.errors import DatasetError
+    from phibench.datasets.progress import progress_console
+    from phibench.datasets.store.files import require_writable
+
+    if not method:
+        raise DatasetError(
+            "`phibench score` scores methods: give --method, such as --method red_centroid. "
+            f"The paper's tables are `phibench paper {directory}`"
+        )
+    run_limits, form = limits.of_run, output.form
+    files = _files(out, [MethodCard.of(name, **resolve(name).document()) for name in method])
+    for target in filter(None, files):
+        require_writable(target)
+    pair_set = wanted_pairs(open_scored(directory), preset, draws, pairs, hints, calibration, boxes, sensor, frames)
+    scored = run_and_score(method, pair_set, workers, progress_console(), "pairs", _seed(bootstrap_seed), run_limits)
+    if targets := [file for file in files if file is not None]:
+        scored = saved_each(scored, targets)
+    print_scores(scored, form, rank, output.wide, calibration is not None)
+    for file in filter(None, files):
+        print(f"written: {file}", file=sys.stdout if form == "terminal" else sys.stderr)
+    return 0
+
+
+def compare(first: Path, second: Path, *, bootstrap_seed: Whole = 0, output: Output = _TABLES) -> int:
+    """Compare two scores of the same pairs, sample by sample.
+
+    Parameters
+    ----------
+    first
+        JSON file that `score --method --out` wrote, with its Parquet file beside it.
+    second
+        Another one, of the same pairs.
+    bootstrap_seed
+        Seed of the bootstrap that makes the intervals.
+    """
+    from phibench.benchmark.scores.compare import compare as compare_scores
+    from phibench.benchmark.scores.compare import note_on_code, note_on_pairs, note_on_size
+    from phibench.benchmark.scores.document import read_score
+    from phibench.benchmark.scores.score_tables import print_comparison
+
+    form, differences = output.form, compare_scores(first, second, _seed(bootstrap_seed))
+    a, b = read_score(first), read_score(second)
+    print_comparison(differences, _distinct(first, a), _distinct(second, b), form, output.wide)
+    lines = sys.stdout if form == "terminal" else sys.stderr
+    for note in filter(None, (note_on_pairs(a, b, str(first), str(second)), note_on_code(a, b))):
+        print(f"note: {note}", file=lines)
+    if small := note_on_size(differences, a.rules, min(a.samples, b.samples)):
+        print(small, file=lines)
+    elif all(item.better in ("no difference shown", "too few samples") for item in differences):
+        print("No metric shows a difference: see docs/scoring.md, Paired comparison, for the test.", file=lines)
+    return 0
+
+
+def report(
+    *files: Path,
+    out: Path,
+    rank: Rank = "phi",
+    study: Annotated[tuple[Path, ...], Parameter(consume_multiple=True, negative="")] = (),
+) -> int:
+    """Write one HTML page about scores (ranking, errors, causes, the worst images) and studies. It needs no network.
+
+    Parameters
+    ----------
+    files
+        JSON files that `score --method --out` wrote, with their Parquet files beside them.
+    out
+        HTML file to write.
+    rank
+        Error that methods are ranked by, missed spots and false detections counted: phi, or depth for D.
+    study
+        Folders that `phibench study` wrote.
+    """
+    from phibench.benchmark.scores.report import write_report
+    from phibench.studies.run import section
+
+    print(write_report(files, out, [section(folder) for folder in study], rank))
+    return 0
+
+
+def results(
+    *files: Path,
+    out: Path | None = None,
+    html: Path | None = None,
+    against: str = "chain_fit",
+    rank: Rank = "phi",
+    bootstrap_seed: Whole = 0,
+    json: Annotated[bool, Parameter(negative="", help="Everything as one JSON document on the standard output.")] = (
+        False
+    ),
+) -> int:
+    """Write the page of results: every method on every preset, differences, strata, causes, from score files.
+
+    Without --out, --html or --json the page goes to the standard output.
+
+    Parameters
+    ----------
+    files
+        JSON files that `score --out` or `bench` wrote, with their Parquet files beside them.
+    out
+        Page in Markdown to write.
+    html
+        Page in HTML to write: one file, without network and scripts.
+    against
+        Method that the others are compared with, sample by sample; the best one where it has no score.
+    rank
+        Error that methods are ranked by, missed spots and false detections counted: phi, or depth for D.
+    bootstrap_seed
+        Seed of the bootstrap that makes the intervals of differences.
+    """
+    from json import dumps
+
+    from phibench.benchmark.scores.results_page import read_parts, results_document, results_page, write_results
+
+    parts = read_parts(files, against, rank, _seed(bootstrap_seed))
+    for path in write_results(parts, out, html, rank):
+        print(f"written: {path}", file=sys.stderr)
+    if json:
+        print(dumps(results_document(parts), allow_nan=False))
+    elif out is None and html is None:
+        sys.stdout.write(results_page(parts, rank))
+    return 0
+
+
+def _files(out: Path | None, cards: Sequence[MethodCard]) -> list[Path | None]:
+    """One file per method: `out` itself for one, with the method's name added for several."""
+    from phibench.datasets.errors import DatasetError
+
+    if out is None:
+        return [None] * len(cards)
+    if out.suffix != ".json":
+        raise DatasetError(f"--out {out}: a score is a JSON file; give a name that ends in .json")
+    if len(cards) == 1:
+        return [out]
+    names = ["".join(c if c.isalnum() or c in "-_." else "-" for c in card.name) for card in cards]
+    if len(set(names)) != len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise DatasetError(f"--method: two methods are called {twice}; score them in two runs with an --out for each")
+    return [out.with_name(f"{out.stem}-{name}.json") for name in names]
+
+
+def _seed(seed: int) -> int:
+    from phibench.datasets.errors import DatasetError
+
+    if seed < 0:
+        raise DatasetError(f"--bootstrap-seed {seed}: must be 0 or above")
+    return seed
+
+
+def _distinct(path: Path, document: ScoreDocument) -> str:
+    return f"{document.method.name} ({path.name})"
+
+
+def bench(
+    directory: Path,
+    *,
+    out: Path,
+    method: BuiltIn = None,
+    pairs: Whole | None = None,
+    workers: Whole = 1,
+    calibration: Path | None = None,
+    limits: Limits = LIMITS,
+) -> int:
+    """Run built-in and registered methods on every preset of a data set and write scores and a report.
+
+    Parameters
+    ----------
+    directory
+        Folder of a finished data set.
+    out
+        Folder for the scores and report.html.
+    pairs
+        Only the first so many of each preset.
+    workers
+        Pairs that are worked on at a time. From 2 on, as many further processes draw them, where they are 40 or more.
+    calibration
+        File of `phibench calibrate`: only its rig's pairs, with the calibrated rig and stroke.
+    """
+    from phibench.benchmark.scores.score import bench as run_bench
+    from phibench.benchmark.scores.score import show
+
+    done = run_bench(directory, out, method, workers, pairs, calibration=calibration, limits=limits.of_run)
+    for note in done.notes:
+        print(f"note: {note}", file=sys.stderr)
+    print(f"{done.report}: the report on {len(done.scores)} scores")
+    show(done.report)
+    return 0

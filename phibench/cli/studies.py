@@ -1,0 +1,298 @@
+"""Commands `phibench paper`, `stroke` and `study ...`: the paper's tables and experiments, strokes, eight studies."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import App, Parameter
+
+from phibench.cli.options import DEFAULT_PRESET, SENSOR, OwnOrPreset, Preset, Whole, number
+
+if TYPE_CHECKING:
+    from phibench.estimator.limits.best_stroke import BestStroke
+    from phibench.studies.paper.experiment_tables import Procedure
+    from phibench.studies.paper.paper_tables import Score
+
+
+def paper(
+    directory: Path,
+    *,
+    misaligned: Annotated[bool, Parameter(negative="")] = False,
+    calibration: Path | None = None,
+    preset: OwnOrPreset = None,
+    draws: Whole | None = None,
+    laser_off: bool | None = None,
+    frames: Annotated[tuple[Whole, Whole] | None, Parameter(negative="")] = None,
+    rig: Annotated[tuple[str, ...], Parameter(consume_multiple=True, negative="")] = (),
+    wide: Annotated[bool, Parameter(negative="")] = False,
+    out: Path | None = None,
+) -> int:
+    """Print the tables of the paper beside those of every depth estimator; no method runs.
+
+    With --misaligned every rig is calibrated from its own frames, measures D, and its errors are compared with their
+    prediction. That data set needs an experiment "calibration" with spots at known distances: paper-misaligned.
+
+    Parameters
+    ----------
+    directory
+        Folder of a data set.
+    misaligned
+        The misaligned experiments instead of the tables.
+    calibration
+        File of `phibench calibrate`: its rig's samples, with the calibrated rig and stroke. Not with --misaligned.
+    preset
+        With --misaligned: preset of the sensor, "mjpeg" (default), "bayer-raw", "srgb8" or "mono-raw".
+    draws
+        With --misaligned: draws of the noise per sample; 1 by default.
+    laser_off
+        With --misaligned: also a frame with the laser off beside each (default); --no-laser-off does without.
+    frames
+        With --misaligned: frames of each position, on and off; 1 1 by default.
+    rig
+        With --misaligned: ids of rigs; all by default.
+    wide
+        Estimates in metres too, or with --misaligned every interval, in up to 210 columns instead of 80.
+    out
+        JSON file for the scores; with --misaligned a Parquet file, one row per sample and draw.
+    """
+    if not misaligned:
+        given = preset, draws, laser_off, frames, rig or None
+        _refuse("is for the misaligned experiments: give --misaligned too", *given)
+        return _tables(directory, calibration, wide, out)
+    if calibration is not None:
+        from phibench.datasets.errors import DatasetError
+
+        raise DatasetError("--calibration does not go with --misaligned, which calibrates every rig itself")
+    with_off = True if laser_off is None else laser_off
+    from phibench.estimator.limits.off_frame_bound import FrameCounts
+    from phibench.studies.paper.experiment_tables import Procedure
+
+    counts = FrameCounts() if frames is None else FrameCounts(*frames)
+    procedure = Procedure(preset or DEFAULT_PRESET, 1 if draws is None else draws, with_off, frames=counts)
+    return _experiments(directory, procedure, rig, wide, out)
+
+
+def _refuse(why: str, *values: object) -> None:
+    from phibench.datasets.errors import DatasetError
+
+    for name, value in zip(("preset", "draws", "laser-off", "frames", "rig"), values, strict=True):
+        if value is not None:
+            raise DatasetError(f"--{name} {why}")
+
+
+def _tables(directory: Path, calibration: Path | None, wide: bool, out: Path | None) -> int:
+    from phibench.benchmark.scores.dataset_pairs import of_calibration
+    from phibench.benchmark.scores.score_tables import show_grid, table_console
+    from phibench.calibration.rig.file import read_calibration
+    from phibench.datasets.read import open_finished
+    from phibench.studies.paper.paper_tables import bias_table, table
+    from phibench.studies.paper.paper_tables import score as score_dataset
+
+    dataset = open_finished(directory)
+    calibrated = None if calibration is None else read_calibration(calibration)
+    scores = score_dataset(dataset if calibrated is None else of_calibration(dataset, calibrated), calibrated)
+    console = table_console(wide)
+    for grid in (table(scores, "truth", wide), table(scores, "frame", wide), bias_table(scores)):
+        show_grid(console, grid)
+    if out is not None:
+        _write_scores(out, directory, scores)
+    return 0
+
+
+def _write_scores(out: Path, directory: Path, scores: Sequence[Score]) -> None:
+    from phibench.datasets.store.files import write_text
+    from phibench.datasets.store.provenance import provenance
+    from phibench.studies.paper.paper_tables import as_records, summarise
+
+    document = {
+        "dataset": str(directory),
+        "provenance": provenance(),
+        "unit": "metre; relative errors are fractions of the true depth; null where there is no estimate",
+        "summary": as_records(summarise(scores)),
+        "scores": as_records(scores),
+    }
+    write_text(out, json.dumps(document, indent=1, allow_nan=False) + "\n")
+
+
+def _experiments(directory: Path, procedure: Procedure, rig: tuple[str, ...], wide: bool, out: Path | None) -> int:
+    from phibench.benchmark.scores.score_tables import show_grid, table_console
+    from phibench.datasets.read import open_finished
+    from phibench.datasets.store.files import require_writable
+    from phibench.studies.paper.experiment_bounds import budget_table, write_rows
+    from phibench.studies.paper.experiment_tables import run_experiments
+
+    if out is not None:
+        require_writable(out)
+    rows = run_experiments(open_finished(directory), procedure, rig or None, lambda name: print(f"{name} is measured"))
+    if out is not None:
+        write_rows(rows, out)
+    show_grid(table_console(wide), budget_table(rows, wide))
+    return 0
+
+
+Metres = Annotated[float, Parameter(converter=number)]
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class StrokeSetting:
+    """Rig, camera and spot for which a stroke is sought."""
+
+    rig: Annotated[
+        Path | None, Parameter(help="TOML file of the rig, as for `measure`; the default rig if not given.")
+    ] = None
+    calibration: Annotated[
+        Path | None,
+        Parameter(help="File of `phibench calibrate`. Without one the rig is as good as one put together by hand."),
+    ] = None
+    preset: Annotated[Preset, Parameter(help="Preset of the sensor.")] = DEFAULT_PRESET
+    strokes_m: Annotated[
+        tuple[Metres, Metres], Parameter(negative="", help="Shortest and longest stroke of the carriage, metres.")
+    ] = (0.10, 1.40)
+    stroke_sigma_m: Annotated[Metres, Parameter(help="Standard deviation of the single stroke, metres.")] = 0.0
+    height_m: Annotated[Metres, Parameter(help="Height of the spot above the floor, metres.")] = 0.5
+    power_mw: Annotated[Metres, Parameter(help="Power of the laser, mW.")] = 1.0
+
+    def best(self, depth_m: float) -> BestStroke:
+        """Best stroke for a distance.
+
+        Raises
+        ------
+        DatasetError
+            If a file or a number will not do.
+        """
+        from phibench.calibration.captures.rig_file import read_rig_file
+        from phibench.calibration.rig.file import read_calibration
+        from phibench.datasets.errors import DatasetError
+        from phibench.datasets.frames.sensor_card import sensor_card
+        from phibench.estimator.limits.best_stroke import best_stroke
+        from phibench.estimator.limits.stroke_curve import Surroundings
+        from phibench.estimator.spots.spot_prediction import Laser
+
+        for name, value, low, high in (("power-mw", self.power_mw, 1e-6, 1e3), ("height-m", self.height_m, 0.0, 20.0)):
+            if not low <= value <= high:
+                raise DatasetError(f"--{name} {value:g}: must be {low:g} to {high:g}")
+        nominal = None if self.rig is None else read_rig_file(self.rig).rig
+        held = None if self.calibration is None else read_calibration(self.calibration, nominal)
+        return best_stroke(
+            depth_m,
+            nominal if held is None else held.rig,
+            covariance_rig=None if held is None else held.covariance,
+            stroke_sigma_m=self.stroke_sigma_m,
+            strokes_m=self.strokes_m,
+            around=Surroundings(heights_m=(self.height_m,)),
+            laser=Laser(power_w=1e-3 * self.power_mw),
+            card=sensor_card(self.preset),
+        )
+
+    @property
+    def words(self) -> str:
+        """Sentence on what the error holds for."""
+        rig = "the default rig" if self.rig is None else f"the rig of {self.rig}"
+        known = "as good as put together by hand" if self.calibration is None else f"calibrated by {self.calibration}"
+        return f"{rig}, {known}; {self.preset}, {self.power_mw:g} mW, spots {self.height_m:g} m high"
+
+
+_STROKE = StrokeSetting()
+
+
+def stroke(
+    *,
+    depth_m: Metres,
+    stroke_m: Annotated[tuple[Metres, ...], Parameter(consume_multiple=True, negative="", show_default=False)] = (),
+    setting: StrokeSetting = _STROKE,
+    out: Path | None = None,
+) -> int:
+    """Find the stroke that measures a distance best, and what another stroke loses.
+
+    The error is a bound: root mean square over eight azimuths of a spot on a white wall, at 1/60 s.
+    docs/studies/stroke.md says what it consists of.
+
+    Parameters
+    ----------
+    depth_m
+        Distance D of the spot from the stroke axis, metres.
+    stroke_m
+        Strokes of the table, metres; round ones if not given.
+    out
+        PNG or SVG to write: the error and its parts by the stroke.
+    """
+    from phibench.benchmark.scores.score_tables import show_grid, table_console
+    from phibench.datasets.store.files import require_writable
+    from phibench.studies.paper.stroke_chart import best_lines, loss_table, require_picture, write_stroke_picture
+
+    if out is not None:
+        require_picture(out)
+        require_writable(out)
+    best = setting.best(depth_m)
+    grid = loss_table(best, stroke_m)
+    for line in (*best_lines(best), setting.words, ""):
+        print(line)
+    show_grid(table_console(wide=False), grid)
+    if out is not None:
+        print(f"{write_stroke_picture(out, best)}: error of D and its parts by the stroke")
+    return 0
+
+
+STUDIES = {
+    "noise": "Error of phi and D against light, distance and stroke, and how near methods come to the bound.",
+    "misalignment": "Error of D that each misalignment of the rig makes, predicted and rendered.",
+    "baseline": "The tables of the paper, with the errors that this camera would make.",
+    "cause": "What makes the error curves that the paper has published.",
+    "isotropy": "Error of D against azimuth, and what panoramas keep.",
+    "stroke": "The stroke that measures a distance best.",
+    "mirror": "Mirrors of other shapes beside each other, for the choice of one.",
+    "loop": "A robot that drives up to its target: time, strokes, success, and what spoils them.",
+}
+"""Every study in one sentence; the names are those of `studies.run`."""
+
+study = App(name="study", group=SENSOR, help="Run a study: its data sets, tables in Parquet, drawings, and findings.")
+
+
+def _command(name: str, sentence: str) -> None:
+    def run(
+        *,
+        out: Path,
+        quick: Annotated[bool, Parameter(negative="")] = False,
+        settings: Path | None = None,
+        data: Path | None = None,
+        workers: Whole | None = None,
+        publish: Path | None = None,
+    ) -> int:
+        """Run a study.
+
+        Parameters
+        ----------
+        out
+            Folder to write.
+        quick
+            The reduced version, some minutes.
+        settings
+            TOML file in place of the study's own.
+        data
+            Folder of the data sets that it renders or finds there; by default "data" in the folder to write.
+        workers
+            Processes that render; by default one per core.
+        publish
+            Folder of the pages of the studies (docs/studies): NAME.json there is replaced. Full studies only.
+        """
+        from phibench.studies.findings import findings_table, print_table
+        from phibench.studies.run import FINDINGS, run_study
+
+        result = run_study(name, out, quick, settings, data, workers, publish=publish)
+        print_table(findings_table(result.findings))
+        for note in result.notes:
+            print(f"note: {note}")
+        tables, drawings = len(result.tables), len(result.drawings)
+        print(f"{out / FINDINGS}: the findings; beside it {tables} tables and {drawings} drawings")
+        return 0
+
+    study.command(run, name=name, help=sentence)
+
+
+for _name, _sentence in STUDIES.items():
+    _command(_name, _sentence)

@@ -1,0 +1,485 @@
+"""Identification of targets among tracks by their blink codes: locks, losses, and the time that each takes.
+
+A track's light in frame k is y_k = C + A x_k for a light with the code. x_k is the part of the exposure of the spot's
+own row during which the code is on, and C what is steady there, such as an edge of the room. The alternative is a light
+whose bits, on the same clock, are on or off by chance. Its likelihood is the mean over all sequences of bits, by the
+forward algorithm (L. R. Rabiner, Proc. IEEE 77, 257, 1989). One frame in 50 may be wrong in both.
+
+The log likelihood ratio rises by at most ln 2 per bit and falls for a light that is steady. If a light blinks by
+chance, the ratio passes L at any time with a probability of at most 1 / L (J. Ville, 1939): the error of a lock is
+stated, however long one looks. L = 2000 takes 11 bits: a code of 15 bits, one a frame, locks within itself, and five
+lights that all blink by chance are taken for the target in at most 0.25 % of all films. A phase that is not known takes
+log2(phases) bits more.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phibench.datasets.frames.sensor_card import SensorCard
+from phibench.estimator.interface import Box
+from phibench.robot.film.spot_tracks import FrameSearch, SpotTrack, SpotTracker
+from phibench.scenes.frames import Array, BoolArray
+from phibench.scenes.motion.film_times import BlinkCode, FilmTimes
+from phibench.scenes.rig import Rig
+from phibench.scenes.validation import SceneError
+
+LOCK = math.log(2000.0)
+"""Log likelihood ratio of a lock."""
+REGAIN = 3.0
+"""The same of a light that comes back where the target is expected."""
+_WRONG = 0.02  # of frames
+_RELATIVE = 0.1  # of a light, that changes from frame to frame: its place in the mosaic
+_LONGEST = 60  # frames that count
+_PHASES_PER_BIT = 4
+_LEAST_SPREAD = 0.3  # of the levels: without an on and an off frame nothing is known
+_STEADY = -1.0  # log odds of such a light
+_CHANGES = 4.0  # standard deviations of chi^2 of a light that is steady
+_FOLLOWS = 6.0  # least A over its standard deviation: noise at a million places does not reach it
+
+
+@dataclass(frozen=True)
+class TargetCode:
+    """Code of a target.
+
+    Parameters
+    ----------
+    name : str
+    code : BlinkCode
+    phase_known : bool
+        The code begins at `code.start_s`, as of a laser that the robot itself switches; otherwise at any time.
+    """
+
+    name: str
+    code: BlinkCode
+    phase_known: bool = True
+
+    def __post_init__(self) -> None:
+        if "0" not in self.code.bits:
+            raise SceneError(
+                f"target '{self.name}': the code '{self.code.bits[:60]}' is always on, as a lamp is; give one with a 0"
+            )
+
+    @property
+    def starts_s(self) -> Array:
+        """Times at which the code may begin."""
+        if self.phase_known:
+            return np.array([self.code.start_s])
+        count = _PHASES_PER_BIT * len(self.code.bits)
+        return np.arange(count) * self.code.bit_s / _PHASES_PER_BIT
+
+    def dark_frames(self, rate_hz: float) -> int:
+        """Frames in turn without a spot that the code explains.
+
+        The longest run of zeros, as the code repeats, and as much again where the spot is found by its changes alone.
+        """
+        longest = max(map(len, (2 * self.code.bits).split("1")))
+        return 2 * math.ceil(longest * self.code.bit_s * rate_hz) + 2
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Comparison of a track with a code.
+
+    Attributes
+    ----------
+    log_odds : float
+        Log likelihood ratio against a light that blinks by chance, less ln(phases).
+    electrons, sigma_e : float
+        Amplitude A of what follows the code, and its standard deviation.
+    phase : int
+        Number of the phase that fits best.
+    """
+
+    log_odds: float = 0.0
+    electrons: float = 0.0
+    sigma_e: float = math.inf
+    phase: int = 0
+
+
+@dataclass(frozen=True)
+class Exposures:
+    """Exposures of N rows, one a frame, by the bits of a code's clock.
+
+    Attributes
+    ----------
+    first : shape (N,)
+        Number of the first bit of each.
+    shares : shape (N, m)
+        Part of the exposure that falls on this bit and the m - 1 after it.
+    """
+
+    first: NDArray[np.int64]
+    shares: Array
+
+    @classmethod
+    def of(cls, middle_s: Array, exposure_s: float, bit_s: float, start_s: float) -> Exposures:
+        """Exposures about `middle_s`, of a clock that starts at `start_s`."""
+        low = (middle_s - 0.5 * exposure_s - start_s) / bit_s
+        first, length = np.floor(low), max(exposure_s / bit_s, 1e-9)
+        ends = first[:, None] + np.arange(math.ceil(length) + 2)
+        passed = np.clip(ends - low[:, None], 0.0, length)
+        return cls(first.astype(np.int64), np.diff(passed, axis=1) / length)
+
+    def levels(self, bits: str) -> Array:
+        """Light of a code, shape (N,), between 0 and 1."""
+        values = np.array([float(bit) for bit in bits])
+        return np.sum(self.shares * values[(self.first[:, None] + np.arange(self.shares.shape[1])) % len(bits)], axis=1)
+
+
+def evidence(electrons: Array, sigma_e: Array, exposures: Sequence[Exposures], bits: str) -> Evidence:
+    """Compare the light of N frames with a code.
+
+    Parameters
+    ----------
+    electrons, sigma_e : shape (N,)
+    exposures : sequence of Exposures
+        For each phase that the code may have.
+    bits : str
+    """
+    best = Evidence(-math.inf)
+    for phase, one in enumerate(exposures):
+        found = _of_phase(electrons, sigma_e, one, bits)
+        if found.log_odds > best.log_odds:
+            best = replace(found, phase=phase)
+    return replace(best, log_odds=best.log_odds - math.log(len(exposures)))
+
+
+def _of_phase(y: Array, sigma: Array, exposures: Exposures, bits: str) -> Evidence:
+    x = exposures.levels(bits)
+    if np.ptp(x) < _LEAST_SPREAD:
+        return Evidence()
+    C, A, sigma_A = _fitted(y, sigma, x)
+    if sigma_A * _FOLLOWS > A:
+        return Evidence(_STEADY, A, sigma_A)
+    flat = _WRONG / (A + 6.0 * float(np.median(sigma)))
+    own = np.log(_likelihood(y, C, A, sigma, x[:, None], flat)).sum()
+    return Evidence(float(own) - _by_chance(y, C, A, sigma, exposures, flat), A, sigma_A)
+
+
+def _fitted(y: Array, sigma: Array, x: Array) -> tuple[float, float, float]:
+    """C, A and the standard deviation of A; the second time frames that cannot be right count less."""
+    weight = 1.0 / sigma**2
+    X = np.stack([np.ones_like(x), x])
+    for _ in range(2):
+        F = (X * weight) @ X.T
+        C, A = np.linalg.solve(F, (X * weight) @ y)
+        spread = np.hypot(sigma, _RELATIVE * (abs(C) + A * x))
+        rest = np.abs(y - C - A * x)
+        weight = np.where(rest < 4.0 * spread, 1.0, (4.0 * spread / np.maximum(rest, 1e-12)) ** 2) / spread**2
+    return float(C), float(A), float(math.sqrt(np.linalg.inv(F)[1, 1]))
+
+
+def _likelihood(y: Array, C: float, A: float, sigma: Array, levels: Array, flat: float) -> Array:
+    """Likelihood of N frames at levels (N, m)."""
+    spread = np.hypot(sigma[:, None], _RELATIVE * (abs(C) + A * levels))
+    normal = np.exp(-0.5 * ((y[:, None] - C - A * levels) / spread) ** 2) / (math.sqrt(2.0 * math.pi) * spread)
+    return np.asarray(flat + (1.0 - _WRONG) * normal)
+
+
+def _by_chance(y: Array, C: float, A: float, sigma: Array, exposures: Exposures, flat: float) -> float:
+    """Log likelihood of a light whose bits are on or off by chance: forward over the bits that a frame sees."""
+    width = exposures.shares.shape[1]
+    patterns = np.arange(2**width)[:, None] >> np.arange(width - 1, -1, -1) & 1  # the first bit leads
+    each = _likelihood(y, C, A, sigma, exposures.shares @ patterns.T, flat)
+    total, weight = 0.0, np.full(len(patterns), 1.0 / len(patterns))
+    for k, likelihood in enumerate(each):
+        for _ in range(min(int(exposures.first[k] - exposures.first[k - 1]), width) if k else 0):
+            # the first bit is dropped, and a new one comes behind
+            kept = weight.reshape(2, -1).sum(axis=0)
+            weight = 0.5 * np.repeat(kept, 2)
+        weight = weight * likelihood
+        total += math.log(weight.sum())
+        weight = weight / weight.sum()
+    return total
+
+
+@dataclass(frozen=True)
+class Hold:
+    """Time during which a target is known.
+
+    Attributes
+    ----------
+    target : str
+    track : SpotTrack
+    locked, lost : int
+        Frame of the lock, and of the loss; -1 where it is known to the end.
+    log_odds : float
+        At the lock.
+    """
+
+    target: str
+    track: SpotTrack = field(repr=False)
+    locked: int
+    lost: int = -1
+    log_odds: float = 0.0
+
+
+@dataclass
+class _Search:
+    """State of one target."""
+
+    code: TargetCode
+    dark_frames: int
+    hold: Hold | None = None
+    past: SpotTrack | None = None  # the track that was lost
+    began: dict[int, int] = field(default_factory=dict)  # frame from which a track's light counts, by its number
+
+
+class TargetTracker:
+    """Targets in the whole frames of a film, frame by frame: detected, associated, identified.
+
+    Parameters
+    ----------
+    rig : Rig
+        Nominal.
+    card : SensorCard
+    times : FilmTimes
+        When each row of each frame is exposed.
+    codes : sequence of TargetCode
+        Targets to look for, each by a code of its own.
+    patience_s : float
+        Time after which a light that is not seen is given up.
+    box : Box, optional
+        Part of the image to search, as of `FrameSearch`.
+
+    Raises
+    ------
+    SceneError
+        If there is no code, two targets share a name, or the film is shorter than a code.
+
+    Examples
+    --------
+    >>> tracker = TargetTracker(rig, card, times, [TargetCode("target", code)])  # doctest: +SKIP
+    >>> for image in film:  # doctest: +SKIP
+    ...     tracker.add(image)
+    ...     if (track := tracker.held("target")) is not None:
+    ...         print(tracker.frame, track.place_px)
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        card: SensorCard,
+        times: FilmTimes,
+        codes: Sequence[TargetCode],
+        patience_s: float = 1.0,
+        box: Box | None = None,
+    ) -> None:
+        _check(times, codes)
+        self.rig, self.times, self.card = rig, times, card
+        self._states = {one.name: _Search(one, one.dark_frames(times.rate_hz)) for one in codes}
+        tentative = max(state.dark_frames for state in self._states.values())
+        self.tracker = SpotTracker(
+            FrameSearch(rig, card, box), max(round(patience_s * times.rate_hz), tentative), tentative
+        )
+        self.holds: list[Hold] = []
+        self._rested = 0  # frames since anything moved
+
+    @property
+    def frame(self) -> int:
+        """Number of the latest frame."""
+        return self.tracker.frame
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the targets."""
+        return tuple(self._states)
+
+    @property
+    def lights(self) -> int:
+        """Lights that are followed now."""
+        return len(self.tracker.live)
+
+    def held(self, name: str) -> SpotTrack | None:
+        """Track of a target; None while it is not known."""
+        hold = self._states[name].hold
+        return None if hold is None else hold.track
+
+    def add(self, image: NDArray[Any], moves: bool = False) -> None:
+        """Take in the next frame.
+
+        Parameters
+        ----------
+        image : array
+            As the camera delivers it.
+        moves : bool
+            Carriage, robot or target may have moved since the frame before.
+
+        Raises
+        ------
+        ValueError
+            If the image does not fit the card's output.
+        """
+        self.tracker.add(image, moves)
+        self._rested = 0 if moves else self._rested + 1
+        for state in self._states.values():
+            self._restart(state)
+            if state.hold is not None:
+                self._check_hold(state, state.hold)
+        for state in self._states.values():
+            if state.hold is None:
+                if not moves:
+                    self._follow(state)
+                self._try_lock(state)
+
+    def _follow(self, state: _Search) -> None:
+        """Look for a light that follows the code at one place, over the latest frames of a rig that rests."""
+        count, code = min(self._rested, self.tracker.kept), state.code
+        if not code.phase_known or count / (self.times.rate_hz * code.code.bit_s) * math.log(2.0) < LOCK:
+            return
+        box = self.tracker.search.box
+        rows = box.v0_px + np.arange(box.height_px, dtype=float)
+        frames = self.frame - count + 1 + np.arange(count, dtype=float)
+        times = self.times.row_s(frames[:, None], rows)
+        earlier = self.tracker.follow(code.code.mean_level(times, self.times.exposure_s))
+        for track in self.tracker.live:
+            if track.number in earlier and track.number not in state.began:
+                self._choose_start(state, track, earlier[track.number])
+
+    def _choose_start(self, state: _Search, track: SpotTrack, before: int) -> None:
+        """Leave the frames out that a track has got, if they speak against the code: something may have hidden it."""
+        longer = self.evidence(state, track).log_odds
+        state.began[track.number] = before
+        if self.evidence(state, track).log_odds <= longer:
+            del state.began[track.number]
+
+    def _may_lock(self, state: _Search, track: SpotTrack) -> bool:
+        """Quick look: frames enough for a lock, and light that changes by more than its noise."""
+        used = self._counting(state, track)
+        bits = used.sum() / (self.times.rate_hz * state.code.code.bit_s) + 1.0
+        if bits * math.log(2.0) < LOCK:
+            return False
+        y, weight = np.array(track.electrons)[used], np.array(track.sigma_e)[used] ** -2.0
+        mean = float(weight @ y / weight.sum())
+        return float(weight @ (y - mean) ** 2) > len(y) + _CHANGES * math.sqrt(2.0 * len(y))
+
+    def _counting(self, state: _Search, track: SpotTrack) -> BoolArray:
+        """Frames of a track that count."""
+        frames = track.frames
+        first = max(state.began.get(track.number, 0), track.last - _LONGEST + 1)
+        return np.asarray((frames >= first) & np.isfinite(track.electrons))
+
+    def _restart(self, state: _Search) -> None:
+        """Begin anew with a light that was dark for longer than the code ever is: something had hidden it."""
+        for track in self.tracker.live:
+            if track.detected[-1]:
+                gap = next((k for k, seen in enumerate(reversed(track.detected[:-1])) if seen), 0)
+                if gap > state.dark_frames:
+                    state.began[track.number] = track.last
+
+    def evidence(self, state: _Search, track: SpotTrack) -> Evidence:
+        """Evidence for a target of the frames that count."""
+        frames, used = track.frames, self._counting(state, track)
+        rows = np.array(track.uv_px)[used, 1]
+        times = self.times.row_s(frames[used].astype(float), rows)
+        code = state.code.code
+        exposures = [
+            Exposures.of(times, self.times.exposure_s, code.bit_s, float(start)) for start in state.code.starts_s
+        ]
+        return evidence(np.array(track.electrons)[used], np.array(track.sigma_e)[used], exposures, code.bits)
+
+    def _check_hold(self, state: _Search, hold: Hold) -> None:
+        """Give a target up that is dark for too long, or whose light no longer follows its code."""
+        track = hold.track
+        gone = track.dark > state.dark_frames or track not in self.tracker.live
+        if gone or self.evidence(state, track).log_odds < 0.0:
+            state.hold, state.past = None, track
+            self.holds[self.holds.index(hold)] = Hold(hold.target, track, hold.locked, self.frame, hold.log_odds)
+
+    def _try_lock(self, state: _Search) -> None:
+        """Lock on the brightest light that has the code, once no brighter one may have it: a reflection is fainter."""
+        taken = {id(other.hold.track) for other in self._states.values() if other.hold is not None}
+        found = [
+            (one, track)
+            for track in self.tracker.live
+            if id(track) not in taken
+            and (track.dark <= state.dark_frames if track is state.past else self._may_lock(state, track))
+            and (one := self.evidence(state, track)).log_odds > 0.0
+        ]
+        sure = [pair for pair in found if pair[0].log_odds >= (REGAIN if pair[1] is state.past else LOCK)]
+        if not sure:
+            return
+        best, track = max(sure, key=lambda pair: pair[0].electrons)
+        if any(one.electrons > best.electrons for one, _ in found):
+            return
+        state.hold = Hold(state.code.name, track, self.frame, log_odds=best.log_odds)
+        self.holds.append(state.hold)
+
+    def seen_places(self, name: str) -> tuple[NDArray[np.int64], Array]:
+        """Frames in which a target was detected while it was known, or shortly before its lock, and places (n, 2).
+
+        Raises
+        ------
+        SceneError
+            If the target was never seen.
+        """
+        self.first_lock(name)
+        places: dict[int, tuple[float, float]] = {}
+        for hold in (one for one in self.holds if one.target == name):
+            track, first = hold.track, hold.locked - math.floor(LOCK / math.log(2.0))
+            last = hold.lost if hold.lost >= 0 else track.last
+            for number, uv, seen in zip(track.frames.tolist(), track.uv_px, track.detected, strict=True):
+                if first <= number <= last and (seen or number == hold.locked):
+                    places[number] = uv
+        frames = sorted(places)
+        return np.array(frames), np.array([places[k] for k in frames])
+
+    def levels(self, name: str, frames: NDArray[np.int64], rows: Array) -> Array:
+        """Part of the exposure of a row, in each frame, during which a target's code is on: shape (n,).
+
+        Where the phase of the code is not known, a quarter bit before and after counts as well.
+        """
+        code, margin_s, start_s = self._states[name].code, 0.0, self._states[name].code.code.start_s
+        if not code.phase_known:
+            track = next(hold.track for hold in reversed(self.holds) if hold.target == name)
+            start_s = float(code.starts_s[self.evidence(self._states[name], track).phase])
+            margin_s = 2.0 * code.code.bit_s / _PHASES_PER_BIT
+        middle = self.times.row_s(frames.astype(float), rows)
+        return replace(code.code, start_s=start_s).mean_level(middle, self.times.exposure_s + margin_s)
+
+    def first_lock(self, name: str) -> Hold:
+        """First lock on a target.
+
+        Raises
+        ------
+        SceneError
+            If the target was never seen.
+        """
+        for hold in self.holds:
+            if hold.target == name:
+                return hold
+        code = self._states[name].code.code
+        raise SceneError(
+            f"target '{name}' was never seen in {self.frame + 1} frames: none of {self.lights} lights blinks by the "
+            f"code {code.bits[:60]}; look longer, turn the robot, or expose longer"
+        )
+
+
+def track_targets(
+    images: Iterable[NDArray[Any]], rig: Rig, card: SensorCard, times: FilmTimes, codes: Sequence[TargetCode]
+) -> TargetTracker:
+    """Tracker after all frames of a film; `TargetTracker` says more."""
+    tracker = TargetTracker(rig, card, times, codes)
+    for image in images:
+        tracker.add(image)
+    return tracker
+
+
+def _check(times: FilmTimes, codes: Sequence[TargetCode]) -> None:
+    if not codes:
+        raise SceneError("no code to look for; give a TargetCode for each target")
+    if len({one.name for one in codes}) < len(codes):
+        raise SceneError(f"targets {[one.name for one in codes]} share a name; name each differently")
+    for one in codes:
+        if times.duration_s < one.code.duration_s * (1.0 - 1e-9):
+            raise SceneError(
+                f"film of {times.frames} frames takes {times.duration_s:.3g} s, and the code of '{one.name}' "
+                f"{one.code.duration_s:.3g} s: give a film that holds the whole code, or a shorter code"
+            )

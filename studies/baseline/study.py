@@ -1,0 +1,363 @@
+"""Study `baseline`: the paper's tables and figures from rendered frames.
+
+The settings and the run come first, then the findings and the small tables of the report.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Literal
+
+import numpy as np
+import polars as pl
+from pydantic import Field
+from scipy.stats import bootstrap
+
+from phibench.estimator.spots.simple_spots import find_spot
+from phibench.scenes.frames import Array
+from phibench.scenes.misalignment import Misalignment
+from phibench.scenes.random_streams import generator
+from phibench.scenes.rig import POSITIONS
+from phibench.studies.baseline.drawings import curves_drawing, laws_drawing
+from phibench.studies.baseline.tables import (
+    EXPECTED,
+    SENSES,
+    Curve,
+    LawFit,
+    band_table,
+    estimates,
+    experiment_table,
+    experiments_of,
+    found_spots,
+    laws_of_noise,
+    published_curve,
+    seen,
+)
+from phibench.studies.findings import Finding, Row
+from phibench.studies.framework import Result, Settings, Study, StudyDatasets
+
+METHODS = ("red_centroid", "chain_fit")
+TABLES = ("table1", "table2", "table3")
+NAMED = ("ray", "normal", "incidence", "outline")
+RESAMPLES = 2000  # of the bootstrap of an rms
+CONFIDENCE = 0.95
+_LEAST = 3  # strokes for two constants and a residual
+
+
+class BaselineSettings(Settings):
+    """Settings of the study `baseline`."""
+
+    recipe: str = Field(description="data set of the paper's experiments, aligned")
+    preset: Literal["srgb8", "mjpeg"] = Field(description="sensor preset; exposure as the camera chooses it")
+    draws: int = Field(ge=2, le=1000, description="draws of the noise that red_centroid reads")
+    fit_draws: int = Field(ge=1, le=1000, description="of these, those that chain_fit reads")
+    rigs: int = Field(ge=10, le=100_000, description="drawn misalignments, closed form")
+    resamples: int = Field(ge=100, le=100_000, description="of the bootstrap")
+    rendered: list[str] = Field(description="recipes of misaligned rigs that are rendered too")
+
+
+def run(settings: BaselineSettings, datasets: StudyDatasets) -> Result:
+    """Run the study."""
+    dataset = datasets.dataset(settings.recipe)
+    experiments, rig = experiments_of(dataset), dataset.samples[0].nominal_rig
+    draws = dict(zip(METHODS, (settings.draws, settings.fit_draws), strict=True))
+    table = experiment_table(experiments, rig, found_spots(dataset, settings.preset, draws, datasets.workers))
+    bands = band_table(experiments, rig, settings.rigs, generator("study", "baseline", "rigs"))
+    laws = laws_of_noise(table, METHODS[0], settings.resamples)
+    curves = [
+        published_curve(name, *_published(table, name), settings.resamples) for name in TABLES if _long(table, name)
+    ]
+    rendered = pl.concat([_rendered(name, datasets) for name in settings.rendered] or [_NONE])
+    found = findings(table, bands, laws, curves, rendered)
+    return Result(
+        {"table": table, "misaligned": bands, "laws": _law_table(laws), "rendered": rendered},
+        found,
+        (
+            curves_drawing(table, bands, METHODS[1], _curves_alt(found)),
+            laws_drawing(table, laws, _laws_alt(laws)),
+        ),
+        {"Errors over the published experiments": senses_shown(table, bands), "Exponents": laws_shown(laws)},
+        notes(settings.rendered, settings.fit_draws, table),
+    )
+
+
+def _curves_alt(found: Sequence[Finding]) -> str:
+    wanted = ("error of the published", "error of the mean reading", "published minus noise-free")
+    parts = "; ".join(finding.text for finding in found if finding.label.startswith(wanted))
+    return f"Error of D against stroke and distance, by table of the paper. {parts}."
+
+
+def _laws_alt(laws: Sequence[LawFit]) -> str:
+    parts = "; ".join(finding.text for law in laws for finding in _law_findings(law))
+    return f"Standard deviation of D against eq. (7), and exponents of D and h. {parts}."
+
+
+_NONE = pl.DataFrame(
+    schema={
+        "recipe": pl.String,
+        "sample_id": pl.String,
+        "sense": pl.String,
+        "rendered_error_m": pl.Float64,
+        "closed_form_error_m": pl.Float64,
+    }
+)
+
+
+def _rendered(recipe: str, datasets: StudyDatasets) -> pl.DataFrame:
+    """Errors of a rendered misaligned rig from its noise-free frames, and by the closed form of `drawn_rigs`."""
+    dataset = datasets.dataset(recipe)
+    samples = [sample for sample in dataset if sample.row.down.visible and sample.row.up.visible]
+    rows = [sample.row for sample in samples]
+    rig = dataset.samples[0].nominal_rig
+    wrong = Misalignment(**dataset.info.recipe["misalignment"])
+    points, strokes = np.array([row.spot_world_m for row in rows]), np.array([row.nominal_stroke_m for row in rows])
+    down, up, true = seen(rig, wrong, points, strokes)
+    found = [
+        np.array(
+            [
+                find_spot(sample.expected_image(p, laser=True), sample.expected_image(p, laser=False)).uv_px
+                for sample in samples
+            ]
+        )
+        for p in POSITIONS
+    ]
+    return pl.DataFrame(
+        [
+            {
+                "recipe": recipe,
+                "sample_id": row.sample_id,
+                "sense": sense,
+                "rendered_error_m": float(estimates(sense, rig, strokes, *found)[i] - row.depth_m),
+                "closed_form_error_m": float(estimates(sense, rig, strokes, down, up)[i] - true[i]),
+            }
+            for sense in SENSES
+            for i, row in enumerate(rows)
+        ]
+    )
+
+
+def _long(table: pl.DataFrame, experiment: str) -> bool:
+    """Check that a table has strokes enough for two constants and a residual."""
+    return len(_published(table, experiment)[0]) >= _LEAST
+
+
+def _published(table: pl.DataFrame, experiment: str) -> tuple[Array, Array]:
+    rows = table.filter(pl.col("experiment") == experiment).unique("sample_id").sort("stroke_m")
+    return rows["stroke_m"].to_numpy(), (rows["published_m"] - rows["depth_m"]).to_numpy()
+
+
+def _law_table(laws: list[LawFit]) -> pl.DataFrame:
+    return pl.DataFrame(
+        [
+            {
+                "quantity": law.name,
+                "of": name,
+                "exponent": float(law.law.exponents[i]),
+                "low": float(law.law.low[i]),
+                "high": float(law.law.high[i]),
+                "cases": law.cases,
+            }
+            for law in laws
+            for i, name in enumerate(("D", "h"))
+        ]
+    )
+
+
+def findings(
+    table: pl.DataFrame, bands: pl.DataFrame, laws: Sequence[LawFit], curves: Sequence[Curve], rendered: pl.DataFrame
+) -> tuple[Finding, ...]:
+    """Findings: published and ours, senses of phi, misalignment, laws, published curves, rendered misalignment."""
+    return (
+        *_error_findings(table),
+        *_table_findings(table),
+        *_sense_findings(table),
+        *_band_findings(table, bands),
+        *(row for law in laws for row in _law_findings(law)),
+        *(row for curve in curves for row in _curve_findings(curve)),
+        *(_rendered_findings(rendered) if len(rendered) else ()),
+    )
+
+
+def notes(rendered: Sequence[str], fit_draws: int, table: pl.DataFrame) -> tuple[str, ...]:
+    """Parts that this run leaves out."""
+    missing = int(table.filter(pl.col("sense") == "exact")["missing"].sum())
+    return tuple(
+        text
+        for text, holds in (
+            ("no misaligned rig was rendered: drawn misalignments are in closed form alone", not rendered),
+            ("chain_fit read one draw per experiment: it has no error bars", fit_draws == 1),
+            (f"{missing} readings gave no estimate and are left out", missing > 0),
+            ("the points of one table share a rig: counts of points in the band are no test", True),
+        )
+        if holds
+    )
+
+
+def _error_findings(table: pl.DataFrame) -> Iterator[Finding]:
+    """Relative errors of D, rms over the experiments, with exact geometry."""
+    own = _own(table, "exact")
+    published = (own["published_m"] / own["depth_m"] - 1.0).to_numpy()
+    bound = (own["bound_m"] / own["depth_m"]).to_numpy()
+    yield rms_finding("error of the published estimates, rms", published, "published")
+    for method in table["method"].unique(maintain_order=True):
+        rows = _own(table, "exact", method)
+        error, sd = ((rows[name] / rows["depth_m"]).to_numpy() for name in ("mean_m", "sd_m"))
+        yield rms_finding(f"error of the mean reading, {method}, rms", error - 1.0, "error", method)
+        if np.isfinite(sd).any():
+            yield rms_finding(f"scatter of a draw, {method}, rms", sd, "scatter", method)
+    yield rms_finding("bound of a pair, rms", bound, "bound")
+    above = int((np.abs(published) > 2.0 * bound).sum())
+    yield Finding("published errors above twice the bound of their experiment", above, unit=f"of {len(own)}")
+
+
+def _table_findings(table: pl.DataFrame) -> Iterator[Finding]:
+    """Errors by table of the paper: a mean over all of them is ruled by the shortest strokes."""
+    for name in sorted(table["experiment"].unique()):
+        own = table.filter((pl.col("experiment") == name) & (pl.col("sense") == "exact"))
+        first = own.filter(pl.col("method") == own["method"][0])
+        published = (first["published_m"] / first["depth_m"] - 1.0).to_numpy()
+        title = _title(name)
+        yield Finding(f"{title}, error of the published estimates, rms", 100.0 * rms(published), unit="%")
+        for method in own["method"].unique(maintain_order=True):
+            rows = own.filter(pl.col("method") == method)
+            error = (rows["mean_m"] / rows["depth_m"] - 1.0).to_numpy()
+            value = 100.0 * rms(error[np.isfinite(error)])
+            yield Finding(f"{title}, error of the mean reading, {method}, rms", value, unit="%")
+
+
+def _sense_findings(table: pl.DataFrame) -> Iterator[Finding]:
+    """Published minus noise-free estimate in each sense of phi, and the sum of squares that the sense leaves."""
+    own = _own(table, "ray")
+    alone = rms(((own["published_m"] - own["depth_m"]) / own["depth_m"]).to_numpy())
+    for sense in NAMED:
+        rows = _own(table, sense)
+        apart = ((rows["published_m"] - rows["noise_free_m"]) / rows["depth_m"]).to_numpy()
+        yield rms_finding(f"published minus noise-free estimate, phi_{sense}, rms", apart, "sense", sense)
+        share = Finding(
+            f"sum of squares that phi_{sense} leaves of the published errors",
+            100.0 * (rms(apart) / alone) ** 2,
+            unit="%",
+        )
+        yield share if sense == "ray" else share.judged("<=", 100.0)
+
+
+def _band_findings(table: pl.DataFrame, bands: pl.DataFrame) -> Iterator[Finding]:
+    for sense in NAMED:
+        inside = _inside(table, bands, sense)
+        label = f"published points in the central 95 % of misaligned rigs, phi_{sense}"
+        yield Finding(label, int(inside.sum()), unit=f"of {len(inside)}")
+
+
+def _law_findings(law: LawFit) -> Iterator[Finding]:
+    """Exponents of D and h against those of eq. (7)."""
+    for name, value, low, high, expected in zip(
+        "Dh", law.law.exponents, law.law.low, law.law.high, EXPECTED, strict=True
+    ):
+        yield Finding(f"{law.name}: exponent of {name}", value, low, high).judged("=", expected)
+
+
+def _curve_findings(curve: Curve) -> Iterator[Finding]:
+    """Signs, exponent and residuals of the published errors of one table; 1/h is the law of noise."""
+    title, law = f"published errors of {_title(curve.experiment)}", curve.law
+    yield Finding(f"{title}: changes of sign along h", curve.signs)
+    yield Finding(f"{title}: rms", curve.rms_m, unit="m")
+    exponent = Finding(f"{title}: exponent of h", law.exponents[0], law.low[0], law.high[0])
+    yield exponent.judged("=", EXPECTED[1])
+    residuals = {"c/h": curve.inverse_m, "a + b h": curve.line_m, "a + b/h": curve.offset_m}
+    for name, value in residuals.items():
+        yield Finding(f"{title}: residual of {name}, per degree of freedom", value, unit="m")
+
+
+def _rendered_findings(rendered: pl.DataFrame) -> Iterator[Finding]:
+    closed = rendered["closed_form_error_m"].to_numpy()
+    gap = rendered["rendered_error_m"].to_numpy() - closed
+    yield Finding("rendered misaligned rig: estimates", len(rendered))
+    yield Finding("rendered misaligned rig: largest error of D", 1e3 * float(np.abs(closed).max()), unit="mm")
+    largest = 1e3 * float(np.nanmax(np.abs(gap)))
+    yield Finding("rendered misaligned rig: largest difference of frames and closed form", largest, unit="mm")
+
+
+def _title(experiment: str) -> str:
+    return f"Table {experiment.removeprefix('table')}"
+
+
+def senses_shown(table: pl.DataFrame, bands: pl.DataFrame) -> tuple[Row, ...]:
+    """Relative errors by sense of phi: rms and extremes, and how many published points lie in the misaligned band."""
+    rows: list[Row] = [("phi", "rms, %", "smallest, %", "largest, %", "rms to published, %", "published in the band")]
+    for sense in table["sense"].unique(maintain_order=True):
+        own, inside = _own(table, sense), _inside(table, bands, sense)
+        error = own["noise_free_m"].to_numpy() / own["depth_m"].to_numpy() - 1.0
+        apart = (own["published_m"].to_numpy() - own["noise_free_m"].to_numpy()) / own["depth_m"].to_numpy()
+        cells = (f"{100.0 * x:.3f}" for x in (rms(error), error.min(), error.max()))
+        rows.append((sense, *cells, f"{100.0 * rms(apart):.2f}", f"{inside.sum()} of {len(inside)}"))
+    return tuple(rows)
+
+
+def laws_shown(laws: Sequence[LawFit]) -> tuple[Row, ...]:
+    """Exponents with intervals."""
+    head = ("standard deviation of D from", "exponent of D", "95 %", "exponent of h", "95 %", "residual, %")
+    return (head, *(_law_row(law) for law in laws))
+
+
+def _law_row(law: LawFit) -> Row:
+    (p, q), low, high = law.law.exponents, law.law.low, law.law.high
+    return (
+        law.name,
+        f"{p:.2f}",
+        f"{low[0]:.2f} to {high[0]:.2f}",
+        f"{q:.2f}",
+        f"{low[1]:.2f} to {high[1]:.2f}",
+        f"{100.0 * law.law.rms_log:.0f}",
+    )
+
+
+def rms(values: Array) -> float:
+    """Root mean square; NaN of nothing."""
+    return float(np.sqrt(np.mean(np.square(values)))) if len(values) else float("nan")
+
+
+def rms_interval(values: Array, *names: str) -> tuple[float, float]:
+    """Percentile bootstrap interval, 95 %, of a root mean square over independent cases; NaN for less than three.
+
+    `names` are those of the random stream.
+    """
+    if len(values) < 3:
+        return float("nan"), float("nan")
+    found = bootstrap(
+        (np.square(values),),
+        lambda squares, axis: np.sqrt(np.mean(squares, axis=axis)),
+        n_resamples=RESAMPLES,
+        confidence_level=CONFIDENCE,
+        method="percentile",
+        vectorized=True,
+        rng=generator("study", "spread", *names),
+    )
+    return float(found.confidence_interval.low), float(found.confidence_interval.high)
+
+
+def rms_finding(label: str, values: Array, *names: str) -> Finding:
+    """Rms of relative values in per cent, with its interval; values that are not finite are left out."""
+    good = values[np.isfinite(values)]
+    low, high = rms_interval(good, *names)
+    return Finding(label, 100.0 * rms(good), 100.0 * low, 100.0 * high, "%")
+
+
+def _own(table: pl.DataFrame, sense: str, method: str | None = None) -> pl.DataFrame:
+    """Rows of one sense and one method, the first if none is named."""
+    return table.filter((pl.col("sense") == sense) & (pl.col("method") == (method or table["method"][0])))
+
+
+def _inside(table: pl.DataFrame, bands: pl.DataFrame, sense: str) -> Array:
+    own = _own(table, sense).join(bands, on=["sample_id", "sense"])
+    error = own["published_m"] - own["depth_m"]
+    return ((error >= own["low_m"]) & (error <= own["high_m"])).to_numpy()
+
+
+STUDY = Study(
+    "baseline",
+    "The paper's tables and figures",
+    "What do the paper's 25 experiments give when they are rendered, in each sense of phi and on misaligned rigs, and "
+    "do the errors follow eq. (7)?",
+    BaselineSettings,
+    run,
+)

@@ -1,0 +1,456 @@
+"""Study `isotropy`: the error of D against the azimuth, for the vertical stroke and for a horizontal baseline.
+
+The horizontal baseline is the competitor that the paper names: the same sensor moved sideways by the same length, or
+two of them. D counts from the vertical through the first position, in both cases. Epipolar lines and upright edges of
+the room are followed in the image and in the panorama. The run comes first, then findings, then tables of the report.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Annotated, Literal
+
+import numpy as np
+import polars as pl
+from pydantic import BeforeValidator, Field
+
+from phibench.benchmark.scores.answer_errors import Rules
+from phibench.datasets.errors import DatasetError
+from phibench.datasets.read import Dataset, Sample
+from phibench.estimator.geometry.panorama import (
+    Grid,
+    SeenEdge,
+    pixels_by_model,
+    seen_edge,
+    track,
+    unrolled,
+    vertical_edges,
+)
+from phibench.estimator.geometry.phi import outline_circle
+from phibench.render.sensor.settings import sensor
+from phibench.scenes.frames import Array
+from phibench.scenes.misalignment import Misalignment
+from phibench.scenes.rig import Rig
+from phibench.studies.findings import Finding, Row
+from phibench.studies.framework import Result, Settings, Study, StudyDatasets
+from phibench.studies.isotropy.binocular import Binocular, Laws, tried
+from phibench.studies.isotropy.drawings import lines_drawing, misaligned_drawing, noise_drawing
+from phibench.studies.isotropy.lines import Line, epipolar_line, half_width_rad, hidden_share
+from phibench.studies.isotropy.noise import (
+    AzimuthNoise,
+    Isotropy,
+    Pair,
+    azimuth_noise,
+    bounds,
+    bounds_over_grid,
+    circle,
+    isotropy,
+    pairs_of,
+    sideways,
+)
+from phibench.studies.misaligned_rigs import Places, errors
+
+
+def _tuples(value: object) -> object:
+    return tuple(value) if isinstance(value, list) else value
+
+
+Height = Annotated[float, Field(ge=0.0, le=3.0)]
+Depth = Annotated[float, Field(gt=0.2, le=50.0)]
+
+
+class IsotropySettings(Settings):
+    """Numbers of the study."""
+
+    preset: Literal["bayer-raw"] = Field(description="sensor whose frames are drawn")
+    draws: int = Field(ge=5, le=100000, description="frame pairs per spot and baseline")
+    false_alarm: float = Field(gt=0.0, lt=0.5, description="probability of a false 'not isotropic'")
+    bound_azimuths: int = Field(ge=4, le=720, description="of the bound's curve")
+    grid_azimuths: int = Field(ge=4, le=720, description="of the bound averaged over the pixel grid")
+    occlusion_heights_m: Annotated[tuple[Height, ...], BeforeValidator(_tuples)] = Field(min_length=1)
+    occlusion_azimuths: int = Field(ge=36, le=100000)
+    line_azimuths: int = Field(ge=2, le=360, description="epipolar lines, evenly around")
+    line_depths_m: Annotated[tuple[Depth, ...], BeforeValidator(_tuples)] = Field(min_length=3)
+    panorama_width_px: int = Field(ge=360, le=16384)
+    edges: Annotated[tuple[str, ...], BeforeValidator(_tuples)] = Field(description="shapes with upright edges")
+    confidence: float = Field(gt=0.5, lt=1.0)
+    resamples: int = Field(ge=100, le=100000, description="of the bootstrap")
+
+
+VERTICAL, HORIZONTAL = "vertical stroke", "horizontal baseline"
+_LOW_RAD, _HIGH_RAD = math.radians(-20.0), math.radians(20.0)
+_LEAST_P = 1e-9  # smaller ones say no more
+_NORMAL_95 = 1.96  # standard errors on both sides of an interval of 95 %
+_STRAIGHT_PX = 0.1  # a tenth of a pixel matters, less does not
+
+
+@dataclass(frozen=True)
+class _Scene:
+    """Shared by all parts: the aligned rig, the spots' circle, the light under the spots."""
+
+    rig: Rig
+    baseline_m: float
+    depth_m: float
+    height_m: float
+    background: Array
+
+
+def run(settings: IsotropySettings, datasets: StudyDatasets) -> Result:
+    """Run the study."""
+    upright, moved, tilted = (
+        datasets.dataset(name) for name in ("study-isotropy", "study-isotropy-sideways", "study-isotropy-tilted")
+    )
+    pairs = {VERTICAL: tuple(pairs_of(upright)), HORIZONTAL: tuple(pairs_of(moved))}
+    for name, each in pairs.items():
+        if not each:
+            raise DatasetError(
+                f"{name}: the data set has no spot that both images show; render it again from its recipe"
+            )
+    scene = _scene(pairs[VERTICAL])
+    noise = _noise(settings, pairs)
+    tests = {name: isotropy(rows, settings.false_alarm) for name, rows in noise.items()}
+    azimuths, curves, few, grid = _curves(settings, scene)
+    true = _misalignment(tilted)
+    wrong = _misaligned(scene, true, azimuths)
+    hidden = _occlusion(settings, scene)
+    lines = _lines(settings, scene, true)
+    edges = {"aligned": _edges(settings, upright), "misaligned": _edges(settings, tilted)}
+    words = f"tilt_y {math.degrees(true.tilt_y_rad):.2g} deg and decentre_y {1e3 * true.decentre_y_m:.2g} mm"
+    findings = (
+        *(row for name in noise for row in scatter_findings(name, noise[name], tests[name])),
+        *(row for name in noise for row in bias_findings(name, noise[name])),
+        *grid_findings(curves[VERTICAL], grid),
+        *baseline_findings(azimuths, curves[VERTICAL], curves[HORIZONTAL], scene.baseline_m),
+        *misaligned_findings(wrong, words),
+        *occlusion_findings(hidden, scene.baseline_m),
+        *tried(
+            Binocular(scene.rig, scene.baseline_m, scene.depth_m, scene.height_m),
+            settings.occlusion_heights_m,
+            Laws(draws=settings.draws),
+            scene.background,
+            sensor(settings.preset),
+        ),
+        *line_findings(*lines),
+        *(row for name, found in edges.items() for row in edge_findings(name, found)),
+    )
+    return Result(
+        {
+            "table": _noise_table(noise),
+            "bounds": pl.DataFrame(
+                {"azimuth_deg": azimuths, **_columns(curves, "bound_m"), **_columns(wrong, "error")}
+            ),
+            "occlusion": hidden,
+            "edges": pl.DataFrame([{"rig": name, **vars(e)} for name, found in edges.items() for e in found]),
+            "lines": _line_table(lines),
+        },
+        findings,
+        (
+            noise_drawing(
+                {
+                    **{name: (azimuths, curve) for name, curve in curves.items()},
+                    f"{VERTICAL}, mean over pixels": (few, grid),
+                },
+                noise,
+            ),
+            misaligned_drawing(azimuths, wrong, words),
+            lines_drawing(*lines, outline_circle(scene.rig)[0]),
+        ),
+        {"Noise of D by azimuth": noise_rows(noise), "Upright edges in the panorama": edge_rows(edges)},
+        _notes(noise),
+    )
+
+
+def _scene(pairs: Sequence[Pair]) -> _Scene:
+    first = pairs[0]
+    light, (u, v) = first.lights[0], np.rint(first.uv_px[0]).astype(int)
+    around = light.ambient_electrons_per_s[:, v - 4 : v + 5, u - 4 : u + 5]
+    level = np.median(np.asarray(around, float), axis=(1, 2))
+    return _Scene(first.rig, first.baseline_m, first.depth_m, float(first.point_m[2]), level)
+
+
+def _noise(settings: IsotropySettings, pairs: dict[str, tuple[Pair, ...]]) -> dict[str, tuple[AzimuthNoise, ...]]:
+    card, rules = sensor(settings.preset), Rules(confidence=settings.confidence, resamples=settings.resamples)
+    return {
+        name: tuple(azimuth_noise(pair, card, settings.draws, name, rules) for pair in each)
+        for name, each in pairs.items()
+    }
+
+
+def _curves(settings: IsotropySettings, scene: _Scene) -> tuple[Array, dict[str, Array], Array, Array]:
+    """Azimuths in degrees and bounds by baseline; azimuths and the vertical bound averaged over the pixel grid."""
+    card = sensor(settings.preset)
+    points = circle(scene.depth_m, scene.height_m, settings.bound_azimuths)
+    rigs = {VERTICAL: scene.rig, HORIZONTAL: sideways(scene.rig)}
+    curves = {name: bounds(rig, scene.baseline_m, points, scene.background, card) for name, rig in rigs.items()}
+    few = circle(scene.depth_m, scene.height_m, settings.grid_azimuths)
+    averaged = bounds_over_grid(scene.rig, scene.baseline_m, few, scene.background, card)
+    return _azimuths_deg(points), curves, _azimuths_deg(few), averaged
+
+
+def _azimuths_deg(points_m: Array) -> Array:
+    return np.asarray(np.degrees(np.arctan2(points_m[:, 1], points_m[:, 0])) % 360.0)
+
+
+def _misalignment(dataset: Dataset) -> Misalignment:
+    return Misalignment(**dataset.recipe.misalignment.model_dump())
+
+
+def _misaligned(scene: _Scene, true: Misalignment, azimuths_deg: Array) -> dict[str, Array]:
+    """Relative errors of the exact estimator with the aligned rig as nominal."""
+    spots = Places(np.array([scene.depth_m]), np.radians(azimuths_deg), scene.height_m, scene.baseline_m)
+    rigs = {VERTICAL: scene.rig, HORIZONTAL: sideways(scene.rig)}
+    return {name: errors(rig, true, spots, ("exact",))[0, 0] for name, rig in rigs.items()}
+
+
+def _occlusion(settings: IsotropySettings, scene: _Scene) -> pl.DataFrame:
+    rows = []
+    for height in settings.occlusion_heights_m:
+        points = circle(scene.depth_m, height, settings.occlusion_azimuths)
+        pair, own = hidden_share(scene.rig, scene.baseline_m, points)
+        half = half_width_rad(scene.rig, scene.baseline_m, scene.depth_m, height)
+        rows.append({"height_m": height, "pair": pair, "own": own, "first_by_mirror_closed_form": half / math.pi})
+    return pl.DataFrame(rows)
+
+
+def _lines(settings: IsotropySettings, scene: _Scene, true: Misalignment) -> tuple[tuple[Line, ...], tuple[Line, ...]]:
+    """Epipolar lines of the aligned and of the misaligned rig."""
+    grid = Grid(settings.panorama_width_px, _LOW_RAD, _HIGH_RAD)
+    points = circle(scene.depth_m, scene.height_m, settings.line_azimuths)
+    depths = np.array(settings.line_depths_m)
+    found = []
+    for m in (Misalignment(), true):
+        rig, h = scene.rig.perturbed(m), m.stroke_m(scene.baseline_m)
+        found.append(tuple(epipolar_line(scene.rig, rig, h, point, depths, grid, True) for point in points))
+    return found[0], found[1]
+
+
+def _edges(settings: IsotropySettings, dataset: Dataset) -> tuple[SeenEdge, ...]:
+    """Upright edges in the down view's noise-free panorama, unrolled with the nominal rig."""
+    sample: Sample = dataset.samples[0]
+    grid = Grid(settings.panorama_width_px, _LOW_RAD, _HIGH_RAD)
+    nominal = sample.nominal_rig.at(0.0)
+    image = unrolled(np.asarray(sample.ambient("down"), float).sum(axis=0), pixels_by_model(nominal, grid))
+    edges = vertical_edges(dataset.room, settings.edges)
+    found = (seen_edge(image, grid, e.name, track(sample.rig.at(0.0), nominal, grid, e)) for e in edges)
+    return tuple(edge for edge in found if edge is not None)
+
+
+def _noise_table(noise: dict[str, tuple[AzimuthNoise, ...]]) -> pl.DataFrame:
+    return pl.DataFrame(
+        [
+            {
+                "baseline": name,
+                "azimuth_deg": one.azimuth_deg,
+                "depth_m": one.depth_m,
+                "bound_m": one.bound_m,
+                "scatter_m": one.scatter_m.value,
+                "scatter_low_m": one.scatter_m.low,
+                "scatter_high_m": one.scatter_m.high,
+                "bias_m": one.bias_m,
+                "bias_sigma_m": one.bias_sigma_m,
+                "draws": len(one.errors_m),
+                "missing": one.missing,
+            }
+            for name, rows in noise.items()
+            for one in rows
+        ]
+    )
+
+
+def _line_table(lines: tuple[tuple[Line, ...], tuple[Line, ...]]) -> pl.DataFrame:
+    return pl.DataFrame(
+        [
+            {
+                "rig": name,
+                "down_u_px": float(line.down_px[0]),
+                "down_v_px": float(line.down_px[1]),
+                "beside_radius_px": line.beside_radius_px,
+                "beside_line_px": line.beside_line_px,
+                "rendered_beside_px": line.rendered_beside_px,
+                "panorama_bend_px": line.bend_px,
+            }
+            for name, each in zip(("aligned", "misaligned"), lines, strict=True)
+            for line in each
+        ]
+    )
+
+
+def _columns(values: dict[str, Array], what: str) -> dict[str, Array]:
+    return {f"{name.split()[0]}_{what}": each for name, each in values.items()}
+
+
+def _notes(noise: dict[str, tuple[AzimuthNoise, ...]]) -> tuple[str, ...]:
+    lost = {name: sum(one.missing for one in rows) for name, rows in noise.items()}
+    missing = [f"{name}: {n} fits found no spot and are left out" for name, n in lost.items() if n]
+    return (
+        *missing,
+        "the horizontal data set keeps 1 mm of stroke, which the estimator knows; no board lies nearer than 15 degrees "
+        "to the baseline's direction",
+    )
+
+
+# -- findings ------------------------------------------------------------------------------------------------------
+
+
+def scatter_findings(name: str, noise: Sequence[AzimuthNoise], test: Isotropy) -> Iterator[Finding]:
+    """Smallest and largest scatter of one baseline, and the tests of isotropy; none with too few azimuths."""
+    for word, pick in (("smallest", min), ("largest", max)):
+        one = pick(noise, key=lambda each: each.scatter_m.value)
+        ends = (one.scatter_m.value, one.scatter_m.low, one.scatter_m.high)
+        yield Finding.ranged(f"{name}: {word} scatter of D", ends, "mm", 1e3)
+        yield Finding(f"{name}: azimuth of the {word} scatter", one.azimuth_deg, unit="deg")
+    yield Finding(f"{name}: D", noise[0].depth_m, unit="m")
+    if test.tested:
+        yield Finding(f"{name}: largest over smallest scatter", test.ratio)
+        for word, p in (
+            ("the same scatter", test.p_value),
+            ("the same multiple of the bound", test.p_value_over_bound),
+        ):
+            yield Finding(f"{name}: p of {word} at all azimuths", max(p, _LEAST_P)).judged(">=", test.false_alarm)
+
+
+def bias_findings(name: str, noise: Sequence[AzimuthNoise]) -> Iterator[Finding]:
+    """Largest systematic error of the likelihood fits; none with too few estimates."""
+    usable = [one for one in noise if one.errors_m.size > 1]
+    if usable:
+        worst = max(usable, key=lambda one: abs(one.bias_m))
+        value, half = 1e3 * abs(worst.bias_m), 1e3 * _NORMAL_95 * worst.bias_sigma_m
+        yield Finding(f"{name}: largest mean error", value, value - half, value + half, "mm")
+        yield Finding(f"{name}: largest mean error over the scatter there", abs(worst.bias_m) / worst.scatter_m.value)
+        yield Finding(f"{name}: azimuth of the largest mean error", worst.azimuth_deg, unit="deg")
+
+
+def grid_findings(single: Array, averaged: Array) -> Iterator[Finding]:
+    """Largest over smallest bound of the vertical stroke, for one place in a Bayer cell and averaged over places.
+
+    The mosaic's grid makes the difference where averaging takes away more than half of the excess over 1.
+    """
+    one, mean = ratio(single), ratio(averaged)
+    yield Finding("even background: largest over smallest bound", one)
+    yield Finding("even background: the same, averaged over places in a Bayer cell", mean).judged(
+        "<=", 1.0 + 0.5 * (one - 1.0)
+    )
+
+
+def baseline_findings(azimuths_deg: Array, vertical: Array, horizontal: Array, baseline_m: float) -> Iterator[Finding]:
+    """Bounds of both baselines at the same length, and the share of azimuths at which the horizontal one is smaller."""
+    seen = np.isfinite(horizontal) & np.isfinite(vertical)
+    from_it = np.degrees(np.arcsin(np.abs(np.sin(np.radians(azimuths_deg)))))
+    yield Finding("length of both baselines", baseline_m, unit="m")
+    yield Finding(f"bound, {VERTICAL}, rms over azimuths", 1e3 * np.sqrt(np.mean(vertical[seen] ** 2)), unit="mm")
+    for word, each in (("across it", -from_it), ("nearest to its direction", from_it)):
+        i = int(np.argmin(np.where(seen, each, np.inf)))
+        yield Finding(f"bound, {HORIZONTAL}, {word}", 1e3 * horizontal[i], unit="mm")
+        yield Finding(f"bound, {HORIZONTAL}, {word}: angle from its direction", from_it[i], unit="deg")
+    better = 100.0 * float(np.mean(horizontal[seen] < vertical[seen]))
+    yield Finding("azimuths at which the horizontal baseline has the smaller bound", better, unit="%")
+
+
+def misaligned_findings(errors_by_baseline: Mapping[str, Array], words: str) -> Iterator[Finding]:
+    """Ends of the relative error over azimuths, with nominal numbers of a misaligned rig."""
+    for name, values in errors_by_baseline.items():
+        for word, value in (("smallest", np.nanmin(values)), ("largest", np.nanmax(values))):
+            yield Finding(f"{name}, {words}: {word} error of D", 100.0 * value, unit="%")
+        count = int(np.count_nonzero(np.isfinite(values)))
+        yield Finding(f"{name}, {words}: azimuths with an estimate", count, unit=f"of {values.size}")
+
+
+def occlusion_findings(hidden: pl.DataFrame, apart_m: float) -> Iterator[Finding]:
+    """Shares of all azimuths that two fixed sensors hide from each other, and one moving sensor from itself."""
+    for row in hidden.iter_rows(named=True):
+        label = f"hidden from each other, two sensors {apart_m:.3g} m apart, spot at {row['height_m']:g} m"
+        yield Finding(label, 100.0 * row["pair"], unit="%")
+    largest = 100.0 * float(np.max(hidden["own"].to_numpy()))
+    yield Finding("hidden from itself, one sensor that moves, largest", largest, unit="%").judged("<=", 0.0)
+
+
+def line_findings(aligned: Sequence[Line], tilted: Sequence[Line]) -> Iterator[Finding]:
+    """Distances of epipolar lines from the radius, the panorama's column, and their best straight line."""
+    for name, lines in (("aligned rig", aligned), ("misaligned rig", tilted)):
+        for word, key, unit in (
+            ("exact points beside the radius", "beside_radius_px", "px"),
+            ("rendered spots beside the radius", "rendered_beside_px", "px"),
+            ("panorama, beside the column", "bend_px", "columns"),
+            ("exact points beside a straight line", "beside_line_px", "px"),
+        ):
+            largest = max(getattr(line, key) for line in lines)
+            yield Finding(f"epipolar lines, {name}: {word}", largest, unit=unit).judged("<=", _STRAIGHT_PX)
+
+
+def edge_findings(name: str, edges: Sequence[SeenEdge]) -> Iterator[Finding]:
+    """Largest lean of the room's upright edges in the panorama, and its largest difference from the prediction."""
+    if edges:
+        worst = max(edges, key=lambda edge: abs(edge.lean_px))
+        lean, half = worst.lean_px, _NORMAL_95 * worst.lean_sigma_px
+        size = Finding("", abs(lean), max(abs(lean) - half, 0.0), abs(lean) + half).judged("<=", _STRAIGHT_PX)
+        label = f"upright edges, {name} rig: largest lean (threshold: of its size)"
+        yield replace(size, label=label, value=lean, low=lean - half, high=lean + half, unit="columns")
+        yield Finding(f"upright edges, {name} rig: rows of the edge with the largest lean", worst.rows)
+        miss = max(abs(edge.lean_px - edge.expected_lean_px) for edge in edges)
+        yield Finding(f"upright edges, {name} rig: largest difference from the prediction", miss, unit="columns")
+
+
+# -- small tables of the report ----------------------------------------------------------------------------------------
+
+
+def noise_rows(noise: Mapping[str, Sequence[AzimuthNoise]]) -> tuple[Row, ...]:
+    """Table: scatter, interval, bound and bias per baseline and azimuth."""
+    heads = ("baseline", "azimuth, degrees", "bound, mm", "scatter, mm (95 %)", "bias, mm", "fits missing")
+    return (
+        heads,
+        *(
+            (
+                name,
+                f"{one.azimuth_deg:.0f}",
+                f"{1e3 * one.bound_m:.2f}",
+                _interval(one),
+                f"{1e3 * one.bias_m:+.2f} +- {1e3 * one.bias_sigma_m:.2f}",
+                str(one.missing),
+            )
+            for name, rows in noise.items()
+            for one in rows
+        ),
+    )
+
+
+def edge_rows(edges: Mapping[str, Sequence[SeenEdge]]) -> tuple[Row, ...]:
+    """Table: upright edges in the panorama."""
+    heads = ("rig", "edge", "azimuth, degrees", "rows", "lean, columns", "predicted", "offset, columns")
+    return (
+        heads,
+        *(
+            (
+                name,
+                edge.name,
+                f"{edge.azimuth_deg:.1f}",
+                str(edge.rows),
+                f"{edge.lean_px:+.3f} +- {edge.lean_sigma_px:.3f}",
+                f"{edge.expected_lean_px:+.3f}",
+                f"{edge.offset_px:+.3f}",
+            )
+            for name, rows in edges.items()
+            for edge in rows
+        ),
+    )
+
+
+def ratio(values: Array) -> float:
+    """Largest over smallest; NaN without any."""
+    known = values[np.isfinite(values)]
+    return float(known.max() / known.min()) if known.size else math.nan
+
+
+def _interval(one: AzimuthNoise) -> str:
+    s = one.scatter_m
+    return f"{1e3 * s.value:.2f} ({1e3 * s.low:.2f} to {1e3 * s.high:.2f})"
+
+
+STUDY = Study(
+    "isotropy",
+    "Isotropy and epipolar geometry",
+    "Is the error of D the same at all azimuths, does a sensor hide itself, and are epipolar lines radial?",
+    IsotropySettings,
+    run,
+)

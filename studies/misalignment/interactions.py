@@ -1,0 +1,215 @@
+"""Interactions of misalignments: first-order and total Sobol indices of the relative error of D.
+
+I. M. Sobol, Math. Comput. Simul. 55, 271 (2001); estimators of A. Saltelli et al., Comput. Phys. Commun. 181, 259
+(2010), as scipy has them. The parameters are uniform from minus to plus the study's magnitude, independent of each
+other. First-order indices that sum to 1 mean errors that add; what is missing is interaction.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from phibench.datasets.errors import DatasetError
+from phibench.estimator.geometry.sensitivities import PARAMETERS as ANALYTIC
+from phibench.scenes.frames import Array
+from phibench.scenes.misalignment import PARAMETERS, Misalignment
+from phibench.scenes.rig import Rig
+from phibench.studies.findings import Finding
+from phibench.studies.misaligned_rigs import ALL, Places, errors, errors_of_many
+
+_ADDITIVE = 0.9  # sum of the first-order indices from which errors add
+OUTPUTS = (("error", 2), ("square", 1))
+"""Outputs, and the power whose mean is the mean square error."""
+
+
+@dataclass(frozen=True)
+class Interactions:
+    """Indices of one output.
+
+    Attributes
+    ----------
+    output : "error" or "square"
+    depth_m : float
+    parameters : tuple of str
+    indices, low, high : shape (2 p + 2,)
+        First-order ones, total ones, the sum of the first-order ones, and the rms relative error over the draws, with
+        the ends of 95 % intervals.
+    """
+
+    output: str
+    depth_m: float
+    parameters: tuple[str, ...]
+    indices: Array
+    low: Array
+    high: Array
+
+    @property
+    def first(self) -> Array:
+        """First-order indices, shape (p,)."""
+        return self.indices[: len(self.parameters)]
+
+    @property
+    def total(self) -> Array:
+        """Total indices, shape (p,)."""
+        return self.indices[len(self.parameters) : -2]
+
+
+def moving(
+    nominal: Rig, places: Places, estimators: tuple[str, ...], parameters: Sequence[str] = ALL
+) -> tuple[str, ...]:
+    """Parameters of a spherical mirror that change any estimate at all, at the study's magnitude.
+
+    Errors of form are left out: `errors_of_many` takes spheres.
+    """
+    aligned = errors(nominal, Misalignment(), places, estimators)
+    return tuple(
+        name
+        for name in parameters
+        if name in ANALYTIC
+        and nominal.perturbed(usual := Misalignment(**{name: PARAMETERS[name].study})).sphere.form is None
+        and np.max(np.abs(errors(nominal, usual, places, estimators) - aligned)) > 0.0
+    )
+
+
+def interactions(
+    nominal: Rig,
+    places: Places,
+    estimator: str,
+    n: int,
+    resamples: int,
+    rng: np.random.Generator,
+    parameters: Sequence[str] = ALL,
+) -> tuple[Interactions, ...]:
+    """Indices for every D: of the relative error at the first azimuth, and of its square, averaged over azimuths.
+
+    Parameters
+    ----------
+    nominal, places
+        The first azimuth is the one of the signed error.
+    estimator : str
+    n : int
+        Base sample, a power of two; n (parameters + 2) rigs are computed.
+    resamples : int
+        Of the bootstrap.
+    rng : Generator
+    parameters : names; those that move no chief ray are left out
+
+    Raises
+    ------
+    DatasetError
+        If a drawn rig has no estimate.
+    """
+    names = moving(nominal, places, (estimator,), parameters)
+    aligned = errors(nominal, Misalignment(), places, (estimator,))[0]
+
+    size = np.array([PARAMETERS[name].study for name in names])
+    for sign in (1.0, -1.0):  # the largest distortion must not fold the image: the many rigs are not checked
+        nominal.perturbed(Misalignment(**dict(zip(names, (sign * size).tolist(), strict=True))))
+
+    def model(unit: Array) -> Array:
+        drawn = (2.0 * unit - 1.0) * size
+        rigs = [Misalignment(**dict(zip(names, row.tolist(), strict=True))) for row in drawn]
+        change = np.moveaxis(errors_of_many(nominal, rigs, places, (estimator,))[:, 0] - aligned, 0, -1)
+        if lost := int(np.isnan(change).any(axis=(0, 1)).sum()):
+            raise DatasetError(
+                f"Sobol indices: {lost} of {len(unit)} drawn rigs lose a spot; take smaller depths_m in the settings"
+            )
+        return np.concatenate([change[:, 0], np.mean(change**2, axis=1)])
+
+    values = evaluated(model, len(names), n, rng)
+    labels = [(kind, power, float(D)) for kind, power in OUTPUTS for D in places.depths_m]
+    powers = np.array([power for _, power, _ in labels])
+    found, low, high = with_intervals(values, powers, resamples, rng)
+    return tuple(Interactions(kind, D, names, found[i], low[i], high[i]) for i, (kind, _, D) in enumerate(labels))
+
+
+@dataclass(frozen=True)
+class Values:
+    """Outputs at the points A and B, shape (s, n), and at A with one column of B, shape (p, s, n)."""
+
+    A: Array
+    B: Array
+    AB: Array
+
+    def taken(self, index: NDArray[np.int64]) -> Values:
+        """Those points only."""
+        return Values(self.A[:, index], self.B[:, index], self.AB[..., index])
+
+
+def evaluated(model: Callable[[Array], Array], p: int, n: int, rng: np.random.Generator) -> Values:
+    """Outputs of a model of p numbers, uniform from 0 to 1, shape (m, p), to (s, m)."""
+    points = stats.qmc.Sobol(2 * p, rng=rng).random(n)
+    A, B = points[:, :p], points[:, p:]
+    mixed = [np.where(np.arange(p) == i, B, A) for i in range(p)]
+    return Values(model(A), model(B), np.stack([model(each) for each in mixed]))
+
+
+def with_intervals(
+    values: Values, powers: Array, resamples: int, rng: np.random.Generator
+) -> tuple[Array, Array, Array]:
+    """`indices_of`, and the ends of 95 % intervals, in the same shape.
+
+    Points are drawn again (percentiles); scipy's own bootstrap of its result takes no generator.
+    """
+    n = values.A.shape[1]
+    drawn = np.stack([indices_of(values.taken(rng.integers(0, n, (n,))), powers) for _ in range(resamples)])
+    low, high = np.quantile(drawn, [0.025, 0.975], axis=0)
+    return indices_of(values, powers), low, high
+
+
+def indices_of(values: Values, powers: Array) -> Array:
+    """First-order, total, sum of first-order, root of the mean of output^power, shape (s, 2 p + 2)."""
+    found = stats.sobol_indices(func={"f_A": values.A, "f_B": values.B, "f_AB": values.AB}, n=values.A.shape[1])
+    first, total = np.atleast_2d(found.first_order), np.atleast_2d(found.total_order)
+    both = np.concatenate([values.A, values.B], axis=1)
+    rms = np.sqrt(np.mean(both ** powers[:, None], axis=1))
+    return np.column_stack([first, total, first.sum(axis=1), rms])
+
+
+def rows(found: Sequence[Interactions], estimator: str, places: Places) -> list[dict[str, Any]]:
+    """One row per output, D and parameter."""
+    return [
+        {
+            "estimator": estimator,
+            "output": one.output,
+            "depth_m": one.depth_m,
+            "stroke_m": places.stroke_m,
+            "parameter": name,
+            **_cells("first", one, i),
+            **_cells("total", one, i + len(one.parameters)),
+            **_cells("first_sum", one, -2),
+            **_cells("rms_relative", one, -1),
+        }
+        for one in found
+        for i, name in enumerate(one.parameters)
+    ]
+
+
+def _cells(name: str, one: Interactions, i: int) -> dict[str, float]:
+    low, high = float(one.low[i]), float(one.high[i])
+    return {name: float(one.indices[i]), f"{name}_low": low, f"{name}_high": high}
+
+
+def interaction_findings(found: Sequence[Interactions]) -> Iterator[Finding]:
+    """All parameters drawn at once: rms change of D, sum of the first-order indices, largest total index."""
+    signed = [one for one in found if one.output == "error"]
+    for one in signed:
+        together = (one.indices[-1], one.low[-1], one.high[-1])
+        yield Finding.ranged(f"all drawn at once, rms change of D, D = {one.depth_m:g} m", together, "%", 100.0)
+    for one in signed:
+        first = (one.indices[-2], one.low[-2], one.high[-2])
+        total = Finding.ranged(f"sum of the first-order Sobol indices, D = {one.depth_m:g} m", first)
+        yield total.judged(">=", _ADDITIVE)
+        rest = (1.0 - first[0], 1.0 - first[2], 1.0 - first[1])
+        yield Finding.ranged(f"variance by interaction, D = {one.depth_m:g} m", rest, "%", 100.0)
+    one = max(signed, key=lambda each: float(np.max(each.total)))
+    top = int(np.argmax(one.total))
+    i = len(one.parameters) + top
+    label = f"largest total Sobol index ({one.parameters[top]}, D = {one.depth_m:g} m)"
+    yield Finding(label, one.total[top], one.low[i], one.high[i])

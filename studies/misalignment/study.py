@@ -1,0 +1,363 @@
+"""Study `misalignment`: the cost of each misalignment for each estimator, predicted and rendered.
+
+Tolerances, a ranking, the effect of a calibration, and interactions follow from the same closed forms.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cache
+from typing import Annotated, Any
+
+import numpy as np
+import polars as pl
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
+
+from phibench.calibration.rig.bundle import Bundle
+from phibench.datasets.errors import DatasetError
+from phibench.datasets.progress import Steps
+from phibench.estimator.geometry.paper_depth import load_published
+from phibench.estimator.geometry.triangulate import depth_exact
+from phibench.scenes.catalog import default_rig
+from phibench.scenes.frames import Array
+from phibench.scenes.misalignment import PARAMETERS, Misalignment
+from phibench.scenes.random_streams import generator
+from phibench.scenes.rig import Rig
+from phibench.scenes.validation import nearest
+from phibench.studies.findings import Finding, Row
+from phibench.studies.framework import Drawing, Result, Settings, Study, StudyDatasets
+from phibench.studies.misaligned_rigs import (
+    ALL,
+    CALIBRATED,
+    NOMINAL,
+    Calibrate,
+    CalibrationSetup,
+    Places,
+    Rendered,
+    pixels,
+    rendered,
+    true_depth_m,
+)
+from phibench.studies.misalignment.drawings import azimuth_drawing, interaction_drawing, ranking_drawing
+from phibench.studies.misalignment.interactions import Interactions, interaction_findings, interactions, rows
+from phibench.studies.misalignment.refocus import FOCUS_M, LENS_M, refocus, refocus_findings, thin_lens
+from phibench.studies.misalignment.tables import (
+    Rank,
+    Search,
+    calibrated_findings,
+    cost_findings,
+    noise_findings,
+    percent,
+    ranking,
+    rendered_findings,
+    rendered_table,
+    shown,
+    slope_findings,
+    slope_misses,
+    study_table,
+    tolerance_findings,
+    tolerance_rows,
+    tolerances_of,
+    worst_disagreement,
+)
+
+
+def _tuples(value: object) -> object:
+    return tuple(_tuples(part) for part in value) if isinstance(value, list) else value
+
+
+Distance = Annotated[float, Field(gt=0.1, le=20.0)]
+Positive = Annotated[float, Field(gt=0.0, le=1.0)]
+Distances = Annotated[tuple[Distance, ...], BeforeValidator(_tuples), Field(min_length=1, max_length=20)]
+Spot = tuple[Distance, Annotated[float, Field(ge=-360.0, le=360.0)]]
+
+
+class SearchSettings(BaseModel):
+    """Values of a parameter that are tried, in units of its usual size."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+
+    start: float = Field(gt=0.0, le=1.0)
+    largest: float = Field(ge=1.0, le=1e5)
+    factor: float = Field(gt=1.01, le=10.0)
+
+
+class MisalignmentSettings(Settings):
+    """Numbers of the study."""
+
+    depths_m: Distances = Field(description="D of the spots from the nominal stroke axis")
+    strokes_m: Distances = Field(description="strokes; calibration, rendering and interactions take the first")
+    height_m: float = Field(ge=0.0, le=3.0, description="of the spots above the floor")
+    azimuths: int = Field(ge=4, le=360, multiple_of=4, description="evenly spaced, from world x")
+    cost: float = Field(gt=0.0, lt=1.0, description="relative change of D that a tolerance allows")
+    search: SearchSettings
+    search_calibrated: SearchSettings
+    rendered_every: int = Field(ge=1, description="every n-th azimuth is rendered, from the second one on")
+    agreement: float = Field(gt=0.0, lt=1.0, description="allowed difference of rendered and predicted change of D")
+    calibration_spots: Annotated[tuple[Spot, ...], BeforeValidator(_tuples)] = Field(min_length=1)
+    calibration_pixel_sigma_px: Positive
+    calibration_distance_sigma_m: Positive
+    calibration_outline_sigma_m: Annotated[tuple[Positive, Positive, Positive], BeforeValidator(_tuples)]
+    noise_draws: int = Field(ge=2, le=10000, description="calibrations of the aligned rig from noisy measurements")
+    sobol_log2: int = Field(ge=3, le=16, description="base sample of the Sobol indices: 2 to this power")
+    resamples: int = Field(ge=20, le=100000, description="of the bootstrap")
+    parameters: Annotated[tuple[str, ...], BeforeValidator(_tuples)] = Field(
+        default=(), description="misalignments; all if empty"
+    )
+
+    @property
+    def azimuths_rad(self) -> Array:
+        """All azimuths."""
+        return np.asarray(np.arange(self.azimuths) * (2.0 * math.pi / self.azimuths), float)
+
+    def places(self, stroke_m: float, azimuths_rad: Array | None = None) -> Places:
+        """Spots at a stroke, at all azimuths or at others."""
+        azimuths = self.azimuths_rad if azimuths_rad is None else azimuths_rad
+        return Places(np.array(self.depths_m), azimuths, self.height_m, stroke_m)
+
+    @property
+    def chosen(self) -> tuple[str, ...]:
+        """Names of the misalignments.
+
+        Raises
+        ------
+        DatasetError
+            If there is none of such a name.
+        """
+        for name in self.parameters:
+            if name not in PARAMETERS:
+                raise DatasetError(f"parameters: no misalignment '{name}'; {nearest(name, tuple(PARAMETERS))}")
+        return self.parameters or ALL
+
+    @property
+    def calibration_setup(self) -> CalibrationSetup:
+        """Simulated calibration of a rig."""
+        spots = [
+            (D * math.cos(math.radians(a)), D * math.sin(math.radians(a)), self.height_m)
+            for D, a in self.calibration_spots
+        ]
+        return CalibrationSetup(
+            np.array(spots),
+            self.calibration_pixel_sigma_px,
+            self.calibration_distance_sigma_m,
+            self.calibration_outline_sigma_m,
+        )
+
+    def tolerance_search(self, calibrated: bool = False) -> Search:
+        """Search for a tolerance."""
+        how = self.search_calibrated if calibrated else self.search
+        return Search(self.cost, how.start, how.largest, how.factor)
+
+
+_PARTS = 5  # table, rendered spots, tolerances, interactions, calibrations with noise; of unequal length
+_SLOPE_TARGET = 1e-3  # of D: a slope that misses by more is said to be not enough
+
+
+def run(settings: MisalignmentSettings, datasets: StudyDatasets) -> Result:
+    """Run the study; it renders spots itself and needs no data set."""
+    nominal = default_rig()
+    strokes = [settings.places(stroke) for stroke in settings.strokes_m]
+    places, names = strokes[0], settings.chosen
+    calibrate = _calibration(settings, nominal, places.stroke_m)
+    with Steps(datasets.console, "misalignment, parts", _PARTS) as steps:
+        table = study_table(nominal, strokes, calibrate, names)
+        steps.advance()
+        some = settings.places(places.stroke_m, settings.azimuths_rad[1 :: settings.rendered_every])
+        seen = tuple(rendered(nominal, some, names))
+        steps.advance()
+        fine, coarse = settings.tolerance_search(), settings.tolerance_search(calibrated=True)
+        tolerances = list(tolerance_rows(nominal, places, fine, coarse, calibrate, names))
+        steps.advance()
+        drawn = _interactions(settings, nominal, places.stroke_m)
+        steps.advance()
+        noise = _noise(settings, nominal, places)
+        steps.advance()
+    ranks = {name: ranking(table, name, places.stroke_m) for name in (*NOMINAL, CALIBRATED)}
+    pictures = rendered_table(seen, some)
+    middle = float(places.depths_m[len(places.depths_m) // 2])
+    return Result(
+        {
+            "table": table.join(pictures.drop("whole_relative"), on=_KEYS, how="left"),
+            "tolerance": pl.DataFrame(tolerances, infer_schema_length=None),
+            "interactions": pl.DataFrame(rows(drawn, "exact", places)),
+        },
+        _findings(settings, table, seen, tolerances, drawn, noise, ranks, places),
+        _drawings(table, pictures, drawn, ranks, places),
+        {
+            "Change of D by a misalignment of the usual size, %, rms over azimuths and signs; exact estimator, nominal "
+            "numbers and calibrated": ranking_rows(ranks["exact"], ranks[CALIBRATED]),
+            f"Tolerances at D = {middle:g} m, exact estimator with nominal numbers": (
+                tightest_table(tolerances, "exact", middle, settings.cost)
+            ),
+            f"Value that costs {100.0 * settings.cost:g} % of D, rms over azimuths and signs; - is never reached": (
+                tolerance_table(tolerances, "rms", ("exact", "paper_normal", CALIBRATED))
+            ),
+            f"Value that costs {100.0 * settings.cost:g} % of D at the worst azimuth and sign": (
+                tolerance_table(tolerances, "worst", ("exact", "paper_normal", CALIBRATED))
+            ),
+        },
+        _notes(settings, seen),
+    )
+
+
+_KEYS = ["parameter", "unit", "value", "estimator", "stroke_m", "height_m", "depth_m", "azimuth_deg"]
+
+
+def _calibration(settings: MisalignmentSettings, nominal: Rig, stroke_m: float) -> Calibrate:
+    """Calibrations of a run, each done once: the table and the tolerances ask for the same."""
+    setup = settings.calibration_setup
+
+    @cache
+    def calibrated(misalignment: Misalignment) -> Bundle:
+        return setup.calibrated(nominal, stroke_m, misalignment)
+
+    return calibrated
+
+
+def _interactions(settings: MisalignmentSettings, nominal: Rig, stroke_m: float) -> tuple[Interactions, ...]:
+    # four azimuths give the mean of all terms up to the third harmonic, and the first one is world x
+    places = settings.places(stroke_m, np.radians([0.0, 90.0, 180.0, 270.0]))
+    rng = generator("study", "misalignment", "sobol")
+    return interactions(nominal, places, "exact", 2**settings.sobol_log2, settings.resamples, rng, settings.chosen)
+
+
+def _noise(settings: MisalignmentSettings, nominal: Rig, places: Places) -> Array:
+    """Relative errors of an aligned rig that was calibrated with noise, shape (draws, d, a)."""
+    down, up = pixels(nominal, Misalignment(), places)
+    D, setup = true_depth_m(nominal, Misalignment(), places), settings.calibration_setup
+    errors = []
+    for draw in range(settings.noise_draws):
+        rng = generator("study", "misalignment", "calibration", draw)
+        found = setup.calibrated(nominal, places.stroke_m, Misalignment(), rng)
+        errors.append(depth_exact(found.rig, found.stroke(np.asarray(places.stroke_m)), down, up).depth_m / D - 1.0)
+    return np.stack(errors)
+
+
+def _refocused(settings: MisalignmentSettings, nominal: Rig) -> tuple[Finding, ...]:
+    """Errors of D after the lens was turned, in the paper's 25 experiments."""
+    rig = replace(nominal, camera=thin_lens(nominal.camera, LENS_M))
+    places = [(row.real_depth_m, row.baseline_m) for row in load_published()]
+    rows = [refocus(rig, focus_m, places, settings.height_m) for focus_m in FOCUS_M]
+    return tuple(refocus_findings(rows))
+
+
+def _findings(
+    settings: MisalignmentSettings,
+    table: pl.DataFrame,
+    seen: tuple[Rendered, ...],
+    tolerances: list[dict[str, object]],
+    drawn: tuple[Interactions, ...],
+    noise: Array,
+    ranks: dict[str, list[Rank]],
+    places: Places,
+) -> tuple[Finding, ...]:
+    middle = float(places.depths_m[len(places.depths_m) // 2])
+    return (
+        *cost_findings(ranks["exact"]),
+        *cost_findings(ranks["paper_normal"]),
+        *slope_findings(slope_misses(table, "exact"), _SLOPE_TARGET),
+        *rendered_findings(seen, settings.agreement),
+        *tolerance_findings(tolerances, "exact", middle, settings.cost),
+        *calibrated_findings(ranks[CALIBRATED], ranks["exact"]),
+        *noise_findings(noise, places.depths_m),
+        *_refocused(settings, default_rig()),
+        *interaction_findings(drawn),
+    )
+
+
+def _drawings(
+    table: pl.DataFrame,
+    pictures: pl.DataFrame,
+    drawn: tuple[Interactions, ...],
+    ranks: dict[str, list[Rank]],
+    places: Places,
+) -> tuple[Drawing, ...]:
+    chosen = {name: ranks[name] for name in ("exact", "paper_normal", "paper_incidence", CALIBRATED)}
+    return (
+        azimuth_drawing(table, pictures, ranks["exact"], places.stroke_m),
+        ranking_drawing(chosen, len(places.depths_m) - 1),
+        interaction_drawing(drawn),
+    )
+
+
+def _notes(settings: MisalignmentSettings, seen: tuple[Rendered, ...]) -> tuple[str, ...]:
+    off, name = worst_disagreement(seen)
+    missed = [
+        f"rendered and predicted change differ by {off:.1e} of D ({name}); {settings.agreement:.0e} was the target"
+    ]
+    coarse = settings.search_calibrated
+    limited = [
+        f"tolerances after calibration are searched up to {coarse.largest:g} times the usual size only, in steps of "
+        f"{coarse.factor:g}"
+    ]
+    return (*missed[: off > settings.agreement], *limited)
+
+
+# -- small tables of the report ----------------------------------------------------------------------------------------
+
+
+def tightest_table(rows: Sequence[dict[str, Any]], estimator: str, depth_m: float, cost: float) -> tuple[Row, ...]:
+    """Table: tolerance of every parameter at one D beside the expected deviation, and their ratio."""
+    heads = ("parameter", f"tolerance for {100.0 * cost:g} % of D", "expected deviation", "ratio")
+    return (
+        heads,
+        *(
+            (
+                row["parameter"],
+                shown(row["parameter"], row["value"]),
+                shown(row["parameter"], PARAMETERS[row["parameter"]].study),
+                f"{row['value_over_study']:.2g}",
+            )
+            for row in tolerances_of(rows, estimator, depth_m)
+            if row["value"] is not None
+        ),
+    )
+
+
+def ranking_rows(ranks: Sequence[Rank], calibrated: Sequence[Rank]) -> tuple[Row, ...]:
+    """Table: what every parameter costs, % of D, rms over azimuths."""
+    after = {one.parameter: one for one in calibrated}
+    depths = [f"{D:g} m" for D in ranks[0].depths_m]
+    heads = ("parameter", "size", *depths, *(f"calibrated, {D}" for D in depths))
+    return (
+        heads,
+        *(
+            (
+                one.parameter,
+                shown(one.parameter, PARAMETERS[one.parameter].study),
+                *map(percent, one.rms),
+                *map(percent, after[one.parameter].rms),
+            )
+            for one in ranks
+        ),
+    )
+
+
+def tolerance_table(rows: Sequence[dict[str, Any]], statistic: str, estimators: Sequence[str]) -> tuple[Row, ...]:
+    """Table: the value of every parameter that costs 1 % of D, per estimator and D."""
+    mine = {(r["parameter"], r["estimator"], r["depth_m"]): r["value"] for r in rows if r["statistic"] == statistic}
+    depths = sorted({depth for _, _, depth in mine})
+    heads = ("parameter", *(f"{name}, {D:g} m" for name in estimators for D in depths))
+    return (
+        heads,
+        *(
+            (p, *(_cell(p, mine[p, name, D]) for name in estimators for D in depths))
+            for p in dict.fromkeys(parameter for parameter, _, _ in mine)
+            if any(mine[p, name, D] is not None for name in estimators for D in depths)
+        ),
+    )
+
+
+def _cell(parameter: str, value: float | None) -> str:
+    return "-" if value is None else shown(parameter, value)
+
+
+STUDY = Study(
+    "misalignment",
+    "Misalignment",
+    "What does each misalignment cost each estimator, how tight must it be for 1 % of depth, and do errors add up?",
+    MisalignmentSettings,
+    run,
+)

@@ -1,0 +1,141 @@
+"""The whole benchmark: every built-in method on every preset that it takes, each pair drawn once, one report."""
+
+from __future__ import annotations
+
+import textwrap
+from dataclasses import replace
+from importlib.metadata import EntryPoint
+from pathlib import Path
+
+import pytest
+from helpers.processes import quiet
+from helpers.sandbox_pairs import HEADER, method_file
+
+from phibench.benchmark.isolation import resolve as resolving
+from phibench.benchmark.isolation.process import MethodProcess
+from phibench.benchmark.isolation.resolve import GROUP, MethodError, RunLimits, resolve
+from phibench.benchmark.isolation.runner import Harness
+from phibench.benchmark.scores import score as scoring
+from phibench.benchmark.scores.dataset_pairs import dataset_pairs
+from phibench.benchmark.scores.document import read_score
+from phibench.benchmark.scores.score import bench, score
+from phibench.datasets.errors import DatasetError
+from phibench.datasets.read import open_finished
+from phibench.estimator.methods import locate
+from phibench.estimator.methods.locate import SharedPair
+from phibench.estimator.methods.registry import METHODS
+from phibench.estimator.spots.detect import detect
+
+
+def test_the_benchmark_runs_what_accepts_each_preset(bench_dataset: Path, tmp_path: Path) -> None:
+    names = ["red_centroid", "raw_maximum_likelihood"]
+    done = bench(bench_dataset, tmp_path / "out", names, workers=2, pairs=2, console=quiet())
+    stems = ["bayer-raw-red_centroid", "bayer-raw-raw_maximum_likelihood", "srgb8-red_centroid", "mjpeg-red_centroid"]
+    assert [path.stem for path in done.scores] == stems
+    assert len(done.notes) == 2
+    assert all("takes mono-raw, bayer-raw, not" in note or "takes bayer-raw, mono-raw" in note for note in done.notes)
+    documents = [read_score(path) for path in done.scores]
+    assert [document.pairs for document in documents] == [2, 2, 2, 2]
+    assert "raw_maximum_likelihood" in done.report.read_text()
+    # one method alone on the same pairs answers the same: the harness keeps them apart
+    one, other = score(bench_dataset, names[0], "bayer-raw", pairs=2, console=quiet()).document, documents[0]
+    assert one.metrics["rms_px"] == other.metrics["rms_px"]
+    assert one.worst == other.worst
+
+
+def test_registered_methods_run_beside_built_in_ones(
+    bench_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A package's method that is `detect` by another name has its scores, to the last bit."""
+    theirs = EntryPoint("theirs", "phibench.estimator.methods.simple:detected_spots", GROUP)
+    monkeypatch.setattr(resolving, "entry_points", lambda group: [theirs])
+    # all presets and the report's thirty figures are those of the test above
+    monkeypatch.setattr(scoring, "_presets", lambda _: ["bayer-raw", "mjpeg"])
+    monkeypatch.setattr(scoring, "write_report", lambda *_: tmp_path)
+    done = bench(bench_dataset, tmp_path / "out", ["theirs", "detect"], pairs=1, console=quiet())
+    documents = {path.stem: read_score(path) for path in done.scores}
+    presets = {stem.removesuffix("-theirs") for stem in documents if stem.endswith("-theirs")}
+    assert presets == {"bayer-raw", "mjpeg"}
+    for preset in presets:
+        theirs_, ours = documents[f"{preset}-theirs"], documents[f"{preset}-detect"]
+        assert theirs_.method.kind == "package"
+        assert theirs_.metrics["rms_counted_px"].value == ours.metrics["rms_counted_px"].value
+
+
+@pytest.mark.parametrize(
+    ("out", "names", "words"),
+    [
+        ("out", ["x"], "no method 'x' is built in or registered by a package; known: "),
+        ("inside", None, "lies inside the data set"),
+    ],
+)
+def test_a_benchmark_that_cannot_be_is_refused(
+    bench_dataset: Path, tmp_path: Path, out: str, names: list[str] | None, words: str
+) -> None:
+    folder = bench_dataset / "out" if out == "inside" else tmp_path / out
+    with pytest.raises(DatasetError, match=words):
+        bench(bench_dataset, folder, names, console=quiet())
+
+
+@pytest.mark.parametrize("preset", ["bayer-raw", "mjpeg"])
+def test_shared_work_is_done_once_and_changes_no_answer(
+    bench_dataset: Path, preset: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pair = dataset_pairs(open_finished(bench_dataset), preset).pair(0)
+    asked = [method for method in METHODS.values() if not method.refusal(pair)]
+    alone = [repr(method(pair)) for method in asked]  # repr of a float tells every bit
+    searches: list[int] = []
+    monkeypatch.setattr(locate, "detect", lambda one: searches.append(one.number) or detect(one))
+    for order in (1, -1):
+        shared = SharedPair.of(pair)
+        assert [repr(method(shared)) for method in asked[::order]] == alone[::order]
+        assert len(shared.work.stages) == 2  # the search, and the fits of each image that joint_fit begins with
+    assert len(asked) >= 9
+    assert searches == [0, 0]
+    # another pair has nothing of this one's work
+    assert replace(shared, stroke_m=0.1).work.stages == {}
+
+
+def test_a_method_of_others_neither_profits_from_shared_work_nor_changes_it(
+    bench_dataset: Path, tmp_path: Path
+) -> None:
+    body = """
+    from phibench.estimator.methods import locate
+    from phibench.estimator.spots import detect
+    locate.detect = detect.detect = lambda pair: 1 / 0
+    return Answer(Spot((float(hasattr(pair, "work")), float(os.getpid()))), Spot.missing(type(pair).__name__))
+    """
+    foreign = method_file(tmp_path, textwrap.dedent(body), header=f"import os\n{HEADER}")
+    pairs = dataset_pairs(open_finished(bench_dataset), "bayer-raw")
+    names = ["red_centroid", foreign, "detect", "off_difference"]
+    with Harness(names) as harness:
+        done = list(harness.outcomes(pairs, range(2)))
+        assert len(harness.isolations) == len(names)
+        assert {"draw", "detect", "red_centroid", "off_difference"} <= set(harness.stages)
+        assert harness.stages["off_difference"] < harness.stages["detect"]  # it found the search done
+    for number, outcomes in enumerate(done):
+        pair = pairs.pair(number)
+        right = {name: repr(METHODS[name](pair)) for name in names if name in METHODS}
+        assert {name: repr(one.answer) for name, one in zip(names, outcomes, strict=True) if name in right} == right
+        answer = outcomes[1].answer
+        assert answer is not None
+        assert (answer.down.uv_px or (1.0,))[0] == 0.0
+        assert answer.up.status == "Pair"
+        # a method's time is what it takes alone, the search included
+        assert outcomes[3].seconds > 0.5 * outcomes[0].seconds
+    with pytest.raises(MethodError, match="built-in methods alone share a process"):
+        MethodProcess(resolve("detect"), RunLimits(), others=[resolve(foreign)])
+
+
+def test_a_shared_process_that_ends_is_started_anew(bench_dataset: Path) -> None:
+    pair = dataset_pairs(open_finished(bench_dataset), "bayer-raw").pair(0)
+    process = MethodProcess(resolve("red_centroid"), RunLimits(), others=[resolve("detect")])
+    try:
+        first = process.ask(pair, 0)
+        process.end()
+        second = process.ask(pair, 1)
+    finally:
+        process.close()
+    assert (repr(first.answer), repr(second.answer)) == tuple(
+        repr(METHODS[n](pair)) for n in ("red_centroid", "detect")
+    )

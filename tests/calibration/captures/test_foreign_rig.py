@@ -1,0 +1,120 @@
+"""Calibrations of other programs as a rig file: the numbers to copy, by the programs' own writers, or why not."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+from phibench.calibration.captures.rig_file import read_rig_file
+from phibench.datasets.errors import DatasetError
+
+K = np.array([[1432.5, 0.0, 640.25], [0.0, 1431.75, 355.5], [0.0, 0.0, 1.0]])
+D = np.array([-0.026, 1.06, 0.001, -0.002, -3.4])
+NUMBERS = ("fx_px = 1432.5", "fy_px = 1431.75", "cx_px = 640.25", "cy_px = 355.5")
+LENS = ("k1 = -0.026", "k2 = 1.06", "p1 = 0.001", "p2 = -0.002")
+SIZE = ("width_px = 1280", "height_px = 720")
+ROS = {
+    "image_width": 1280,
+    "image_height": 720,
+    "camera_name": "c310",
+    "camera_matrix": {"rows": 3, "cols": 3, "data": K.ravel().tolist()},
+    "distortion_model": "plumb_bob",
+    "distortion_coefficients": {"rows": 1, "cols": 5, "data": D.tolist()},
+    "rectification_matrix": {"rows": 3, "cols": 3, "data": np.eye(3).ravel().tolist()},
+}
+MESSAGE = {"height": 720, "width": 1280, "distortion_model": "plumb_bob", "d": D.tolist(), "k": K.ravel().tolist()}
+KALIBR = {
+    "cam0": {
+        "camera_model": "pinhole",
+        "intrinsics": [1432.5, 1431.75, 640.25, 355.5],
+        "distortion_model": "radtan",
+        "distortion_coeffs": D[:4].tolist(),
+        "resolution": [1280, 720],
+        "rostopic": "/cam0/image_raw",
+    }
+}
+
+
+def said(folder: Path, text: str) -> str:
+    """The one sentence about a rig file with this text."""
+    path = folder / "rig.yaml"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(DatasetError) as error:
+        read_rig_file(path)
+    assert "\n" not in str(error.value)
+    return str(error.value)
+
+
+@pytest.mark.parametrize("suffix", ["yml", "xml", "json"])
+def test_opencv_writes_what_is_copied(tmp_path: Path, suffix: str) -> None:
+    file = str(tmp_path / f"camera.{suffix}")
+    storage = cv2.FileStorage(file, cv2.FILE_STORAGE_WRITE)
+    for key, value in {"image_width": 1280, "image_height": 720, "camera_matrix": K}.items():
+        storage.write(key, value)
+    storage.write("distortion_coefficients", D[None])
+    storage.release()
+    text = said(tmp_path, Path(file).read_text())
+    for words in ("of OpenCV", *SIZE, *NUMBERS, *LENS, "k3 = -3.4", "radius_m and z_c_m"):
+        assert words in text
+
+
+@pytest.mark.parametrize("flow", [True, False])
+def test_ros_and_kalibr(tmp_path: Path, flow: bool) -> None:
+    """Lists in brackets, and one number a line."""
+
+    def dumped(document: object) -> str:
+        return yaml.safe_dump(document, default_flow_style=None if flow else False, sort_keys=False)
+
+    for document, program in ((ROS, "ROS"), (MESSAGE, "ROS"), (KALIBR, "Kalibr")):
+        text = said(tmp_path, dumped(document))
+        for words in (program, *SIZE, *NUMBERS, *LENS):
+            assert words in text, (program, words)
+        assert ("k3 = -3.4" in text) == (program == "ROS")
+    capital = {"K" if key == "k" else "D" if key == "d" else key: value for key, value in MESSAGE.items()}
+    assert NUMBERS[0] in said(tmp_path, dumped(capital))
+    bent = {**KALIBR["cam0"], "distortion_model": "equidistant"}
+    text = said(tmp_path, dumped({"cam0": bent, "cam1": bent}))
+    assert "equidistant" in text
+    assert "k1 = " not in text
+    assert "first camera of 2" in text
+    rational = {**ROS, "distortion_coefficients": {"rows": 1, "cols": 8, "data": [*D.tolist(), 0.5, 0.0, 0.0]}}
+    assert "its k4 have no keys" in said(tmp_path, dumped(rational))
+
+
+def test_a_dumped_matrix_is_known(tmp_path: Path) -> None:
+    text = said(tmp_path, json.dumps({"camera_matrix": K.tolist(), "dist_coeffs": [D.tolist()]}))
+    for words in (*NUMBERS, *LENS):
+        assert words in text
+
+
+OMNI = {**KALIBR["cam0"], "camera_model": "omni", "intrinsics": [1.7, 1432.5, 1431.75, 640.25, 355.5]}
+IN_ONE = {
+    "OCamCalib": "#polynomial coefficients for the DIRECT mapping function (ocam_model.ss).\n\n5 -2.6e+02 0.0",
+    "Kalibr": yaml.safe_dump({"cam0": OMNI}),
+    "OpenCV": "%YAML:1.0\n---\ncamera_matrix: !!opencv-matrix\n   rows: 3\n   cols: 3\n   dt: d\n"
+    "   data: [ 500., 0., 320., 0., 500., 240., 0., 0., 1. ]\nxi: 1.2\n",
+    "CamOdoCal": "%YAML:1.0\n---\nmodel_type: MEI\nimage_width: 752\nmirror_parameters:\n   xi: 1.1\n",
+    "Basalt": '{"value0": {"intrinsics": [{"camera_type": "ds", "intrinsics": {"fx": 350.0, "xi": -0.2}}]}}',
+}
+
+
+@pytest.mark.parametrize("program", IN_ONE)
+def test_a_model_of_mirror_and_camera_cannot_be_split(tmp_path: Path, program: str) -> None:
+    text = said(tmp_path, IN_ONE[program])
+    assert program in text
+    assert "mirror and camera in one" in text
+    assert "cannot be split" in text
+    assert "fx_px =" not in text
+
+
+def test_what_is_none_of_them_is_no_toml(tmp_path: Path) -> None:
+    for text in ("nonsense", "rig:\n  fx_px: 1430\n", "[rig\nfx_px = 3"):
+        assert "is not valid TOML" in said(tmp_path, text)
+    (tmp_path / "calib.mat").write_bytes(b"MATLAB 5.0 MAT-file" + bytes(range(256)))
+    with pytest.raises(DatasetError, match="cannot be split"):
+        read_rig_file(tmp_path / "calib.mat")

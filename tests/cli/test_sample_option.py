@@ -1,0 +1,100 @@
+"""`--sample` in every command that has it: a number or an id, with the same result and the same refusal."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from phibench.cli.main import main
+from phibench.datasets.errors import DatasetError
+from phibench.datasets.read import open_dataset, place_of
+
+ROOT = Path(__file__).resolve().parents[2]
+COMMANDS: dict[str, Callable[[str, str, str], list[str]]] = {
+    "dataset show": lambda folder, name, out: ["dataset", "show", folder, "--sample", name, "--html", f"{out}.html"],
+    "dataset frames": lambda folder, name, out: [
+        *("dataset", "frames", folder, "--sample", name, "--preset", "mono-raw", "--region", "32"),
+        *("--workers", "1", "--out", out),
+    ],
+    "dataset panorama": lambda folder, name, out: [
+        *(
+            "dataset",
+            "panorama",
+            folder,
+            "--sample",
+            name,
+            "--preset",
+            "layers",
+            "--width",
+            "90",
+            "--out",
+            f"{out}.png",
+        ),
+    ],
+    "calibrate": lambda folder, name, out: [
+        *("calibrate", folder, "--sample", name, "--preset", "layers", "--out", f"{out}.json"),
+    ],
+}
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    found = {file.name: file.read_bytes() for file in sorted(folder.rglob("*")) if file.is_file()}
+    return {name: data for name, data in found.items() if not name.endswith((".json", ".jsonl", ".parquet"))}
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_number_does_what_the_id_does(
+    tiny_dataset: Path, tmp_path: Path, command: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Same files and words; a small image that cannot be calibrated is refused for that, and not for its number."""
+    ids = [row.sample_id for row in open_dataset(tiny_dataset).rows]
+    outs, said = [tmp_path / "number", tmp_path / "id"], []
+    for out, name in zip(outs, ("1", ids[1]), strict=True):
+        out.mkdir()
+        code = main(COMMANDS[command](str(tiny_dataset), name, str(out / "made")))
+        said.append((code, capsys.readouterr().err.replace(str(out), "")))
+    first, second = (files(out) for out in outs)
+    assert said[0] == said[1]
+    assert first == second
+    assert (len(first) > 0) != (said[0][0] == 2)
+    assert "no sample" not in said[0][1]
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_others_are_refused_alike(
+    tiny_dataset: Path, tmp_path: Path, command: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    ids = [row.sample_id for row in open_dataset(tiny_dataset).rows]
+    for name, reason in (
+        ("99", f"has {len(ids)}, numbered from 0 to {len(ids) - 1}"),
+        ("nobody", "no sample 'nobody'"),
+    ):
+        assert main(COMMANDS[command](str(tiny_dataset), name, str(tmp_path / "made"))) == 2
+        said = capsys.readouterr().err.strip().splitlines()
+        assert reason in said[-1]
+
+
+def test_no_command_with_this_option_is_left_out() -> None:
+    sources = (ROOT / "phibench/cli").glob("*.py")
+    options = sum(len(re.findall(r"^    sample: ", file.read_text(), re.M)) for file in sources)
+    assert options == len(COMMANDS)
+
+
+def test_an_id_goes_before_a_number() -> None:
+    ids = ["7", "1", "0"]
+    assert [place_of(name, ids, Path("x")) for name in ("7", "1", "0", "2")] == [0, 1, 2, 2]
+    for name in ("3", "-1", "1.0", ""):
+        with pytest.raises(DatasetError):
+            place_of(name, ids, Path("x"))
+    with pytest.raises(DatasetError, match="x has no samples"):
+        place_of("0", [], Path("x"))
+
+
+def test_a_sample_that_is_named_twice_comes_once(tiny_dataset: Path) -> None:
+    dataset = open_dataset(tiny_dataset)
+    name = dataset.rows[1].sample_id
+    assert dataset.chosen(["1", name, "0"]) == (dataset[1], dataset[0])
+    assert dataset["1"] == dataset[name]

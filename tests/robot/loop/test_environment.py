@@ -1,0 +1,168 @@
+"""Environment: it is what `gymnasium` asks for, the same seed gives the same bits, and faults end in a sentence."""
+
+from __future__ import annotations
+
+import math
+import time
+import warnings
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+from phibench.robot.loop.environment import ENVIRONMENT, ApproachTarget, action_of, flat_observation, register
+from phibench.robot.loop.simulator import (
+    COLLISION,
+    LATE,
+    REACHED,
+    WRONG,
+    Action,
+    Setup,
+    Simulator,
+)
+from phibench.scenes.validation import SceneError
+
+
+@pytest.fixture(scope="module")
+def env() -> ApproachTarget:
+    register()
+    register()
+    made = gymnasium.make(ENVIRONMENT).unwrapped
+    assert isinstance(made, ApproachTarget)
+    return made
+
+
+def drive(env, seed: int, steps: int) -> list[np.ndarray]:
+    """Flat observations under actions of the action space's own seed."""
+    env.action_space.seed(seed)
+    rows = [flat_observation(env.reset(seed=seed)[0])]
+    for _ in range(steps):
+        action = env.action_space.sample()
+        action["stated_m"][:] = 0.0
+        observation, reward, over, late, _ = env.step(action)
+        rows.append(np.append(flat_observation(observation), reward))
+        if over or late:
+            rows.append(flat_observation(env.reset()[0]))
+    return rows
+
+
+def test_it_passes_the_checks_of_gymnasium(env) -> None:
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", category=UserWarning)
+        warnings.filterwarnings("ignore", message=".*recommend using a symmetric and normalized space.*")
+        check_env(env, skip_render_check=True)
+
+
+def test_the_same_seed_gives_the_same_bits_and_another_does_not(env) -> None:
+    first, again, other = drive(env, 5, 40), drive(env, 5, 40), drive(env, 6, 40)
+    assert len(first) == len(again)
+    assert all(np.array_equal(a, b) for a, b in zip(first, again, strict=True))
+    assert not np.array_equal(first[0], other[0])
+
+
+def test_the_vector_version_is_the_single_ones_side_by_side(env) -> None:
+    register()
+    vector = gymnasium.make_vec(ENVIRONMENT, num_envs=3, vectorization_mode="sync")
+    observations, _ = vector.reset(seed=[11, 12, 13])
+    for k, seed in enumerate((11, 12, 13)):
+        single, _ = env.reset(seed=seed)
+        assert np.array_equal(observations["spots"][k], single["spots"])
+    _, rewards, _, _, _ = vector.step(vector.action_space.sample())
+    assert rewards.shape == (3,)
+    vector.close()
+
+
+def still(env, **numbers) -> tuple[float, bool, bool, dict]:
+    action = {name: np.zeros(1) for name in env.action_space if name not in ("exposure", "code")}
+    _, reward, over, late, info = env.step(action | {"exposure": 4, "code": 1} | numbers)
+    return reward, over, late, info
+
+
+def test_reward_and_ends(env) -> None:
+    """-0.01 a second; 1 for D stated right where the robot shall stand, -1 for the same elsewhere or another D."""
+    env.reset(seed=1)
+    assert still(env)[0] == pytest.approx(-0.001)
+    reward, over, late, info = still(env, stated_m=np.array([env.simulator.distance_m]))
+    assert (reward, over, late, info["outcome"]) == (pytest.approx(-1.001), True, False, WRONG)
+    with pytest.raises(SceneError, match="no episode is running"):
+        still(env)
+
+    near = ApproachTarget(distances_m=(1.0, 1.04))
+    near.reset(seed=2)
+    true = near.simulator.distance_m
+    assert abs(true - 1.0) < 0.05
+    reward, over, _, info = still(near, stated_m=np.array([1.019 * true]))
+    assert (reward, over, info["outcome"]) == (pytest.approx(0.999), True, REACHED)
+    near.reset(seed=2)
+    assert still(near, stated_m=np.array([1.021 * true]))[3]["outcome"] == WRONG
+
+    short = ApproachTarget(longest_s=0.2)
+    short.reset(seed=3)
+    assert still(short)[1:3] == (False, False)
+    assert still(short)[1:3] == (False, True)
+    assert short.simulator.outcome == LATE
+
+
+def test_walls_end_an_episode(env) -> None:
+    env.reset(seed=4)
+    for _ in range(400):
+        reward, over, _, info = still(env, drive_m_per_s=np.array([0.5]))
+        if over:
+            break
+    assert (info["outcome"], reward) == (COLLISION, pytest.approx(-1.001))
+
+
+def test_what_is_refused_is_said_in_one_sentence(env) -> None:
+    env.reset(seed=1)
+    reward, _, _, info = still(env, drive_m_per_s=np.array([0.2]), stroke_m_per_s=np.array([0.2]))
+    assert "only while the robot stands" in info["refused"]
+    assert env.simulator.stroke_m == 0.0
+    assert reward == pytest.approx(-0.011)
+    for _ in range(20):
+        info = still(env, flipper_rad_per_s=np.array([1.0]))[3]
+    assert "flippers turn from -1.4 to 1.6 rad" in info["refused"]
+    assert env.simulator.flipper_rad == 1.6
+    assert "carriage goes from 0 to 0.8 m" in still(env, stroke_m_per_s=np.array([-0.1]))[3]["refused"]
+    assert still(env)[3]["refused"] == ""
+    with pytest.raises(SceneError, match=r"action drive_m_per_s = nan: must be finite"):
+        still(env, drive_m_per_s=np.array([math.nan]))
+    with pytest.raises(SceneError, match="exposure = 9"):
+        still(env, exposure=9)
+
+
+def test_a_raised_front_moves_the_spot_and_is_reported(env) -> None:
+    """Flippers down by 1.2 rad tilt the rig by some 10 degrees: the spot moves by many pixels."""
+    simulator = Simulator(Setup())
+    simulator.start("flippers")
+    level = simulator.act(Action())
+    for _ in range(12):
+        raised = simulator.act(Action(flipper_rad_per_s=-1.0))
+    assert raised.flipper_rad == pytest.approx(-1.2)
+    held = raised.attitude(simulator.setup.vehicle)
+    assert held is not None
+    assert math.degrees(held.raised_rad) > 5.0
+    assert level.spots != raised.spots
+
+
+def test_actions_take_defaults_for_what_is_left_out() -> None:
+    assert action_of({"drive_m_per_s": [0.2], "code": 2}) == Action(drive_m_per_s=0.2, code=2)
+
+
+@pytest.mark.slow
+def test_steps_per_second_of_the_exact_model(capsys) -> None:
+    """At least 2000 steps of one environment in a second of one core, four lights in a room."""
+    env = ApproachTarget()
+    env.reset(seed=1)
+    actions = [env.action_space.sample() | {"stated_m": np.zeros(1)} for _ in range(500)]
+    best = 0.0
+    for _ in range(3):
+        start = time.process_time()
+        for action in actions:
+            _, _, over, late, _ = env.step(action)
+            if over or late:
+                env.reset()
+        best = max(best, len(actions) / (time.process_time() - start))
+    with capsys.disabled():
+        print(f"exact model: {best:.0f} steps per CPU second")
+    assert best >= 2000
