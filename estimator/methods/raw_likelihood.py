@@ -237,8 +237,12 @@ def _processed(pair: Pair, separate: Answer) -> Answer:
 
 
 def _of_other_shape(spot: Spot, one: SpotLikelihood) -> bool:
-    """True if a fit claims far more than the model's likelihood: its light has another shape, as on an edge."""
-    return bool(np.trace(np.array(spot.covariance_px2)) > _OTHER_SHAPE * np.trace(place_covariance(one)))
+    """True if a fit claims far more than the model's likelihood: its light has another shape, as on an edge.
+
+    Not of faint spots: their likelihood has valleys, and the posterior says what they claim.
+    """
+    own = float(np.trace(place_covariance(one)))
+    return own < 2.0 * _FAINT_PX**2 and bool(np.trace(np.array(spot.covariance_px2)) > _OTHER_SHAPE * own)
 
 
 def _combined(pair: Pair, separate: Answer) -> Answer:

@@ -37,7 +37,7 @@ def test_accuracy_of_what_faint_spots_claim(bench_dataset: Path) -> None:
     claim that is 1.6 times too small passes with a chance of 3e-3.
     """
     dataset = open_dataset(bench_dataset)
-    frames = {**dataset.info.recipe["frames"], "laser_level": 0.05, "exposure_s": 0.01, "hint": 1.0}
+    frames = {**dataset.info.recipe["frames"], "laser_level": 0.06, "exposure_s": 0.01, "hint": 1.0}
     sample = with_tables(dataset, frames=frames)[0]
     drawn = pairs_of(sample.dataset, [sample], "bayer-raw", draws=DRAWS)
     before, after = [], []
