@@ -186,7 +186,7 @@ def test_every_result_is_shown_by_a_short_table(tiny_dataset: Path) -> None:
     assert len(easy_set) == 1
     for result in results:
         lines = repr(result).splitlines()
-        assert len(lines) <= 26, type(result)
+        assert len(lines) <= 25, type(result)
         assert max(map(len, lines)) <= (260 if result is answer else 120), type(result)
         assert result._repr_html_() == f"<pre>{html.escape(repr(result))}</pre>"
     assert "red_centroid: 1 pairs mono-raw" in repr(results[-1])

@@ -214,7 +214,7 @@ def frames_line(document: ScoreDocument) -> str:
     there = {name: spread for name in shown if (spread := document.frames.get(name)) is not None}
     words = {name: f"{shown[name][0]} {spread.text(*shown[name][1:])}" for name, spread in there.items()}
     levels = [words.pop(name) for name in ("laser_level", "lamp_level") if name in words]
-    draws = f"{document.draws} draw{'s' * (document.draws != 1)} of the noise"
+    draws = f"{document.draws} noise draw{'s' * (document.draws != 1)}"
     return (
         f"Frames: {', '.join(words.values())}. Light: {', '.join([*levels, draws])}." if "exposure_s" in there else ""
     )
@@ -225,10 +225,8 @@ def light_line(document: ScoreDocument) -> str:
     shift, depth = (document.light.get(name) for name in ("shift_px", "depth_m"))
     if shift is None:
         return ""
-    text = (
-        f"Scores refer to the centre of the light. It is {_median_and_most(shift)} mpx at worst from the beam's axis."
-    )
-    return text if depth is None else f"{text} D of the two differs by {_median_and_most(depth)} mm at worst."
+    text = f"Scores refer to the centre of the light. It is {_median_and_most(shift)} mpx at most from the beam's axis."
+    return text if depth is None else f"{text} D of the two differs by {_median_and_most(depth)} mm at most."
 
 
 def _median_and_most(spread: Spread) -> str:

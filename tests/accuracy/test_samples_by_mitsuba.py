@@ -23,7 +23,7 @@ PARTS = ("outline", "light in the mirror", "flux of the spot", "centroid of the 
 def sample_of(kind: str, shared: SharedFolder, folder: Path) -> Sample:
     """Sample of a kind; the sphere in the lab is the paper's, where that data set is there."""
     if kind == "lab" and PAPER.is_dir():
-        return open_dataset(PAPER)["table3-d4.180-h0.100"]
+        return open_dataset(PAPER)["table2-d3.180-h0.425"]
     if kind in ("lab", "hyperboloid"):
         text = (TESTS / "mitsuba_mirrors.toml").read_text(encoding="utf-8")
         recipe = folder / f"{kind}.toml"
