@@ -23,7 +23,7 @@ from phibench.render.optics.spot_layer import spot_layer
 from phibench.render.room.ambient import render_ambient
 from phibench.render.room.light_map import BakeSettings
 from phibench.render.sensor.settings import sensor
-from phibench.scenes.catalog import Target, lab
+from phibench.scenes.catalog import TargetBoard, lab
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import Rig
 from phibench.studies.isotropy.binocular import Binocular, Laws, tried
@@ -38,7 +38,7 @@ _HALF_PX, _ZOOM, _WIDTH_PX = 40, 4, 1000
 
 def seen(both: Binocular, index: int) -> tuple[Image.Image, Array]:
     """Picture of one sensor, and the pixel of the spot's centroid."""
-    target = Target("a105", DEPTH_M, math.radians(AZIMUTH_DEG), HEIGHT_M)
+    target = TargetBoard("a105", DEPTH_M, math.radians(AZIMUTH_DEG), HEIGHT_M)
     view, room = both.views[index], lab([target])
     room = replace(room, furniture=(*room.furniture, *both.seen_beside(index)))
     settings = BakeSettings()

@@ -14,13 +14,13 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from phibench.datasets.read import Sample, open_dataset
-from phibench.estimator.geometry.panorama import Grid, frame, nominal_view, panorama
+from phibench.estimator.geometry.panorama import PanoramaGrid, frame, nominal_view, panorama
 from phibench.estimator.geometry.reflection import reflect
 from phibench.estimator.spots.detect import epipolar_curve, mirror_box
 from phibench.scenes.frames import Array
 
 LINES, SIDE, GAP, FONT = 12, 560, 10, 18
-GRID = Grid(860, math.radians(-75.0), math.radians(35.0))
+GRID = PanoramaGrid(860, math.radians(-75.0), math.radians(35.0))
 COLOURS = {"down": (80, 190, 255), "up": (255, 220, 60), "line": (255, 130, 60)}
 
 

@@ -31,7 +31,7 @@ class Distraction:
 
 
 @dataclass(frozen=True)
-class SpotTruth:
+class ImageTruth:
     """Exact answer for one image of a pair.
 
     Attributes
@@ -119,8 +119,8 @@ class PairTruth(ShortForm):
     stroke_m: float
     true_rig: Rig
     nominal_rig: Rig
-    down: SpotTruth
-    up: SpotTruth
+    down: ImageTruth
+    up: ImageTruth
     nominal_stroke_m: float | None = None
     calibration_covariance: Array | None = None
     exposure_s: float | None = None

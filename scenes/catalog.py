@@ -23,7 +23,7 @@ _LAMP_RADIANCE = (3.6, 3.2, 2.4)  # W/m^2/sr per band: on the floor about 300 lx
 
 
 @dataclass(frozen=True)
-class Target:
+class TargetBoard:
     """A target board that faces the stroke axis, and the spot at its centre.
 
     Parameters
@@ -58,7 +58,7 @@ class Target:
         return (-math.cos(self.azimuth_rad), -math.sin(self.azimuth_rad), 0.0)
 
 
-def board(target: Target) -> Cuboid:
+def board(target: TargetBoard) -> Cuboid:
     """Thin cuboid whose front face carries the target's spot."""
     behind = target.depth_m + BOARD_THICKNESS_M / 2.0
     centre = (behind * math.cos(target.azimuth_rad), behind * math.sin(target.azimuth_rad), target.height_m)
@@ -66,7 +66,7 @@ def board(target: Target) -> Cuboid:
     return cuboid(f"board_{target.name}", centre, size, (BOARD_ALBEDO,) * 3, rotation_xyz(z_rad=target.azimuth_rad))
 
 
-def lab(targets: Sequence[Target] = ()) -> Room:
+def lab(targets: Sequence[TargetBoard] = ()) -> Room:
     """Room of 10 x 9 x 3 m: tiled floor, striped and plain walls, six lamps, a door, furniture, boards."""
     furniture = (
         cuboid("table", (3.6, -1.9, 0.72), (1.6, 0.8, 0.05), (0.45, 0.33, 0.20)),
@@ -80,7 +80,7 @@ def lab(targets: Sequence[Target] = ()) -> Room:
     return Room("lab", (*_shell(), *_lamps()), (*furniture, *(board(target) for target in targets)))
 
 
-def dark(targets: Sequence[Target] = ()) -> Room:
+def dark(targets: Sequence[TargetBoard] = ()) -> Room:
     """The lab with every lamp off, for tests."""
     return lab(targets).dark()
 
@@ -139,5 +139,5 @@ def c310_rig() -> Rig:
     return Rig(camera=c310_camera())
 
 
-ROOMS: dict[str, Callable[[Sequence[Target]], Room]] = {"lab": lab, "dark": dark}
+ROOMS: dict[str, Callable[[Sequence[TargetBoard]], Room]] = {"lab": lab, "dark": dark}
 RIGS: dict[str, Callable[[], Rig]] = {"default": default_rig, "c310": c310_rig}

@@ -20,7 +20,7 @@ from pydantic import BaseModel, ConfigDict
 from rich.console import Console
 
 from phibench.benchmark.scores import figures
-from phibench.benchmark.scores.figures import Picture
+from phibench.benchmark.scores.figures import EmbeddedFigure
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.input_files import SETTINGS_BYTES, InputFile
 from phibench.datasets.read import Dataset, open_finished
@@ -106,7 +106,7 @@ class Drawing:
         """Name of its file."""
         return f"{self.name}.{self.kind}"
 
-    def picture(self) -> Picture:
+    def picture(self) -> EmbeddedFigure:
         """The drawing as a data address, for a report."""
         return figures.picture(self.data, self.kind, self.alt)
 
@@ -124,7 +124,7 @@ def drawn(name: str, figure: Figure, alt: str, kind: str = "svg") -> Drawing:
 
 
 @dataclass(frozen=True)
-class Result:
+class StudyResult:
     """Result of a study.
 
     Attributes
@@ -183,7 +183,7 @@ class Study(Generic[S]):
     title: str
     question: str
     settings: type[S]
-    run: Callable[[S, StudyDatasets], Result]
+    run: Callable[[S, StudyDatasets], StudyResult]
 
 
 QUICK = "quick"

@@ -14,10 +14,10 @@ import numpy as np
 
 from phibench.benchmark.scores.dataset_pairs import SpotBounds, spot_bounds
 from phibench.datasets.frames.sensor_card import card_of
-from phibench.datasets.frames.source import Side
+from phibench.datasets.frames.source import PositionLight
 from phibench.estimator.interface import Box, Pair
+from phibench.estimator.pair_set import ImageTruth as Answer
 from phibench.estimator.pair_set import PairTruth
-from phibench.estimator.pair_set import SpotTruth as Answer
 from phibench.render.optics.spot_layer import SpotLayer, spot_layer
 from phibench.render.optics.truth import SpotTruth, depth_m, spot_truth
 from phibench.render.sensor.camera_chain import Chain
@@ -137,11 +137,11 @@ class Shot:
     sensor: Sensor
     laser_level: float = 1.0
 
-    def side(self, pair: SpotPair, position: str, camera_seed: int, flicker: float = 1.0) -> Side:
+    def side(self, pair: SpotPair, position: str, camera_seed: int, flicker: float = 1.0) -> PositionLight:
         """Camera and light at one position; `flicker` multiplies the laser."""
         camera = pair.rig.camera
         light = pair.views[position].light(self.laser_level * flicker, camera.f_number)
-        return Side(Chain(self.sensor, camera_seed, camera), light, Region.whole(light.size))
+        return PositionLight(Chain(self.sensor, camera_seed, camera), light, Region.whole(light.size))
 
 
 def drawn_pair(

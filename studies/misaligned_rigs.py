@@ -17,7 +17,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from phibench.calibration.outline.limb_image import Measured
+from phibench.calibration.outline.limb_image import PoseMeasurement
 from phibench.calibration.rig.bundle import Bundle, KnownSpot, apparent_outline, calibrate
 from phibench.datasets.errors import DatasetError
 from phibench.estimator.geometry.estimators import ESTIMATORS
@@ -349,7 +349,7 @@ class CalibrationSetup:
             KnownSpot(d, u, C, C, stroke_m, float(each), self.distance_sigma_m)
             for d, u, each in zip(down, up, D, strict=True)
         ]
-        measured = Measured(outline, np.diag(np.square(self.outline_sigma_m)))
+        measured = PoseMeasurement(outline, np.diag(np.square(self.outline_sigma_m)))
         return calibrate(nominal, measured, spots, sigmas=nominal_sigmas())
 
 

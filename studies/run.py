@@ -28,7 +28,7 @@ from phibench.datasets.store.provenance import provenance
 from phibench.datasets.store.schema import Document
 from phibench.scenes.validation import nearest
 from phibench.studies.findings import Finding, findings_table, markdown_table
-from phibench.studies.framework import Drawing, Result, Settings, Study, StudyDatasets, read_settings
+from phibench.studies.framework import Drawing, Settings, Study, StudyDatasets, StudyResult, read_settings
 
 KIND: Literal["phibench study"] = "phibench study"
 DOCUMENT = "study.json"
@@ -64,7 +64,7 @@ class StudyDocument(Document):
     provenance: dict[str, Any]
 
 
-def write_study(out: Path, study: Study[Any], settings: Settings, quick: bool, result: Result) -> Path:
+def write_study(out: Path, study: Study[Any], settings: Settings, quick: bool, result: StudyResult) -> Path:
     """Write a result into a folder, the document last; files of an earlier run are replaced.
 
     Returns
@@ -82,7 +82,7 @@ def write_study(out: Path, study: Study[Any], settings: Settings, quick: bool, r
     return _written(out / DOCUMENT, document)
 
 
-def publish_study(folder: Path, study: Study[Any], settings: Settings, result: Result, seconds: float) -> Path:
+def publish_study(folder: Path, study: Study[Any], settings: Settings, result: StudyResult, seconds: float) -> Path:
     """Write the document of a full study as `NAME.json`, beside the page of the study.
 
     Returns
@@ -97,7 +97,7 @@ def publish_study(folder: Path, study: Study[Any], settings: Settings, result: R
     )
 
 
-def _document(study: Study[Any], settings: Settings, quick: bool, result: Result) -> StudyDocument:
+def _document(study: Study[Any], settings: Settings, quick: bool, result: StudyResult) -> StudyDocument:
     return StudyDocument(
         name=study.name,
         title=study.title,
@@ -153,7 +153,7 @@ def section(folder: Path) -> Section:
     )
 
 
-def findings_text(study: Study[Any], result: Result) -> str:
+def findings_text(study: Study[Any], result: StudyResult) -> str:
     """The findings as Markdown: question, table, notes, further tables, drawings."""
     lines = [f"# {study.title}", "", study.question, "", markdown_table(findings_table(result.findings)), ""]
     lines += [f"* Note: {note}" for note in result.notes] + [""] * bool(result.notes)
@@ -164,7 +164,7 @@ def findings_text(study: Study[Any], result: Result) -> str:
     return "\n".join(lines)
 
 
-def _files(study: Study[Any], settings: Settings, result: Result) -> dict[str, bytes]:
+def _files(study: Study[Any], settings: Settings, result: StudyResult) -> dict[str, bytes]:
     tables = {f"{name}.parquet": _parquet(table) for name, table in result.tables.items()}
     drawings = {drawing.file_name: drawing.data for drawing in result.drawings}
     text = json.dumps(settings.model_dump(mode="json"), indent=1) + "\n"
@@ -206,7 +206,7 @@ def run_study(
     workers: int | None = None,
     console: Console | None = None,
     publish: Path | None = None,
-) -> Result:
+) -> StudyResult:
     """Run a study and write its folder.
 
     Parameters

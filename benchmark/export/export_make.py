@@ -75,7 +75,7 @@ class Shard:
 
 
 @dataclass(frozen=True)
-class Exported:
+class ExportOutcome:
     """Outcome: the folder, pairs by split, shards written and kept, and notes on what was left out."""
 
     folder: Path
@@ -92,7 +92,7 @@ def export(
     *,
     workers: int | None = None,
     console: Console | None = None,
-) -> Exported:
+) -> ExportOutcome:
     """Write the pairs of a data set for other tools; what is there and undamaged is kept.
 
     Raises
@@ -113,7 +113,7 @@ def export(
         raise DatasetError(f"{text}; then run the same command again") from error
 
 
-def _export(dataset: Dataset, request: ExportRequest, out: Path, workers: int, console: Console) -> Exported:
+def _export(dataset: Dataset, request: ExportRequest, out: Path, workers: int, console: Console) -> ExportOutcome:
     _claim(out, dataset, request)
     shards, notes = _shards(dataset, request, out)
     known = {row.name: row for row in read_rows(out / SHARDS, ShardRow)} if (out / SHARDS).is_file() else {}
@@ -130,7 +130,7 @@ def _export(dataset: Dataset, request: ExportRequest, out: Path, workers: int, c
     _write_rows(out, rows.values())
     _finish(dataset, request, out, shards, rows)
     counts = {name: sum(len(shard.pairs) for shard in shards if shard.split == name) for name in SPLITS}
-    return Exported(out, counts, made, len(shards) - made, tuple(notes))
+    return ExportOutcome(out, counts, made, len(shards) - made, tuple(notes))
 
 
 def perform(shard: Shard) -> tuple[ShardRow, bool]:

@@ -16,7 +16,7 @@ from phibench.benchmark.isolation.easy_pairs import EasyPairs
 from phibench.benchmark.isolation.resolve import RunLimits
 from phibench.benchmark.isolation.runner import Harness
 from phibench.estimator.interface import OK, Outcome, Spot
-from phibench.estimator.pair_set import PairTruth, SpotTruth
+from phibench.estimator.pair_set import ImageTruth, PairTruth
 from phibench.scenes.frames import Array
 
 PAIRS = 10
@@ -196,7 +196,7 @@ def _views(pairs: EasyPairs, answered: Sequence[Outcome]) -> Views:
     return Views((camera.height_px, camera.width_px), np.array(origins, float))
 
 
-def _of(truth: PairTruth, position: str) -> SpotTruth:
+def _of(truth: PairTruth, position: str) -> ImageTruth:
     return truth.down if position == "down" else truth.up
 
 

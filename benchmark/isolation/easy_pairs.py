@@ -28,7 +28,7 @@ from phibench.estimator.interface import Box, Pair
 from phibench.estimator.limits.position_bound import spot_limit
 from phibench.estimator.limits.spot_snr import raw_snr
 from phibench.estimator.methods.locate import around, clipped
-from phibench.estimator.pair_set import PairTruth, SpotTruth
+from phibench.estimator.pair_set import ImageTruth, PairTruth
 from phibench.estimator.spots.camera_codes import tone_of, yuyv_image
 from phibench.estimator.spots.gaussian_spot import outer, profile
 from phibench.estimator.spots.image_planes import KINDS, linear_planes, through_jpeg
@@ -339,12 +339,12 @@ def _scene(rig: Rig, number: int) -> EasyScene:
     return easy_scene(rig, number)
 
 
-def _spot_truth(camera: EasyCamera, scene: EasyScene, spot: EasySpot) -> SpotTruth:
+def _spot_truth(camera: EasyCamera, scene: EasyScene, spot: EasySpot) -> ImageTruth:
     region, card = camera.expected(spot, scene.flux_e), camera.card
     limit = spot_limit(region, card)
     bound = limit.covariance_px2
     peak = float(region.mean_e.max())
-    return SpotTruth(
+    return ImageTruth(
         spot.uv_px,
         spot.phi_rad,
         spot.azimuth_rad,

@@ -32,7 +32,7 @@ Digest = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
 
 
 @dataclass(frozen=True)
-class Part:
+class ReleasePart:
     """One data set of a release.
 
     Parameters
@@ -72,16 +72,18 @@ class Part:
 
 
 PARTS = (
-    Part("dev", "bench-dev", "pairs", "c7d7e7de3551cd4d0e55fbac91ca9936a6debe57958051dc6046242d4a1c4fa0"),
-    Part("test", "bench-test", "sealed", "46144d56bc9db2639ef887f4cd169a6b808ad06e67ad0c5a54cd6404de1f3540"),
-    Part("paper", "paper", "pairs", "025ece80c9cfc9cce31e558089867a760568627e53154381c59bf926be27563d"),
-    Part("mirrors", "bench-mirrors", "pairs", "2b63e735f53c26545511c37c369ee0525a2e1423719e6e663c3d0f27f52b6b9e"),
-    Part("films", "bench-films", "films", "d7e243e791f85a1e0c0e761c5f1ca5377cc839d1a7e1221b5d0a87424c91b9c9"),
-    Part("drives", "bench-drives", "films", "825473dc49345b0f331de47ab49b735d453fcdfafa669aa45dbbb39c4a3926f3"),
+    ReleasePart("dev", "bench-dev", "pairs", "c7d7e7de3551cd4d0e55fbac91ca9936a6debe57958051dc6046242d4a1c4fa0"),
+    ReleasePart("test", "bench-test", "sealed", "46144d56bc9db2639ef887f4cd169a6b808ad06e67ad0c5a54cd6404de1f3540"),
+    ReleasePart("paper", "paper", "pairs", "025ece80c9cfc9cce31e558089867a760568627e53154381c59bf926be27563d"),
+    ReleasePart(
+        "mirrors", "bench-mirrors", "pairs", "2b63e735f53c26545511c37c369ee0525a2e1423719e6e663c3d0f27f52b6b9e"
+    ),
+    ReleasePart("films", "bench-films", "films", "d7e243e791f85a1e0c0e761c5f1ca5377cc839d1a7e1221b5d0a87424c91b9c9"),
+    ReleasePart("drives", "bench-drives", "films", "825473dc49345b0f331de47ab49b735d453fcdfafa669aa45dbbb39c4a3926f3"),
 )
 
 
-def chosen_parts(names: tuple[str, ...]) -> tuple[Part, ...]:
+def chosen_parts(names: tuple[str, ...]) -> tuple[ReleasePart, ...]:
     """Parts by their last words or whole titles; all where none is named.
 
     Raises

@@ -58,7 +58,7 @@ class _HeldUpError(OSError):
     """A server that takes more time, or says more, than it may."""
 
 
-class Pace:
+class TransferPace:
     """Time and bytes that an exchange with a server may take: one for each file and try.
 
     Parameters
@@ -116,7 +116,7 @@ class Pace:
 class _PacedFile(io.RawIOBase):
     """Bytes of a socket, each piece within what a pace allows."""
 
-    def __init__(self, connected: socket.socket, pace: Pace) -> None:
+    def __init__(self, connected: socket.socket, pace: TransferPace) -> None:
         self._socket, self._pace = connected, pace
         self._raw = connected.makefile("rb", buffering=0)  # keeps the socket open for as long as it is read
 
@@ -144,7 +144,7 @@ class _PacedFile(io.RawIOBase):
 class _PacedSocket:
     """Socket whose file is paced; all else is the socket's own."""
 
-    def __init__(self, connected: socket.socket, pace: Pace) -> None:
+    def __init__(self, connected: socket.socket, pace: TransferPace) -> None:
         self._socket, self._pace = connected, pace
 
     def makefile(self, *_: Any, **__: Any) -> io.BufferedReader:
@@ -157,7 +157,7 @@ class _PacedSocket:
 class _PacedAdapter(HTTPAdapter):
     """Transport of `requests` whose sockets are paced, behind a proxy as well."""
 
-    def __init__(self, pace: Pace) -> None:
+    def __init__(self, pace: TransferPace) -> None:
         class Plain(HTTPConnection):
             def connect(self) -> None:
                 super().connect()
@@ -184,7 +184,7 @@ class _PacedAdapter(HTTPAdapter):
 
 
 @contextmanager
-def answer(url: str, headers: dict[str, str], pace: Pace) -> Iterator[requests.Response]:
+def answer(url: str, headers: dict[str, str], pace: TransferPace) -> Iterator[requests.Response]:
     """Server's answer after its redirects, the body not yet read, and not to be packed for the way.
 
     Raises
@@ -206,7 +206,7 @@ def answer(url: str, headers: dict[str, str], pace: Pace) -> Iterator[requests.R
             response.close()
 
 
-def _followed(session: requests.Session, url: str, headers: dict[str, str], pace: Pace) -> requests.Response:
+def _followed(session: requests.Session, url: str, headers: dict[str, str], pace: TransferPace) -> requests.Response:
     for _ in range(pace.patience.redirects + 1):
         response = _asked(session, url, headers, pace.patience.answer_s)
         target = session.get_redirect_target(response)
@@ -252,7 +252,7 @@ def shown_address(url: str) -> str:
         return "an address that cannot be read"
 
 
-def body(response: requests.Response, pace: Pace) -> Iterator[bytes]:
+def body(response: requests.Response, pace: TransferPace) -> Iterator[bytes]:
     """Pieces of a body, unpacked where the server has packed it with gzip unasked; together they are bounded.
 
     Raises

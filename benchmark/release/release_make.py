@@ -29,8 +29,8 @@ from phibench.benchmark.release.benchmark import (
     Archive,
     Digest,
     Manifest,
-    Part,
     ReleasedPart,
+    ReleasePart,
     drawn_numbers,
     read_manifest_file,
     same_but_drawn,
@@ -94,7 +94,7 @@ class ReleaseRequest:
     archive_bytes : an archive holds files up to this size, or one larger file
     """
 
-    parts: Sequence[Part]
+    parts: Sequence[ReleasePart]
     out: Path
     work: Path
     secret_seed: Path | None
@@ -104,7 +104,7 @@ class ReleaseRequest:
     workers: int | None = None
     console: Console = field(default_factory=progress_console)
 
-    def samples_of(self, part: Part) -> int | None:
+    def samples_of(self, part: ReleasePart) -> int | None:
         """Samples to draw; None for a part that draws none."""
         own = drawn_numbers(part.text())[1]
         return own if own is None or self.samples is None else self.samples
@@ -175,7 +175,7 @@ def dry_run(request: ReleaseRequest) -> Iterator[str]:
             yield f"{part.title}: {count}about {megabytes(size)}, {hours:.2g} CPU-hours{rendered}"
 
 
-def _film_cost(part: Part) -> str:
+def _film_cost(part: ReleasePart) -> str:
     plan, films = film_plans(parse_recipe(part.text()), recipe_files(part.recipe))
     forecast = films_forecast(plan, films)
     hours = (forecast.cpu_s + sum(forecast.bakes)) / 3600.0
@@ -221,7 +221,7 @@ def _claimed(out: Path) -> Manifest:
     return manifest.model_copy(update={"phibench": version("phibench")})
 
 
-def _seed(request: ReleaseRequest, part: Part, make_it: bool = True) -> int | None:
+def _seed(request: ReleaseRequest, part: ReleasePart, make_it: bool = True) -> int | None:
     """Seed of a part: the recipe's, or the secret one. None if that is still to be drawn."""
     if part.kind != "sealed":
         return drawn_numbers(part.text())[0]
@@ -245,7 +245,7 @@ def _assigned(request: ReleaseRequest) -> dict[str, Path]:
 _OTHER = "it is no data set of a recipe that is to be released"
 
 
-def _misfit(request: ReleaseRequest, part: Part, folder: Path) -> str:
+def _misfit(request: ReleaseRequest, part: ReleasePart, folder: Path) -> str:
     """Reason why a folder does not do for a part; empty if it does."""
     info = FILM_INFO if part.kind == "films" else schema.INFO
     if not (folder / info).is_file() or not (folder / schema.RECIPE).is_file():
@@ -268,7 +268,7 @@ def _misfit(request: ReleaseRequest, part: Part, folder: Path) -> str:
     return ""
 
 
-def _dataset(request: ReleaseRequest, part: Part, used: Mapping[str, Path], seal: Seal) -> Path:
+def _dataset(request: ReleaseRequest, part: ReleasePart, used: Mapping[str, Path], seal: Seal) -> Path:
     """Folder whose files are to be packed: made, if need be, or used."""
     folder = used.get(part.title, request.work / part.title)
     if part.title not in used:
@@ -295,7 +295,7 @@ def _dataset(request: ReleaseRequest, part: Part, used: Mapping[str, Path], seal
 # Archives.
 
 
-def _packed(request: ReleaseRequest, part: Part, folder: Path, manifest: Manifest) -> tuple[Manifest, int, int]:
+def _packed(request: ReleaseRequest, part: ReleasePart, folder: Path, manifest: Manifest) -> tuple[Manifest, int, int]:
     """Archives of one part, and the manifest with it; numbers of archives written and kept."""
     out = request.out
     members, title = _members(part, folder), part.title
@@ -338,7 +338,7 @@ def _packed(request: ReleaseRequest, part: Part, folder: Path, manifest: Manifes
     return manifest, made, len(shares) - made
 
 
-def _members(part: Part, folder: Path) -> dict[str, str]:
+def _members(part: ReleasePart, folder: Path) -> dict[str, str]:
     """Files to be packed with their SHA-256, sorted by name: what SHA256SUMS lists, itself, and the journal."""
     listed = read_checksums(folder)
     extra = [schema.CHECKSUMS, *([schema.JOURNAL] if part.kind == "pairs" else [])]
@@ -396,7 +396,7 @@ class _Hashing(io.RawIOBase):
         return data
 
 
-def _sample_count(part: Part, folder: Path) -> int:
+def _sample_count(part: ReleasePart, folder: Path) -> int:
     """Pairs of a data set or of a sealed one, or films."""
     name, key = {"pairs": (schema.INFO, "samples"), "sealed": (_SEAL, "pairs"), "films": (FILM_INFO, "films")}[
         part.kind

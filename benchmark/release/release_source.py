@@ -26,7 +26,7 @@ from phibench.scenes.validation import printable_line
 if TYPE_CHECKING:
     import requests
 
-    from phibench.benchmark.release.paced_http import Pace, Patience
+    from phibench.benchmark.release.paced_http import Patience, TransferPace
 
 SOURCE = "PHIBENCH_SOURCE"
 """Environment variable: the default place of releases, a folder or an HTTP address."""
@@ -143,7 +143,7 @@ class _Transfer:
         self._name, self._archive, self._patience = name, archive, patience
         self._partial = None if archive is None else Partial(folder, archive)
         self._most = SETTINGS_BYTES if archive is None else archive.size
-        self._pace: Pace | None = None
+        self._pace: TransferPace | None = None
 
     @property
     def fault(self) -> str:
@@ -181,10 +181,10 @@ class _Transfer:
             except ValueError as error:
                 raise ValueError(f"has more than {self._most} bytes, the most that are read of its kind") from error
 
-    def _new_pace(self) -> Pace:
-        from phibench.benchmark.release.paced_http import Pace
+    def _new_pace(self) -> TransferPace:
+        from phibench.benchmark.release.paced_http import TransferPace
 
-        self._pace = Pace(self._patience, self._most, is_document=self._archive is None)
+        self._pace = TransferPace(self._patience, self._most, is_document=self._archive is None)
         return self._pace
 
 
@@ -222,7 +222,7 @@ class Partial:
         """Bytes that are there."""
         return self.path.stat().st_size if self.path.is_file() else 0
 
-    def download(self, url: str, target: str, new_pace: Callable[[], Pace]) -> None:
+    def download(self, url: str, target: str, new_pace: Callable[[], TransferPace]) -> None:
         """Put the whole archive into the file `target`, from the bytes that are there and the rest of the server's.
 
         Bytes that were put together from two answers are taken with the right SHA-256 only; else all are asked for.
@@ -244,7 +244,7 @@ class Partial:
         self.path.replace(target)
         self.validator.unlink(missing_ok=True)
 
-    def _completed(self, url: str, pace: Pace) -> bool:
+    def _completed(self, url: str, pace: TransferPace) -> bool:
         """Ask for the bytes that are missing; False if the server does not give them, or if they do not fit."""
         from phibench.benchmark.release.paced_http import answer
 
@@ -262,7 +262,7 @@ class Partial:
                 self._take(response, pace, "ab")
         return sha256(self.path) == self._archive.sha256
 
-    def _take_whole(self, response: requests.Response, pace: Pace) -> None:
+    def _take_whole(self, response: requests.Response, pace: TransferPace) -> None:
         self.validator.unlink(missing_ok=True)
         self.path.unlink(missing_ok=True)
         if response.headers.get("Content-Encoding", "identity") == "identity":
@@ -271,7 +271,7 @@ class Partial:
             self.validator.write_text(strong, "ascii", "ignore")
         self._take(response, pace, "wb")
 
-    def _take(self, response: requests.Response, pace: Pace, mode: str) -> None:
+    def _take(self, response: requests.Response, pace: TransferPace, mode: str) -> None:
         import requests
 
         from phibench.benchmark.release.paced_http import body

@@ -37,8 +37,8 @@ from scipy.ndimage import uniform_filter
 
 from phibench.benchmark.scores.answer_errors import Rules
 from phibench.estimator.interface import FAILURES, Answer, Pair
-from phibench.estimator.methods.fit_at_truth import Reference, fit_at_truth, reaches_bound
-from phibench.estimator.pair_set import PairSet, PairTruth, SpotTruth
+from phibench.estimator.methods.fit_at_truth import FitAtTruth, fit_at_truth, reaches_bound
+from phibench.estimator.pair_set import ImageTruth, PairSet, PairTruth
 from phibench.estimator.spots.camera_codes import rgb_codes
 from phibench.estimator.spots.image_planes import PROCESSED
 from phibench.scenes.frames import Array
@@ -74,7 +74,7 @@ class Case:
     fit: Callable[[Pair, PairTruth], Answer | None] = fit_at_truth
 
     @property
-    def spot(self) -> SpotTruth:
+    def spot(self) -> ImageTruth:
         """Truth of the image."""
         return getattr(self.truth, self.position)
 
@@ -119,7 +119,7 @@ def _is_cause(case: Case, name: str) -> bool:
     return _RULES[name](case) and not (name in _OF_THE_IMAGE and case.spot.visible and case.allows_a_fit)
 
 
-def with_causes(records: pl.DataFrame, pairs: PairSet, rules: Rules, fit: Reference = fit_at_truth) -> pl.DataFrame:
+def with_causes(records: pl.DataFrame, pairs: PairSet, rules: Rules, fit: FitAtTruth = fit_at_truth) -> pl.DataFrame:
     """Records with `kind`, `cause` and, of false detections, `taken_for`; null where the spot was detected.
 
     Parameters
@@ -156,7 +156,7 @@ def count_failures(records: pl.DataFrame) -> dict[str, int]:
     return {name: numbers[name] for name in FAILURES}
 
 
-def _case(row: dict[str, Any], pairs: PairSet, rules: Rules, fit: Reference) -> Case:
+def _case(row: dict[str, Any], pairs: PairSet, rules: Rules, fit: FitAtTruth) -> Case:
     answer = None if row["u_px"] is None else np.array([row["u_px"], row["v_px"]])
     return Case(row["image"], pairs.truth(row["number"]), answer, row["failure"], pairs.pair, rules, fit)
 

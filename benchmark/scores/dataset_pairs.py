@@ -22,7 +22,7 @@ from phibench.datasets.exposures.expected import ExpectedRegion, expected_of_lig
 from phibench.datasets.exposures.pair_draws import CachedSample, PairDraw, pair_draws, search_boxes
 from phibench.datasets.frames.sensor_card import SensorCard, card_of
 from phibench.datasets.frames.sensor_file import SensorFile
-from phibench.datasets.frames.source import FrameSource, Side
+from phibench.datasets.frames.source import FrameSource, PositionLight
 from phibench.datasets.read import Dataset, Sample, open_dataset
 from phibench.datasets.store import schema
 from phibench.datasets.store.files import sha256
@@ -35,7 +35,7 @@ from phibench.estimator.limits.off_frame_bound import FrameCounts, on_off_limit,
 from phibench.estimator.limits.position_bound import SpotLimit, spot_limit
 from phibench.estimator.limits.processed_bound import chain_limit
 from phibench.estimator.limits.spot_snr import processed_snr, raw_snr
-from phibench.estimator.pair_set import LEAST_BOX_PX, Distraction, PairSet, PairTruth, SpotTruth, truth_folders
+from phibench.estimator.pair_set import LEAST_BOX_PX, Distraction, ImageTruth, PairSet, PairTruth, truth_folders
 from phibench.estimator.spots.gaussian_spot import SpotBlur
 from phibench.estimator.spots.image_planes import PROCESSED
 from phibench.estimator.spots.spot_prediction import spot_blur
@@ -242,7 +242,7 @@ def _with_boxes(dataset: Dataset, chosen: tuple[PairDraw, ...], side_px: int, hi
     return tuple(replace(draw, boxes=boxes[draw.sample_id]) for draw in chosen)
 
 
-def _spot_truth(sample: CachedSample, source: FrameSource, position: str, frames: FrameCounts | None) -> SpotTruth:
+def _spot_truth(sample: CachedSample, source: FrameSource, position: str, frames: FrameCounts | None) -> ImageTruth:
     row, side = sample.row.position(position), source.sides[position]
     centre = row.centre
     uv_px = (centre.u_px, centre.v_px)
@@ -250,7 +250,7 @@ def _spot_truth(sample: CachedSample, source: FrameSource, position: str, frames
     bounds = spot_bounds(
         side, sample.rig, uv_px, row.electrons_per_s, row.visible, depth_m=depth_m, beam=beam, frames=frames
     )
-    return SpotTruth(
+    return ImageTruth(
         uv_px=uv_px,
         phi_rad={"ray": centre.phi_ray_rad, "normal": centre.phi_normal_rad, "incidence": centre.phi_incidence_rad},
         azimuth_rad=centre.azimuth_rad,
@@ -262,7 +262,7 @@ def _spot_truth(sample: CachedSample, source: FrameSource, position: str, frames
     )
 
 
-def _distractions(sample: CachedSample, side: Side, position: str) -> tuple[Distraction, ...]:
+def _distractions(sample: CachedSample, side: PositionLight, position: str) -> tuple[Distraction, ...]:
     """Lights beside the spot that this image shows."""
     return tuple(
         Distraction(
@@ -289,7 +289,7 @@ class SpotBounds:
 
 
 def spot_bounds(
-    side: Side,
+    side: PositionLight,
     rig: Rig,
     uv_px: tuple[float, float],
     rates_per_s: tuple[float, ...],
@@ -347,7 +347,7 @@ def spot_bounds(
     )
 
 
-def spot_electrons(rates_per_s: tuple[float, ...] | Array, side: Side) -> float:
+def spot_electrons(rates_per_s: tuple[float, ...] | Array, side: PositionLight) -> float:
     """Electrons of a whole spot: behind the red filter, or all of them where there are no filters."""
     sensor = side.chain.sensor
     weights = sensor.mono_weights if sensor.mosaic == "mono" else (1.0, 0.0, 0.0)

@@ -21,7 +21,7 @@ from pydantic import AfterValidator, Field, model_validator
 from phibench.benchmark.scores.answer_errors import Rules
 from phibench.benchmark.scores.causes import count, count_failures
 from phibench.benchmark.scores.intervals import Estimate
-from phibench.benchmark.scores.metrics import METRICS, Measured
+from phibench.benchmark.scores.metrics import METRICS, MetricEstimate
 from phibench.benchmark.scores.records import COLUMN_TYPES
 from phibench.benchmark.scores.strata import Stratum, count_pairs, light_shift, measured, strata
 from phibench.datasets.errors import DatasetError
@@ -51,7 +51,7 @@ class Value(Document):
     note: str
 
     @classmethod
-    def of(cls, measured: Measured, **fields: str) -> Self:
+    def of(cls, measured: MetricEstimate, **fields: str) -> Self:
         """From a measurement, and the fields that a subclass has besides."""
         e = measured.estimate
         numbers = {"value": finite(e.value), "low": finite(e.low), "high": finite(e.high)}
@@ -73,7 +73,7 @@ class Value(Document):
         return Estimate(value, low, high, self.note)
 
 
-class Metric(Value):
+class MetricDescription(Value):
     """A metric of the whole, with what it is; the unit is also in the metric's name."""
 
     unit: str
@@ -151,7 +151,7 @@ class Flag(Document):
         return f"knows more than the images: {self.quantity} {times} ({where}; by chance {chance})"
 
 
-class Spread(Document):
+class PairRange(Document):
     """Least, median and greatest of a number over the pairs."""
 
     low: float
@@ -159,7 +159,7 @@ class Spread(Document):
     high: float
 
     @classmethod
-    def of(cls, values: pl.Series) -> Spread | None:
+    def of(cls, values: pl.Series) -> PairRange | None:
         """Of the values that are known; None where there are none."""
         known = values.drop_nulls().cast(pl.Float64)
         if not len(known):
@@ -177,17 +177,17 @@ FRAME_COLUMNS = ("exposure_s", "analogue_gain", "jpeg_quality", "laser_level", "
 """Columns of the records that say how frames were taken."""
 
 
-def frame_numbers(records: pl.DataFrame) -> dict[str, Spread | None]:
+def frame_numbers(records: pl.DataFrame) -> dict[str, PairRange | None]:
     """Numbers of a score's frames: each of `FRAME_COLUMNS` over its pairs."""
     pairs = records.filter(pl.col("image") == "down")
-    return {name: Spread.of(pairs[name]) for name in FRAME_COLUMNS}
+    return {name: PairRange.of(pairs[name]) for name in FRAME_COLUMNS}
 
 
-def light_distances(records: pl.DataFrame) -> dict[str, Spread | None]:
+def light_distances(records: pl.DataFrame) -> dict[str, PairRange | None]:
     """Distances of the light from the beam's axis: in visible images, pixels; of D, metres."""
     seen = records.filter("visible").select(shift=light_shift())["shift"]
     pairs = records.filter((pl.col("image") == "down") & pl.col("pair_visible"))
-    return {"shift_px": Spread.of(seen), "depth_m": Spread.of((pairs["depth_m"] - pairs["axis_depth_m"]).abs())}
+    return {"shift_px": PairRange.of(seen), "depth_m": PairRange.of((pairs["depth_m"] - pairs["axis_depth_m"]).abs())}
 
 
 class EncodedPicture(Document):
@@ -243,8 +243,8 @@ class ScoreDocument(Document):
     images: int
     samples: int
     draws: int = Field(description="draws of the noise of a sample and preset, at most")
-    frames: dict[str, Spread | None] = Field(description="how they were taken; null where nobody knows")
-    light: dict[str, Spread | None] = Field(description="how far the light lies from the beam's axis")
+    frames: dict[str, PairRange | None] = Field(description="how they were taken; null where nobody knows")
+    light: dict[str, PairRange | None] = Field(description="how far the light lies from the beam's axis")
     seed: int
     rules: dict[str, float]
     limits: dict[str, Any]
@@ -254,7 +254,7 @@ class ScoreDocument(Document):
     code_sha256: str = Field(description="of everything behind the score")
     missed_relative: float = Field(description="relative error of D as which a missed pair counts")
     flags: list[Flag] = Field(description="what the images cannot tell so well")
-    metrics: dict[str, Metric] = Field(description="of the whole: `jq .metrics.rms_px.value`")
+    metrics: dict[str, MetricDescription] = Field(description="of the whole: `jq .metrics.rms_px.value`")
     strata: list[StratumScore] = Field(description="parts of the whole")
     causes: dict[str, dict[str, int]] = Field(description="images by cause and kind")
     failures: dict[str, int] = Field(description="pairs for which the method did not come back, by the harness's word")
@@ -332,9 +332,9 @@ def results_sha256(records: pl.DataFrame) -> str:
     return hashlib.sha256(json.dumps(columns, separators=(",", ":")).encode()).hexdigest()
 
 
-def _metric(name: str, value: Measured) -> Metric:
+def _metric(name: str, value: MetricEstimate) -> MetricDescription:
     metric = METRICS[name]
-    return Metric.of(value, unit=metric.unit, better=metric.better, text=metric.text)
+    return MetricDescription.of(value, unit=metric.unit, better=metric.better, text=metric.text)
 
 
 def _stratum(stratum: Stratum, rules: Rules, seed: int) -> StratumScore:

@@ -44,7 +44,7 @@ _METADATA: dict[str, dict[str, Any]] = {"svg": {"Date": None}, "png": {"Software
 
 
 @dataclass(frozen=True)
-class Picture:
+class EmbeddedFigure:
     """A figure as a data address, with its alternative in words."""
 
     source: str
@@ -63,9 +63,9 @@ def encoded(figure: Figure, kind: str, transparent: bool = False) -> bytes:
     return buffer.getvalue()
 
 
-def picture(data: bytes, kind: str, alt: str) -> Picture:
+def picture(data: bytes, kind: str, alt: str) -> EmbeddedFigure:
     """An encoded figure as a picture."""
-    return Picture(f"data:{_MIME[kind]};base64,{base64.b64encode(data).decode('ascii')}", alt)
+    return EmbeddedFigure(f"data:{_MIME[kind]};base64,{base64.b64encode(data).decode('ascii')}", alt)
 
 
 # names of methods are text: a "$" in one is no formula
@@ -85,12 +85,12 @@ Named = Mapping[str, ScoreDocument]
 Tables = Mapping[str, pl.DataFrame]
 
 
-def keys(names: Sequence[str]) -> dict[str, Picture]:
+def keys(names: Sequence[str]) -> dict[str, EmbeddedFigure]:
     """Line and marker of each method, to be shown beside its name."""
     return {name: _key(i) for i, name in enumerate(names)}
 
 
-def error_panels(scores: Named) -> list[Picture]:
+def error_panels(scores: Named) -> list[EmbeddedFigure]:
     """Rms errors of phi, position and depth against depth, stroke and signal, the bound drawn in."""
     panels = []
     for metric, bound, label in _ROWS:
@@ -116,10 +116,10 @@ def _placed(tables: Tables) -> dict[str, pl.DataFrame]:
     return {name: table for name, table in tables.items() if table["u_true_px"].is_not_null().any()}
 
 
-def error_maps(tables: Tables) -> dict[str, Picture]:
+def error_maps(tables: Tables) -> dict[str, EmbeddedFigure]:
     """Maps of errors over the frame: a mark at every true position, as large as the error."""
     tables = _placed(tables)
-    maps: dict[str, Picture] = {}
+    maps: dict[str, EmbeddedFigure] = {}
     if not tables:
         return maps
     scale = _scale(tables)
@@ -139,9 +139,9 @@ def error_maps(tables: Tables) -> dict[str, Picture]:
     return maps
 
 
-def radius_panels(tables: Tables) -> list[Picture]:
+def radius_panels(tables: Tables) -> list[EmbeddedFigure]:
     """Radial and tangential rms error against the distance from the image of the sphere centre."""
-    panels: list[Picture] = []
+    panels: list[EmbeddedFigure] = []
     tables = _placed(tables)
     for column, label in (("radial_px", "radial"), ("tangential_px", "tangential")) if tables else ():
         with mpl.rc_context(_PANEL):
@@ -161,7 +161,7 @@ def radius_panels(tables: Tables) -> list[Picture]:
     return panels
 
 
-def cause_bars(scores: Named) -> Picture:
+def cause_bars(scores: Named) -> EmbeddedFigure:
     """Images without a right position by cause, one bar per method."""
     causes = [c for c in next(iter(scores.values())).causes if any(sum(s.causes[c].values()) for s in scores.values())]
     with mpl.rc_context(_PANEL):
@@ -182,7 +182,7 @@ def cause_bars(scores: Named) -> Picture:
         return _svg(figure, f"Stacked bars of the causes, share of all images. {words}.")
 
 
-def pull_histogram(tables: Tables) -> Picture | None:
+def pull_histogram(tables: Tables) -> EmbeddedFigure | None:
     """Whitened errors of the methods that claim a covariance, against the normal distribution; None if none does."""
     pulls = {name: _pulls(table) for name, table in tables.items()}
     pulls = {name: values for name, values in pulls.items() if values.size}
@@ -324,7 +324,7 @@ def _panel() -> tuple[Figure, Axes]:
     return figure, figure.subplots()
 
 
-def _key(i: int) -> Picture:
+def _key(i: int) -> EmbeddedFigure:
     with mpl.rc_context(_PANEL):
         figure = Figure(figsize=(0.5, 0.2))
         axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
@@ -346,9 +346,9 @@ def _shares(score: ScoreDocument) -> str:
     return ", ".join(f"{cause} {100.0 * n / score.images:.1f} %" for cause, n in there.items()) or "none"
 
 
-def _svg(figure: Figure, alt: str) -> Picture:
+def _svg(figure: Figure, alt: str) -> EmbeddedFigure:
     return picture(encoded(figure, "svg", True), "svg", alt)
 
 
-def _png(figure: Figure, alt: str) -> Picture:
+def _png(figure: Figure, alt: str) -> EmbeddedFigure:
     return picture(encoded(figure, "png", True), "png", alt)

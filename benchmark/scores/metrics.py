@@ -289,7 +289,7 @@ def applies(name: str, sees: str) -> bool:
 
 
 @dataclass(frozen=True)
-class Measured:
+class MetricEstimate:
     """An estimate with its numbers of records and samples.
 
     `share` is that of the visible spots, or pairs, which the records are; NaN of metrics that are of all of them.
@@ -318,7 +318,7 @@ def prepared(records: pl.DataFrame) -> pl.DataFrame:
 
 def measure(
     records: pl.DataFrame, rules: Rules, *stream: Name, names: tuple[str, ...] | None = None
-) -> dict[str, Measured]:
+) -> dict[str, MetricEstimate]:
     """All metrics of some records, or those of `names`.
 
     Parameters
@@ -328,7 +328,7 @@ def measure(
     *stream : names of the random stream of the resamples
     """
     wanted = {name: METRICS[name] for name in names or METRICS}
-    found: dict[str, Measured] = {}
+    found: dict[str, MetricEstimate] = {}
     groups: dict[bytes, dict[str, _Ready]] = {}
     for family in dict.fromkeys(metric.family for metric in wanted.values()):
         part = {name: metric for name, metric in wanted.items() if metric.family == family}
@@ -342,7 +342,7 @@ def measure(
     return {name: _with_share(metric, found[name], records) for name, metric in wanted.items()}
 
 
-def _with_share(metric: Metric, measured: Measured, records: pl.DataFrame) -> Measured:
+def _with_share(metric: Metric, measured: MetricEstimate, records: pl.DataFrame) -> MetricEstimate:
     if metric.family not in CHOSEN:
         return measured
     every = len(records.filter(FAMILIES["pair" if metric.family in OF_PAIRS else "visible"]))
@@ -368,13 +368,15 @@ class _Ready:
     samples: int
 
 
-def _rates(metrics: dict[str, Metric], records: pl.DataFrame, clusters: Clusters, rules: Rules) -> dict[str, Measured]:
+def _rates(
+    metrics: dict[str, Metric], records: pl.DataFrame, clusters: Clusters, rules: Rules
+) -> dict[str, MetricEstimate]:
     """Rates, and every metric that has no records."""
     if clusters.n == 0:
         why = {name: WHY_EMPTY[metric.family] for name, metric in metrics.items()}
-        return {name: Measured(Estimate(math.nan, math.nan, math.nan, note), 0, 0) for name, note in why.items()}
+        return {name: MetricEstimate(Estimate(math.nan, math.nan, math.nan, note), 0, 0) for name, note in why.items()}
     rates = {name: _column(records, metric.columns[0]) for name, metric in metrics.items() if metric.kind == "rate"}
-    return {name: Measured(rate(clusters, hits, rules), len(records), clusters.n) for name, hits in rates.items()}
+    return {name: MetricEstimate(rate(clusters, hits, rules), len(records), clusters.n) for name, hits in rates.items()}
 
 
 def _statistics(metrics: dict[str, Metric], records: pl.DataFrame, clusters: Clusters) -> dict[str, _Ready]:
@@ -386,13 +388,13 @@ def _statistics(metrics: dict[str, Metric], records: pl.DataFrame, clusters: Clu
     }
 
 
-def _resampled(ready: dict[str, _Ready], rules: Rules, rng: np.random.Generator) -> dict[str, Measured]:
+def _resampled(ready: dict[str, _Ready], rules: Rules, rng: np.random.Generator) -> dict[str, MetricEstimate]:
     if not ready:
         return {}
     samples = next(iter(ready.values())).samples
     numbers = estimates([item.statistic for item in ready.values()], samples, rules, rng)
     return {
-        name: Measured(trusted(item.metric, number, item.samples), item.n, item.samples)
+        name: MetricEstimate(trusted(item.metric, number, item.samples), item.n, item.samples)
         for (name, item), number in zip(ready.items(), numbers, strict=True)
     }
 

@@ -34,7 +34,7 @@ from phibench.estimator.geometry.phi import outline_circle
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.estimator.interface import OK, Answer, Outcome, Spot
 from phibench.estimator.limits.beyond_images import searched_px2
-from phibench.estimator.pair_set import PairSet, PairTruth, SpotTruth
+from phibench.estimator.pair_set import ImageTruth, PairSet, PairTruth
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import POSITIONS, Rig
 
@@ -249,7 +249,7 @@ def _of_rigs(
 def _image_columns(
     position: str, nominal: Rig, true: Rig, truths: list[PairTruth], outcomes: list[Outcome], rules: Rules
 ) -> dict[str, Any]:
-    spots: list[SpotTruth] = [getattr(truth, position) for truth in truths]
+    spots: list[ImageTruth] = [getattr(truth, position) for truth in truths]
     answers = [_spot(outcome, position) for outcome in outcomes]
     xy, uv = _stack(spot.uv_px for spot in spots), _stack(map(_position, answers))
     error, phi = pixel_errors(true, xy, uv), _phi_columns(nominal, true, xy, uv, spots, answers)
@@ -311,7 +311,7 @@ def _parts(name: str, matrices: Array) -> dict[str, Array]:
     return {f"{name}_{part}_px2": matrices[:, i, j] for part, (i, j) in places.items()}
 
 
-def _ranked_phi_error(nominal: Rig, spots: list[SpotTruth], uv: Array, phi: dict[str, Any]) -> Array:
+def _ranked_phi_error(nominal: Rig, spots: list[ImageTruth], uv: Array, phi: dict[str, Any]) -> Array:
     """Error of phi that ranks; of "outline" that of phi_ray at the answered pixel.
 
     "outline" is a formula in the image, true of any rig: no error of the nominal rig would count.
@@ -322,7 +322,7 @@ def _ranked_phi_error(nominal: Rig, spots: list[SpotTruth], uv: Array, phi: dict
 
 
 def _phi_columns(
-    nominal: Rig, true: Rig, xy: Array, uv: Array, spots: list[SpotTruth], answers: list[Spot | None]
+    nominal: Rig, true: Rig, xy: Array, uv: Array, spots: list[ImageTruth], answers: list[Spot | None]
 ) -> dict[str, Any]:
     own = np.array([_own_phi(answer) for answer in answers])
     convention = [
@@ -497,7 +497,7 @@ def _from(own: bool, there: bool) -> str | None:
     return "method" if own else "pixels"
 
 
-def _bounds(spots: list[SpotTruth], name: str) -> Array:
+def _bounds(spots: list[ImageTruth], name: str) -> Array:
     matrices: Iterator[Array | None] = (getattr(spot, name) for spot in spots)
     return np.stack([_NO_MATRIX if matrix is None else np.asarray(matrix, float) for matrix in matrices])
 

@@ -19,7 +19,7 @@ from phibench.benchmark.scores.causes import CAUSES, KINDS
 from phibench.benchmark.scores.compare import note_on_others, same_pairs
 from phibench.benchmark.scores.document import EncodedPicture, ScoreDocument, read_records, read_score
 from phibench.benchmark.scores.figures import (
-    Picture,
+    EmbeddedFigure,
     cause_bars,
     error_maps,
     error_panels,
@@ -77,7 +77,7 @@ class Section:
 
     title: str
     paragraphs: tuple[str, ...] = ()
-    pictures: tuple[Picture, ...] = ()
+    pictures: tuple[EmbeddedFigure, ...] = ()
     tables: tuple[tuple[tuple[str, ...], ...], ...] = ()
     captions: tuple[str, ...] = ()
 
@@ -128,12 +128,12 @@ class Ranking:
     verdict: str
     pair_set: Mapping[str, object]
     scores: Mapping[str, ScoreDocument]
-    keys: Mapping[str, Picture]
-    curves: Sequence[Picture]
-    maps: Mapping[str, Picture]
-    by_radius: Sequence[Picture]
-    causes: Picture
-    pulls: Picture | None
+    keys: Mapping[str, EmbeddedFigure]
+    curves: Sequence[EmbeddedFigure]
+    maps: Mapping[str, EmbeddedFigure]
+    by_radius: Sequence[EmbeddedFigure]
+    causes: EmbeddedFigure
+    pulls: EmbeddedFigure | None
     frames: Mapping[str, EncodedPicture]
     frame_of: Mapping[tuple[str, int], str]
     false_lines: Mapping[str, str]

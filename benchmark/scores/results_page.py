@@ -30,7 +30,7 @@ from phibench.benchmark.scores.report import Section, report_html
 from phibench.benchmark.scores.score_tables import (
     DIGITS,
     FLAGGED,
-    Grid,
+    TextTable,
     cause_table,
     cell_parts,
     differences_json,
@@ -71,7 +71,7 @@ _HEADS = {
 
 
 @dataclass(frozen=True)
-class Part:
+class ScoreGroup:
     """Scores of the same pairs, the best first, and their differences against one of them.
 
     Attributes
@@ -92,7 +92,7 @@ class Part:
     notes: tuple[str, ...]
 
 
-def read_parts(files: Sequence[Path], against: str = AGAINST, by: str = "phi", seed: int = 0) -> list[Part]:
+def read_parts(files: Sequence[Path], against: str = AGAINST, by: str = "phi", seed: int = 0) -> list[ScoreGroup]:
     """Scores on disk by what they were taken on, in the order in which these come.
 
     Parameters
@@ -127,7 +127,7 @@ def _part(
     against: str,
     by: str,
     seed: int,
-) -> Part:
+) -> ScoreGroup:
     tables = {document.method.name: table for document, table in group}
     refusals = {name: why for name, table in tables.items() if (why := refused(table))}
     documents = [document for document, _ in group]
@@ -146,17 +146,17 @@ def _part(
     title = ", ".join(base.pair_set.get("presets", ())) or "pairs"
     if apart := note_on_others(order, every):
         notes, title = [apart, *notes], f"{title}, {base.pairs} pairs"
-    return Part(title, tuple(order), name, differences, tuple(notes))
+    return ScoreGroup(title, tuple(order), name, differences, tuple(notes))
 
 
 # -- tables ------------------------------------------------------------------------------------------------------------
 
 
-def grids(part: Part) -> list[Grid]:
+def grids(part: ScoreGroup) -> list[TextTable]:
     """Tables of a part: ranking, errors, claims, differences, strata, causes."""
     causes = cause_table(part.scores)
     if len(part.scores) == 1:
-        causes = Grid(causes.title, causes.heads[:-1], tuple(row[:-1] for row in causes.rows), causes.columns[:-1])
+        causes = TextTable(causes.title, causes.heads[:-1], tuple(row[:-1] for row in causes.rows), causes.columns[:-1])
     made = [
         _board(part, "Ranking", _BOARD),
         _board(part, "Errors of found spots and depths", _ERRORS),
@@ -170,13 +170,13 @@ def _head(name: str) -> str:
     return _HEADS[name] if unit == "1" else f"{_HEADS[name]} / {unit}"
 
 
-def _board(part: Part, title: str, names: Sequence[str]) -> Grid:
+def _board(part: ScoreGroup, title: str, names: Sequence[str]) -> TextTable:
     rows = []
     for one in part.scores:
         cells = (" ".join(shown_parts(m, one.metrics[m])) if applies(m, one.method.sees) else "" for m in names)
         rows.append((f"{one.method.name}{FLAGGED if one.flags else ''}", *(_cut(cell) for cell in cells)))
     note = " ".join(filter(None, (frames_line(part.scores[0]), light_line(part.scores[0]))))
-    return Grid(title, ("method", *map(_head, names)), tuple(rows), "l" + "r" * len(names), note)
+    return TextTable(title, ("method", *map(_head, names)), tuple(rows), "l" + "r" * len(names), note)
 
 
 def _cut(cell: str) -> str:
@@ -185,14 +185,14 @@ def _cut(cell: str) -> str:
     return f"{value} *" if bracket else cell.strip()
 
 
-def _differences(part: Part) -> Grid:
+def _differences(part: ScoreGroup) -> TextTable:
     rows = []
     for name, found in part.differences.items():
         by_name = {one.name: one for one in found}
         cells = (_change(by_name[metric]) for metric in _DIFFERENCES)
         rows.append((name, *cells))
     heads = ("method", *map(_head, _DIFFERENCES))
-    return Grid(f"Method minus {part.against}", heads, tuple(rows), "l" + "r" * len(_DIFFERENCES))
+    return TextTable(f"Method minus {part.against}", heads, tuple(rows), "l" + "r" * len(_DIFFERENCES))
 
 
 _SIGNS = {"second": " **", "first": " **", "no difference shown": "", "too few samples": ""}
@@ -203,7 +203,7 @@ def _change(one: Difference) -> str:
     return _cut(" ".join(cell_parts(one.difference, factor, DIGITS, significant=True))) + _SIGNS[one.better]
 
 
-def _strata(part: Part) -> Grid:
+def _strata(part: ScoreGroup) -> TextTable:
     """Found spots and their median error in each stratum; of one method per column."""
     order = [one for one in part.scores if one.method.name != part.against]
     base = next(one for one in part.scores if one.method.name == part.against)
@@ -214,7 +214,7 @@ def _strata(part: Part) -> Grid:
             cells = (_in_stratum(one, stratum) for one in shown)
             rows.append((stratum.by, stratum.label, str(stratum.images), *cells))
     heads = ("by", "stratum", "images", *(one.method.name for one in shown))
-    return Grid("Found / %; median error / px", heads, tuple(rows), "llr" + "r" * len(shown))
+    return TextTable("Found / %; median error / px", heads, tuple(rows), "llr" + "r" * len(shown))
 
 
 def _in_stratum(one: ScoreDocument, wanted: StratumScore) -> str:
@@ -250,7 +250,7 @@ A blank: the metric is not that method's. A dash: nothing to compute it from.
 """
 
 
-def results_page(parts: Sequence[Part], by: str = "phi") -> str:
+def results_page(parts: Sequence[ScoreGroup], by: str = "phi") -> str:
     """The page in Markdown."""
     text = [_INTRODUCTION, _LEGEND.format(quantity={"phi": "phi", "depth": "D"}[by])]
     text.append("## What was scored\n\n" + "\n".join(_sources(parts)) + "\n")
@@ -261,7 +261,7 @@ def results_page(parts: Sequence[Part], by: str = "phi") -> str:
     return "\n".join(text)
 
 
-def _titled(grid: Grid) -> str:
+def _titled(grid: TextTable) -> str:
     """Table in Markdown below its title in bold."""
     _, _, rest = markdown(grid).partition("\n\n")
     lines = [line if line.startswith("|") else textwrap.fill(line, 120) for line in rest.split("\n")]
@@ -277,14 +277,14 @@ def _item(note: str) -> str:
 _SOURCE_HEADS = ("preset", "data set", "pairs", "samples", "task", "hash of the data set", "scored by")
 
 
-def _sources(parts: Sequence[Part]) -> Iterator[str]:
+def _sources(parts: Sequence[ScoreGroup]) -> Iterator[str]:
     yield f"| {' | '.join(_SOURCE_HEADS)} |"
     yield "|---" * len(_SOURCE_HEADS) + "|"
     for row in _source_rows(parts):
         yield f"| {' | '.join(map(markdown_cell, row))} |"
 
 
-def results_html(parts: Sequence[Part], by: str = "phi") -> str:
+def results_html(parts: Sequence[ScoreGroup], by: str = "phi") -> str:
     """The page in HTML: one file, nothing fetched, no script."""
     intro = (
         "Values have 95 % intervals over samples in brackets. A star: too few samples for an interval.",
@@ -299,7 +299,7 @@ def results_html(parts: Sequence[Part], by: str = "phi") -> str:
     return report_html([], sections, by, title="phibench results")
 
 
-def _source_rows(parts: Sequence[Part]) -> Iterator[tuple[str, ...]]:
+def _source_rows(parts: Sequence[ScoreGroup]) -> Iterator[tuple[str, ...]]:
     for part in parts:
         first = part.scores[0]
         programs = sorted({one.program or "not told" for one in part.scores})
@@ -308,7 +308,7 @@ def _source_rows(parts: Sequence[Part]) -> Iterator[tuple[str, ...]]:
         yield (*map(str, cells), digest, ", ".join(programs))
 
 
-def results_document(parts: Sequence[Part]) -> dict[str, Any]:
+def results_document(parts: Sequence[ScoreGroup]) -> dict[str, Any]:
     """JSON document: per part the scores without pictures and the paired differences, SI units in full."""
     return {
         "kind": "phibench results",
@@ -326,7 +326,7 @@ def results_document(parts: Sequence[Part]) -> dict[str, Any]:
     }
 
 
-def write_results(parts: Sequence[Part], out: Path | None, html: Path | None, by: str = "phi") -> list[Path]:
+def write_results(parts: Sequence[ScoreGroup], out: Path | None, html: Path | None, by: str = "phi") -> list[Path]:
     """Write the pages that are wanted; their paths."""
     made = ((out, results_page), (html, results_html))
     return [write_text(path, page(parts, by)) for path, page in made if path is not None]

@@ -24,7 +24,7 @@ from rich.text import Text
 
 from phibench.benchmark.scores.causes import CAUSES, KINDS, NOISE, TAKEN_FOR
 from phibench.benchmark.scores.compare import Difference
-from phibench.benchmark.scores.document import ScoreDocument, Spread, Value
+from phibench.benchmark.scores.document import PairRange, ScoreDocument, Value
 from phibench.benchmark.scores.intervals import Estimate
 from phibench.benchmark.scores.metrics import CHOSEN, METRICS, RANKS, applies
 from phibench.datasets.shown_text import csv_text, latex_text, markdown_cell, markdown_text
@@ -65,7 +65,7 @@ _STRATA = ("detection_rate", "false_rate", "rms_px", "rms_phi_rad", "rms_depth_r
 
 
 @dataclass(frozen=True)
-class Grid:
+class TextTable:
     """A table as text.
 
     Attributes
@@ -124,7 +124,7 @@ def refused(records: pl.DataFrame) -> str:
     return status if not failure and status.startswith(REFUSED) else ""
 
 
-def leaderboard(documents: Sequence[ScoreDocument], by: str = "phi", wide: bool = False) -> Grid:
+def leaderboard(documents: Sequence[ScoreDocument], by: str = "phi", wide: bool = False) -> TextTable:
     """One row per method, the best first; `wide` adds intervals and the last columns."""
     first, names = documents[0], tuple(HEADS)[: None if wide else NARROW]
     rows = []
@@ -136,10 +136,10 @@ def leaderboard(documents: Sequence[ScoreDocument], by: str = "phi", wide: bool 
     title = f"{_pairs_in_words(first)}, {rank_words(by)}"
     flagged = _FLAG_NOTE if any(document.flags for document in documents) else ""
     note = " ".join(filter(None, (frames_line(first), light_line(first), interval.strip(), flagged)))
-    return Grid(title, ("method", *map(head, names)), tuple(rows), "L" + "r" * len(names), note)
+    return TextTable(title, ("method", *map(head, names)), tuple(rows), "L" + "r" * len(names), note)
 
 
-def score_table(document: ScoreDocument, by: str = "phi") -> Grid:
+def score_table(document: ScoreDocument, by: str = "phi") -> TextTable:
     """One row per metric of one method, with its interval; of a method that finds nothing, rows with values alone."""
     title = f"{document.method.name}: {_pairs_in_words(document)}, {rank_words(by)}"
     there = [name for name in HEADS if applies(name, document.method.sees)]
@@ -148,7 +148,7 @@ def score_table(document: ScoreDocument, by: str = "phi") -> Grid:
         order = [name for name in order if document.metrics[name].value is not None]
     rows = ((METRICS[name].text, METRICS[name].shown[1], *_parts(name, document.metrics[name])) for name in order)
     interval = f"{100 * document.rules['confidence']:g} % interval"
-    return Grid(
+    return TextTable(
         title,
         ("metric", "unit", "value", interval),
         tuple(rows),
@@ -157,7 +157,7 @@ def score_table(document: ScoreDocument, by: str = "phi") -> Grid:
     )
 
 
-def strata_table(document: ScoreDocument, wide: bool = False) -> Grid:
+def strata_table(document: ScoreDocument, wide: bool = False) -> TextTable:
     """One row per stratum of one method."""
     rows = []
     for stratum in (document.whole, *document.strata):
@@ -166,20 +166,20 @@ def strata_table(document: ScoreDocument, wide: bool = False) -> Grid:
         rows.append((stratum.by, stratum.label, str(stratum.images), *cells))
     note = f"*: fewer than {document.rules['least_samples']:g} samples, no interval"
     heads = ("by", "stratum", "images", *map(head, _STRATA))
-    return Grid(f"{document.method.name}: strata", heads, tuple(rows), "ll" + "r" * (1 + len(_STRATA)), note)
+    return TextTable(f"{document.method.name}: strata", heads, tuple(rows), "ll" + "r" * (1 + len(_STRATA)), note)
 
 
-def cause_table(documents: Sequence[ScoreDocument]) -> Grid:
+def cause_table(documents: Sequence[ScoreDocument]) -> TextTable:
     """Images without a right position: of one method by cause, of several one row per method."""
     title = "Images without a right position"
     kinds = tuple(KINDS.values())
     if len(documents) > 1:
         rows = tuple((d.method.name, *_kind_totals(d), ", ".join(_most_frequent(d))) for d in documents)
-        return Grid(title, ("method", *kinds, "most frequent causes"), rows, "LrrrL")
+        return TextTable(title, ("method", *kinds, "most frequent causes"), rows, "LrrrL")
     (document,) = documents
     counts = ((cause, document.causes[cause]) for cause in CAUSES)
     rows = tuple((cause, *(str(kind[k]) for k in KINDS), CAUSES[cause]) for cause, kind in counts if any(kind.values()))
-    return Grid(title, ("cause", *kinds, "definition"), rows, "lrrrL")
+    return TextTable(title, ("cause", *kinds, "definition"), rows, "lrrrL")
 
 
 def _kind_totals(document: ScoreDocument) -> Iterator[str]:
@@ -229,7 +229,7 @@ def light_line(document: ScoreDocument) -> str:
     return text if depth is None else f"{text} D of the two differs by {_median_and_most(depth)} mm at most."
 
 
-def _median_and_most(spread: Spread) -> str:
+def _median_and_most(spread: PairRange) -> str:
     """Median and largest value of a spread, in thousandths, two digits."""
     median, most = (f"{float(f'{1e3 * x:.2g}'):g}" for x in (spread.median, spread.high))
     return f"{median} (median) and {most}"
@@ -311,7 +311,7 @@ def depth_line(document: ScoreDocument) -> str:
 _BETTER = {"no difference shown": "not shown", "too few samples": "not shown"}
 
 
-def comparison(differences: Sequence[Difference], first: str, second: str, wide: bool = False) -> Grid:
+def comparison(differences: Sequence[Difference], first: str, second: str, wide: bool = False) -> TextTable:
     """One row per metric: both values, second minus first with its interval, and which is better if that is shown."""
     rows = []
     for item in differences:
@@ -324,7 +324,7 @@ def comparison(differences: Sequence[Difference], first: str, second: str, wide:
     counted = ("n", "samples", "chance") if wide else ()
     heads = ("metric", "unit", "first", "second", "second\n- first", "interval", *counted, "better")
     columns = "LlrrrL" + "r" * len(counted) + "L"
-    return Grid(f"Over what both have. First: {first}. Second: {second}", heads, tuple(rows), columns)
+    return TextTable(f"Over what both have. First: {first}. Second: {second}", heads, tuple(rows), columns)
 
 
 # -- output --------------------------------------------------------------------------------------------------------
@@ -414,7 +414,7 @@ def _line(console: Console, text: str) -> None:
 # -- forms ---------------------------------------------------------------------------------------------------------
 
 
-def show_grid(console: Console, grid: Grid) -> None:
+def show_grid(console: Console, grid: TextTable) -> None:
     """Print a table to a terminal; text that is too long for it goes on below."""
     gap = int(len(grid.heads) < _MANY)
     table = Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, gap, 0, 0), show_edge=False)
@@ -427,7 +427,7 @@ def show_grid(console: Console, grid: Grid) -> None:
     console.print()
 
 
-def text_of(grid: Grid) -> str:
+def text_of(grid: TextTable) -> str:
     """Table as a terminal of 80 columns shows it."""
     console = Console(file=io.StringIO(), width=80, markup=False, emoji=False, color_system=None)
     show_grid(console, grid)
@@ -435,7 +435,7 @@ def text_of(grid: Grid) -> str:
     return "\n".join(line.rstrip() for line in shown.rstrip().split("\n"))
 
 
-def markdown(grid: Grid) -> str:
+def markdown(grid: TextTable) -> str:
     """Table in Markdown, a line of text before it."""
     marks = ["--:" if kind == "r" else ":--" for kind in grid.columns]
     lines = [_row(grid.heads), _row(marks), *map(_row, grid.rows)]
@@ -443,7 +443,7 @@ def markdown(grid: Grid) -> str:
     return "\n".join((f"{markdown_text(grid.title)}\n", *lines, *note)) + "\n"
 
 
-def latex(grid: Grid) -> str:
+def latex(grid: TextTable) -> str:
     """Table in LaTeX, for the package booktabs."""
     lines = [" & ".join(map(latex_text, row)) + r" \\" for row in (grid.heads, *grid.rows)]
     body = [

@@ -15,7 +15,7 @@ from itertools import pairwise
 import polars as pl
 
 from phibench.benchmark.scores.answer_errors import Rules
-from phibench.benchmark.scores.metrics import METRICS, OF_PAIRS, Measured, measure, prepared
+from phibench.benchmark.scores.metrics import METRICS, OF_PAIRS, MetricEstimate, measure, prepared
 from phibench.scenes.random_streams import Name
 
 _EDGES: dict[str, tuple[str, tuple[float, ...], str]] = {
@@ -95,7 +95,7 @@ def light_shift() -> pl.Expr:
     return (du**2 + dv**2).sqrt()
 
 
-def measured(stratum: Stratum, rules: Rules, *stream: Name) -> dict[str, Measured]:
+def measured(stratum: Stratum, rules: Rules, *stream: Name) -> dict[str, MetricEstimate]:
     """Metrics of a stratum, resampled from a stream of its own."""
     names = (*stream, stratum.by, stratum.label)
     if stratum.pairs is None:

@@ -49,7 +49,7 @@ _NOT_BELOW_0 = (
 
 
 @dataclass(frozen=True)
-class Checked:
+class SealedScoreCheck:
     """Outcome: faults, a sentence each, and what could not be checked."""
 
     file: str
@@ -71,7 +71,7 @@ def check_score(
     limits: RunLimits | None = None,
     workers: int = 1,
     console: Console | None = None,
-) -> Checked:
+) -> SealedScoreCheck:
     """Check a score of a set that is not sealed.
 
     Parameters
@@ -101,7 +101,7 @@ def check_score(
     if data is None:
         unchecked.append("truth, bounds, causes and worst images: give --data, the folder of the data set")
     if broken:  # of wrong records every number would differ
-        return Checked(path.name, document.method.name, document.pairs, (*faults, *broken), tuple(unchecked))
+        return SealedScoreCheck(path.name, document.method.name, document.pairs, (*faults, *broken), tuple(unchecked))
     if data is None:
         wrong = list(_of_errors(table, document))
         faults += wrong or _of_statistics(document, table)
@@ -111,7 +111,7 @@ def check_score(
         if method is not None and again.pairs is not None:
             run = check_run(document, table, method, again.pairs, limits or RunLimits(), workers, console)
             faults, unchecked = [*faults, *run.faults], [*unchecked, *run.unchecked]
-    return Checked(path.name, document.method.name, document.pairs, tuple(faults), tuple(unchecked))
+    return SealedScoreCheck(path.name, document.method.name, document.pairs, tuple(faults), tuple(unchecked))
 
 
 # -- the document ------------------------------------------------------------------------------------------------------

@@ -21,7 +21,7 @@ from phibench.datasets.errors import DatasetError
 from phibench.datasets.input_files import InputFile, Name
 from phibench.datasets.store.documents import from_json, to_json
 from phibench.datasets.store.schema import Document, Number
-from phibench.estimator.pair_set import LEAST_BOX_PX, Distraction, PairTruth, SpotTruth
+from phibench.estimator.pair_set import LEAST_BOX_PX, Distraction, ImageTruth, PairTruth
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import Rig
 
@@ -117,7 +117,7 @@ class TruthRow(Document):
         return {renamed.get(name, name): value for name, value in document.items()}
 
 
-class TruthFile(Document):
+class SealedTruth(Document):
     """The truth's file."""
 
     format: Literal["phibench truth 1", "phibench truth 2"]
@@ -154,7 +154,7 @@ def read_truth_file(path: Path, sha256: str) -> list[PairTruth]:
             f"{sha256[:12]}; give the file that `phibench seal make` wrote for this set"
         )
     truths = []
-    for place, row in enumerate(file.document(TruthFile, data).truths):
+    for place, row in enumerate(file.document(SealedTruth, data).truths):
         try:
             truths.append(truth_of(row))
         except DatasetError as error:
@@ -187,13 +187,13 @@ def truth_of(row: TruthRow) -> PairTruth:
     return PairTruth(**{**dict(row), **rigs, "down": _spot(row.down), "up": _spot(row.up)})
 
 
-def _spot(row: SpotTruthRow) -> SpotTruth:
+def _spot(row: SpotTruthRow) -> ImageTruth:
     matrices = {name: _array(getattr(row, name)) for name in _MATRICES}
     distractions = tuple(Distraction(**dict(one)) for one in row.distractions)
-    return SpotTruth(**{**dict(row), **matrices, "phi_rad": dict(row.phi_rad), "distractions": distractions})
+    return ImageTruth(**{**dict(row), **matrices, "phi_rad": dict(row.phi_rad), "distractions": distractions})
 
 
-def _without_arrays(spot: SpotTruth) -> SpotTruth:
+def _without_arrays(spot: ImageTruth) -> ImageTruth:
     return replace(spot, bound_px2=None, raw_bound_px2=None)
 
 

@@ -19,8 +19,8 @@ from phibench.calibration.captures.measure import (
     widened_by_shape,
     with_blur_of,
 )
-from phibench.calibration.captures.spot_shape import SHAPE, UNLIKE, SpotImage, SpotShape, fit_shape
-from phibench.calibration.outline.limb_image import Measured
+from phibench.calibration.captures.spot_shape import SHAPE, UNLIKE, SpotPicture, SpotShape, fit_shape
+from phibench.calibration.outline.limb_image import PoseMeasurement
 from phibench.calibration.outline.outline import find_outline
 from phibench.calibration.outline.outline_result import Outline, mean_measured
 from phibench.calibration.rig.bundle import Bundle, KnownSpot, calibrate
@@ -154,7 +154,7 @@ def _outlines(
     return images, outlines, names
 
 
-def _vertical(images: Sequence[Photograph], outlines: Sequence[Outline], nominal: Rig) -> Measured:
+def _vertical(images: Sequence[Photograph], outlines: Sequence[Outline], nominal: Rig) -> PoseMeasurement:
     """Mean vertical of the pictures that show one, with the covariance of a single one.
 
     Pictures of one room show the same edges, whose own errors they share.
@@ -164,7 +164,7 @@ def _vertical(images: Sequence[Photograph], outlines: Sequence[Outline], nominal
     ImageError
         If no picture shows one.
     """
-    found: list[Measured] = []
+    found: list[PoseMeasurement] = []
     fault: ImageError | None = None
     for image, outline in zip(images, outlines, strict=True):
         try:
@@ -181,7 +181,7 @@ def _shape(
     imported: ImportedSet, rows: Sequence[ImportedRow], rig: Rig, aligned: Bundle, outlines: Sequence[Outline]
 ) -> SpotShape:
     """Blur and filters of all spots that lie where the tape says: another light has another width and colour."""
-    images: list[SpotImage] = []
+    images: list[SpotPicture] = []
     for row in rows:
         stroke_m = float(stroke_of(np.array(row.stroke_m), aligned.values))
         pair = replace(imported.pair(row), rig=rig, stroke_m=stroke_m)

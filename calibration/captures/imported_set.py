@@ -22,7 +22,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from phibench.calibration.captures.measure import Setting, read_setting
+from phibench.calibration.captures.measure import KnownNumbers, read_setting
 from phibench.calibration.captures.pair_list import ListedPair, photos_of, read_pair_list
 from phibench.calibration.captures.pair_photos import PairPhotos, pair_of_photos
 from phibench.calibration.captures.picture_files import Photo, SensorChoice, require_colour, sensor_choice
@@ -40,7 +40,7 @@ from phibench.datasets.store.leftovers import OwnedFolder, folder_for_work
 from phibench.datasets.store.provenance import provenance
 from phibench.datasets.store.schema import CHECKSUMS, Document, TruthFolder
 from phibench.estimator.interface import Image, Pair
-from phibench.estimator.pair_set import PairTruth, SpotTruth
+from phibench.estimator.pair_set import ImageTruth, PairTruth
 from phibench.scenes.laser import Beam
 from phibench.scenes.rig import Rig
 
@@ -125,7 +125,7 @@ def _there(path: Path) -> Path | None:
     return path if path.is_file() else None
 
 
-def _import(folder: Path, listed: Sequence[ListedPair], setting: Setting, work: Path, out: Path) -> Imported:
+def _import(folder: Path, listed: Sequence[ListedPair], setting: KnownNumbers, work: Path, out: Path) -> Imported:
     rows: list[ImportedRow] = []
     first: Photo | None = None
     test: ChainTest | None = None
@@ -180,7 +180,7 @@ def _import(folder: Path, listed: Sequence[ListedPair], setting: Setting, work: 
     return Imported(out, len(rows), sum(row.depth_m is not None for row in rows), chosen.note)
 
 
-def _test_of(photos: PairPhotos, row: ListedPair, setting: Setting) -> ChainTest:
+def _test_of(photos: PairPhotos, row: ListedPair, setting: KnownNumbers) -> ChainTest:
     """Chain of a set, by its first pair."""
     return chain_test(
         photos,
@@ -189,7 +189,7 @@ def _test_of(photos: PairPhotos, row: ListedPair, setting: Setting) -> ChainTest
     )
 
 
-def _chosen(test: ChainTest, setting: Setting) -> SensorChoice:
+def _chosen(test: ChainTest, setting: KnownNumbers) -> SensorChoice:
     """Sensor of a set, with what the pictures say of its chain.
 
     Raises
@@ -327,7 +327,7 @@ def open_imported(folder: str | Path) -> ImportedSet:
 
 # -- scoring ---------------------------------------------------------------------------------------------------------
 
-_NOWHERE = SpotTruth(
+_NOWHERE = ImageTruth(
     uv_px=(np.nan, np.nan),
     phi_rad={"ray": np.nan, "normal": np.nan, "incidence": np.nan},
     azimuth_rad=np.nan,

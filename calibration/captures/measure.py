@@ -39,14 +39,14 @@ from phibench.calibration.captures.spot_shape import (
     PRIOR_SIGMA,
     SHAPE,
     UNLIKE,
-    SpotImage,
+    SpotPicture,
     SpotShape,
     fit_shape,
     seen_through,
     spot_images,
 )
 from phibench.calibration.captures.tested_chain import ChainTest, chain_test
-from phibench.calibration.outline.limb_image import Measured
+from phibench.calibration.outline.limb_image import PoseMeasurement
 from phibench.calibration.outline.outline import find_outline
 from phibench.calibration.outline.outline_result import Outline, mean_outline
 from phibench.calibration.rig.bundle import calibrate
@@ -72,7 +72,7 @@ DOUBTFUL_P = 1e-3
 
 
 @dataclass(frozen=True)
-class Setting:
+class KnownNumbers:
     """Numbers that are known beside the pictures.
 
     Attributes
@@ -92,7 +92,7 @@ class Setting:
 
 def read_setting(
     rig: Path, calibration: Path | None = None, sensor: Path | None = None, stroke_sigma_m: float = 0.0
-) -> Setting:
+) -> KnownNumbers:
     """Setting of files.
 
     Raises
@@ -104,7 +104,7 @@ def read_setting(
     held = None if calibration is None else read_calibration(calibration, known.rig)
     if not 0.0 <= stroke_sigma_m <= MOST_STROKE_M:
         raise DatasetError(f"the stroke's standard deviation is {stroke_sigma_m:g} m: must be 0 or above")
-    return Setting(known, held, None if sensor is None else read_sensor_file(sensor), stroke_sigma_m)
+    return KnownNumbers(known, held, None if sensor is None else read_sensor_file(sensor), stroke_sigma_m)
 
 
 @dataclass(frozen=True)
@@ -177,7 +177,7 @@ class Measurement:
         return tuple(note for note in self.notes if note.startswith(_DOUBTFUL_SPOTS))
 
 
-def measure(photos: PairPhotos, stroke_m: float, setting: Setting) -> Measurement:
+def measure(photos: PairPhotos, stroke_m: float, setting: KnownNumbers) -> Measurement:
     """Measure D.
 
     Parameters
@@ -209,7 +209,7 @@ def measure(photos: PairPhotos, stroke_m: float, setting: Setting) -> Measuremen
     return _measured(test, stroke_m, setting)
 
 
-def _measured(test: ChainTest, stroke_m: float, setting: Setting) -> Measurement:
+def _measured(test: ChainTest, stroke_m: float, setting: KnownNumbers) -> Measurement:
     """Measurement with the phases of a test, which are in sigma where they are several."""
     photos, chosen = test.photos, sensor_choice(test.photos.down.on[0], setting.sensor)
     parts: list[tuple[_Fitted, float]] = []
@@ -263,7 +263,7 @@ class _Fitted:
 
 
 def _fitted(
-    photos: PairPhotos, stroke_m: float, setting: Setting, card: SensorCard, limb: _Limb | None = None
+    photos: PairPhotos, stroke_m: float, setting: KnownNumbers, card: SensorCard, limb: _Limb | None = None
 ) -> _Fitted:
     """Fit both spots; outlines are looked for, or are those of `limb`, with why there are none."""
     pair = pair_of_photos(photos, stroke_m, setting.known, card)
@@ -292,8 +292,8 @@ def _mixed(parts: Sequence[tuple[SeenSpot, float]], added_px: float) -> SeenSpot
 
 
 def _without(
-    corner: tuple[int, int], photos: PairPhotos, stroke_m: float, setting: Setting
-) -> tuple[PairPhotos, float, Setting]:
+    corner: tuple[int, int], photos: PairPhotos, stroke_m: float, setting: KnownNumbers
+) -> tuple[PairPhotos, float, KnownNumbers]:
     """Pictures of DN and setting without the first columns and rows, so that red comes first."""
     du, dv = corner
 
@@ -323,7 +323,7 @@ def _rig_at(rig: Rig, du: int, dv: int) -> Rig:
 
 
 def _shifted(
-    found: Measurement, corner: tuple[int, int], photos: PairPhotos, setting: Setting, note: str
+    found: Measurement, corner: tuple[int, int], photos: PairPhotos, setting: KnownNumbers, note: str
 ) -> Measurement:
     """Measurement of cut pictures in the pixels of the whole ones."""
     down, up = (replace(spot, uv_px=spot.uv_px + np.array(corner)) for spot in (found.down, found.up))
@@ -360,7 +360,7 @@ def _picture(pair: Pair, position: str) -> Image:
     return pair.images[name] if pair.card.output == "raw" else pair.stack(name)[0]
 
 
-def _corrected(setting: Setting, outlines: Sequence[Outline], why: str) -> tuple[Rig, Array, Array, str]:
+def _corrected(setting: KnownNumbers, outlines: Sequence[Outline], why: str) -> tuple[Rig, Array, Array, str]:
     """Corrected rig, covariance and values of `PARAMETERS`, and a sentence."""
     nominal = setting.known.rig
     if setting.calibration is not None:
@@ -375,7 +375,7 @@ def _corrected(setting: Setting, outlines: Sequence[Outline], why: str) -> tuple
     return bundle.rig, bundle.covariance, bundle.values, text
 
 
-def outlines_as_one(outlines: Sequence[Outline]) -> Measured:
+def outlines_as_one(outlines: Sequence[Outline]) -> PoseMeasurement:
     """Weighted mean of outlines of one rig, with the covariance of a single one.
 
     What an outline claims is mostly what all of them share: the lens's blur, where the limb lies in its edge, the
@@ -395,7 +395,7 @@ def _calibration_note(held: Calibration, nominal: Rig, outlines: Sequence[Outlin
     if not made or not outlines:
         return text
     sigmas = np.array(held.made_from["sigma_m"])
-    then = Measured(np.mean(made, axis=0), np.diag(np.mean(sigmas**2, axis=0)))
+    then = PoseMeasurement(np.mean(made, axis=0), np.diag(np.mean(sigmas**2, axis=0)))
     now = outlines_as_one(outlines)
     across = (now.value - then.value)[:2]
     off = float(np.sqrt(across @ np.linalg.solve((now.covariance + then.covariance)[:2, :2], across)))
@@ -421,13 +421,13 @@ def with_blur_of(rig: Rig, outlines: Sequence[Outline]) -> Rig:
 # -- spots -----------------------------------------------------------------------------------------------------------
 
 
-def seen_images(pair: Pair) -> dict[str, SpotImage]:
+def seen_images(pair: Pair) -> dict[str, SpotPicture]:
     """Pictures of a pair, by position, in which `detect` sees the spot."""
     found = detect(pair)
     return spot_images(pair, *(Spot(None if one is None else one.uv_px) for one in (found.down, found.up)))
 
 
-def _shape(setting: Setting, pair: Pair, images: dict[str, SpotImage], outlines: Sequence[Outline]) -> SpotShape:
+def _shape(setting: KnownNumbers, pair: Pair, images: dict[str, SpotPicture], outlines: Sequence[Outline]) -> SpotShape:
     """Blur and filters: of the calibration's spots, or of these, about what outline and rig file say."""
     held = setting.calibration
     if held is not None and (document := held.made_from.get(SHAPE)) is not None:
@@ -441,7 +441,7 @@ def shape_prior(rig: Rig, outlines: Sequence[Outline]) -> SpotShape:
     return SpotShape.prior(rig, OUTLINE_SIGMA_PX if by_light else PRIOR_SIGMA[0])
 
 
-def widened_by_shape(spot: SeenSpot, image: SpotImage | None, shape: SpotShape) -> SeenSpot:
+def widened_by_shape(spot: SeenSpot, image: SpotPicture | None, shape: SpotShape) -> SeenSpot:
     """Spot with what the uncertainty of blur and filters adds to its place, and how far its light is none."""
     if image is None:
         return spot
@@ -449,7 +449,7 @@ def widened_by_shape(spot: SeenSpot, image: SpotImage | None, shape: SpotShape) 
     return replace(spot, covariance_px2=spot.covariance_px2 + added, unlike=unlike)
 
 
-def _shape_note(shape: SpotShape, setting: Setting) -> str:
+def _shape_note(shape: SpotShape, setting: KnownNumbers) -> str:
     (blur, green, blue), (blur_sigma, *_) = shape.values, shape.sigmas
     held = setting.calibration is not None and SHAPE in setting.calibration.made_from
     source = "of the calibration" if held else "of these spots" if shape.images else "of the rig file"

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-from phibench.calibration.captures.measure import Measurement, Setting, measure
+from phibench.calibration.captures.measure import KnownNumbers, Measurement, measure
 from phibench.calibration.captures.pair_photos import LEAST_STROKE_M, MOST_STROKE_M, PairPhotos, PositionPhotos
 from phibench.calibration.captures.picture_files import read_photo
 from phibench.datasets.errors import DatasetError
@@ -133,7 +133,7 @@ def _number(key: str, text: str, fault: Callable[[str], DatasetError]) -> float:
     return value
 
 
-def photos_of(folder: Path, row: ListedPair, setting: Setting) -> PairPhotos:
+def photos_of(folder: Path, row: ListedPair, setting: KnownNumbers) -> PairPhotos:
     """Pictures of a row.
 
     Raises
@@ -154,7 +154,7 @@ def photos_of(folder: Path, row: ListedPair, setting: Setting) -> PairPhotos:
 
 
 @dataclass(frozen=True)
-class Result:
+class PairOutcome:
     """Outcome for one row: a measurement, or one sentence that says why there is none."""
 
     row: ListedPair
@@ -184,7 +184,9 @@ class Result:
         return "ok"
 
 
-def measured_pairs(folder: Path, setting: Setting, told: Callable[[Result], None] = lambda _: None) -> list[Result]:
+def measured_pairs(
+    folder: Path, setting: KnownNumbers, told: Callable[[PairOutcome], None] = lambda _: None
+) -> list[PairOutcome]:
     """Measure all pairs of a folder; a pair that cannot be measured ends no run.
 
     Parameters
@@ -199,9 +201,9 @@ def measured_pairs(folder: Path, setting: Setting, told: Callable[[Result], None
     for row in read_pair_list(folder):
         own = replace(setting, stroke_sigma_m=row.stroke_sigma_m or setting.stroke_sigma_m)
         try:
-            result = Result(row, measure(photos_of(folder, row, own), row.stroke_m, own))
+            result = PairOutcome(row, measure(photos_of(folder, row, own), row.stroke_m, own))
         except DatasetError as error:
-            result = Result(row, None, printable_line(str(error), 600))
+            result = PairOutcome(row, None, printable_line(str(error), 600))
         told(result)
         results.append(result)
     return results
@@ -214,7 +216,7 @@ COLUMNS = (
 )
 
 
-def write_results(path: Path, results: Sequence[Result]) -> Path:
+def write_results(path: Path, results: Sequence[PairOutcome]) -> Path:
     """Write results as CSV, atomically."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
@@ -223,7 +225,7 @@ def write_results(path: Path, results: Sequence[Result]) -> Path:
     return write_text(path, text.getvalue())
 
 
-def _values(result: Result) -> Iterable[float | str | None]:
+def _values(result: PairOutcome) -> Iterable[float | str | None]:
     row, found = result.row, result.found
     yield from (row.name, row.stroke_m)
     if found is None:

@@ -29,7 +29,7 @@ from phibench.estimator.interface import Answer, Pair, Spot
 from phibench.estimator.methods.chain_fit import spot_outputs
 from phibench.estimator.methods.locate import pair_blur, seen_depth_m
 from phibench.estimator.methods.raw_likelihood import raw_spot_data
-from phibench.estimator.processed.quasi_score import Window, fit_window
+from phibench.estimator.processed.quasi_score import CoefficientWindow, fit_window
 from phibench.estimator.spots.fisher import limited
 from phibench.estimator.spots.fit_raw import SpotData, fit_law
 from phibench.estimator.spots.gaussian_spot import SpotModel, SpotPixels
@@ -116,7 +116,7 @@ class SpotShape:
 
 
 @dataclass(frozen=True)
-class SpotImage:
+class SpotPicture:
     """One picture of a spot near (u, v), with the distance, if it is known."""
 
     pair: Pair
@@ -133,17 +133,17 @@ def with_shape(calibration: Calibration) -> Calibration:
     return replace(calibration, rig=SpotShape.of_document(document).rig(calibration.rig))
 
 
-def spot_images(pair: Pair, down: Spot, up: Spot) -> dict[str, SpotImage]:
+def spot_images(pair: Pair, down: Spot, up: Spot) -> dict[str, SpotPicture]:
     """Pictures of a pair, by position, in which a spot was seen."""
     depth_m = seen_depth_m(pair, Answer(down, up))
     return {
-        name: SpotImage(pair, name, np.array(spot.uv_px), depth_m)
+        name: SpotPicture(pair, name, np.array(spot.uv_px), depth_m)
         for name, spot in zip(POSITIONS, (down, up), strict=True)
         if spot.uv_px is not None
     }
 
 
-def fit_shape(images: Sequence[SpotImage], prior: SpotShape) -> SpotShape:
+def fit_shape(images: Sequence[SpotPicture], prior: SpotShape) -> SpotShape:
     """Shape of all these spots together; the prior where none of them can be fitted."""
     values, weight = prior.values, np.linalg.inv(prior.covariance)
     outputs = [_outputs(image) for image in images]
@@ -166,7 +166,7 @@ def fit_shape(images: Sequence[SpotImage], prior: SpotShape) -> SpotShape:
     return SpotShape(values, covariance + np.diag(_FIELD) ** 2, len(scores))
 
 
-def seen_through(image: SpotImage, shape: SpotShape) -> tuple[Array, float]:
+def seen_through(image: SpotPicture, shape: SpotShape) -> tuple[Array, float]:
     """Part of a place's covariance that the shape adds, shape (2, 2), square pixels; share of the light that is unlike.
 
     The part is 0 where the light is no spot alone, the share where it is noise.
@@ -180,7 +180,7 @@ def seen_through(image: SpotImage, shape: SpotShape) -> tuple[Array, float]:
 
 # -- one picture -----------------------------------------------------------------------------------------------------
 
-_Outputs = SpotData | tuple[Window, Array, Array]
+_Outputs = SpotData | tuple[CoefficientWindow, Array, Array]
 
 
 @dataclass(frozen=True)
@@ -227,18 +227,18 @@ class _Linear:
         return limited(self.theta[None], own[None])[0]
 
 
-def _outputs(image: SpotImage) -> _Outputs:
+def _outputs(image: SpotPicture) -> _Outputs:
     outputs = raw_spot_data if image.pair.card.output == "raw" else spot_outputs
     return outputs(image.pair, image.position, image.uv_px, image.depth_m)
 
 
-def _linear(image: SpotImage, outputs: _Outputs, values: Array, theta: Array | None) -> _Linear | None:
+def _linear(image: SpotPicture, outputs: _Outputs, values: Array, theta: Array | None) -> _Linear | None:
     """Linear model of one picture; None where it has no fit, or what is there is no spot alone."""
     found = _any_linear(image, outputs, values, theta)
     return found if found is not None and found.sound else None
 
 
-def _any_linear(image: SpotImage, outputs: _Outputs, values: Array, theta: Array | None) -> _Linear | None:
+def _any_linear(image: SpotPicture, outputs: _Outputs, values: Array, theta: Array | None) -> _Linear | None:
     if isinstance(outputs, SpotData):
         return _of_data(image, outputs, values)
     return _of_window(image, outputs[0], outputs[1], values, theta)
@@ -250,10 +250,12 @@ def _unlike(squares: float, freedom: int, light2: float) -> float:
     return math.sqrt(left / light2) if left > _UNLIKE_SIGMAS * math.sqrt(2.0 * freedom) and light2 > 0.0 else 0.0
 
 
-def _of_window(image: SpotImage, window: Window, start: Array, values: Array, theta: Array | None) -> _Linear | None:
+def _of_window(
+    image: SpotPicture, window: CoefficientWindow, start: Array, values: Array, theta: Array | None
+) -> _Linear | None:
     filters = window.model.filters[None]
 
-    def at(shape: Array) -> Window:
+    def at(shape: Array) -> CoefficientWindow:
         pixels = replace(_pixels(image, shape, filters, None), background_e=window.pixels.background_e)
         return replace(window, pixels=pixels)
 
@@ -279,7 +281,7 @@ def _of_window(image: SpotImage, window: Window, start: Array, values: Array, th
     return _Linear(theta, A, J @ K.T, K @ K.T, J @ r, K @ r, excess, unlike)
 
 
-def _of_data(image: SpotImage, data: SpotData, values: Array) -> _Linear | None:
+def _of_data(image: SpotPicture, data: SpotData, values: Array) -> _Linear | None:
     known = None if data.pixels.levels.shape[1] else data.pixels.background_e
 
     def at(shape: Array) -> SpotPixels:
@@ -304,11 +306,11 @@ def _of_data(image: SpotImage, data: SpotData, values: Array) -> _Linear | None:
     return _Linear(theta, A, (J * w) @ K.T, (K * w) @ K.T, J @ s, K @ s, excess, unlike)
 
 
-def _pixels(image: SpotImage, values: Array, filters: Any, background_e: Array | None) -> SpotPixels:
+def _pixels(image: SpotPicture, values: Array, filters: Any, background_e: Array | None) -> SpotPixels:
     return SpotPixels.of(filters, _blur(image, values), SpotModel(_response(image.pair, values), background_e))
 
 
-def _blur(image: SpotImage, values: Array) -> Any:
+def _blur(image: SpotPicture, values: Array) -> Any:
     rig = replace(image.pair.rig, camera=replace(image.pair.rig.camera, blur_sigma_px=float(values[0])))
     return pair_blur(replace(image.pair, rig=rig), image.uv_px, image.depth_m)
 

@@ -28,7 +28,7 @@ from phibench.datasets.frames.sensor_card import SensorCard, sensor_card
 from phibench.estimator.interface import Image, Pair
 from phibench.estimator.methods.chain_fit import spot_outputs
 from phibench.estimator.processed.chain_model import UNIT_MATRIX
-from phibench.estimator.processed.quasi_score import Window, fit_window
+from phibench.estimator.processed.quasi_score import CoefficientWindow, fit_window
 from phibench.estimator.spots.camera_codes import light_of, tone_of
 from phibench.estimator.spots.detect import detect
 from phibench.estimator.spots.fit_raw import SpotData
@@ -224,7 +224,7 @@ def _spot_chances(pair: Pair, position: str, uv_px: tuple[float, float], phase: 
 _REACH = 6  # steps on either side that an output's chances are counted over
 
 
-def _log_chances(window: Window, theta: Array) -> tuple[Array, Array, Array]:
+def _log_chances(window: CoefficientWindow, theta: Array) -> tuple[Array, Array, Array]:
     """Logarithm of each output's chance, a Gaussian within one step; its mean and variance under the model."""
     inputs, step = window.inputs(theta), window.model.step
     sigma = np.sqrt(np.einsum("rn,rn->n", inputs.factor, inputs.factor) + inputs.own)

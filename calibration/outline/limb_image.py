@@ -326,7 +326,7 @@ def convolved(values: Array, kernel: Array) -> Array:
 
 
 @dataclass(frozen=True)
-class Measured:
+class PoseMeasurement:
     """A sphere centre or a vertical that was measured, with its covariance."""
 
     value: Array

@@ -28,7 +28,7 @@ from phibench.datasets.rooms.panorama_settings import PanoramaSettings
 from phibench.datasets.store.layers import write_exr
 from phibench.datasets.store.pictures import save_png
 from phibench.estimator.geometry.mirror_image import image_of
-from phibench.estimator.geometry.panorama import Grid, unrolled
+from phibench.estimator.geometry.panorama import PanoramaGrid, unrolled
 from phibench.estimator.spots.camera_codes import linear_to_srgb
 from phibench.estimator.spots.image_planes import ImageError
 from phibench.scenes.camera import Camera
@@ -211,7 +211,7 @@ def unwrap(light: NDArray[np.float32], ball: Ball, surroundings_m: float, width_
     if not 32 <= width <= MOST_COLUMNS or width % 2:
         raise DatasetError(f"--width {width}: must be an even number from 32 to {MOST_COLUMNS}")
     parts = max(1, math.ceil(native / width - 0.01))
-    grid = Grid(width * parts, -math.pi / 2.0, math.pi / 2.0)
+    grid = PanoramaGrid(width * parts, -math.pi / 2.0, math.pi / 2.0)
     table = _Angles(ball.view, surroundings_m, ball.circle_px[2])
     result, seen = np.empty((width // 2, width, 3), np.float32), np.empty((width // 2, width), bool)
     for first in range(0, width // 2, _ROWS_AT_ONCE):
@@ -225,7 +225,7 @@ def unwrap(light: NDArray[np.float32], ball: Ball, surroundings_m: float, width_
     return BallPanorama(result, seen, ball)
 
 
-def _directions(grid: Grid, rows: slice) -> Array:
+def _directions(grid: PanoramaGrid, rows: slice) -> Array:
     """Unit vectors of some rows of a grid, shape (n, W, 3)."""
     turn, up = grid.azimuths_rad[None, :], grid.elevations_rad[rows, None]
     flat = np.cos(up)

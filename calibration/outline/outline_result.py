@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from phibench.calibration.outline.ball_circle import BallCircle
 from phibench.calibration.outline.edge_ring import TURNS
-from phibench.calibration.outline.limb_image import Measured
+from phibench.calibration.outline.limb_image import PoseMeasurement
 from phibench.calibration.outline.outline_fit import OutlinePixels, Step
 from phibench.calibration.outline.outline_jpeg import JpegAgain
 from phibench.datasets.frames.sensor_card import SensorCard
@@ -99,11 +99,11 @@ class Outline:
         return replace(self, covariance_m2=self.covariance_m2 * factor**2, covariance=wider)
 
     @property
-    def measured(self) -> Measured:
+    def measured(self) -> PoseMeasurement:
         """Data of a bundle: the sphere's centre, shape (3,), or vertex and ellipse, shape (5,)."""
         if self.ellipse_px is None or self.covariance is None:
-            return Measured(self.sphere_in_camera_m, self.covariance_m2)
-        return Measured(np.concatenate([self.sphere_in_camera_m, self.ellipse_px]), self.covariance)
+            return PoseMeasurement(self.sphere_in_camera_m, self.covariance_m2)
+        return PoseMeasurement(np.concatenate([self.sphere_in_camera_m, self.ellipse_px]), self.covariance)
 
     def rig(self, nominal: Rig) -> Rig:
         """The nominal rig with the mirror where its outline is, turned as the nominal one is."""
@@ -111,12 +111,12 @@ class Outline:
         return replace(nominal, T_camera_sphere=pose)
 
 
-def mean_outline(outlines: Sequence[Outline]) -> Measured:
+def mean_outline(outlines: Sequence[Outline]) -> PoseMeasurement:
     """Weighted mean of what outlines measure, see `mean_measured`."""
     return mean_measured([outline.measured for outline in outlines])
 
 
-def mean_measured(parts: Sequence[Measured]) -> Measured:
+def mean_measured(parts: Sequence[PoseMeasurement]) -> PoseMeasurement:
     """Weighted mean of vectors; their scatter widens the covariance where it is larger than they claim."""
     weights = np.array([np.linalg.inv(part.covariance) for part in parts])
     covariance = np.linalg.inv(weights.sum(axis=0))
@@ -125,7 +125,7 @@ def mean_measured(parts: Sequence[Measured]) -> Measured:
     off = values - mean
     degrees = values.shape[1] * (len(parts) - 1)
     chi2 = float(np.einsum("ki,kij,kj->", off, weights, off))
-    return Measured(mean, covariance * max(1.0, chi2 / degrees if degrees else 1.0))
+    return PoseMeasurement(mean, covariance * max(1.0, chi2 / degrees if degrees else 1.0))
 
 
 # -- what fits of outlines share ---------------------------------------------------------------------------------------

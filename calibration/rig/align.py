@@ -84,7 +84,7 @@ class Alignment:
 
 
 @dataclass(frozen=True)
-class Numbers:
+class SphereOptions:
     """Camera and mirror, a sphere, as options of the command; None where an option is not given.
 
     `distance_mm` is that of the mirror's centre from the lens, `focus_mm` that of the plane of focus.
@@ -110,7 +110,7 @@ class Numbers:
                 raise DatasetError(f"{option} {value:g}: must be above 0")
 
 
-def rig_of_numbers(image: NDArray[Any], card: SensorCard, numbers: Numbers) -> Rig | None:
+def rig_of_numbers(image: NDArray[Any], card: SensorCard, numbers: SphereOptions) -> Rig | None:
     """Rig of a picture by numbers, those of the default rig where they are not given.
 
     None for a picture of another size than the default camera's, if no focal length is given.

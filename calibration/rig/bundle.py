@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from scipy import optimize
 
 from phibench.calibration.outline.contour import place_of_outline, tilts_of_ellipse
-from phibench.calibration.outline.limb_image import Measured
+from phibench.calibration.outline.limb_image import PoseMeasurement
 from phibench.calibration.rig.vertical_edges import vertical_of
 from phibench.datasets.errors import DatasetError
 from phibench.estimator.geometry.mirror_image import image_of
@@ -83,7 +83,7 @@ class KnownSpot:
 
 
 @dataclass(frozen=True)
-class Direction:
+class WeakDirection:
     """A combination of parameters that the data do not tell apart.
 
     Attributes
@@ -117,7 +117,7 @@ class Bundle:
     covariance: Array = field(repr=False)
     chi2: float
     degrees: int
-    undetermined: tuple[Direction, ...] = ()
+    undetermined: tuple[WeakDirection, ...] = ()
 
     @property
     def sigmas(self) -> dict[str, float]:
@@ -131,9 +131,9 @@ class Bundle:
 
 def calibrate(
     nominal: Rig,
-    outline: Measured | None = None,
+    outline: PoseMeasurement | None = None,
     spots: Sequence[KnownSpot] = (),
-    vertical: Measured | None = None,
+    vertical: PoseMeasurement | None = None,
     sigmas: Array | None = None,
 ) -> Bundle:
     """Fit a rig.
@@ -184,9 +184,9 @@ class _Problem:
     """Residuals over their standard deviations. Unknowns: parameters over prior sigma, then points (x, y, z)."""
 
     nominal: Rig
-    outline: Measured | None
+    outline: PoseMeasurement | None
     spots: tuple[KnownSpot, ...]
-    vertical: Measured | None
+    vertical: PoseMeasurement | None
     prior: Array
     free: NDArray[np.intp]
     by_principal_point: Array
@@ -373,15 +373,15 @@ def _whitened(residual: Array, covariance: Array) -> Array:
     return np.linalg.solve(np.linalg.cholesky(covariance), residual)
 
 
-def _undetermined(covariance: Array, names: Sequence[str]) -> tuple[Direction, ...]:
+def _undetermined(covariance: Array, names: Sequence[str]) -> tuple[WeakDirection, ...]:
     """Eigenvectors of the covariance in units of the prior, those with nearly all of its variance left."""
     size, vectors = np.linalg.eigh(covariance)
     weak = [i for i in np.argsort(-size) if size[i] > _WEAK]
     parts = [{n: float(x) for n, x in zip(names, vectors[:, i], strict=True) if abs(x) > 0.2} for i in weak]
-    return tuple(Direction(part, float(np.sqrt(size[i]))) for part, i in zip(parts, weak, strict=True))
+    return tuple(WeakDirection(part, float(np.sqrt(size[i]))) for part, i in zip(parts, weak, strict=True))
 
 
-def with_radius(measured: Measured, nominal_m: float, other_m: float) -> Measured:
+def with_radius(measured: PoseMeasurement, nominal_m: float, other_m: float) -> PoseMeasurement:
     """An outline's centre for another radius: R and |s| scale together."""
     factor = other_m / nominal_m
     return replace(measured, value=measured.value * factor, covariance=measured.covariance * factor**2)

@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from phibench.calibration.outline.edge_ring import Circle
-from phibench.calibration.outline.limb_image import Measured
+from phibench.calibration.outline.limb_image import PoseMeasurement
 from phibench.calibration.rig.bundle import vertical_by_principal_point
 from phibench.calibration.rig.vertical_edges import agreeing, regression, require_edges
 from phibench.scenes.frames import Array
@@ -147,7 +147,7 @@ def stated_tilt(rig: Rig, tilt_sigma_rad: float, principal_point_sigma_px: float
     return CameraTilt(rig.T_world_camera.R.T[:, 2], np.zeros(2), np.zeros(2), covariance)
 
 
-def with_vertical(stated: CameraTilt, rig: Rig, vertical: Measured) -> CameraTilt:
+def with_vertical(stated: CameraTilt, rig: Rig, vertical: PoseMeasurement) -> CameraTilt:
     """The same with a vertical from edges, of `vertical_edges.find_vertical`.
 
     Edges that contradict the statement widen the covariance of what comes out.

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from phibench.calibration.outline.limb_image import Measured
+from phibench.calibration.outline.limb_image import PoseMeasurement
 from phibench.calibration.outline.outline import find_outline
 from phibench.calibration.outline.outline_result import Outline, mean_measured, mean_outline
 from phibench.calibration.rig.bundle import Bundle, KnownSpot, calibrate
@@ -213,7 +213,7 @@ def frame_spots(
     return found
 
 
-def _vertical(images: Sequence[Photograph], outlines: Sequence[Outline], nominal: Rig) -> Measured:
+def _vertical(images: Sequence[Photograph], outlines: Sequence[Outline], nominal: Rig) -> PoseMeasurement:
     """Mean vertical of images whose outlines are known."""
     pairs = zip(images, outlines, strict=True)
     return mean_measured([find_vertical(i.pixels, o.rig(nominal), i.card, o.covariance_m2) for i, o in pairs])
@@ -245,7 +245,7 @@ def _made_from(
     preset: str,
     outlines: Sequence[Outline],
     spots: Sequence[KnownSpot],
-    vertical: Measured | None,
+    vertical: PoseMeasurement | None,
 ) -> dict[str, Any]:
     return {
         "dataset": dataset.info.name,

@@ -27,7 +27,7 @@ from skimage.feature import canny
 from skimage.transform import probabilistic_hough_line
 
 from phibench.calibration.outline.edge_ring import Circle
-from phibench.calibration.outline.limb_image import Measured, planes_of
+from phibench.calibration.outline.limb_image import PoseMeasurement, planes_of
 from phibench.calibration.outline.outline_start import grey, rig_circle
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.estimator.geometry.reflection import reflect
@@ -212,7 +212,7 @@ class Vertical:
 
 def find_vertical(
     image: NDArray[Any], rig: Rig, card: SensorCard | None = None, sphere_covariance_m2: Array | None = None
-) -> Measured:
+) -> PoseMeasurement:
     """The world's vertical in the camera frame: x and y of the unit vector, shape (2,), as `bundle.calibrate` takes it.
 
     Parameters
@@ -235,14 +235,14 @@ def find_vertical(
     return measured_vertical(edges_of(grey(planes_of(image, card)), rig), rig, sphere_covariance_m2)
 
 
-def measured_vertical(edges: Sequence[Array], rig: Rig, sphere_covariance_m2: Array | None = None) -> Measured:
+def measured_vertical(edges: Sequence[Array], rig: Rig, sphere_covariance_m2: Array | None = None) -> PoseMeasurement:
     """The same from the pixels of edges, each of shape (k, 2)."""
     found = vertical_of(edges, rig)
     covariance = found.covariance
     if sphere_covariance_m2 is not None:
         slope = _by_sphere(edges, rig, found)
         covariance = covariance + slope @ sphere_covariance_m2 @ slope.T
-    return Measured(found.up[:2], covariance)
+    return PoseMeasurement(found.up[:2], covariance)
 
 
 def vertical_of(edges: Sequence[Array], rig: Rig) -> Vertical:

@@ -30,7 +30,7 @@ from phibench.calibration.sensor_fit.photon_transfer import TransferFit, fit_tra
 from phibench.calibration.sensor_fit.processed_noise import ProcessedNoise, fit_noise
 from phibench.calibration.sensor_fit.tone_curve import ToneFit, fit_tone
 from phibench.datasets.frames.sensor_card import SensorCard, sensor_card
-from phibench.datasets.frames.sensor_file import FitTables, Measured, SensorFile, allowed_numbers
+from phibench.datasets.frames.sensor_file import FitTables, MeasuredQuantity, SensorFile, allowed_numbers
 from phibench.datasets.input_files import InputFile
 from phibench.scenes.frames import Array
 
@@ -75,7 +75,7 @@ class _Draft:
     missing: dict[str, str] = field(default_factory=dict)
     assumed: dict[str, str] = field(default_factory=dict)
     findings: dict[str, str] = field(default_factory=dict)
-    measured: dict[str, Measured] = field(default_factory=dict)
+    measured: dict[str, MeasuredQuantity] = field(default_factory=dict)
 
     def take(self, name: str, value: object, sigma: float | tuple[float, ...] | None = None) -> None:
         self.numbers[name] = value
@@ -88,7 +88,7 @@ class _Draft:
         self.assumed[name] = self.missing.pop(name)
 
     def measure(self, name: str, value: float | list[float], sigma: float | list[float], unit: str) -> None:
-        self.measured[name] = Measured(value=value, sigma=sigma, unit=unit)
+        self.measured[name] = MeasuredQuantity(value=value, sigma=sigma, unit=unit)
 
     def file(self, capture: Capture) -> SensorFile:
         kept, refused = allowed_numbers(capture.kind, self.numbers)
@@ -163,7 +163,7 @@ def _take_transfer(draft: _Draft, capture: Capture, found: TransferFit) -> None:
     if "row_noise_e" not in found.values and "row_noise_e" not in found.reasons:
         draft.missing["row_noise_e"] = "not above the noise of these frames"
     if found.ratios:
-        draft.measured["flat_red_green_blue"] = Measured(value=list(found.ratios))
+        draft.measured["flat_red_green_blue"] = MeasuredQuantity(value=list(found.ratios))
 
 
 def _take_end(draft: _Draft, codes: float, capture: Capture) -> None:

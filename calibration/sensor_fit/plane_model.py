@@ -41,7 +41,7 @@ _HARMONICS = np.arange(1.0, 6.0)
 
 
 @dataclass(frozen=True)
-class Numbers:
+class PlaneParameters:
     """Numbers that are fitted.
 
     Attributes
@@ -86,7 +86,7 @@ class PlaneModel:
         """Chroma has half of the columns."""
         return self.card.output == "yuyv"
 
-    def covariances(self, level: NoiseLevel, x: Numbers) -> list[Array]:
+    def covariances(self, level: NoiseLevel, x: PlaneParameters) -> list[Array]:
         """Covariances of `NoiseLevel.planes`, codes^2, rounding included."""
         ycc, variances = self._answers(level, x)
         answers = ycc if self.halved else np.einsum("ij,jshw->ishw", RGB_FROM_YCC, ycc)
@@ -101,7 +101,7 @@ class PlaneModel:
             result.append(np.array([at[lag] for lag in plane.lags]))
         return result
 
-    def lattice_errors(self, level: NoiseLevel, x: Numbers) -> list[float]:
+    def lattice_errors(self, level: NoiseLevel, x: PlaneParameters) -> list[float]:
         """Relative errors of `covariances`, one deviation, by planes: the converter's codes lie on a lattice.
 
         Steps of the converter are s codes of 8 bits apart. Rounding beats with them at |k s - round(k s)| = f per step;
@@ -121,7 +121,7 @@ class PlaneModel:
         own = [0.4 * each[0], each[1], 0.4 * each[2]]
         return [*map(float, own), *[0.5 * float(each[1])] * (len(level.planes) - 3)]
 
-    def pattern(self, level: NoiseLevel, x: Numbers) -> float:
+    def pattern(self, level: NoiseLevel, x: PlaneParameters) -> float:
         """`NoiseLevel.spatial` of a responsivity that spreads by 1."""
         answers, _ = self._answers(level, x)
         linear, _, _ = self._light(level, x)
@@ -129,10 +129,10 @@ class PlaneModel:
         rough = np.fft.ifft2(answers[0][:4] * (1.0 - _box())).real
         return float(0.25 * light**2 @ (rough**2).sum(axis=(1, 2)))
 
-    def _balance(self, x: Numbers) -> Array:
+    def _balance(self, x: PlaneParameters) -> Array:
         return np.array([x.red, 1.0, x.blue])
 
-    def _light(self, level: NoiseLevel, x: Numbers) -> tuple[Array, Array, Array]:
+    def _light(self, level: NoiseLevel, x: PlaneParameters) -> tuple[Array, Array, Array]:
         """Linear light of R, G, B, shape (3,), variance of a raw pixel, (4,), and of the planes by place, (3, 4).
 
         Light is full scale 1 after white balance, a raw pixel before. The mean code of noisy light is the measured one.
@@ -152,7 +152,7 @@ class PlaneModel:
             linear = linear + (wanted - 255.0 * at.mean.mean(axis=1)) / (255.0 * at.by_mean.mean(axis=1))
         return linear, raw, planes
 
-    def _answers(self, level: NoiseLevel, x: Numbers) -> tuple[Spectra, Array]:
+    def _answers(self, level: NoiseLevel, x: PlaneParameters) -> tuple[Spectra, Array]:
         """Spectra of the answers of Y', Cb, Cr, shape (3, sources, side, side), and the sources' variances.
 
         Sources are raw pixels at four places, and what the tone curve's bend leaves of each colour at each place.
@@ -172,7 +172,7 @@ class PlaneModel:
         variances = np.concatenate([raw, own])
         return self._filtered(np.stack(codes), variances, x), variances
 
-    def _filtered(self, codes: Array, variances: Array, x: Numbers) -> Spectra:
+    def _filtered(self, codes: Array, variances: Array, x: PlaneParameters) -> Spectra:
         """Spectra of Y', Cb, Cr after unsharp mask, denoising and 4:2:2, shape (3, sources, side, side)."""
         limited = self.halved and self.card.ycbcr_range == "limited"
         scale = np.array([219.0, 224.0, 224.0]) / 255.0 if limited else np.ones(3)
@@ -187,7 +187,7 @@ class PlaneModel:
             ycc[1:] = ycc[1:] * _transfer((0.0, 1.0, 0.0), (x.left, 1.0 - x.left - x.right, x.right))
         return np.asarray(ycc)
 
-    def _smoothing(self, luma: Spectra, variances: Array, x: Numbers) -> Array:
+    def _smoothing(self, luma: Spectra, variances: Array, x: PlaneParameters) -> Array:
         """Transfer function of the blur of Y' less 1, by the noise that comes in, shape (side, side)."""
         across = np.array(_TAPS[self.reach_px])
         alone = np.zeros(len(across))

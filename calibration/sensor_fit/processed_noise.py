@@ -21,7 +21,7 @@ from scipy.optimize import least_squares
 from phibench.calibration.sensor_fit.block_sums import jackknife_sigma
 from phibench.calibration.sensor_fit.edge_spread import Smoothing
 from phibench.calibration.sensor_fit.noise_levels import NoiseLevel
-from phibench.calibration.sensor_fit.plane_model import Numbers, PlaneModel
+from phibench.calibration.sensor_fit.plane_model import PlaneModel, PlaneParameters
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.scenes.frames import Array
 
@@ -55,7 +55,7 @@ class ProcessedNoise:
     chi2: float
     levels: tuple[NoiseLevel, ...]
     card: SensorCard
-    numbers: Numbers | None = None
+    numbers: PlaneParameters | None = None
     smoothing: Smoothing | None = None
 
 
@@ -71,7 +71,7 @@ class _Solution:
     misfit: float
     chi2: float
 
-    def numbers(self) -> Numbers:
+    def numbers(self) -> PlaneParameters:
         return _numbers(self.names, self.x)
 
 
@@ -109,16 +109,16 @@ def _usable(level: NoiseLevel) -> bool:
     return inside and float(level.planes[0].covariance[0, 0]) > _LEAST_VARIANCE
 
 
-def _numbers(names: tuple[str, ...], x: Array) -> Numbers:
+def _numbers(names: tuple[str, ...], x: Array) -> PlaneParameters:
     values = {name: float(v) for name, v in zip(names, x, strict=True)}
-    return replace(Numbers(), **{**values, "white_e": float(np.exp(values["white_e"]))})
+    return replace(PlaneParameters(), **{**values, "white_e": float(np.exp(values["white_e"]))})
 
 
 def _solved(
     used: list[NoiseLevel],
     model: PlaneModel,
     extra: tuple[str, ...],
-    start: Numbers | None,
+    start: PlaneParameters | None,
     lattice: list[list[float]] | None,
 ) -> _Solution:
     names = (*_BASE, *(("left", "right") if model.halved else ()), *extra)
@@ -138,7 +138,7 @@ def _solved(
         numbers = _numbers(names, x)
         return np.concatenate([part for one in used for part in model.covariances(one, numbers)])
 
-    given = start or Numbers(red=model.card.white_balance[0], blue=model.card.white_balance[2])
+    given = start or PlaneParameters(red=model.card.white_balance[0], blue=model.card.white_balance[2])
     first = np.array([np.log(given.white_e) if n == "white_e" else getattr(given, n) for n in names])
     if extra and start is not None and start.denoise == 0.0:
         first[names.index("denoise")] = 0.5
@@ -207,7 +207,7 @@ def _told(
     return ProcessedNoise(found, sigmas, reasons, best.chi2, tuple(levels), card, numbers, smoothing)
 
 
-def _prnu(used: list[NoiseLevel], model: PlaneModel, numbers: Numbers) -> Array | None:
+def _prnu(used: list[NoiseLevel], model: PlaneModel, numbers: PlaneParameters) -> Array | None:
     """Squared PRNU and its replicates."""
     known = [one for one in used if np.isfinite(one.spatial).all()]
     if not known:

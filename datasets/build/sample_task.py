@@ -16,7 +16,7 @@ from phibench.datasets.plan.plan import PairPlan
 from phibench.datasets.rooms.room_sources import RoomSource, room_of
 from phibench.datasets.store import schema
 from phibench.datasets.store.layers import SpotWindow, read_ambient, read_ambient_variance, read_spot
-from phibench.datasets.store.pictures import Side, sample_picture, save_png
+from phibench.datasets.store.pictures import PositionImages, sample_picture, save_png
 from phibench.datasets.store.schema import NoiseRow
 from phibench.render.optics.room_tracer import room_geometry
 from phibench.render.optics.truth import SpotTruth, spot_truth
@@ -44,7 +44,7 @@ def finish_sample(out: Path, pair: PairPlan, rig: Rig, source: RoomSource, spot:
         rows[position] = None if budget is None else noise_row(budget).model_dump(mode="json")
         frame = planes.astype(float)
         window.add_to(frame)
-        sides.append(Side(position, truth, frame, planes))
+        sides.append(PositionImages(position, truth, frame, planes))
     file = schema.preview_file(pair.sample_id)
     save_png(out / file, sample_picture(sides, rig.camera.detector))
     return Made((file,), rows)

@@ -71,7 +71,7 @@ _UNEVEN = 5e-3  # of the flux: what it changes from frame to frame beside its ow
 
 
 @dataclass(frozen=True)
-class Made:
+class FilmsMade:
     """Outcome: the folder, and the films made and kept."""
 
     folder: Path
@@ -79,7 +79,9 @@ class Made:
     kept: tuple[str, ...]
 
 
-def make_films(recipe: str | Path, out: str | Path, workers: int | None = None, console: Console | None = None) -> Made:
+def make_films(
+    recipe: str | Path, out: str | Path, workers: int | None = None, console: Console | None = None
+) -> FilmsMade:
     """Make the films of a recipe in a folder; films that are there and unchanged are kept.
 
     Raises
@@ -133,7 +135,9 @@ def _refuse_other(out: Path, name: str) -> None:
         raise DatasetError(f"{out} holds the films of '{held}', not of '{name}'; give another folder")
 
 
-def _make(plan: Plan, films: Sequence[FilmPlan], text: str, out: Path, workers: int | None, console: Console) -> Made:
+def _make(
+    plan: Plan, films: Sequence[FilmPlan], text: str, out: Path, workers: int | None, console: Console
+) -> FilmsMade:
     keys = _keys(plan, films)
     todo = [film for film in films if not _is_done(out, film, keys[film.film_id])]
     for name in {film.film_id for film in films} - {film.film_id for film in todo}:
@@ -158,7 +162,7 @@ def _make(plan: Plan, films: Sequence[FilmPlan], text: str, out: Path, workers: 
     write_text(out / CROISSANT, text)
     write_checksums(out, names)
     made = tuple(film.film_id for film in todo)
-    return Made(out, made, tuple(name for name in names if name not in made))
+    return FilmsMade(out, made, tuple(name for name in names if name not in made))
 
 
 def film_key(plan: Plan, film: FilmPlan, code: str) -> str:

@@ -44,7 +44,7 @@ from phibench.scenes.validation import structural_faults
 _OF_ONE_CAPTURE = ("name", "exposure_s", "output")  # of frames, not of the camera
 
 
-class Measured(Document):
+class MeasuredQuantity(Document):
     """One measured quantity that is no number of the chain.
 
     `value` is a number or a list of numbers; `sigma` has its shape, or is one number for all.
@@ -62,7 +62,7 @@ class FitTables(Document):
     sigma: dict[str, float | list[float]] = Field(default_factory=dict)
     assumed: dict[str, str] = Field(default_factory=dict)
     not_determined: dict[str, str] = Field(default_factory=dict)
-    measured: dict[str, Measured] = Field(default_factory=dict)
+    measured: dict[str, MeasuredQuantity] = Field(default_factory=dict)
     source: dict[str, str | float | int] = Field(default_factory=dict)
 
 

@@ -175,7 +175,7 @@ class SampleLayers(Protocol):
 
 
 @dataclass(frozen=True)
-class Side:
+class PositionLight:
     """One position: the camera, the light that falls on it, and which pixels are read."""
 
     chain: Chain
@@ -204,7 +204,7 @@ class FrameSource:
 
     request: FrameRequest
     names: tuple[str, int, str]
-    sides: Mapping[str, Side]
+    sides: Mapping[str, PositionLight]
 
     @classmethod
     def from_request(cls, sample: SampleLayers, request: FrameRequest) -> FrameSource:
@@ -262,7 +262,7 @@ def _exposed(sample: SampleLayers, request: FrameRequest) -> Sensor:
     return auto_exposed(request.sensor(), Light(ambient, lamp_level=request.lamp_level, f_number=f_number))
 
 
-def _side(sample: SampleLayers, position: str, request: FrameRequest, sensor: Sensor) -> Side:
+def _side(sample: SampleLayers, position: str, request: FrameRequest, sensor: Sensor) -> PositionLight:
     camera = sample.rig.camera
     spot = sample.spot(position)
     light = Light(
@@ -275,7 +275,7 @@ def _side(sample: SampleLayers, position: str, request: FrameRequest, sensor: Se
     )
     moving = _moving(sample, position, spot, sensor, request.carriage_speed_m_s)
     region = _region(sample.row, position, request.region, light.size)
-    return Side(Chain(sensor, request.camera_seed, camera), replace(light, spot=moving), region)
+    return PositionLight(Chain(sensor, request.camera_seed, camera), replace(light, spot=moving), region)
 
 
 def _moving(sample: SampleLayers, position: str, spot: SpotWindow, sensor: Sensor, speed_m_s: float) -> SpotWindow:

@@ -21,7 +21,7 @@ from phibench.datasets.recipe.tables import (
 )
 from phibench.datasets.rooms.room_sources import NamedRoom, room_of
 from phibench.scenes.camera import Camera
-from phibench.scenes.catalog import BOARD_ALBEDO, RIGS, Target
+from phibench.scenes.catalog import BOARD_ALBEDO, RIGS, TargetBoard
 from phibench.scenes.faces import face_table
 from phibench.scenes.frames import Array, Pose, Vector, as_matrix, as_vector, rotation_xyz
 from phibench.scenes.holder import LENGTHS, Holder, fitted
@@ -266,9 +266,9 @@ def true_stroke_m(misalignment: Misalignment, nominal_stroke_m: float) -> float:
     return true_m if true_m == nominal_stroke_m else round(true_m, _NANOMETRE)
 
 
-def build_target(table: TargetTable) -> Target:
+def build_target(table: TargetTable) -> TargetBoard:
     """Target board of a recipe."""
-    return Target(table.name, table.depth_m, float(np.radians(table.azimuth_deg)), table.height_m)
+    return TargetBoard(table.name, table.depth_m, float(np.radians(table.azimuth_deg)), table.height_m)
 
 
 def room_source(table: RoomTable, targets: Iterable[TargetTable]) -> NamedRoom:

@@ -18,7 +18,7 @@ from phibench.render.optics.beam_deposit import BEAM_REACH_M
 from phibench.render.optics.room_tracer import RoomGeometry, RoomHits, own_geometry, room_geometry
 from phibench.render.optics.spot_layer import spot_layer
 from phibench.render.optics.truth import VISIBLE, spot_truth
-from phibench.scenes.catalog import BOARD_SIZE_M, Target, board
+from phibench.scenes.catalog import BOARD_SIZE_M, TargetBoard, board
 from phibench.scenes.faces import FaceTable
 from phibench.scenes.frames import Array, as_vector
 from phibench.scenes.laser import LaserSpot
@@ -32,7 +32,7 @@ _HOUSING_REACH_M = 0.1  # housing and mast stay within this of the lens
 class Boards:
     """Boards of a room, for many rigs: nearly all are too far from the carriage to be asked."""
 
-    def __init__(self, targets: Sequence[Target]) -> None:
+    def __init__(self, targets: Sequence[TargetBoard]) -> None:
         self._plates = [board(target) for target in targets]
         self._centres_m = np.array([plate.T_world_shape.translation_m for plate in self._plates]).reshape(-1, 3)
 

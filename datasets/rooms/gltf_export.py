@@ -31,13 +31,13 @@ _STRENGTH = "KHR_materials_emissive_strength"
 
 def glb_of(room: Room) -> bytes:
     """Bytes of a `.glb` file; `MeshSettings(up_axis="y", metres_per_unit=1, emission_w_m2_sr=1)` reads it."""
-    document = GltfDocument()
+    document = GltfWriter()
     for shape in (*room.surfaces, *room.furniture):
         document.add(shape)
     return document.encoded(room.name)
 
 
-class GltfDocument:
+class GltfWriter:
     """Parts of a glTF document in the making; equal textures are written once."""
 
     def __init__(self) -> None:

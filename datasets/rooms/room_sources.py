@@ -18,7 +18,7 @@ from phibench.datasets.input_files import FILE_NAME
 from phibench.datasets.rooms.mesh_placement import MeshSettings
 from phibench.datasets.rooms.panorama_settings import PanoramaSettings
 from phibench.datasets.rooms.room_files import RoomError, checked_file
-from phibench.scenes.catalog import ROOMS, Target
+from phibench.scenes.catalog import ROOMS, TargetBoard
 from phibench.scenes.room import Room
 from phibench.scenes.validation import SceneError, nearest, printable_line
 from phibench.scenes.worlds.generated_room import generate_room
@@ -36,7 +36,7 @@ class NamedRoom:
     """A room of the catalogue, with target boards."""
 
     name: str
-    targets: tuple[Target, ...]
+    targets: tuple[TargetBoard, ...]
     kind: Literal["named"] = "named"
 
     def build(self, folder: Path | None = None) -> Room:

@@ -48,7 +48,7 @@ Crop = tuple[int, int, int, int]
 
 
 @dataclass(frozen=True)
-class Difference:
+class RendererDifference:
     """Mitsuba less phibench, and its standard error."""
 
     value: float
@@ -67,7 +67,7 @@ class Difference:
 
 
 @dataclass(frozen=True)
-class Checked:
+class ViewComparison:
     """One view of a sample.
 
     Attributes
@@ -80,7 +80,7 @@ class Checked:
 
     sample_id: str
     position: str
-    differences: dict[str, Difference]
+    differences: dict[str, RendererDifference]
     left_out: tuple[str, ...]
 
     @property
@@ -103,15 +103,15 @@ def chosen_samples(dataset: Dataset, count: int) -> list[Sample]:
     return [dataset[int(place)] for place in places]
 
 
-def check_sample(sample: Sample) -> Iterator[Checked]:
+def check_sample(sample: Sample) -> Iterator[ViewComparison]:
     """Compare both views of a sample."""
     for position in POSITIONS:
         yield check_view(sample, position)
 
 
-def check_view(sample: Sample, position: str) -> Checked:
+def check_view(sample: Sample, position: str) -> ViewComparison:
     """Compare one view of a sample."""
-    found: dict[str, Difference] = {}
+    found: dict[str, RendererDifference] = {}
     left_out: list[str] = []
     view, room = sample.view(position), sample.room
     try:
@@ -128,7 +128,7 @@ def check_view(sample: Sample, position: str) -> Checked:
                 found |= _spot(scene)
     except SceneError as error:
         left_out.append(f"not compared: {error}")
-    return Checked(sample.row.sample_id, position, found, tuple(left_out))
+    return ViewComparison(sample.row.sample_id, position, found, tuple(left_out))
 
 
 class _Loaded:
@@ -169,7 +169,7 @@ class _Loaded:
 # Ambient light.
 
 
-def _ambient(scene: _Loaded) -> dict[str, Difference]:
+def _ambient(scene: _Loaded) -> dict[str, RendererDifference]:
     ours = np.moveaxis(expected_radiance(scene.sample, scene.position, "ambient"), 0, -1)
     if not ours.any():
         return {}
@@ -179,7 +179,7 @@ def _ambient(scene: _Loaded) -> dict[str, Difference]:
         if len(windows) > 1:
             ratios = np.array([_window_ratio(scene, ours, crop) for crop in windows]) - 1.0
             error = ratios.mean(axis=1).std(ddof=1) / np.sqrt(len(ratios))
-            found[f"light {name}"] = Difference(float(ratios.mean()), float(error), LIGHT_TOLERANCE, "1")
+            found[f"light {name}"] = RendererDifference(float(ratios.mean()), float(error), LIGHT_TOLERANCE, "1")
     return found
 
 
@@ -238,7 +238,7 @@ def _window_ratio(scene: _Loaded, ours: Array, crop: Crop) -> Array:
 _DENSE = 14400  # places of the outline, 0.15 px apart for the default rig
 
 
-def _outline(scene: _Loaded) -> Difference:
+def _outline(scene: _Loaded) -> RendererDifference:
     """Mean distance of Mitsuba's outline beyond ours, over places around it."""
     rig = scene.sample.rig
     outline = scene.camera.project(rig.camera.rays(rig.outline_px(_DENSE)))
@@ -252,8 +252,8 @@ def _outline(scene: _Loaded) -> Difference:
             index = _shape_index(scene, (_FINEST * u, _FINEST * v, _FINEST * side, _FINEST * side), _FINEST)
             offsets.append(_offset_px(around, inner, (u, v, side, side), float((index == mirror).mean())))
     if len(offsets) < 2:
-        return Difference(0.0, float("inf"), OUTLINE_TOLERANCE_PX, "px")
-    return Difference(
+        return RendererDifference(0.0, float("inf"), OUTLINE_TOLERANCE_PX, "px")
+    return RendererDifference(
         float(np.mean(offsets)), float(np.std(offsets, ddof=1) / np.sqrt(len(offsets))), OUTLINE_TOLERANCE_PX, "px"
     )
 
@@ -286,7 +286,7 @@ def _offset_px(outline: Array, inner: Array, crop: Crop, share: float) -> float:
 # The spot.
 
 
-def _spot(scene: _Loaded) -> dict[str, Difference]:
+def _spot(scene: _Loaded) -> dict[str, RendererDifference]:
     """Flux and centroid of the spot's light, where all of it falls on the image."""
     sample, camera = scene.sample, scene.camera
     row = sample.truth_row(scene.position)
@@ -312,10 +312,10 @@ def _spot(scene: _Loaded) -> dict[str, Difference]:
     mean, error = apart.mean(axis=0), apart.std(axis=0, ddof=1) / np.sqrt(len(runs))
     ratio = flux / row.electrons_per_s[0]
     return {
-        "flux of the spot": Difference(
+        "flux of the spot": RendererDifference(
             float(ratio.mean() - 1.0), float(ratio.std(ddof=1) / np.sqrt(len(runs))), LIGHT_TOLERANCE, "1"
         ),
-        "centroid of the spot": Difference(
+        "centroid of the spot": RendererDifference(
             float(np.linalg.norm(mean)), float(np.linalg.norm(error)), CENTROID_TOLERANCE_PX, "px"
         ),
     }

@@ -34,7 +34,7 @@ README = "README.md"
 
 
 @dataclass(frozen=True)
-class Exported:
+class ExportedScene:
     """Files of an export, and what its scenes do not carry."""
 
     scenes: tuple[Path, ...]
@@ -70,7 +70,7 @@ def sample_scene(sample: Sample, position: str, light: Light = "all") -> Plugin:
     return standard_scene(sample.view(position), sample.room, sample.laser_spot, light)
 
 
-def export_scene(sample: Sample, out: Path, positions: Sequence[str] = POSITIONS) -> Exported:
+def export_scene(sample: Sample, out: Path, positions: Sequence[str] = POSITIONS) -> ExportedScene:
     """Write the scenes of a sample to a folder: XML, meshes, pictures, our own layers as radiance, and a README.
 
     Raises
@@ -94,7 +94,7 @@ def export_scene(sample: Sample, out: Path, positions: Sequence[str] = POSITIONS
         view = sample.view(position)
         write_bytes(out / f"{position}.glb", scene_glb(view, sample.room, sample.laser_spot))
     losses = tuple(what_is_lost(sample.view(positions[0]), sample.room))
-    return Exported(tuple(scenes), write_text(out / README, _readme(sample, positions, losses)), losses)
+    return ExportedScene(tuple(scenes), write_text(out / README, _readme(sample, positions, losses)), losses)
 
 
 def scene_file(position: str, light: Light) -> str:

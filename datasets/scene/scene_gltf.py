@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from phibench.datasets.rooms.gltf_export import GltfDocument, y_up
+from phibench.datasets.rooms.gltf_export import GltfWriter, y_up
 from phibench.render.plugins.mirror_plugins import cap_grid, form_grid, grid_triangles
 from phibench.scenes.frames import Array
 from phibench.scenes.laser import LaserSpot
@@ -27,7 +27,7 @@ _SPOT_LIFT_M = 1e-4
 
 def scene_glb(view: View, room: Room, spot: LaserSpot | None = None) -> bytes:
     """Bytes of a `.glb` file of one view."""
-    document = GltfDocument()
+    document = GltfWriter()
     for shape in room.shapes(view):
         document.add(shape)
     _add_mirror(document, view)
@@ -45,7 +45,7 @@ def mirror_grid(mirror: SphereMirror | RevolvedMirror, rings: int, spokes: int) 
     return form_grid(mirror, rings, spokes)
 
 
-def _add_mirror(document: GltfDocument, view: View) -> None:
+def _add_mirror(document: GltfWriter, view: View) -> None:
     mirror = view.rig.mirror
     points, normals = mirror_grid(mirror, _RINGS, _SPOKES)
     pose = view.T_world_sphere
@@ -63,7 +63,7 @@ def _add_mirror(document: GltfDocument, view: View) -> None:
     )
 
 
-def _add_spot(document: GltfDocument, spot: LaserSpot) -> None:
+def _add_spot(document: GltfWriter, spot: LaserSpot) -> None:
     a, b = spot.tangents()
     turn = 2.0 * np.pi * np.arange(_SPOT_SIDES) / _SPOT_SIDES
     rim = 0.5 * spot.diameter_m * (np.cos(turn)[:, None] * a + np.sin(turn)[:, None] * b)
@@ -77,7 +77,7 @@ def _add_spot(document: GltfDocument, spot: LaserSpot) -> None:
     document.add_mesh("laser_spot", points, document.emitting("laser_spot", (radiance, 0.0, 0.0)), fan)
 
 
-def _add_camera(document: GltfDocument, view: View) -> None:
+def _add_camera(document: GltfWriter, view: View) -> None:
     """Camera of the view; glTF's looks along -z, its y axis up in the image."""
     camera = view.rig.camera
     matrix = np.eye(4)

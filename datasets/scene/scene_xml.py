@@ -14,7 +14,7 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 
 from phibench.datasets.store.files import write_bytes, write_text
-from phibench.render.plugins.plugin_tree import Picture, Plugin, Rgb, Setting, Triangles, Value
+from phibench.render.plugins.plugin_tree import BitmapPlugin, Plugin, Rgb, SceneSetting, Triangles, Value
 
 FOLDERS = {"ply": "meshes", "pfm": "pictures"}
 
@@ -32,7 +32,7 @@ class _Writer:
         self._names: dict[str, str] = {}
 
     def text(self, scene: Plugin) -> str:
-        settings = {value.name: value.value for value in scene.all_values() if isinstance(value, Setting)}
+        settings = {value.name: value.value for value in scene.all_values() if isinstance(value, SceneSetting)}
         lines = ['<?xml version="1.0" encoding="utf-8"?>', '<scene version="3.0.0">']
         lines += [f'    <default name="{name}" value="{value}"/>' for name, value in settings.items()]
         for name, value in scene.values.items():
@@ -64,17 +64,17 @@ class _Writer:
             return f'<point name="{name}" x="{x}" y="{y}" z="{z}"/>'
         if isinstance(value, Rgb):
             return f'<rgb name="{name}" value="{_numbers(np.array(value.values))}"/>'
-        if isinstance(value, Setting):
+        if isinstance(value, SceneSetting):
             return f'<integer name="{name}" value="${value.name}"/>'
         if isinstance(value, bool):
             return f'<boolean name="{name}" value="{str(value).lower()}"/>'
         if isinstance(value, int | float):
             return f'<float name="{name}" value="{float(value)!r}"/>'
-        if isinstance(value, Picture | Triangles):
+        if isinstance(value, BitmapPlugin | Triangles):
             value = self._file(value)
         return f"<string name={quoteattr(name)} value={quoteattr(str(value))}/>"
 
-    def _file(self, content: Picture | Triangles) -> str:
+    def _file(self, content: BitmapPlugin | Triangles) -> str:
         """Name of a file with this content; written now if it is not yet."""
         data = content.data()
         digest = hashlib.sha256(data).hexdigest()

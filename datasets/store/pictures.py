@@ -145,7 +145,7 @@ _LARGEST_ZOOM = 6
 
 
 @dataclass(frozen=True)
-class Side:
+class PositionImages:
     """One position of a sample: where its spot is, its frame and its ambient layer, shape (3, H, W), electrons/s."""
 
     position: str
@@ -154,7 +154,7 @@ class Side:
     ambient: NDArray[np.float32]
 
 
-def sample_picture(sides: Sequence[Side], detector: Detector) -> Picture:
+def sample_picture(sides: Sequence[PositionImages], detector: Detector) -> Picture:
     """Both positions side by side, exposed for the first."""
     exposure = display_exposure_s(halved(sides[0].ambient), detector)
     return np.concatenate([_picture(s.frame, s.position, s.spot, detector, exposure) for s in sides], axis=1)

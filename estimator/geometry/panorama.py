@@ -38,7 +38,7 @@ _WIDTHS = (16, 16384)
 
 
 @dataclass(frozen=True)
-class Grid:
+class PanoramaGrid:
     """Directions of a panorama's pixels, seen from inside: left edge behind the robot, middle its front (world x).
 
     Column j has the azimuth pi - (j + 1/2) step from world x towards y, row i the elevation high - (i + 1/2) step, with
@@ -106,7 +106,7 @@ class Grid:
         return np.stack([column, (self.high_rad - elevation) / self.step_rad - 0.5], axis=-1)
 
 
-def pixels_by_model(view: View, grid: Grid, distance_m: float = FAR_M) -> Array:
+def pixels_by_model(view: View, grid: PanoramaGrid, distance_m: float = FAR_M) -> Array:
     """Image pixel (u, v) of every grid point, shape (H, W, 2), by the closed form; NaN where the image shows it not.
 
     Parameters
@@ -213,7 +213,7 @@ def vertical_edges(room: Room, names: tuple[str, ...]) -> Iterator[RoomEdge]:
             yield RoomEdge(f"{shape.name} {'left' if side < 0.0 else 'right'}", low, high)
 
 
-def track(true_view: View, nominal_view: View, grid: Grid, edge: RoomEdge) -> Array:
+def track(true_view: View, nominal_view: View, grid: PanoramaGrid, edge: RoomEdge) -> Array:
     """Columns and rows, shape (n, 2), bottom to top, of an edge that one rig sees and another one unrolls."""
     share = np.linspace(0.0, 1.0, _TRACK)[:, None]
     uv = image_of(true_view, (1.0 - share) * edge.low_m + share * edge.high_m).uv_px
@@ -222,7 +222,7 @@ def track(true_view: View, nominal_view: View, grid: Grid, edge: RoomEdge) -> Ar
     return places
 
 
-def seen_edge(panorama: Array, grid: Grid, name: str, expected_px: Array) -> SeenEdge | None:
+def seen_edge(panorama: Array, grid: PanoramaGrid, name: str, expected_px: Array) -> SeenEdge | None:
     """Measure an edge; None where it has too little contrast or too few rows.
 
     In each row the levels beside the edge are the means of the outer columns of a window; between them the edge is
@@ -327,7 +327,7 @@ def _places_of_normals(normals: Array, view: View) -> Array:
     return view.T_world_sphere.points(P)
 
 
-def pixels_by_truth(directions: Array, grid: Grid) -> Array:
+def pixels_by_truth(directions: Array, grid: PanoramaGrid) -> Array:
     """Image pixel (u, v) of every grid point, shape (H, W, 2), from `ray_directions`; NaN where no pixel shows it."""
     inner = np.zeros(directions.shape[:2], bool)
     inner[1:-1, 1:-1] = _with_neighbours(directions)
@@ -388,7 +388,12 @@ class Panorama:
 
 
 def panorama(
-    sample: Sample, position: str, grid: Grid, by: By = "model", distance_m: float = FAR_M, image: Array | None = None
+    sample: Sample,
+    position: str,
+    grid: PanoramaGrid,
+    by: By = "model",
+    distance_m: float = FAR_M,
+    image: Array | None = None,
 ) -> Panorama:
     """Unroll a picture, shape (h, w, 3), uint8, or the noise-free view with the laser on."""
     picture = frame(sample, position) if image is None else image
@@ -403,7 +408,7 @@ def panorama(
     return Panorama(np.rint(np.where(seen[..., None], values, 0.0)).astype(np.uint8), float(seen.mean()))
 
 
-def places(sample: Sample, position: str, grid: Grid, by: By = "model", distance_m: float = FAR_M) -> Array:
+def places(sample: Sample, position: str, grid: PanoramaGrid, by: By = "model", distance_m: float = FAR_M) -> Array:
     """Image pixel of every grid point, shape (H, W, 2), by the nominal rig or by the truth layer of the true one."""
     if by == "model":
         return pixels_by_model(nominal_view(sample, position), grid, distance_m)

@@ -238,7 +238,7 @@ def train_crop(folder: Path, settings: TrainingSettings, samples: Sequence[str] 
     chosen = rooms_of(folder, settings.seed)[0] if samples is None else samples
     crops = crops_of(folder, settings, chosen, settings.crops, settings.seed)
     p = {name: torch.tensor(value, requires_grad=True) for name, value in first_crop_weights(settings.seed).items()}
-    steps = Steps(torch, p, settings.rate, settings.epochs * settings.passes * (settings.crops // settings.batch))
+    steps = AdamSteps(torch, p, settings.rate, settings.epochs * settings.passes * (settings.crops // settings.batch))
     for epoch in range(settings.epochs):
         crops.set_epoch(epoch)
         items, total = items_of(crops, settings), []
@@ -264,7 +264,7 @@ def _batches(items: Items, settings: TrainingSettings, epoch: int) -> Iterator[t
             yield items.flipped(order[first : first + settings.batch], draw)
 
 
-class Steps:
+class AdamSteps:
     """Adam with a rate that rises over 5 % of the steps and falls as a cosine; gradients are cut at a norm of 5."""
 
     def __init__(self, torch: Any, p: Parameters, rate: float, steps: int) -> None:

@@ -32,9 +32,9 @@ from phibench.datasets.training import CropSettings, SpotCrops
 from phibench.estimator.interface import Box
 from phibench.estimator.learned.crop_training import (
     REQUESTS,
+    AdamSteps,
     Answers,
     Parameters,
-    Steps,
     TrainingSettings,
     add_passes,
     first_layer,
@@ -252,7 +252,7 @@ def train_detector(spots: Tiles, maps: Sequence[FrameMap], settings: FrameSettin
     torch, draw = torch_on_one_thread(), generator("learned", "detector", settings.seed)
     p = {name: torch.tensor(x, requires_grad=True) for name, x in first_detector_weights(settings.seed).items()}
     each_round = settings.passes * ((len(spots.planes) + _OF_A_FRAME * len(maps)) // settings.batch)
-    steps = Steps(torch, p, settings.rate, settings.rounds * each_round)
+    steps = AdamSteps(torch, p, settings.rate, settings.rounds * each_round)
     for number in range(settings.rounds):
         # before the first round red light itself is what misleads
         heats = heats_of(p, maps) if number else [one.planes[0].astype(float) for one in maps]

@@ -38,7 +38,7 @@ class Node:
 
 
 @dataclass(frozen=True)
-class Model:
+class OnnxModel:
     """Everything in an ONNX file that counts."""
 
     nodes: list[Node] = field(default_factory=list)
@@ -49,7 +49,7 @@ class Model:
     opsets: list[tuple[str, int]] = field(default_factory=list)
 
 
-def read_model(data: bytes) -> Model:
+def read_model(data: bytes) -> OnnxModel:
     """Contents of a file.
 
     Raises
@@ -57,7 +57,7 @@ def read_model(data: bytes) -> Model:
     NetworkFileError
         If it is no ONNX model, or has a part that no network of phibench has.
     """
-    model = Model()
+    model = OnnxModel()
     try:
         _model(model, memoryview(data))
     except (IndexError, UnicodeDecodeError, OverflowError) as error:
@@ -65,7 +65,7 @@ def read_model(data: bytes) -> Model:
     return model
 
 
-def require_layers(model: Model, nodes: list[Node], shapes: Mapping[str, tuple[int, ...]], opset: int) -> None:
+def require_layers(model: OnnxModel, nodes: list[Node], shapes: Mapping[str, tuple[int, ...]], opset: int) -> None:
     """Refuse a model that is not of these layers.
 
     Parameters
@@ -98,7 +98,7 @@ def require_layers(model: Model, nodes: list[Node], shapes: Mapping[str, tuple[i
 # -- the message ------------------------------------------------------------------------------------------------------
 
 
-def _model(model: Model, data: memoryview) -> None:
+def _model(model: OnnxModel, data: memoryview) -> None:
     for number, value in _fields(data):
         if number == 7:
             _graph(model, _bytes(value))
@@ -115,7 +115,7 @@ def _model(model: Model, data: memoryview) -> None:
             raise NetworkFileError(f"has a part (field {number} of the model) that no network of phibench has")
 
 
-def _graph(model: Model, data: memoryview) -> None:
+def _graph(model: OnnxModel, data: memoryview) -> None:
     for number, value in _fields(data):
         if number == 1:
             model.nodes.append(_node(_bytes(value)))

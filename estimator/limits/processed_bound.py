@@ -26,7 +26,7 @@ from phibench.estimator.limits.position_bound import SpotLimit, limit_of, raw_in
 from phibench.estimator.processed.chain_model import chain_model
 from phibench.estimator.processed.fit_chain import own_codes, unrounded
 from phibench.estimator.processed.fit_jpeg import grid_px
-from phibench.estimator.processed.quasi_score import Window
+from phibench.estimator.processed.quasi_score import CoefficientWindow
 from phibench.estimator.spots.fisher import covariance_bound, fisher_matrix
 from phibench.estimator.spots.gaussian_spot import LASER_RESPONSE, SpotBlur, SpotModel, SpotPixels
 from phibench.estimator.spots.image_planes import PROCESSED
@@ -112,13 +112,13 @@ def limit_window(
     blur: SpotBlur,
     response: tuple[float, float, float] = LASER_RESPONSE,
     pattern_known: bool = False,
-) -> tuple[Window, Array]:
+) -> tuple[CoefficientWindow, Array]:
     """Window of outputs, all 0, that holds a spot at (u, v), and its first raw pixel (u, v); rest as `chain_limit`."""
     model = chain_model(card, unrounded(card, pattern_known))
     units, sides = np.array(grid_px(card)[::-1]), np.array(model.shape[::-1])
     corner = np.rint((uv_px + 0.5 - sides / 2) / units) * units - model.margin
     pixels = SpotPixels.of(model.filters[None], blur, SpotModel(response))
-    return Window(np.zeros(len(model.step)), model, pixels), corner
+    return CoefficientWindow(np.zeros(len(model.step)), model, pixels), corner
 
 
 # -- bound by the electrons of a spot --------------------------------------------------------------------------------

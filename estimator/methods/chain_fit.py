@@ -34,7 +34,7 @@ from phibench.estimator.processed.fit_chain import (
     undone_mean,
     unrounded,
 )
-from phibench.estimator.processed.quasi_score import Window
+from phibench.estimator.processed.quasi_score import CoefficientWindow
 from phibench.estimator.spots.detect import Detection
 from phibench.estimator.spots.fit_raw import SpotData, SpotFit
 from phibench.estimator.spots.gaussian_spot import SpotBlur, SpotModel
@@ -190,7 +190,9 @@ def spot_likelihood(pair: Pair, position: str, spot: Spot, depth_m: float | None
     return of_pixels(outputs, uv) if isinstance(outputs, SpotData) else of_window(*outputs)
 
 
-def spot_outputs(pair: Pair, position: str, uv: Array, depth_m: float | None) -> SpotData | tuple[Window, Array, Array]:
+def spot_outputs(
+    pair: Pair, position: str, uv: Array, depth_m: float | None
+) -> SpotData | tuple[CoefficientWindow, Array, Array]:
     """Outputs of one image about a spot at (u, v), with their model: what a fit and a likelihood are made of.
 
     Codes of their own where a single frame has such (`own_codes`); else a window, a start and the window's corner.

@@ -15,14 +15,14 @@ import numpy as np
 from phibench.estimator.interface import Answer, Box, Image, Pair
 from phibench.estimator.methods.chain_fit import chain_fit
 from phibench.estimator.methods.raw_likelihood import raw_likelihood
-from phibench.estimator.pair_set import PairTruth, SpotTruth
+from phibench.estimator.pair_set import ImageTruth, PairTruth
 from phibench.estimator.spots.image_planes import PROCESSED
 
 _BOX_PX = 24
 _SIGMAS = 4.0  # of the bound: a fit at the bound is further off in 3e-4 of the cases
 
 
-class Reference(Protocol):
+class FitAtTruth(Protocol):
     """Function that answers a pair as a fit at the truth does."""
 
     def __call__(self, pair: Pair, truth: PairTruth) -> Answer | None:
@@ -48,7 +48,7 @@ class KeptFits:
         return self._answers[truth.number]
 
 
-def reaches_bound(answer: Answer | None, position: str, spot: SpotTruth, match_px: float) -> bool:
+def reaches_bound(answer: Answer | None, position: str, spot: ImageTruth, match_px: float) -> bool:
     """Tell whether an answer is as near to the truth as the bound says.
 
     Where the bound itself is so wide that four of its deviations exceed `match_px`, nothing is reached: an answer in
@@ -61,7 +61,7 @@ def reaches_bound(answer: Answer | None, position: str, spot: SpotTruth, match_p
     return reach <= match_px and float(np.linalg.norm(np.subtract(found.uv_px, spot.uv_px))) <= reach
 
 
-def _box_about(spot: SpotTruth, image: Image) -> Box | None:
+def _box_about(spot: ImageTruth, image: Image) -> Box | None:
     if not (spot.visible and np.isfinite(spot.uv_px).all()):
         return None
     height, width = image.shape[:2]

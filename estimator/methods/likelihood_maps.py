@@ -16,7 +16,7 @@ from scipy.interpolate import RegularGridInterpolator
 
 from phibench.estimator.geometry.joint_posterior import MISFIT_RANGE, LikelihoodMap
 from phibench.estimator.processed.interval_fit import interval_posterior
-from phibench.estimator.processed.quasi_score import Window, fit_window
+from phibench.estimator.processed.quasi_score import CoefficientWindow, fit_window
 from phibench.estimator.spots.fisher import covariance_bound, limited, scoring_step
 from phibench.estimator.spots.fit_raw import SpotData
 from phibench.scenes.frames import Array
@@ -61,7 +61,7 @@ class SpotLikelihood:
     excess: float
 
 
-def of_window(window: Window, start: Array, corner_px: Array) -> SpotLikelihood | None:
+def of_window(window: CoefficientWindow, start: Array, corner_px: Array) -> SpotLikelihood | None:
     """Likelihood of a window of outputs; None where they say nothing."""
     if window.of_intervals:
         posterior = interval_posterior(window, start)

@@ -16,8 +16,8 @@ from scipy.ndimage import convolve1d, gaussian_filter
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.estimator.geometry.status import Status, flag, keep
 from phibench.estimator.processed.chain_model import UNIT_MATRIX, ChainModel, chain_model, window_px
-from phibench.estimator.processed.fit_jpeg import Region, fit_region, grid_px, region_window
-from phibench.estimator.processed.quasi_score import Window, WindowFit
+from phibench.estimator.processed.fit_jpeg import JpegRegion, fit_region, grid_px, region_window
+from phibench.estimator.processed.quasi_score import CoefficientWindow, WindowFit
 from phibench.estimator.spots.camera_codes import light_of, rgb_codes, tone_slope
 from phibench.estimator.spots.fisher import covariance_bound
 from phibench.estimator.spots.fit_raw import LEAST_SNR, SpotData, SpotFit, fit_law, spot_data
@@ -239,7 +239,7 @@ def _region(
     index: int,
     size_px: tuple[int, int],
     pattern_known: bool = False,
-) -> tuple[Region, Array]:
+) -> tuple[JpegRegion, Array]:
     """Region of one image's frames, and its first row and column (u, v): the window's grid begins there."""
     (u0, v0), (h, w), zero = origin, frames.shape[1:3], np.zeros(frames.shape[1:3])
     ends = (bool(v0 == 0), bool(v0 + h == size_px[1]), bool(u0 == 0), bool(u0 + w == size_px[0]))
@@ -248,7 +248,7 @@ def _region(
     prnu = card.prnu if background is not None and background.holds_pattern and not pattern_known else 0.0
     u1, v1 = origin % np.array(grid_px(card)[::-1])
     behind = (known[0][v1:, u1:], known[1][v1:, u1:])
-    return Region(frames[:, v1:, u1:], ends, *behind, room, prnu), np.array([u1, v1])
+    return JpegRegion(frames[:, v1:, u1:], ends, *behind, room, prnu), np.array([u1, v1])
 
 
 def spot_window(
@@ -260,7 +260,7 @@ def spot_window(
     model: SpotModel,
     background: Background | None,
     size_px: tuple[int, int],
-) -> tuple[Window, Array, Array]:
+) -> tuple[CoefficientWindow, Array, Array]:
     """Window of outputs of one image, a start of a fit at (u, v) of the whole image, and the window's corner there.
 
     Parameters as for `fit_jpeg`, with n = 1; `image` has the shape (1, f, h, w, planes), `origin` (1, 2).

@@ -21,8 +21,8 @@ from phibench.estimator.processed.chain_model import (
     window_px,
 )
 from phibench.estimator.processed.interval_fit import fit_intervals
-from phibench.estimator.processed.interval_moments import Steps
-from phibench.estimator.processed.quasi_score import Window, WindowFit, fit_window
+from phibench.estimator.processed.interval_moments import QuantiserSteps
+from phibench.estimator.processed.quasi_score import CoefficientWindow, WindowFit, fit_window
 from phibench.estimator.spots.camera_codes import ycbcr_codes
 from phibench.estimator.spots.gaussian_spot import SpotBlur, SpotModel, SpotPixels
 from phibench.estimator.spots.jpeg_coefficients import hidden_share, mcu_px, qtables_of, room_variance
@@ -34,7 +34,7 @@ _HIDDEN = 1e-4  # variance of a room's coefficient, in steps squared, from which
 
 
 @dataclass(frozen=True)
-class Region:
+class JpegRegion:
     """One region on the grid of JPEG units, or one that begins at an even row and column.
 
     Attributes
@@ -58,7 +58,7 @@ class Region:
     prnu: float = 0.0
 
 
-def window_at(region: Region, chain: ChainModel, uv: Array) -> tuple[int, int]:
+def window_at(region: JpegRegion, chain: ChainModel, uv: Array) -> tuple[int, int]:
     """First row and column, in the region, of the window on the grid that has (u, v) nearest to its middle."""
     steps = grid_px(chain.card)
     places = []
@@ -74,7 +74,7 @@ def grid_px(card: SensorCard) -> tuple[int, int]:
 
 
 def fit_region(
-    region: Region, chain: ChainModel, starts: Array, blur: SpotBlur, model: SpotModel
+    region: JpegRegion, chain: ChainModel, starts: Array, blur: SpotBlur, model: SpotModel
 ) -> tuple[WindowFit, Array]:
     """Fit the spot of one region.
 
@@ -108,8 +108,8 @@ def fit_region(
 
 
 def region_window(
-    region: Region, chain: ChainModel, uv: Array, blur: SpotBlur, model: SpotModel
-) -> tuple[Window, Array]:
+    region: JpegRegion, chain: ChainModel, uv: Array, blur: SpotBlur, model: SpotModel
+) -> tuple[CoefficientWindow, Array]:
     """Window of a region for a spot near (u, v), and the window's first raw pixel (u, v) in the region."""
     row, column = window_at(region, chain, uv)
     (h, w), m = chain.shape, chain.margin
@@ -125,11 +125,11 @@ def region_window(
         room = _room(replace(region, image=region.room), chain, (row, column), background, extra.ravel())
     each = outputs_at(region, chain, row, column)
     shared = extra.ravel(), room[0], len(each), region.prnu
-    return Window(each.mean(axis=0), chain, pixels, *shared, each, room[1]), corner
+    return CoefficientWindow(each.mean(axis=0), chain, pixels, *shared, each, room[1]), corner
 
 
 def _room(
-    region: Region, chain: ChainModel, place: tuple[int, int], background_e: Array, extra_e2: Array
+    region: JpegRegion, chain: ChainModel, place: tuple[int, int], background_e: Array, extra_e2: Array
 ) -> tuple[Array, Array | float]:
     """Room's coefficients as the region's frames show them.
 
@@ -153,7 +153,7 @@ def _room(
     room = room_variance(each.mean(axis=0), step, hidden_share(np.sqrt(spread) / step, len(each)))
     known = np.einsum("rn,rn->n", E, E)
     coarse = np.flatnonzero((spread < step**2) & (room > _HIDDEN * step**2))
-    steps, mean = Steps.of(each, step).part(coarse), (at.mean @ chain.transform + chain.shift)[coarse]
+    steps, mean = QuantiserSteps.of(each, step).part(coarse), (at.mean @ chain.transform + chain.shift)[coarse]
     found, left = steps.shared(mean, _WEAK * (known + room)[coarse], spread[coarse])
     offset = np.zeros(len(step))
     offset[coarse] = found - mean
@@ -161,7 +161,7 @@ def _room(
     return room, offset
 
 
-def outputs_at(region: Region, chain: ChainModel, row: int, column: int) -> Array:
+def outputs_at(region: JpegRegion, chain: ChainModel, row: int, column: int) -> Array:
     """Quantised outputs of each frame, shape (f, n), of the window that begins at (row, column) of the region."""
     if chain.card.output == "mjpeg":
         return coefficients_at(region, chain, row, column)
@@ -172,7 +172,7 @@ def outputs_at(region: Region, chain: ChainModel, row: int, column: int) -> Arra
     return np.asarray(np.moveaxis(images, -1, 1).reshape(len(images), -1), float)
 
 
-def coefficients_at(region: Region, chain: ChainModel, row: int, column: int) -> Array:
+def coefficients_at(region: JpegRegion, chain: ChainModel, row: int, column: int) -> Array:
     """Quantised coefficients of each frame, shape (f, n), of the window that begins at (row, column)."""
     card, (h, w) = chain.card, chain.shape
     down, across = mcu_px(card.jpeg_subsampling)

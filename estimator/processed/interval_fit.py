@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
-from phibench.estimator.processed.interval_moments import Sites, Steps
-from phibench.estimator.processed.quasi_score import Inputs, Rows, Window, WindowFit, fit_window
+from phibench.estimator.processed.interval_moments import QuantiserSteps, Sites
+from phibench.estimator.processed.quasi_score import CoefficientWindow, Inputs, Rows, WindowFit, fit_window
 from phibench.estimator.spots.fisher import limited
 from phibench.scenes.frames import Array
 
@@ -109,7 +109,7 @@ class IntervalPosterior:
     settled : bool
     """
 
-    window: Window
+    window: CoefficientWindow
     theta: Array
     covariance: Array
     index: NDArray[np.int64]
@@ -147,7 +147,7 @@ class IntervalPosterior:
         return residuals
 
 
-def fit_intervals(window: Window, start: Array) -> WindowFit:
+def fit_intervals(window: CoefficientWindow, start: Array) -> WindowFit:
     """Fit a window from a hypothesis, shape (k,), which is also the prior's mean.
 
     Returns
@@ -166,13 +166,15 @@ def fit_intervals(window: Window, start: Array) -> WindowFit:
     return WindowFit(found.theta, np.asarray(np.linalg.inv(found.covariance), float), chi2, found.settled)
 
 
-def interval_posterior(window: Window, start: Array, prior_px: float = _PRIOR_PX) -> IntervalPosterior | None:
+def interval_posterior(
+    window: CoefficientWindow, start: Array, prior_px: float = _PRIOR_PX
+) -> IntervalPosterior | None:
     """Posterior of a window, parameters as `fit_intervals`; None where the arithmetic fails.
 
     The place of the start is known to `prior_px`, one standard deviation of each of its coordinates.
     """
     prior, step = np.diag(_prior_sigma(start, window, prior_px) ** 2), window.model.step
-    steps = Steps.of(window.each, step)
+    steps = QuantiserSteps.of(window.each, step)
     theta, covariance = fit_window(window, start[None], _START_STEPS).theta, _CLOSER**2 * prior
     sites, last, settled = Sites(*np.zeros((2, len(step)))), np.zeros(len(start)), False
     for k in range(_ROUNDS):
@@ -202,13 +204,13 @@ def _nothing(theta: Array) -> WindowFit:
     return WindowFit(theta, np.zeros((len(theta),) * 2), np.nan, False)
 
 
-def _prior_sigma(start: Array, window: Window, prior_px: float) -> Array:
+def _prior_sigma(start: Array, window: CoefficientWindow, prior_px: float) -> Array:
     level = _PRIOR_LEVEL_E + np.abs(start[3:6])
     width = [_PRIOR_WIDTH * start[6]] if window.pixels.free_width else []
     return np.array([prior_px, prior_px, _PRIOR_LEVEL_E + abs(start[2]), *level, *width])
 
 
-def _near(inputs: Inputs, covariance: Array, steps: Steps) -> NDArray[np.int64]:
+def _near(inputs: Inputs, covariance: Array, steps: QuantiserSteps) -> NDArray[np.int64]:
     """Index of outputs that noise and hypotheses can bring to an edge of their steps."""
     J, F = inputs.slopes, inputs.factor
     variance = np.einsum("rn,rn->n", F, F) + inputs.own + np.einsum("kn,kl,ln->n", J, covariance, J)
@@ -219,7 +221,7 @@ def _near(inputs: Inputs, covariance: Array, steps: Steps) -> NDArray[np.int64]:
     return np.flatnonzero(room < _FAR * np.sqrt(variance))
 
 
-def _propagated(belief: _Belief, sites: Sites, steps: Steps, spread: Array, sweeps: int) -> Sites:
+def _propagated(belief: _Belief, sites: Sites, steps: QuantiserSteps, spread: Array, sweeps: int) -> Sites:
     """Sites after some sweeps of expectation propagation, all intervals at once."""
     prior = np.diagonal(belief.outputs)
     least = _LEAST_STEP2 * steps.step**2

@@ -41,7 +41,7 @@ class Sites:
 
 
 @dataclass(frozen=True)
-class Steps:
+class QuantiserSteps:
     """Steps of the quantiser that the frames' outputs lie in.
 
     Attributes
@@ -58,7 +58,7 @@ class Steps:
     frames: int
 
     @classmethod
-    def of(cls, outputs: Array, step: Array) -> Steps:
+    def of(cls, outputs: Array, step: Array) -> QuantiserSteps:
         """Steps of outputs, shape (f, n)."""
         number = np.rint(outputs / step).astype(np.int64)
         lowest = number.min(axis=0)
@@ -72,12 +72,12 @@ class Steps:
         levels = np.arange(1, len(self.counts) + 1)[:, None]
         return np.asarray(self.first + self.step * np.where(self.counts > 0.0, levels, 0).max(axis=0))
 
-    def part(self, index: NDArray[np.int64]) -> Steps:
+    def part(self, index: NDArray[np.int64]) -> QuantiserSteps:
         """Take some of them."""
         counts = self.counts[:, index]
         levels = np.flatnonzero(counts.any(axis=1))
         top = int(levels[-1]) + 1 if levels.size else 1
-        return Steps(self.step[index], self.first[index], counts[:top], self.frames)
+        return QuantiserSteps(self.step[index], self.first[index], counts[:top], self.frames)
 
     def sites(self, mean: Array, variance: Array, spread: Array) -> Sites:
         """Sites for what the other outputs say of each output.

@@ -153,7 +153,7 @@ class WindowFit:
 
 
 @dataclass(frozen=True)
-class Window:
+class CoefficientWindow:
     """Coefficients of one window with the model that is fitted to them.
 
     Attributes
@@ -312,7 +312,7 @@ def shared_covariance(factor: Array, room: Array, sigma: Array, slope: Array, st
     return np.asarray(C)
 
 
-def fit_window(window: Window, starts: Array, steps: int = _STEPS) -> WindowFit:
+def fit_window(window: CoefficientWindow, starts: Array, steps: int = _STEPS) -> WindowFit:
     """Fit one window from hypotheses, shape (s, k); the one with the smallest misfit after some steps goes on."""
     noise = window.noise(starts[0])
     if noise.dead:
@@ -331,7 +331,7 @@ def fit_window(window: Window, starts: Array, steps: int = _STEPS) -> WindowFit:
     return WindowFit(theta, J[0] @ J[0].T, chi2, length < _REST)
 
 
-def _best(window: Window, noise: Noise, starts: Array) -> Array:
+def _best(window: CoefficientWindow, noise: Noise, starts: Array) -> Array:
     """Start with the smallest misfit after some steps."""
     theta = starts
     if len(starts) > 1:
@@ -341,7 +341,9 @@ def _best(window: Window, noise: Noise, starts: Array) -> Array:
     return np.asarray(theta[np.argmin(np.einsum("ml,ml->m", r, r))])
 
 
-def _descended(window: Window, noise: Noise, theta: Array, r: Array, J: Array) -> tuple[Array, Array, Array, float]:
+def _descended(
+    window: CoefficientWindow, noise: Noise, theta: Array, r: Array, J: Array
+) -> tuple[Array, Array, Array, float]:
     """One step that does not raise the misfit, what belongs to it, and its squared length in standard deviations."""
     step = _newton(r, J)
     length = float(np.sum((step[0] @ J[0]) ** 2))
@@ -358,6 +360,6 @@ def _newton(r: Array, J: Array) -> Array:
     return scoring_step(J @ np.swapaxes(J, 1, 2), np.einsum("mkl,ml->mk", J, r))
 
 
-def _moved(window: Window, theta: Array, step: Array) -> Array:
+def _moved(window: CoefficientWindow, theta: Array, step: Array) -> Array:
     """Hypotheses after limited steps."""
     return limited(theta, step, most_px=_STEP_PX, free_width=window.pixels.free_width)

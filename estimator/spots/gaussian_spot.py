@@ -105,7 +105,7 @@ class SpotModel:
 
 
 @dataclass(frozen=True)
-class Profile:
+class GaussianProfile:
     """One axis of `m` Gaussians of unit flux on `count` pixels, shape (m, count).
 
     Attributes
@@ -119,7 +119,7 @@ class Profile:
     by_sigma: Array
 
 
-def profile(centre_px: Array, sigma_px: Array, count: int) -> Profile:
+def profile(centre_px: Array, sigma_px: Array, count: int) -> GaussianProfile:
     """Integrate over the pixels 0 to `count` - 1, whose centres are integers.
 
     Parameters
@@ -130,7 +130,7 @@ def profile(centre_px: Array, sigma_px: Array, count: int) -> Profile:
     edges = (np.arange(count + 1) - 0.5 - centre_px[:, None]) / sigma_px[:, None]
     density = np.exp(-0.5 * edges * edges) / _ROOT_2PI
     sigma = sigma_px[:, None]
-    return Profile(
+    return GaussianProfile(
         np.diff(ndtr(edges), axis=1), -np.diff(density, axis=1) / sigma, -np.diff(edges * density, axis=1) / sigma
     )
 

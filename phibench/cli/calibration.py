@@ -168,7 +168,7 @@ def align(
     from phibench.calibration.captures.rig_file import read_rig_file, require_camera_size
     from phibench.calibration.outline.outline_start import rig_circle
     from phibench.calibration.rig.align import (
-        Numbers,
+        SphereOptions,
         alignment,
         camera_in_words,
         circle_in_words,
@@ -186,7 +186,7 @@ def align(
     from phibench.datasets.errors import DatasetError
     from phibench.datasets.frames.sensor_file import read_sensor_file
 
-    numbers = Numbers(radius_mm, distance_mm, focal_px, cx_px, cy_px, focus_mm)
+    numbers = SphereOptions(radius_mm, distance_mm, focal_px, cx_px, cy_px, focus_mm)
     numbers.require_sound()
     given = numbers.given()
     if rig is not None and given:

@@ -10,7 +10,7 @@ from cyclopts import App, Parameter
 from phibench.cli.options import SENSOR, number
 
 if TYPE_CHECKING:
-    from phibench.calibration.captures.measure import Setting
+    from phibench.calibration.captures.measure import KnownNumbers
 
 Pictures = Annotated[tuple[Path, ...], Parameter(consume_multiple=True, negative="", show_default=False)]
 Metres = Annotated[float, Parameter(converter=number)]
@@ -71,7 +71,7 @@ def measure(
     return _measure_pair((down, up, down_off, up_off), stroke_m or 0.0, setting, out)
 
 
-def _measure_pair(files: tuple[Pictures, ...], stroke_m: float, setting: Setting, out: Path | None) -> int:
+def _measure_pair(files: tuple[Pictures, ...], stroke_m: float, setting: KnownNumbers, out: Path | None) -> int:
     from phibench.calibration.captures.measure import measure as measured
     from phibench.calibration.captures.measure_picture import write_measure_picture
     from phibench.calibration.captures.pair_photos import PairPhotos, PositionPhotos
@@ -92,16 +92,16 @@ def _measure_pair(files: tuple[Pictures, ...], stroke_m: float, setting: Setting
     return 0
 
 
-def _measure_folder(directory: Path, setting: Setting, out: Path | None) -> int:
+def _measure_folder(directory: Path, setting: KnownNumbers, out: Path | None) -> int:
     """Exit code 1 if a pair could not be measured, or contradicts itself or the tape."""
-    from phibench.calibration.captures.pair_list import Result, measured_pairs, write_results
+    from phibench.calibration.captures.pair_list import PairOutcome, measured_pairs, write_results
     from phibench.datasets.errors import DatasetError
 
     if out is None or out.suffix.lower() != ".csv":
         given = "without --out" if out is None else f"--out {out}"
         raise DatasetError(f"{given}: the results of a folder are a CSV file; give --out with a name that ends in .csv")
 
-    def told(result: Result) -> None:
+    def told(result: PairOutcome) -> None:
         found = result.found
         text = "" if found is None else f"D = {found.depth_m:.4f} m, sigma {found.sigma_m:.4f} m; "
         print(f"{result.row.name}: {text}{result.status}", flush=True)

@@ -509,10 +509,10 @@ def panorama(
     from phibench.datasets.read import open_finished
     from phibench.datasets.store.files import require_writable
     from phibench.datasets.store.pictures import save_png
-    from phibench.estimator.geometry.panorama import FAR_M, Grid
+    from phibench.estimator.geometry.panorama import FAR_M, PanoramaGrid
     from phibench.estimator.geometry.panorama import panorama as unroll
 
-    grid = Grid(width, *(math.radians(each) for each in elevation_deg))
+    grid = PanoramaGrid(width, *(math.radians(each) for each in elevation_deg))
     dataset = open_finished(directory)
     (chosen,) = dataset.chosen(["0" if sample is None else sample])
     require_writable(out)

@@ -29,7 +29,7 @@ class Rgb:
 
 
 @dataclass(frozen=True)
-class Setting:
+class SceneSetting:
     """Whole number that whoever opens the scene may change by its name."""
 
     name: str
@@ -37,7 +37,7 @@ class Setting:
 
 
 @dataclass(frozen=True, eq=False)
-class Picture:
+class BitmapPlugin:
     """Linear values, shape (rows, columns, 3), float32; v = 0 is the edge of the first row."""
 
     name: str
@@ -117,7 +117,7 @@ class Plugin:
                 yield from value.all_values()
 
 
-Value = float | bool | str | Rgb | Setting | Picture | Triangles | Plugin | Array
+Value = float | bool | str | Rgb | SceneSetting | BitmapPlugin | Triangles | Plugin | Array
 
 
 def mitsuba_dict(mi: ModuleType, scene: Plugin) -> dict[str, Any]:
@@ -136,14 +136,14 @@ def _taken(mi: ModuleType, value: Value) -> Any:
     if isinstance(value, Plugin):
         if isinstance(value.values.get("filename"), Triangles):
             return _mesh(mi, value)
-        if isinstance(picture := value.values.get("filename"), Picture):
+        if isinstance(picture := value.values.get("filename"), BitmapPlugin):
             entry = mitsuba_dict(mi, value)
             del entry["filename"]
             return entry | {"bitmap": mi.Bitmap(np.array(picture.values, dtype=np.float32))}
         return mitsuba_dict(mi, value)
     if isinstance(value, Rgb):
         return {"type": "rgb", "value": [float(x) for x in value.values]}
-    if isinstance(value, Setting):
+    if isinstance(value, SceneSetting):
         return value.value
     if isinstance(value, np.ndarray):
         return mi.ScalarTransform4f(value) if value.ndim == 2 else [float(x) for x in value]

@@ -15,7 +15,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from phibench.render.plugins.plugin_tree import Picture, Plugin, Rgb, Triangles, Value
+from phibench.render.plugins.plugin_tree import BitmapPlugin, Plugin, Rgb, Triangles, Value
 from phibench.render.room.camera_plugin import MM_PER_M
 from phibench.render.room.scene import to_scene_mm
 from phibench.scenes.faces import face_table
@@ -152,6 +152,6 @@ def _albedo(texture: Texture, label: str, index: int) -> Rgb | Plugin:
 
 def _bitmap(texture: Bitmap, label: str, index: int) -> Plugin:
     """Bitmap with linear values, repeated."""
-    picture = Picture(shape_key(index), texture.values[..., :3])
+    picture = BitmapPlugin(shape_key(index), texture.values[..., :3])
     values: dict[str, Value] = {"filename": picture, "raw": True, "filter_type": "bilinear", "wrap_mode": "repeat"}
     return Plugin("texture", "bitmap", values, label=label)

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from phibench.render.plugins.plugin_tree import Plugin, Setting, Value
+from phibench.render.plugins.plugin_tree import Plugin, SceneSetting, Value
 from phibench.render.room.camera_plugin import MM_PER_M
 from phibench.scenes.camera import Camera
 from phibench.scenes.frames import Array
@@ -80,7 +80,7 @@ def sensor_plugin(view: View) -> Plugin:
     sizes = (camera.width_px, camera.height_px)
     crops = {"width": x.size, "height": y.size, "crop_offset_x": x.offset, "crop_offset_y": y.offset}
     crops |= dict(zip(("crop_width", "crop_height"), sizes, strict=True))
-    film: dict[str, Value] = {name: Setting(name, value) for name, value in crops.items()}
+    film: dict[str, Value] = {name: SceneSetting(name, value) for name, value in crops.items()}
     film |= {"pixel_format": "rgb", "component_format": "float32", "sample_border": False}
     film["rfilter"] = Plugin("rfilter", "box")
     values: dict[str, Value] = {
@@ -91,7 +91,7 @@ def sensor_plugin(view: View) -> Plugin:
         "near_clip": _NEAR_MM,
         "far_clip": _FAR_MM,
         "to_world": _to_world(view, camera, axes),
-        "sampler": Plugin("sampler", "multijitter", {"sample_count": Setting("spp", SAMPLES)}),
+        "sampler": Plugin("sampler", "multijitter", {"sample_count": SceneSetting("spp", SAMPLES)}),
         "film": Plugin("film", "hdrfilm", film),
     }
     return Plugin("sensor", "thinlens", values, label="camera")

@@ -21,7 +21,7 @@ import numpy as np
 from phibench.render.optics.beam_deposit import BEAM_REACH_M, deposit, transmittance
 from phibench.render.optics.room_tracer import RoomGeometry, room_geometry
 from phibench.render.optics.truth import spot_truth
-from phibench.render.plugins.plugin_tree import Picture, Plugin, Rgb, Value
+from phibench.render.plugins.plugin_tree import BitmapPlugin, Plugin, Rgb, Value
 from phibench.render.plugins.room_plugins import diffuse, placed
 from phibench.scenes.faces import FaceTable, IntArray
 from phibench.scenes.frames import Array, Pose, Vector, as_matrix, as_vector
@@ -211,6 +211,6 @@ def _ground(name: str, lit: Lit, albedo: Vector) -> Plugin:
 
 
 def _picture(name: str, values: Array) -> Plugin:
-    picture = Picture(name, values.astype(np.float32))
+    picture = BitmapPlugin(name, values.astype(np.float32))
     own: dict[str, Value] = {"filename": picture, "raw": True, "filter_type": "bilinear", "wrap_mode": "clamp"}
     return Plugin("texture", "bitmap", own)

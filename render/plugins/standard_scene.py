@@ -11,7 +11,7 @@ from __future__ import annotations
 from typing import Literal
 
 from phibench.render.plugins.mirror_plugins import mirror_plugin
-from phibench.render.plugins.plugin_tree import Plugin, Setting, Value
+from phibench.render.plugins.plugin_tree import Plugin, SceneSetting, Value
 from phibench.render.plugins.room_plugins import room_plugins
 from phibench.render.plugins.sensor_plugin import DEPTH, sensor_plugin
 from phibench.render.plugins.spot_plugins import spot_plugins
@@ -43,7 +43,7 @@ def standard_scene(view: View, room: Room, spot: LaserSpot | None = None, light:
     """
     depth = _SPOT_DEPTH if light == "spot" else DEPTH
     values: dict[str, Value] = {
-        "integrator": Plugin("integrator", "path", {"max_depth": Setting("max_depth", depth)}),
+        "integrator": Plugin("integrator", "path", {"max_depth": SceneSetting("max_depth", depth)}),
         "sensor": sensor_plugin(view),
         MIRROR_NAME: mirror_plugin(view),
     }

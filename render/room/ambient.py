@@ -21,7 +21,7 @@ from phibench.render.room.light_map import BakeSettings, LightMap, fixed_shapes,
 from phibench.render.room.noise_budget import BUDGET
 from phibench.render.room.refinement import render_refined
 from phibench.render.room.shading import LampOutlines, Look
-from phibench.render.room.subpixel_grid import Crop, Film, FilmGrid, Stack
+from phibench.render.room.subpixel_grid import CellSampler, Crop, FilmGrid, Stack
 from phibench.render.room.surfaces import Surfaces
 from phibench.render.room.texel_grid import TexelGrid
 from phibench.render.setup.variant import activate
@@ -114,7 +114,7 @@ def view_film(
     cells_per_pixel: int,
     seed: int,
     surfaces: Surfaces,
-) -> Film:
+) -> CellSampler:
     """Film of one view, whose cells can be sampled; arguments as for `render_ambient`."""
     mi = activate()
     table = surfaces.table
@@ -125,7 +125,7 @@ def view_film(
     # a rough mirror blurs outlines by itself, a glass tube bends the rays
     known = view.rig.mirror.roughness_alpha == 0.0 and view.tube is None and bool(table.emits.any())
     lamps = LampOutlines(mi, look, surfaces) if known else None
-    return Film(mi, look, FilmGrid.of(view.rig.camera, cells_per_pixel), seed, lamps)
+    return CellSampler(mi, look, FilmGrid.of(view.rig.camera, cells_per_pixel), seed, lamps)
 
 
 def _texel_sizes_m(surfaces: Surfaces, fixed: int, texel_m: float) -> Array:
@@ -145,7 +145,7 @@ def _bands(grid: FilmGrid, window: Crop) -> list[Crop]:
     return [(u0, v, width, min(rows, v0 + height - v)) for v in range(v0, v0 + height, rows)]
 
 
-def _band(film: Film, band: Crop, window: Crop, rounds: int, budget: float) -> tuple[Stack, Stack]:
+def _band(film: CellSampler, band: Crop, window: Crop, rounds: int, budget: float) -> tuple[Stack, Stack]:
     """Pixels of a band, refined with its neighbourhood: what is beyond it reaches the band by less than the budget."""
     u0, v0, width, height = band
     top, bottom = max(v0 - _OVERLAP_PX, window[1]), min(v0 + height + _OVERLAP_PX, window[1] + window[3])

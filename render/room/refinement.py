@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from phibench.render.room.noise_budget import allowed_per_s2, excess, is_full
-from phibench.render.room.subpixel_grid import Crop, Film, FilmGrid, Samples, Stack
+from phibench.render.room.subpixel_grid import CellSampler, Crop, FilmGrid, Samples, Stack
 
 _TILE_PX = 48
 _SIDES = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)  # strata along a cell; few values, few kernel launches
@@ -68,7 +68,7 @@ class Cells:
     lamps: NDArray[np.int32]
 
 
-def render_refined(film: Film, window: Crop, rounds: int, budget: float) -> tuple[Stack, Stack]:
+def render_refined(film: CellSampler, window: Crop, rounds: int, budget: float) -> tuple[Stack, Stack]:
     """Pixels of a window and their variance, shape (3, height, width) each.
 
     All cells get two samples. Those that see the mirror, and the few around them, are then refined.
@@ -129,7 +129,7 @@ def _cells(
     return Cells(grid, numbers, side, mean, variance, pixels, tight, suspected, mirrored, budget, lamps)
 
 
-def refine(film: Film, cells: Cells, turn: int) -> bool:
+def refine(film: CellSampler, cells: Cells, turn: int) -> bool:
     """Sample cells near pixels that are over their budget again; False if there are none.
 
     Parameters
@@ -194,7 +194,9 @@ def _wanted(cells: Cells, chosen: NDArray[np.intp], near: Stack, tight: Stack) -
     return np.where(side == 1, blind, informed).astype(np.int32)
 
 
-def _sample_again(film: Film, cells: Cells, chosen: NDArray[np.intp], side: NDArray[np.int32], turn: int) -> None:
+def _sample_again(
+    film: CellSampler, cells: Cells, chosen: NDArray[np.intp], side: NDArray[np.int32], turn: int
+) -> None:
     """Replace what is known of some cells (flat indices) by new samples."""
     lamps = cells.lamps.ravel()[chosen]
     for part, near in ((lamps < 0, None), (lamps >= 0, lamps[lamps >= 0])):
@@ -205,7 +207,7 @@ def _sample_again(film: Film, cells: Cells, chosen: NDArray[np.intp], side: NDAr
     _without_hidden_lamps(film, cells, turn)
 
 
-def _without_hidden_lamps(film: Film, cells: Cells, turn: int) -> None:
+def _without_hidden_lamps(film: CellSampler, cells: Cells, turn: int) -> None:
     """Sample cells again by chance around those whose mean is negative: no cell that sees its lamp has such a mean.
 
     The samples are new ones: those that told of it have met more of what hides the lamp than others.
@@ -233,7 +235,7 @@ def _replace(cells: Cells, chosen: NDArray[np.intp], side: NDArray[np.int32], a:
     cells.side.ravel()[chosen] = side
 
 
-def _lamps_near(film: Film, numbers: NDArray[np.uint32], patches: list[NDArray[np.uint32]]) -> NDArray[np.int32]:
+def _lamps_near(film: CellSampler, numbers: NDArray[np.uint32], patches: list[NDArray[np.uint32]]) -> NDArray[np.int32]:
     """Brightest lamp that samples of cells within the blur's reach met, shape (rows, columns), -1 for none.
 
     None either where a sample in reach met the outline of that lamp but not the lamp. What a hidden lamp would cover

@@ -199,7 +199,7 @@ class Samples:
     patch: NDArray[np.uint32]
 
 
-class Film:
+class CellSampler:
     """Samples cells; what a cell gets depends on its number, the seed and the stream alone.
 
     Parameters

@@ -47,7 +47,7 @@ _COLOURS: dict[State, str] = {"ok": "green", "optional": "dim", "warning": "yell
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class Diagnosis:
     """One line of the table; `advice` says what to do about it."""
 
     subject: str
@@ -56,7 +56,7 @@ class Finding:
     advice: str = ""
 
 
-def examine() -> Iterator[Finding]:
+def examine() -> Iterator[Diagnosis]:
     """Look at everything, cheap things first."""
     yield python_finding(sys.version_info[:3])
     packages = list(package_findings(pinned_versions()))
@@ -67,7 +67,7 @@ def examine() -> Iterator[Finding]:
         yield scoring_finding(after=packages)
         return
     variant = os.environ.get(ENVIRONMENT) or default_variant()
-    yield Finding("variant", variant)
+    yield Diagnosis("variant", variant)
     llvm = llvm_finding(is_needed=variant.startswith("llvm"))
     yield llvm
     yield cores_finding()
@@ -75,13 +75,13 @@ def examine() -> Iterator[Finding]:
     yield image_finding(after=[*packages, llvm])
 
 
-def python_finding(version: tuple[int, ...]) -> Finding:
+def python_finding(version: tuple[int, ...]) -> Diagnosis:
     """Judge the version of Python."""
     text = f"{'.'.join(map(str, version))} on {platform.system()} {platform.machine()}"
     if version >= OLDEST_PYTHON:
-        return Finding("Python", text)
+        return Diagnosis("Python", text)
     oldest = ".".join(map(str, OLDEST_PYTHON))
-    return Finding("Python", text, "fault", f"Python is too old: make the environment with Python {oldest} or later.")
+    return Diagnosis("Python", text, "fault", f"Python is too old: make the environment with Python {oldest} or later.")
 
 
 def pinned_versions() -> dict[str, str]:
@@ -91,13 +91,13 @@ def pinned_versions() -> dict[str, str]:
     return dict(line.strip().split("==", 1) for line in lines if "==" in line)
 
 
-def package_findings(pinned: dict[str, str]) -> Iterator[Finding]:
+def package_findings(pinned: dict[str, str]) -> Iterator[Diagnosis]:
     """Compare what is installed with what this checkout was tested with."""
     for name in CORE:
         yield package_finding(name, pinned.get(name))
     for name in RENDER:
         absent = is_scoring_only()
-        yield Finding(name, "not installed", "optional") if absent else package_finding(name, pinned.get(name))
+        yield Diagnosis(name, "not installed", "optional") if absent else package_finding(name, pinned.get(name))
     for name in sorted(set(pinned) - set(CORE) - set(RENDER)):
         finding = package_finding(name, pinned[name])
         # What the tests or the checks need may be absent; what is there should be what was tested.
@@ -105,37 +105,37 @@ def package_findings(pinned: dict[str, str]) -> Iterator[Finding]:
             yield finding
 
 
-def package_finding(name: str, pinned: str | None) -> Finding:
+def package_finding(name: str, pinned: str | None) -> Diagnosis:
     """Judge one package: absent is a fault, another version than the pinned one a warning."""
     try:
         installed = metadata.version(name)
     except metadata.PackageNotFoundError:
         extra = "phibench[render]" if name in RENDER else "phibench"
-        return Finding(name, "not installed", "fault", f"{name} is not installed: run `pip install '{extra}'`.")
+        return Diagnosis(name, "not installed", "fault", f"{name} is not installed: run `pip install '{extra}'`.")
     if pinned in (None, installed):
-        return Finding(name, installed)
+        return Diagnosis(name, installed)
     advice = f"{name} is {installed}, tested with {pinned}: run `pip install -c constraints.txt {name}`."
-    return Finding(name, installed, "warning", advice)
+    return Diagnosis(name, installed, "warning", advice)
 
 
-def llvm_finding(*, is_needed: bool) -> Finding:
+def llvm_finding(*, is_needed: bool) -> Diagnosis:
     """Find an LLVM and prove it; without one only the variants that need none can be used."""
     state: State = "fault" if is_needed else "warning"
     try:
         llvm = find_llvm()
     except LlvmError as error:
-        return Finding("LLVM", "none usable", state, f"LLVM: {error}")
+        return Diagnosis("LLVM", "none usable", state, f"LLVM: {error}")
     text = f"{llvm.label} at {llvm.path}"
     if not is_installed("drjit"):
-        return Finding("LLVM", f"{text}, untried without drjit")
+        return Diagnosis("LLVM", f"{text}, untried without drjit")
     if fault := prove(llvm):
-        return Finding(
+        return Diagnosis(
             "LLVM",
             text,
             state,
             f"LLVM {llvm.label} fails the proof, {fault}: {_remedy(fault)}.",
         )
-    return Finding("LLVM", text)
+    return Diagnosis("LLVM", text)
 
 
 def _remedy(fault: str) -> str:
@@ -156,42 +156,42 @@ def is_scoring_only() -> bool:
     return not any(is_installed(name) for name in RENDER)
 
 
-def scoring_finding(after: list[Finding]) -> Finding:
+def scoring_finding(after: list[Diagnosis]) -> Diagnosis:
     """Say what an installation without the renderer can do, unless something it needs is already found missing."""
     if any(finding.state == "fault" for finding in after):
-        return Finding("use", "scoring only, once the faults are set right")
+        return Diagnosis("use", "scoring only, once the faults are set right")
     advice = f"scoring works; rendering needs {' and '.join(RENDER)}: run `pip install 'phibench[render]'`."
-    return Finding("use", "scoring works, no renderer", "warning", advice)
+    return Diagnosis("use", "scoring works, no renderer", "warning", advice)
 
 
-def cores_finding() -> Finding:
+def cores_finding() -> Diagnosis:
     """Count the cores that this process may use."""
-    return Finding("cores", str(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()))
+    return Diagnosis("cores", str(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()))
 
 
-def disk_finding(folder: Path) -> Finding:
+def disk_finding(folder: Path) -> Diagnosis:
     """Judge the free space where data sets are written by default."""
     free = shutil.disk_usage(folder).free / 2**30
     text = f"{free:.1f} GiB free in the current folder"
     if free >= LEAST_DISK_GIB:
-        return Finding("disk", text)
-    return Finding(
+        return Diagnosis("disk", text)
+    return Diagnosis(
         "disk", text, "warning", f"only {free:.1f} GiB are free here: write data sets elsewhere with `--out`."
     )
 
 
-def image_finding(after: list[Finding]) -> Finding:
+def image_finding(after: list[Diagnosis]) -> Diagnosis:
     """Render the known image in a child process, unless something it needs is already found missing."""
     if causes := [finding.subject for finding in after if finding.state == "fault"]:
         advice = f"no test image was rendered: set right first {', '.join(causes)}."
-        return Finding("test image", "not tried", "fault", advice)
+        return Diagnosis("test image", "not tried", "fault", advice)
     if fault := fault_of("phibench.render.setup.selftest", timeout_s=_RENDER_S):
         advice = f"the test image failed, {fault}: run `python -m phibench.render.setup.selftest` to see all of it."
-        return Finding("test image", "wrong", "fault", advice)
-    return Finding("test image", "rendered, values as expected")
+        return Diagnosis("test image", "wrong", "fault", advice)
+    return Diagnosis("test image", "rendered, values as expected")
 
 
-def show(findings: list[Finding]) -> None:
+def show(findings: list[Diagnosis]) -> None:
     """Print the table, then one line per warning or fault."""
     from rich.console import Console
     from rich.markup import escape

@@ -45,7 +45,7 @@ _SMALL = 1e-4  # of slip and skid, for differences
 
 
 @dataclass(frozen=True)
-class Way:
+class RobotWay:
     """Way of a robot as it is told, at N times.
 
     Attributes
@@ -129,7 +129,9 @@ class DrivingDepth:
     uv_px: Array
 
 
-def driving_depth(rig: Rig, way: Way, positions: FilmPositions, covariance_rig: Array | None = None) -> DrivingDepth:
+def driving_depth(
+    rig: Rig, way: RobotWay, positions: FilmPositions, covariance_rig: Array | None = None
+) -> DrivingDepth:
     """Fit the point of a film of a robot that drives with the carriage down.
 
     Parameters
@@ -175,7 +177,7 @@ def _independent(covariance: Array | None) -> Array:
 @dataclass(frozen=True)
 class _Problem:
     rig: Rig
-    way: Way
+    way: RobotWay
     keep: Index
     positions: FilmPositions
     parts: Array
@@ -329,7 +331,7 @@ def driving_film_depth(
         times = frames.times.row_s(numbers.astype(float), places[:, 1])
         # tracks are read with every frame, and run evenly from one to the next
         tracks = np.stack([np.interp(times, frames.times.frame_s, one) for one in read.T], axis=1)
-        way = Way(drive.vehicle, tracks, drive.state(times)[:, 3])
+        way = RobotWay(drive.vehicle, tracks, drive.state(times)[:, 3])
         found = driving_depth(frames.rig, way, _spread(positions, on, len(numbers)), covariance_rig)
         if abs(found.depth_m[0] - before_m) < _SAME * found.sigma_m[0]:
             break

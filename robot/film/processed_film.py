@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from phibench.estimator.processed.fit_chain import spot_window, undone, unrounded
 from phibench.estimator.processed.interval_fit import interval_posterior
-from phibench.estimator.processed.quasi_score import Window, fit_window
+from phibench.estimator.processed.quasi_score import CoefficientWindow, fit_window
 from phibench.estimator.spots.fisher import covariance_bound, scoring_step
 from phibench.estimator.spots.fit_raw import LEAST_SNR
 from phibench.estimator.spots.gaussian_spot import SpotModel
@@ -72,7 +72,7 @@ def processed_positions(frames: FilmFrames, point_world_m: Array, which: Index) 
     return FilmPositions(uv, noise, nothing), offsets[which]
 
 
-def _of_intervals(window: Window, start: Array) -> tuple[Array, Array]:
+def _of_intervals(window: CoefficientWindow, start: Array) -> tuple[Array, Array]:
     """Unknowns and Fisher matrix by the likelihood alone; NaN where the posterior is none."""
     found = interval_posterior(window, start, _PREDICTED_PX)
     if found is None or not found.settled:
@@ -82,7 +82,7 @@ def _of_intervals(window: Window, start: Array) -> tuple[Array, Array]:
     return found.theta + scoring_step(fisher[None], (J @ r)[None])[0], fisher
 
 
-def _of_score(window: Window, start: Array) -> tuple[Array, Array]:
+def _of_score(window: CoefficientWindow, start: Array) -> tuple[Array, Array]:
     found = fit_window(window, start[None])
     return (found.theta if found.converged else np.full(len(start), np.nan)), found.fisher
 

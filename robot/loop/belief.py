@@ -26,7 +26,7 @@ import numpy as np
 
 from phibench.estimator.geometry.sphere_image import SphereImager
 from phibench.estimator.geometry.triangulate import depth_exact
-from phibench.robot.loop.sensing import Direction, Reading, wrapped
+from phibench.robot.loop.sensing import Direction, SpotReading, wrapped
 from phibench.scenes.frames import Array
 from phibench.scenes.motion.vehicle import PlanarPose, Stance, Vehicle, arc_covariance, rig_placement
 from phibench.scenes.rig import Rig
@@ -396,9 +396,9 @@ class PairTracker:
     def __init__(self, rig: Rig, least_stroke_m: float = 0.2) -> None:
         self.rig, self.least_stroke_m = rig, least_stroke_m
         self.distance_m, self.distance_sigma_m = math.nan, math.nan
-        self._frames: list[tuple[float, Reading]] = []
+        self._frames: list[tuple[float, SpotReading]] = []
 
-    def update(self, reading: Reading, stroke_m: float) -> None:
+    def update(self, reading: SpotReading, stroke_m: float) -> None:
         """Take in a frame."""
         apart = [frame for frame in self._frames if abs(frame[0] - stroke_m) >= self.least_stroke_m]
         self._frames.append((stroke_m, reading))

@@ -23,7 +23,7 @@ _PATTERN_REACH_PX, _TEXTURE_REACH_M = 1.0, 0.5
 
 
 @dataclass(frozen=True)
-class Frames:
+class FrameHistory:
     """N frames in order.
 
     Attributes
@@ -54,15 +54,15 @@ class Frames:
     shared_px: Array
     stroke_sigma_m: Array
 
-    def joined(self, other: Frames) -> Frames:
+    def joined(self, other: FrameHistory) -> FrameHistory:
         """Both, this one's first."""
-        return Frames(*(np.concatenate([getattr(self, n), getattr(other, n)]) for n in self.__dataclass_fields__))
+        return FrameHistory(*(np.concatenate([getattr(self, n), getattr(other, n)]) for n in self.__dataclass_fields__))
 
-    def thinned(self) -> Frames:
+    def thinned(self) -> FrameHistory:
         """Every other frame of the older half, and all of the newer."""
         n = len(self.time_s)
         keep = np.concatenate([np.arange(0, n // 2, 2), np.arange(n // 2, n)])
-        return Frames(*(getattr(self, name)[keep] for name in self.__dataclass_fields__))
+        return FrameHistory(*(getattr(self, name)[keep] for name in self.__dataclass_fields__))
 
 
 @dataclass(frozen=True)
@@ -84,14 +84,14 @@ class Course:
         P[:2] += self.place_m[-1]
         return np.asarray(P)
 
-    def seen_from(self, frames: Frames, point_m: Array, velocity_m_per_s: Array, time_s: float) -> Array:
+    def seen_from(self, frames: FrameHistory, point_m: Array, velocity_m_per_s: Array, time_s: float) -> Array:
         """Places, in the rig's frame at each frame, of what is at a point at a time; shape (N, 3)."""
         points = point_m - (time_s - frames.time_s)[:, None] * velocity_m_per_s
         points[:, :2] -= self.place_m[frames.steps]
         level = np.einsum("nji,nj->ni", _yaw(self.heading_rad[frames.steps]), points) - self.sensor_m
         return np.einsum("nji,nj->ni", frames.turned, level - frames.origin_m)
 
-    def slopes(self, frames: Frames, E: Array) -> Array:
+    def slopes(self, frames: FrameHistory, E: Array) -> Array:
         """F of the frames, by the target's place, from slopes by the place in the rig's frame; shape (N, 2, 3)."""
         yaw = _yaw(self.heading_rad[frames.steps])
         return np.asarray(E @ np.swapaxes(frames.turned, 1, 2) @ np.swapaxes(yaw, 1, 2))
@@ -107,7 +107,7 @@ def _yaw(heading_rad: Array) -> Array:
 
 
 @dataclass(frozen=True)
-class Way:
+class TrackSteps:
     """Steps of the tracks since the first frame.
 
     Attributes
@@ -136,7 +136,7 @@ class Way:
         """Way before each step, shape (S + 1,)."""
         return np.concatenate([[0.0], np.cumsum(np.abs(self.tracks_m).mean(axis=1))])
 
-    def after(self, left_m: float, right_m: float, step_s: float) -> Way:
+    def after(self, left_m: float, right_m: float, step_s: float) -> TrackSteps:
         """Way with another step; one that moves no track takes time only."""
         later = replace(self, time_s=self.time_s + step_s)
         if not (left_m or right_m):
@@ -156,7 +156,7 @@ class Way:
         places = np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
         return Course(heading, places, np.array([self.vehicle.sensor_x_m, 0.0, 0.0]))
 
-    def shared_by_steps(self, course: Course, point_m: Array, frames: Frames, F: Array) -> Array:
+    def shared_by_steps(self, course: Course, point_m: Array, frames: FrameHistory, F: Array) -> Array:
         """Covariance of residuals by random parts of the steps between frames and now, shape (N, 2, N, 2)."""
         n = len(frames.time_s)
         S = self._place_covariance(course, point_m)[frames.steps]
@@ -183,7 +183,7 @@ def shared_by_motion(acceleration_m2_per_s3: float, lag_s: Array, F: Array) -> A
     return np.asarray(K[:, None, :, None] * (flat @ flat.T).reshape(n, 2, n, 2))
 
 
-def shared_px2(frames: Frames, driven_m: Array) -> Array:
+def shared_px2(frames: FrameHistory, driven_m: Array) -> Array:
     """Covariance of pixels that frames share, each coordinate, shape (N, N): fixed pattern, and the wall's texture.
 
     The pattern is that of the pixels under the spot. The texture stays where it is around the spot while only the

@@ -19,7 +19,7 @@ import numpy as np
 
 from phibench.estimator.geometry.rig_parameters import RigBias
 from phibench.robot.loop.belief import Belief
-from phibench.robot.loop.sensing import Direction, Reading, direction_read
+from phibench.robot.loop.sensing import Direction, SpotReading, direction_read
 from phibench.robot.loop.simulator import CODES, Action, Known, Observation, Simulator
 from phibench.robot.loop.smoothing import belief_of
 from phibench.scenes.frames import Array
@@ -56,7 +56,7 @@ class Identifier:
     lit: list[bool] = field(default_factory=list)
     places: list[tuple[float, float]] = field(default_factory=list)
     seen: list[list[bool]] = field(default_factory=list)
-    latest: list[Reading] = field(default_factory=list)
+    latest: list[SpotReading] = field(default_factory=list)
 
     def add(self, observation: Observation) -> None:
         """Take in a frame."""
@@ -67,7 +67,7 @@ class Identifier:
             self.seen[k][-1], self.latest[k] = True, spot
         self.lit.append(observation.lit)
 
-    def _place_of(self, spot: Reading, before: int) -> int:
+    def _place_of(self, spot: SpotReading, before: int) -> int:
         for k, (u, v) in enumerate(self.places):
             if math.hypot(spot.u_px - u, spot.v_px - v) < _SAME_PX:
                 return k
@@ -76,7 +76,7 @@ class Identifier:
         self.latest.append(spot)
         return len(self.places) - 1
 
-    def target(self) -> Reading | None:
+    def target(self) -> SpotReading | None:
         """Latest reading of the spot that agrees with the code; None before a whole code, or where none does."""
         if len(self.lit) < len(CODES[CODED]) or not self.places:
             return None
@@ -145,7 +145,7 @@ class SearchingPolicy(abc.ABC):
                 if (spot := found.target()) is not None and self._lock(spot):
                     return
 
-    def _lock(self, spot: Reading) -> bool:
+    def _lock(self, spot: SpotReading) -> bool:
         first = direction_read(self.known.rig, spot)
         if first is None:
             return False
@@ -267,7 +267,7 @@ class DriveOnly(SearchingPolicy):
 
 
 @dataclass(frozen=True)
-class Plan:
+class ApproachPlan:
     """Stroke before the drive, stroke after it, metres; and what is expected: time and standard deviation of D."""
 
     before_m: float
@@ -295,18 +295,18 @@ class GreedyInformation(SearchingPolicy):
             yield from self.stroke(here + after if here + after <= self.known.task.stroke_m else here - after)
         yield from self.state()
 
-    def best(self, arrived: bool = False) -> Plan:
+    def best(self, arrived: bool = False) -> ApproachPlan:
         """Quickest plan that is sure enough; the surest one where none is."""
         if arrived:
-            plans = [self.expected(Plan(0.0, h)) for h in self.strokes_m[1:]]
+            plans = [self.expected(ApproachPlan(0.0, h)) for h in self.strokes_m[1:]]
         else:
-            plans = [self.expected(Plan(a, b)) for a in self.strokes_m for b in (0.0, 0.1, 0.2)]
+            plans = [self.expected(ApproachPlan(a, b)) for a in self.strokes_m for b in (0.0, 0.1, 0.2)]
         enough = [plan for plan in plans if plan.sigma_m <= goal_sigma_m(self.known)]
         if enough:
             return min(enough, key=lambda plan: plan.time_s)
         return min(plans, key=lambda plan: plan.sigma_m)
 
-    def expected(self, plan: Plan) -> Plan:
+    def expected(self, plan: ApproachPlan) -> ApproachPlan:
         """The plan with its expected time and standard deviation: the belief's own filter, fed with its own mean."""
         belief, task = self.target.copied(), self.known.task
         noise = self._frame_noise()
@@ -323,7 +323,7 @@ class GreedyInformation(SearchingPolicy):
                 belief.imagine(here, noise / frames)
         self._imagine_stroke(belief, here, plan.after_m, noise)
         time_s = (plan.before_m + plan.after_m) / _STROKE_SPEED + abs(way) / fastest
-        return Plan(plan.before_m, plan.after_m, time_s, belief.distance_sigma_m)
+        return ApproachPlan(plan.before_m, plan.after_m, time_s, belief.distance_sigma_m)
 
     def _imagine_stroke(self, belief: Belief, from_m: float, way_m: float, noise: Array) -> float:
         if way_m == 0.0:

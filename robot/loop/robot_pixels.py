@@ -28,7 +28,7 @@ from phibench.estimator.spots.gaussian_spot import SpotBlur
 from phibench.estimator.spots.image_planes import colour_planes
 from phibench.estimator.spots.raw_pixels import noise_of, raw_electrons
 from phibench.estimator.spots.spot_prediction import Laser, spot_blur
-from phibench.robot.loop.sensing import EXPOSURES_S, SEEN, Light, Reading
+from phibench.robot.loop.sensing import EXPOSURES_S, SEEN, SpotOnSurface, SpotReading
 from phibench.scenes.frames import Array, BoolArray, as_vector
 from phibench.scenes.laser import LaserSpot, beam_diameter_m
 from phibench.scenes.random_streams import Name
@@ -92,7 +92,7 @@ class RobotCamera:
     def take(
         self,
         room: BakedRoom,
-        lights: Sequence[tuple[Light, float, float]],
+        lights: Sequence[tuple[SpotOnSurface, float, float]],
         placement: tuple[Array, Array],
         stroke_m: float,
         exposure: int,
@@ -129,7 +129,7 @@ class RobotCamera:
         drawn = camera.frames(light, EXPOSURES_S[exposure], regions, *stream)
         return tuple(Window(r.u0_px, r.v0_px, pixels) for r, pixels in zip(regions, drawn, strict=True))
 
-    def _spot(self, light: Light, placement: tuple[Array, Array]) -> LaserSpot:
+    def _spot(self, light: SpotOnSurface, placement: tuple[Array, Array]) -> LaserSpot:
         R, origin = placement
         own = (light.point_m - origin) @ R
         return LaserSpot(
@@ -175,18 +175,18 @@ class SpotReader:
         self._sigma_px = rig.camera.blur_sigma_px
         self._disc = _inside_outline(rig) if fidelity == "frames" else None
 
-    def read(self, windows: Sequence[Window], exposure: int) -> tuple[Reading, ...]:
+    def read(self, windows: Sequence[Window], exposure: int) -> tuple[SpotReading, ...]:
         """Spots by rising u; of a whole frame the strongest ones."""
         card = self._cards[exposure]
         found = [reading for window in windows for reading in self._in_window(window, card)]
         found.sort(key=lambda reading: -reading.electrons)
-        apart: list[Reading] = []
+        apart: list[SpotReading] = []
         for one in found:
             if all(math.hypot(one.u_px - other.u_px, one.v_px - other.v_px) > _APART_PX for other in apart):
                 apart.append(one)
         return tuple(sorted(apart[:_MOST_SPOTS]))
 
-    def _in_window(self, window: Window, card: SensorCard) -> list[Reading]:
+    def _in_window(self, window: Window, card: SensorCard) -> list[SpotReading]:
         height, width = window.pixels.shape
         planes = colour_planes(window.pixels, card, Box(0, 0, width, height))
         inside = np.ones((height, width), bool)
@@ -199,7 +199,7 @@ class SpotReader:
         corner = corner[np.all((corner >= 0) & (corner + size <= (width, height)), axis=1)]
         return self._fitted(window, corner, size, card)
 
-    def _fitted(self, window: Window, corner: NDArray[np.int64], size: int, card: SensorCard) -> list[Reading]:
+    def _fitted(self, window: Window, corner: NDArray[np.int64], size: int, card: SensorCard) -> list[SpotReading]:
         if not len(corner):
             return []
         regions = np.stack([window.pixels[v : v + size, u : u + size] for u, v in corner])
@@ -215,7 +215,7 @@ class SpotReader:
         good = (fit.status == Status.OK) & (sigma <= 2.0 * self._sigma_px / self._least_z)
         texture = bound * np.sqrt(np.maximum(fit.chi2 - 1.0, 0.0))
         rows = np.column_stack([fit.uv_px, sigma, fit.flux_e, texture])[good]
-        return [Reading(u, v, s, e, SEEN, _PATTERN_PX, t) for u, v, s, e, t in rows.tolist()]
+        return [SpotReading(u, v, s, e, SEEN, _PATTERN_PX, t) for u, v, s, e, t in rows.tolist()]
 
 
 def _inside_outline(rig: Rig) -> BoolArray:

@@ -41,7 +41,7 @@ OUTSIDE, HIDDEN, FAINT, BRIGHT, DARK = (
 SEEN = ""
 
 
-class Light(NamedTuple):
+class SpotOnSurface(NamedTuple):
     """Spot on a surface.
 
     Attributes
@@ -56,7 +56,7 @@ class Light(NamedTuple):
     power: float
 
 
-class Reading(NamedTuple):
+class SpotReading(NamedTuple):
     """One spot in one image.
 
     Attributes
@@ -88,9 +88,9 @@ class _Seen(NamedTuple):
     facing: float
 
 
-def unseen(cause: str) -> Reading:
+def unseen(cause: str) -> SpotReading:
     """Reading of a spot that is not seen."""
-    return Reading(0.0, 0.0, 0.0, 0.0, cause)
+    return SpotReading(0.0, 0.0, 0.0, 0.0, cause)
 
 
 @dataclass(frozen=True)
@@ -148,13 +148,13 @@ class Sensing:
 
     def read(
         self,
-        lights: Sequence[Light],
+        lights: Sequence[SpotOnSurface],
         placement: tuple[Array, Array],
         stroke_m: float,
         exposure: int,
         arena: Arena | None,
         rng: np.random.Generator | None,
-    ) -> list[Reading]:
+    ) -> list[SpotReading]:
         """Readings of spots, in their order.
 
         Parameters
@@ -179,7 +179,7 @@ class Sensing:
         ]
 
     def unhidden(
-        self, lights: Sequence[Light], placement: tuple[Array, Array], stroke_m: float, arena: Arena
+        self, lights: Sequence[SpotOnSurface], placement: tuple[Array, Array], stroke_m: float, arena: Arena
     ) -> list[tuple[float, float] | str]:
         """Pixel of each light that a baked room shows, by the room's own shapes; else the cause, `OUTSIDE` or `HIDDEN`.
 
@@ -200,13 +200,13 @@ class Sensing:
         return result
 
     def _in_shadow(
-        self, seen: _Seen, light: Light, placement: tuple[Array, Array], stroke_m: float, room: BakedRoom
+        self, seen: _Seen, light: SpotOnSurface, placement: tuple[Array, Array], stroke_m: float, room: BakedRoom
     ) -> bool:
         mirror = np.array(self.imager.mirror_point_m(seen.image, *seen.lowered_m.tolist())) + stroke_m * self._axis
         start = mirror @ placement[0].T + placement[1]
         return room.blocks(start, light.point_m)
 
-    def _image(self, light: Light, R: Array, origin: Array, stroke_m: float) -> _Seen | None:
+    def _image(self, light: SpotOnSurface, R: Array, origin: Array, stroke_m: float) -> _Seen | None:
         own = (light.point_m - origin) @ R
         lowered = own - stroke_m * self._axis
         image = self.imager.image(*lowered.tolist())
@@ -214,7 +214,7 @@ class Sensing:
 
     def _reading(
         self, seen: _Seen | None, power: float, exposure: int, rng: np.random.Generator | None, hidden: bool
-    ) -> Reading:
+    ) -> SpotReading:
         if seen is None:
             return unseen(OUTSIDE)
         if hidden or seen.facing <= 0.0:
@@ -226,7 +226,7 @@ class Sensing:
         if not sigma <= FAINTEST_PX:
             return unseen(BRIGHT if math.isnan(sigma) else FAINT)
         du, dv = (0.0, 0.0) if rng is None else (sigma * rng.standard_normal(2)).tolist()
-        return Reading(image.u_px + du, image.v_px + dv, sigma, electrons, SEEN)
+        return SpotReading(image.u_px + du, image.v_px + dv, sigma, electrons, SEEN)
 
     def _hidden(
         self,
@@ -293,7 +293,7 @@ def direction_of(rig: Rig, u_px: float, v_px: float, sigma_px: float) -> Directi
     return direction_with(rig, u_px, v_px, sigma_px**2 * np.eye(2))
 
 
-def direction_read(rig: Rig, reading: Reading) -> Direction | None:
+def direction_read(rig: Rig, reading: SpotReading) -> Direction | None:
     """Direction of a reading, with what its error shares with that of other frames."""
     found = direction_of(rig, reading.u_px, reading.v_px, reading.sigma_px)
     return None if found is None else replace(found, shared_px=(reading.pattern_px, reading.texture_px))

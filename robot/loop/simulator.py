@@ -17,7 +17,7 @@ import numpy as np
 from phibench.estimator.spots.spot_prediction import Laser
 from phibench.robot.loop.arena import Arena, Target, plain_arena
 from phibench.robot.loop.robot_pixels import FIDELITIES, Fidelity, RobotCamera, SpotReader, Window, pixel_form
-from phibench.robot.loop.sensing import DARK, EXPOSURES_S, FAINT, SEEN, Light, Reading, Sensing
+from phibench.robot.loop.sensing import DARK, EXPOSURES_S, FAINT, SEEN, Sensing, SpotOnSurface, SpotReading
 from phibench.scenes.frames import Array
 from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.motion.vehicle import Obstacle, PlanarPose, Stance, Vehicle, rig_placement, stance
@@ -94,7 +94,7 @@ class Observation(NamedTuple):
     roll_rad: float
     stroke_m: float
     lit: bool
-    spots: tuple[Reading, ...]
+    spots: tuple[SpotReading, ...]
     windows: tuple[Window, ...] = ()
 
     def attitude(self, vehicle: Vehicle) -> Stance | None:
@@ -230,7 +230,7 @@ class Setup:
 class _Light:
     """A spot in the room that is not the target's."""
 
-    spot: Light
+    spot: SpotOnSurface
     bits: str
 
 
@@ -267,7 +267,10 @@ class Simulator:
         self.stream, self._rng = stream, rng
         self.arena, self.target = self._place(rng, stream)
         self._lights = [
-            _Light(Light(*self.arena.draw_distractor(rng), float(rng.uniform(0.3, 3.0))), str(rng.choice(_OTHER_CODES)))
+            _Light(
+                SpotOnSurface(*self.arena.draw_distractor(rng), float(rng.uniform(0.3, 3.0))),
+                str(rng.choice(_OTHER_CODES)),
+            )
             for _ in range(task.lights)
         ]
         self.slip = float(np.clip(setup.vehicle.slip + setup.vehicle.slip_sigma * rng.standard_normal(), -0.2, 0.5))
@@ -426,7 +429,7 @@ class Simulator:
     def _observe(self, action: Action, left_m: float, right_m: float) -> Observation:
         lit = CODES[action.code][self.step % len(CODES[action.code])] == "1"
         on = [light.spot for light in self._lights if light.bits[self.step % len(light.bits)] == "1"]
-        lights = [Light(*self.target, self.setup.task.power), *on] if lit else on
+        lights = [SpotOnSurface(*self.target, self.setup.task.power), *on] if lit else on
         windows: tuple[Window, ...] = ()
         if self._camera is None:
             read = self._sensing.read(lights, self.placement, self.raised_m, action.exposure, self.arena, self._rng)
@@ -439,8 +442,8 @@ class Simulator:
         return Observation(self.step, left_m, right_m, *held, lit, spots, windows)
 
     def _look(
-        self, camera: RobotCamera, lights: Sequence[Light], exposure: int, lit: bool
-    ) -> tuple[tuple[Window, ...], tuple[Reading, ...]]:
+        self, camera: RobotCamera, lights: Sequence[SpotOnSurface], exposure: int, lit: bool
+    ) -> tuple[tuple[Window, ...], tuple[SpotReading, ...]]:
         """Pixels, and the spots that are read in them."""
         room = self.arena.baked
         assert room is not None
@@ -453,7 +456,7 @@ class Simulator:
         return windows, spots
 
 
-def _cause_of(place: tuple[float, float] | str, spots: Sequence[Reading], read: bool) -> str:
+def _cause_of(place: tuple[float, float] | str, spots: Sequence[SpotReading], read: bool) -> str:
     """Cause that the target is not among the spots."""
     if isinstance(place, str):
         return place

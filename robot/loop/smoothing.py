@@ -29,7 +29,7 @@ from phibench.estimator.geometry.reflection import reflect
 from phibench.estimator.geometry.rig_parameters import RigBias, changed, stroke_of
 from phibench.robot.film.film_positions import FilmPositions
 from phibench.robot.loop.belief import ANY_TARGET, LEAST_Q, SKID, SLIP, VELOCITY, Belief, TargetBelief, TargetPrior
-from phibench.robot.loop.kept_frames import Course, Frames, Way, shared_by_motion, shared_px2
+from phibench.robot.loop.kept_frames import Course, FrameHistory, TrackSteps, shared_by_motion, shared_px2
 from phibench.robot.loop.sensing import Direction, angle_slopes, angles, direction_with, turned, wrapped
 from phibench.scenes.frames import Array
 from phibench.scenes.motion.vehicle import Stance, Vehicle
@@ -100,14 +100,14 @@ class SmoothedBelief(Belief):
         self._bias, of_target = bias, 8 if prior.moves else 5
         n = of_target + bias.count
         self._deviations = slice(of_target, n)
-        self._way = Way(vehicle)
+        self._way = TrackSteps(vehicle)
         x, q = np.zeros(n), prior.q
         x[:5] = first.azimuth_rad, first.rise + stroke_m * q, q, vehicle.slip, vehicle.skid
         self._prior, self._precision = x.copy(), np.zeros(n)
         self._precision[[SLIP, SKID]] = 1.0 / (np.array([vehicle.slip_sigma, vehicle.skid_sigma]) ** 2 + 1e-12)
         self._precision[self._deviations] = 1.0
         self._P = np.zeros((n, n))
-        self._latest: tuple[tuple[Direction, float, Stance | None, float, int], Frames] | None = None
+        self._latest: tuple[tuple[Direction, float, Stance | None, float, int], FrameHistory] | None = None
         self._x, self._middle = x, x[self._deviations]
         self._views = self._around()
         self._frames = self._frame(first, stroke_m, None)
@@ -246,13 +246,13 @@ class SmoothedBelief(Belief):
 
     # -- model -----------------------------------------------------------------------------------------------------
 
-    def _frame(self, seen: Direction, stroke_m: float, held: Stance | None) -> Frames:
+    def _frame(self, seen: Direction, stroke_m: float, held: Stance | None) -> FrameHistory:
         """One frame, now; that of the latest direction again, as `update` follows `distance2`."""
         when = seen, stroke_m, held, self._way.time_s, self._way.steps
         if self._latest is not None and self._latest[0][0] is seen and self._latest[0][1:] == when[1:]:
             return self._latest[1]
         R, t = self._tilt(held)
-        one = Frames(
+        one = FrameHistory(
             seen.uv_px[None],
             seen.covariance_px2[None],
             np.array([stroke_m]),
@@ -280,12 +280,12 @@ class SmoothedBelief(Belief):
         rig = changed(self.rig, values)
         return _DeviatedView(rig.at(0.0), np.array(rig.stroke_axis_world), values)
 
-    def _residuals(self, x: Array, frames: Frames) -> Array:
+    def _residuals(self, x: Array, frames: FrameHistory) -> Array:
         """Pixels by those of the target, shape (N, 2)."""
         rays = self._rig(x[self._deviations]).rays_beside(frames.uv_px, frames.stroke_m)
         return _pixel_residual(self._places(x, frames)[0], rays)[0]
 
-    def _rows(self, x: Array, frames: Frames) -> _Rows:
+    def _rows(self, x: Array, frames: FrameHistory) -> _Rows:
         """Residuals of frames, their slopes and covariance."""
         n, m = len(frames.time_s), self._deviations.start
         rays = self._rig(x[self._deviations]).rays_beside(frames.uv_px, frames.stroke_m)
@@ -308,14 +308,14 @@ class SmoothedBelief(Belief):
         """Course of the robot by the state's slip and skid."""
         return self._way.course(y[SLIP], y[SKID])
 
-    def _places(self, y: Array, frames: Frames) -> tuple[Array, Array]:
+    def _places(self, y: Array, frames: FrameHistory) -> tuple[Array, Array]:
         """Places of the target in the rig's frame as the robot stood at each frame, shape (N, 3), and its velocity."""
         course, velocity = self._course(y), np.zeros(3)
         if self.prior.moves:
             velocity = course.last_yaw @ y[VELOCITY] / max(float(y[2]), LEAST_Q)
         return course.seen_from(frames, course.fixed(self.point_m(y)), velocity, self._way.time_s), velocity
 
-    def _covariance(self, x: Array, frames: Frames, E: Array) -> tuple[Array, Array]:
+    def _covariance(self, x: Array, frames: FrameHistory, E: Array) -> tuple[Array, Array]:
         """Covariance of residuals, shape (2 N, 2 N): pixels, readings of the stroke, steps and motion; and F."""
         n, course = len(frames.time_s), self._course(x)
         C = np.zeros((n, 2, n, 2))

@@ -23,7 +23,7 @@ _TOUCH_M = 1e-3
 
 
 @dataclass(frozen=True)
-class Part:
+class AssemblyShape:
     """A shape in the frame of its assembly; `role` marks what may be switched on: "screen" or "bulb"."""
 
     shape: Shape
@@ -34,7 +34,7 @@ class Part:
 class Assembly:
     """Parts of one piece, in its own frame."""
 
-    parts: list[Part] = field(default_factory=list)
+    parts: list[AssemblyShape] = field(default_factory=list)
     _bounds: dict[int, Array] = field(default_factory=dict, repr=False)  # by the number of parts
 
     def box(self, name: str, x: Span, y: Span, z: Span, surface: Surface, yaw_rad: float = 0.0) -> None:
@@ -46,13 +46,13 @@ class Assembly:
     def tilted(self, name: str, centre_m: Vector, size_m: Vector, surface: Surface, rotation: Matrix) -> None:
         """Add a cuboid of any direction; its size is exact."""
         pose = Pose("world", "shape", centre_m, rotation)
-        self.parts.append(Part(Cuboid(name, pose, size_m, surface.texture, surface.coat)))
+        self.parts.append(AssemblyShape(Cuboid(name, pose, size_m, surface.texture, surface.coat)))
 
     def post(self, name: str, x: float, y: float, z: Span, radius_m: float, surface: Surface, sides: int = 8) -> None:
         """Add an upright prism."""
         height = max(z[1] - z[0] - 2.0 * GAP_M, 1e-3)
         pose = Pose("world", "shape", (x, y, 0.5 * (z[0] + z[1])))
-        self.parts.append(Part(Prism(name, pose, radius_m, height, sides, surface.texture, surface.coat)))
+        self.parts.append(AssemblyShape(Prism(name, pose, radius_m, height, sides, surface.texture, surface.coat)))
 
     def rod(self, name: str, start: Vector, end: Vector, radius_m: float, surface: Surface, sides: int = 8) -> None:
         """Add a prism between two points."""
@@ -60,14 +60,14 @@ class Assembly:
         up = (0.0, 0.0, 1.0) if abs((b - a)[2]) < 0.99 * np.linalg.norm(b - a) else (1.0, 0.0, 0.0)
         pose = Pose("world", "shape", as_vector(0.5 * (a + b)), rotation_facing(as_vector(b - a), up))
         length = float(np.linalg.norm(b - a))
-        self.parts.append(Part(Prism(name, pose, radius_m, length, sides, surface.texture, surface.coat)))
+        self.parts.append(AssemblyShape(Prism(name, pose, radius_m, length, sides, surface.texture, surface.coat)))
 
     def panel(
         self, name: str, centre_m: Vector, normal: Vector, size_m: Vector, surface: Surface, role: str = ""
     ) -> None:
         """Add a rectangle."""
         pose = Pose("world", "shape", centre_m, rotation_facing(normal))
-        self.parts.append(Part(Rectangle(name, pose, size_m, surface.texture, coat=surface.coat), role))
+        self.parts.append(AssemblyShape(Rectangle(name, pose, size_m, surface.texture, coat=surface.coat), role))
 
     def mesh(
         self, name: str, vertices_m: Array, triangles: NDArray[np.int64], surface: Surface, texel_m: float
@@ -75,7 +75,7 @@ class Assembly:
         """Add a two-sided mesh whose texture lies along the longest axes of its triangles' corners (x and z)."""
         texels = (vertices_m[:, [0, 2]] / texel_m)[triangles]
         shape = Mesh(name, vertices_m, triangles, surface.texture, texels, two_sided=True, coat=surface.coat)
-        self.parts.append(Part(shape))
+        self.parts.append(AssemblyShape(shape))
 
     def add(self, other: Assembly, x: float, y: float, z: float, yaw_rad: float, prefix: str) -> None:
         """Add the parts of another assembly, moved and turned about the upright axis."""
@@ -102,7 +102,7 @@ def part_bounds_m(shape: Shape) -> Array:
     return np.array([t - half, t + half])
 
 
-def moved(parts: Iterable[Part], pose: Pose, prefix: str = "") -> list[Part]:
+def moved(parts: Iterable[AssemblyShape], pose: Pose, prefix: str = "") -> list[AssemblyShape]:
     """Parts in another frame, their names after a prefix if one is given."""
     R, t = pose.R, pose.t
     done = []

@@ -14,7 +14,7 @@ import numpy as np
 
 from phibench.scenes.frames import Pose, Vector, rotation_xyz
 from phibench.scenes.shapes import Rectangle, rectangle
-from phibench.scenes.worlds.assembly import Assembly, Footprint, Part, footprint_of, moved, part_bounds_m
+from phibench.scenes.worlds.assembly import Assembly, AssemblyShape, Footprint, footprint_of, moved, part_bounds_m
 from phibench.scenes.worlds.materials import Surface
 from phibench.scenes.worlds.properties import RoomProperties
 
@@ -174,7 +174,7 @@ class Layout:
     """Contents of a room so far: parts in the plan frame, and what they take of the room."""
 
     plan: FloorPlan
-    parts: list[Part] = field(default_factory=list)
+    parts: list[AssemblyShape] = field(default_factory=list)
     taken: list[Footprint] = field(default_factory=list)
     counts: dict[str, int] = field(default_factory=dict)
 
@@ -204,12 +204,12 @@ class Layout:
         return True
 
 
-def patch_count(parts: list[Part]) -> int:
+def patch_count(parts: list[AssemblyShape]) -> int:
     """Number of faces."""
     return sum(_faces(part) for part in parts)
 
 
-def _faces(part: Part) -> int:
+def _faces(part: AssemblyShape) -> int:
     shape = part.shape
     if isinstance(shape, Rectangle):
         return 1

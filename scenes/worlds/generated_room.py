@@ -19,7 +19,7 @@ from phibench.scenes.shapes import Rectangle, Shape
 from phibench.scenes.textures import Bitmap, Uniform
 from phibench.scenes.validation import SceneError
 from phibench.scenes.worlds import fixtures, furniture, graphics, small_objects, standing_objects, tabletop
-from phibench.scenes.worlds.assembly import Assembly, Footprint, Part, footprint_of, moved
+from phibench.scenes.worlds.assembly import Assembly, AssemblyShape, Footprint, footprint_of, moved
 from phibench.scenes.worlds.floor_plan import (
     FREE_DISC_M,
     FloorPlan,
@@ -277,7 +277,7 @@ class _Generator:
         if not any(part.role == "lamp" for part in self.layout.parts):
             raise SceneError("generate_room: no lamp finds a place; lower furniture_per_m2 or near_objects")
         walls, floor, ceiling = self._shell_surfaces()
-        parts = [Part(surface) for surface in shell(self.plan, floor, ceiling, walls)]
+        parts = [AssemblyShape(surface) for surface in shell(self.plan, floor, ceiling, walls)]
         parts += self._switched_on()
         shapes = [part.shape for part in moved(parts, self.plan.T_world_plan)]
         lights = tuple(shape for shape in shapes if isinstance(shape, Rectangle))
@@ -296,7 +296,7 @@ class _Generator:
         count = len(self.plan.walls)
         return tuple(accent if k == count // 2 else main for k in range(count)), floor, ceiling
 
-    def _switched_on(self) -> list[Part]:
+    def _switched_on(self) -> list[AssemblyShape]:
         """Parts with their light: lamps share the room's flux; screens, bulbs, sky and views as stated."""
         p, parts = self.properties, self.layout.parts
         lamp = self._lamp_radiance(parts)
@@ -324,19 +324,19 @@ class _Generator:
                 done.append(self._shining(shape, part.role, sky))
         return done
 
-    def _lamp_radiance(self, parts: Sequence[Part]) -> np.ndarray:
+    def _lamp_radiance(self, parts: Sequence[AssemblyShape]) -> np.ndarray:
         """All lamps alike: their flux, pi L A each, over the floor's area is the stated illuminance."""
         p = self.properties
         sizes = [part.shape.size_m for part in parts if part.role == "lamp" and isinstance(part.shape, Rectangle)]
         area = sum(size[0] * size[1] for size in sizes)
         return band_radiance(p.illuminance_lx * self.plan.area_m2 / (math.pi * area), p.colour_temperature_k)
 
-    def _chosen(self, parts: Sequence[Part], role: str, most: int) -> set[int]:
+    def _chosen(self, parts: Sequence[AssemblyShape], role: str, most: int) -> set[int]:
         """Numbers of the parts that are switched on."""
         numbers = [k for k, part in enumerate(parts) if part.role == role]
         return {int(k) for k in self.rng(role).permutation(numbers)[:most]} if numbers else set()
 
-    def _shining(self, shape: Rectangle, role: str, sky: np.ndarray) -> Part:
+    def _shining(self, shape: Rectangle, role: str, sky: np.ndarray) -> AssemblyShape:
         """Screen or view whose texture is its light."""
         if role == "screen":
             values = graphics.screen(self.rng("screen", shape.name), (40, 64))
@@ -345,7 +345,7 @@ class _Generator:
             assert isinstance(shape.texture, Bitmap)
             values, white = shape.texture.values.astype(float), sky
         bitmap = radiance_bitmap(values, shape.size_m, white)
-        return Part(replace(shape, texture=bitmap, coat=0.0), role)
+        return AssemblyShape(replace(shape, texture=bitmap, coat=0.0), role)
 
     def _sun(self) -> Sun | None:
         """Sun before the first window, if there is one and it shines."""
@@ -361,9 +361,11 @@ class _Generator:
         return Sun(tuple(float(x) for x in world), tuple(float(x) for x in irradiance))
 
 
-def _emitting(shape: Rectangle, radiance: np.ndarray, window: bool = False) -> Part:
+def _emitting(shape: Rectangle, radiance: np.ndarray, window: bool = False) -> AssemblyShape:
     values = tuple(float(x) for x in radiance)
-    return Part(replace(shape, texture=Uniform((0.0, 0.0, 0.0)), radiance_w_m2_sr=values, coat=0.0, window=window))
+    return AssemblyShape(
+        replace(shape, texture=Uniform((0.0, 0.0, 0.0)), radiance_w_m2_sr=values, coat=0.0, window=window)
+    )
 
 
 def _gaps(wall: Wall, doors: Sequence[Footprint]) -> list[tuple[float, float]]:

@@ -34,7 +34,7 @@ from phibench.studies.baseline.tables import (
     seen,
 )
 from phibench.studies.findings import Finding, Row
-from phibench.studies.framework import Result, Settings, Study, StudyDatasets
+from phibench.studies.framework import Settings, Study, StudyDatasets, StudyResult
 
 METHODS = ("red_centroid", "chain_fit")
 TABLES = ("table1", "table2", "table3")
@@ -56,7 +56,7 @@ class BaselineSettings(Settings):
     rendered: list[str] = Field(description="recipes of misaligned rigs that are rendered too")
 
 
-def run(settings: BaselineSettings, datasets: StudyDatasets) -> Result:
+def run(settings: BaselineSettings, datasets: StudyDatasets) -> StudyResult:
     """Run the study."""
     dataset = datasets.dataset(settings.recipe)
     experiments, rig = experiments_of(dataset), dataset.samples[0].nominal_rig
@@ -69,7 +69,7 @@ def run(settings: BaselineSettings, datasets: StudyDatasets) -> Result:
     ]
     rendered = pl.concat([_rendered(name, datasets) for name in settings.rendered] or [_NONE])
     found = findings(table, bands, laws, curves, rendered)
-    return Result(
+    return StudyResult(
         {"table": table, "misaligned": bands, "laws": _law_table(laws), "rendered": rendered},
         found,
         (

@@ -26,9 +26,9 @@ from phibench.studies.cause.paper_reading import (
     AZIMUTHS,
     Convention,
     Experiments,
+    PaperReading,
     Parameters,
     Reader,
-    Reading,
     inverse_depth,
     radii_px,
     read,
@@ -136,7 +136,7 @@ class Explanation(Settings):
 
 
 @dataclass(frozen=True)
-class Model:
+class DepthModel:
     """An explanation with priors, data and the nominal rig: what a sampler needs.
 
     Parameters
@@ -181,7 +181,7 @@ class Model:
         """Sigma of the reading noise."""
         return named.get(NOISE, np.asarray(WHOLE_PIXEL_PX))
 
-    def reading(self, points: Array) -> Reading:
+    def reading(self, points: Array) -> PaperReading:
         """Noise-free estimates, shape (..., n)."""
         return read(self.named(points), self.experiments, self.explanation.reader, self.rig)
 
@@ -205,7 +205,7 @@ class Model:
                 return np.asarray(_normal(residual, self.covariance(reading, points)) + jacobian)
             return np.asarray(_normal_in_groups(residual, own, common, self._targets) + jacobian)
 
-    def covariance(self, reading: Reading, points: Array) -> Array:
+    def covariance(self, reading: PaperReading, points: Array) -> Array:
         """Covariance of the inverse estimates, shape (..., n, n), in m^-2."""
         own, common = self._variances(reading, points)
         if self.explanation.shared_down:
@@ -215,7 +215,7 @@ class Model:
         result[..., diagonal, diagonal] += own
         return np.asarray(result)
 
-    def _variances(self, reading: Reading, points: Array) -> tuple[Array, list[Array]]:
+    def _variances(self, reading: PaperReading, points: Array) -> tuple[Array, list[Array]]:
         """Variances of each inverse estimate by itself, and effects that all estimates of a target share."""
         noise, square = self.noise_px(self.named(points)), reading.inverse_depth_per_m * reading.inverse_depth_per_m
         seen = reading.by_up * reading.by_up
@@ -234,7 +234,7 @@ class Model:
         changes = np.diagonal(self.experiments.same_target, 1)
         return np.concatenate([[0], np.flatnonzero(~changes) + 1])
 
-    def _student(self, residual: Array, reading: Reading, points: Array) -> Array:
+    def _student(self, residual: Array, reading: PaperReading, points: Array) -> Array:
         """Independent Student t of 4 degrees of freedom with the scale of the Gaussian."""
         scale = np.sqrt(np.diagonal(self.covariance(reading, points), axis1=-2, axis2=-1))
         heavy = 0.5 * (FREEDOM + 1.0) * np.log1p((residual / scale) ** 2 / FREEDOM)
@@ -247,7 +247,7 @@ class Model:
         return np.array([self.log_likelihood(point) for point in points])
 
 
-def standardised(model: Model, points: Array, independent: bool = False) -> Array:
+def standardised(model: DepthModel, points: Array, independent: bool = False) -> Array:
     """Residuals made independent with unit variance, shape (..., n).
 
     By the Cholesky factor of their covariance, or by their own deviations where they count as independent.
@@ -261,11 +261,11 @@ def standardised(model: Model, points: Array, independent: bool = False) -> Arra
     return np.asarray(np.linalg.solve(factor, residual[..., None])[..., 0])
 
 
-def without_table(model: Model, table: int) -> tuple[Model, NDArray[np.bool_]]:
+def without_table(model: DepthModel, table: int) -> tuple[DepthModel, NDArray[np.bool_]]:
     """The model on the other three tables, and the mask of the experiments that are left out."""
     out = model.experiments.table == table
     chosen = model.experiments.chosen(~out)
-    return Model(model.explanation, model.priors, chosen, model.rig, model.depth_sigma_m), out
+    return DepthModel(model.explanation, model.priors, chosen, model.rig, model.depth_sigma_m), out
 
 
 def _normal(residual: Array, covariance: Array) -> Array:
@@ -288,7 +288,9 @@ def _outer(vector: Array) -> Array:
     return vector[..., :, None] * vector[..., None, :]
 
 
-def simulate(model: Model, points: Array, random: np.random.Generator, experiments: Experiments | None = None) -> Array:
+def simulate(
+    model: DepthModel, points: Array, random: np.random.Generator, experiments: Experiments | None = None
+) -> Array:
     """Printed estimates of as many worlds as there are points, shape (m, n), metres.
 
     Parameters as for `unrounded`.
@@ -298,7 +300,7 @@ def simulate(model: Model, points: Array, random: np.random.Generator, experimen
 
 
 def unrounded(
-    model: Model, points: Array, random: np.random.Generator, experiments: Experiments | None = None
+    model: DepthModel, points: Array, random: np.random.Generator, experiments: Experiments | None = None
 ) -> Array:
     """Estimates of as many worlds as there are points, before they are printed, shape (m, n), metres.
 
@@ -323,7 +325,7 @@ def unrounded(
     return np.asarray(1.0 / inverse_depth(named, asked, reader, model.rig, down + errors[0], up + errors[1]))
 
 
-def brute_force(model: Model, point: Array, random: np.random.Generator, draws: int) -> tuple[Array, Array]:
+def brute_force(model: DepthModel, point: Array, random: np.random.Generator, draws: int) -> tuple[Array, Array]:
     """Log density of each published estimate, by simulation and by the likelihood, shape (n,) each.
 
     The simulated density is a kernel estimate in 1/D of `draws` worlds with the same parameters. The probability of a
@@ -343,7 +345,7 @@ def brute_force(model: Model, point: Array, random: np.random.Generator, draws: 
     return simulated + jacobian, linear + jacobian
 
 
-def _reading_errors(model: Model, points: Array, random: np.random.Generator, size: tuple[int, int]) -> Array:
+def _reading_errors(model: DepthModel, points: Array, random: np.random.Generator, size: tuple[int, int]) -> Array:
     """Errors of the radii in both images, shape (2, m, n), pixels."""
     if model.explanation.noise == "free":
         return np.asarray(model.noise_px(model.named(points)) * random.normal(size=(2, *size)))

@@ -24,8 +24,8 @@ from phibench.studies.cause.model import (
     COMMON,
     GROUPS,
     NOISE,
+    DepthModel,
     Explanation,
-    Model,
     Prior,
     simulate,
     without_table,
@@ -86,7 +86,7 @@ def require_sampler() -> None:
         raise DatasetError("the study needs the package dynesty: pip install 'phibench[study]'") from error
 
 
-def sample(model: Model, live_points: int, stop: float, *names: Name) -> Posterior:
+def sample(model: DepthModel, live_points: int, stop: float, *names: Name) -> Posterior:
     """Run nested sampling.
 
     Parameters
@@ -164,12 +164,12 @@ class CauseSettings(Settings):
         """Explanation of a name."""
         return next(explanation for explanation in self.explanations if explanation.name == name)
 
-    def model(self, name: str, experiments: Experiments, scale: float = 1.0) -> Model:
+    def model(self, name: str, experiments: Experiments, scale: float = 1.0) -> DepthModel:
         """Model of an explanation; normal priors of what may be wrong are `scale` times as wide."""
         explanation = self.explanation(name)
         priors = {**self.priors, **explanation.priors}
         scaled = {n: prior if n in COMMON else prior.scaled(scale) for n, prior in priors.items()}
-        return Model(explanation, scaled, experiments, Rig(), self.depth_sigma_m)
+        return DepthModel(explanation, scaled, experiments, Rig(), self.depth_sigma_m)
 
 
 def require_consistent(settings: CauseSettings) -> None:
@@ -234,7 +234,7 @@ class Run:
     """
 
     key: tuple[Name, ...]
-    model: Model
+    model: DepthModel
     live_points: int
     stop: float
 
@@ -280,7 +280,7 @@ def _again(repeats: int) -> list[tuple[Name, ...]]:
     return [(), *((repeat,) for repeat in range(1, repeats))]
 
 
-def made_up(settings: CauseSettings, truth: Truth, number: int, repeat: int) -> Model:
+def made_up(settings: CauseSettings, truth: Truth, number: int, repeat: int) -> DepthModel:
     """The explanation of a truth with data that it has made."""
     data = published_experiments()
     model = settings.model(truth.explanation, data)

@@ -101,7 +101,7 @@ class Reader:
 
 
 @dataclass(frozen=True)
-class Reading:
+class PaperReading:
     """Inverse depths and how pixel noise moves them.
 
     Parameters
@@ -122,7 +122,7 @@ class Reading:
         return 1.0 / self.inverse_depth_per_m
 
 
-def read(parameters: Parameters, experiments: Experiments, reader: Reader, rig: Rig) -> Reading:
+def read(parameters: Parameters, experiments: Experiments, reader: Reader, rig: Rig) -> PaperReading:
     """Noise-free estimates of experiments with true rigs, and their slopes by the radii in the images.
 
     Parameters
@@ -143,7 +143,7 @@ def read(parameters: Parameters, experiments: Experiments, reader: Reader, rig: 
     down, up = radii_px(parameters, experiments, reader, rig)
     nudged = (np.stack([down, down + _STEP_PX, down]), np.stack([up, up, up + _STEP_PX]))
     value, by_down, by_up = inverse_depth(parameters, experiments, reader, rig, *nudged)
-    return Reading(value, (by_down - value) / _STEP_PX, (by_up - value) / _STEP_PX)
+    return PaperReading(value, (by_down - value) / _STEP_PX, (by_up - value) / _STEP_PX)
 
 
 PARAMETERS = (

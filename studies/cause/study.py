@@ -25,7 +25,7 @@ from phibench.studies.cause.nested_sampling import (
 )
 from phibench.studies.cause.tables import DECIDED, ENOUGH, FLOOR, SIGMAS, verdict
 from phibench.studies.findings import Finding, Row
-from phibench.studies.framework import Result, Study, StudyDatasets
+from phibench.studies.framework import Study, StudyDatasets, StudyResult
 
 ALIKE = 0.95  # cosine from which two parameters do the same
 SMALL_P = 0.05
@@ -41,7 +41,7 @@ _LIMITS = (
 )
 
 
-def run(settings: CauseSettings, datasets: StudyDatasets) -> Result:
+def run(settings: CauseSettings, datasets: StudyDatasets) -> StudyResult:
     """Run the study; it needs no data set."""
     require_consistent(settings)
     require_sampler()
@@ -72,7 +72,7 @@ def run(settings: CauseSettings, datasets: StudyDatasets) -> Result:
     best = f"Best: {table.sort('log_evidence', descending=True)['text'][0]}."
     noise = "; ".join(finding.text for finding in noise_findings(table) if finding.unit == "px")
     drawn = ", ".join(f"'{settings.explanation(name).text}'" for name in settings.drawn)
-    return Result(
+    return StudyResult(
         {
             "table": table,
             "prior_scales": scales,

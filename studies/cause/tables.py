@@ -23,7 +23,7 @@ from phibench.studies.cause.model import (
     FREEDOM,
     NOISE,
     WHOLE_PIXEL_PX,
-    Model,
+    DepthModel,
     brute_force,
     simulate,
     standardised,
@@ -76,7 +76,7 @@ class Fit:
     trend_p: float
 
 
-def fit_of(model: Model, points: Array, random: np.random.Generator) -> Fit:
+def fit_of(model: DepthModel, points: Array, random: np.random.Generator) -> Fit:
     """Fit of a posterior, points of shape (m, d); every point gets one replica of the data.
 
     Under a Gaussian with known covariance the standardised residuals of a replica are independent unit normals; with
@@ -105,10 +105,10 @@ def _trend(residuals: Array, experiments: Experiments) -> Array:
     return np.asarray(np.mean(residuals[:, neighbours] * residuals[:, neighbours + 1], axis=-1))
 
 
-def left_out_score(model: Model, points: Array, table: int) -> tuple[float, float]:
+def left_out_score(model: DepthModel, points: Array, table: int) -> tuple[float, float]:
     """Log density of one table given draws from the posterior without it, shape (m, d), and its Monte Carlo error."""
     _, out = without_table(model, table)
-    only = Model(model.explanation, model.priors, model.experiments.chosen(out), model.rig, model.depth_sigma_m)
+    only = DepthModel(model.explanation, model.priors, model.experiments.chosen(out), model.rig, model.depth_sigma_m)
     logs = only.log_likelihoods(points)
     logs = np.where(np.isfinite(logs), logs, -np.inf)
     top = logs.max()
@@ -117,14 +117,14 @@ def left_out_score(model: Model, points: Array, table: int) -> tuple[float, floa
     return float(top + np.log(mean)), float(weights.std() / mean / np.sqrt(len(weights)))
 
 
-def coverage(model: Model, points: Array, truth: dict[str, float], level: float) -> dict[str, bool]:
+def coverage(model: DepthModel, points: Array, truth: dict[str, float], level: float) -> dict[str, bool]:
     """Flags of parameters whose central interval holds the true value."""
     tail = (1.0 - level) / 2.0
     low, high = np.quantile(points, [tail, 1.0 - tail], axis=0)
     return {name: bool(low[i] <= truth[name] <= high[i]) for i, name in enumerate(model.names) if name in truth}
 
 
-def band(model: Model, points: Array, grid: Experiments, random: np.random.Generator, level: float) -> Array:
+def band(model: DepthModel, points: Array, grid: Experiments, random: np.random.Generator, level: float) -> Array:
     """Lower end of simulated estimates on a grid, median of noise-free ones, upper end; shape (3, n)."""
     tail = (1.0 - level) / 2.0
     low, high = np.nanquantile(simulate(model, points, random, grid), [tail, 1.0 - tail], axis=0)
@@ -132,7 +132,7 @@ def band(model: Model, points: Array, grid: Experiments, random: np.random.Gener
     return np.stack([low, np.nanmedian(middle, axis=0), high])
 
 
-def alike(model: Model, point: Array) -> list[tuple[str, str, float]]:
+def alike(model: DepthModel, point: Array) -> list[tuple[str, str, float]]:
     """Pairs of parameters and the cosine between what they do to the 25 estimates, in units of their noise.
 
     +-1: the estimates cannot tell the two apart, however good they are.
@@ -148,7 +148,7 @@ def alike(model: Model, point: Array) -> list[tuple[str, str, float]]:
     ]
 
 
-def _effect(model: Model, at: dict[str, Array], name: str, step: float, covariance: Array) -> Array:
+def _effect(model: DepthModel, at: dict[str, Array], name: str, step: float, covariance: Array) -> Array:
     """Change of the inverse estimates by a parameter, in units of their noise, shape (n,)."""
     ends = [
         read({**at, name: np.asarray(by)}, model.experiments, model.explanation.reader, model.rig).inverse_depth_per_m

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from phibench.estimator.geometry.mirror_image import image_of, range_at
-from phibench.estimator.geometry.panorama import Grid
+from phibench.estimator.geometry.panorama import PanoramaGrid
 from phibench.estimator.geometry.phi import outline_circle
 from phibench.estimator.geometry.reflection import reflect
 from phibench.render.optics.room_tracer import blocked_by
@@ -57,7 +57,7 @@ class Line:
 
 
 def epipolar_line(
-    nominal: Rig, true: Rig, stroke_m: float, down_point_m: Array, depths_m: Array, grid: Grid, render: bool
+    nominal: Rig, true: Rig, stroke_m: float, down_point_m: Array, depths_m: Array, grid: PanoramaGrid, render: bool
 ) -> Line:
     """Line of the down pixel that shows a point.
 
@@ -109,7 +109,7 @@ def beside_best(points_px: Array) -> Array:
     return np.abs(off @ across)
 
 
-def _columns(nominal: Rig, stroke_m: float, down_px: Array, uv: Array, grid: Grid) -> Array:
+def _columns(nominal: Rig, stroke_m: float, down_px: Array, uv: Array, grid: PanoramaGrid) -> Array:
     """Columns of the down pixel and of the up pixels, shape (1 + n,), without a jump at the seam."""
     views: tuple[tuple[View, Array], ...] = ((nominal.at(0.0), down_px[None]), (nominal.at(stroke_m), uv))
     columns = np.concatenate([grid.place(reflect(view, at).direction_world)[:, 0] for view, at in views])

@@ -41,7 +41,7 @@ _SIDE_PX = 11  # a board of 0.3 m at 2.5 m is 16 px high in the image: a larger 
 
 
 @dataclass(frozen=True)
-class Pair:
+class BaselinePair:
     """A spot seen from both ends of a baseline.
 
     Parameters
@@ -79,14 +79,14 @@ def sideways(rig: Rig) -> Rig:
     return replace(rig, stroke_axis_world=(1.0, 0.0, 0.0))
 
 
-def pairs_of(dataset: Dataset) -> Iterator[Pair]:
+def pairs_of(dataset: Dataset) -> Iterator[BaselinePair]:
     """Visible pairs of a data set; the baseline is what its true rig moves by, known to the estimator."""
     for sample in dataset:
         if sample.row.down.visible and sample.row.up.visible:
             yield _pair(sample)
 
 
-def _pair(sample: Sample) -> Pair:
+def _pair(sample: Sample) -> BaselinePair:
     centres = [sample.view(position).camera_centre_m for position in POSITIONS]
     along = centres[1] - centres[0]
     length = float(np.linalg.norm(along))
@@ -95,19 +95,19 @@ def _pair(sample: Sample) -> Pair:
         Light(sample.ambient(position), sample.spot(position), f_number=rig.camera.f_number) for position in POSITIONS
     )
     places = [(sample.truth_row(position).u_px, sample.truth_row(position).v_px) for position in POSITIONS]
-    return Pair(
+    return BaselinePair(
         sample.row.sample_id, rig, length, np.array(sample.row.spot_world_m), (lights[0], lights[1]), np.array(places)
     )
 
 
-def flat_pair(rig: Rig, baseline_m: float, point_m: Array, background_electrons_per_s: Array) -> Pair | None:
+def flat_pair(rig: Rig, baseline_m: float, point_m: Array, background_electrons_per_s: Array) -> BaselinePair | None:
     """Pair rendered without a room, on an even background; None where an image does not show the spot."""
     views = (rig.at(0.0), rig.at(baseline_m))
     uv = np.array([image_of(view, point_m).uv_px for view in views])
     if not np.all(rig.camera.contains(uv)):
         return None
     lights = [_flat(view, point_m, background_electrons_per_s) for view in views]
-    return Pair("flat", rig, baseline_m, point_m, (lights[0], lights[1]), uv)
+    return BaselinePair("flat", rig, baseline_m, point_m, (lights[0], lights[1]), uv)
 
 
 def _flat(view: View, point_m: Array, background: Array) -> Light:
@@ -117,7 +117,7 @@ def _flat(view: View, point_m: Array, background: Array) -> Light:
     return replace(light, spot=spot_layer(view, spot_of(point_m), ()), f_number=camera.f_number)
 
 
-def bound_m(pair: Pair, sensor: Sensor) -> float:
+def bound_m(pair: BaselinePair, sensor: Sensor) -> float:
     """Least standard deviation of D from the noise of both frames; nothing else is unknown of the rig."""
     C = [
         spot_limit(expected_of_light(light, sensor, pair.rig.camera), card_of(sensor)).covariance_px2
@@ -126,7 +126,7 @@ def bound_m(pair: Pair, sensor: Sensor) -> float:
     return float(depth_exact(pair.rig, pair.baseline_m, *pair.uv_px, *C).sigma_m)
 
 
-def errors_m(pair: Pair, sensor: Sensor, draws: int, *names: str) -> Array:
+def errors_m(pair: BaselinePair, sensor: Sensor, draws: int, *names: str) -> Array:
     """Estimate minus D, shape (draws,), by likelihood fits to raw frames; NaN where a fit fails.
 
     Every draw is of another camera, as the bound counts the fixed pattern as noise.
@@ -135,12 +135,12 @@ def errors_m(pair: Pair, sensor: Sensor, draws: int, *names: str) -> Array:
     return np.asarray(depth_exact(pair.rig, pair.baseline_m, uv[0], uv[1]).depth_m - pair.depth_m)
 
 
-def fitted_px(pair: Pair, sensor: Sensor, draws: int, *names: str) -> Array:
+def fitted_px(pair: BaselinePair, sensor: Sensor, draws: int, *names: str) -> Array:
     """Pixels that likelihood fits find in raw frames of both images, shape (2, draws, 2); NaN where a fit fails."""
     return np.stack([_fitted(pair, i, sensor, draws, names) for i in range(2)])
 
 
-def _fitted(pair: Pair, i: int, sensor: Sensor, draws: int, names: tuple[str, ...]) -> Array:
+def _fitted(pair: BaselinePair, i: int, sensor: Sensor, draws: int, names: tuple[str, ...]) -> Array:
     """Pixels (draws, 2) found in one image."""
     light, card, (u, v) = pair.lights[i], card_of(sensor), pair.uv_px[i]
     region = Region.around(u, v, light.size, _SIDE_PX)
@@ -225,7 +225,7 @@ class Isotropy:
         return self.p_value_over_bound >= self.false_alarm
 
 
-def azimuth_noise(pair: Pair, sensor: Sensor, draws: int, baseline: str, rules: Rules) -> AzimuthNoise:
+def azimuth_noise(pair: BaselinePair, sensor: Sensor, draws: int, baseline: str, rules: Rules) -> AzimuthNoise:
     """Draw frames of a pair, estimate, and compare with the bound."""
     all_errors = errors_m(pair, sensor, draws, *_STREAM, baseline)
     errors = all_errors[np.isfinite(all_errors)]

@@ -20,7 +20,7 @@ from phibench.benchmark.scores.answer_errors import Rules
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.read import Dataset, Sample
 from phibench.estimator.geometry.panorama import (
-    Grid,
+    PanoramaGrid,
     SeenEdge,
     pixels_by_model,
     seen_edge,
@@ -34,14 +34,14 @@ from phibench.scenes.frames import Array
 from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.rig import Rig
 from phibench.studies.findings import Finding, Row
-from phibench.studies.framework import Result, Settings, Study, StudyDatasets
+from phibench.studies.framework import Settings, Study, StudyDatasets, StudyResult
 from phibench.studies.isotropy.binocular import Binocular, Laws, tried
 from phibench.studies.isotropy.drawings import lines_drawing, misaligned_drawing, noise_drawing
 from phibench.studies.isotropy.lines import Line, epipolar_line, half_width_rad, hidden_share
 from phibench.studies.isotropy.noise import (
     AzimuthNoise,
+    BaselinePair,
     Isotropy,
-    Pair,
     azimuth_noise,
     bounds,
     bounds_over_grid,
@@ -97,7 +97,7 @@ class _Scene:
     background: Array
 
 
-def run(settings: IsotropySettings, datasets: StudyDatasets) -> Result:
+def run(settings: IsotropySettings, datasets: StudyDatasets) -> StudyResult:
     """Run the study."""
     upright, moved, tilted = (
         datasets.dataset(name) for name in ("study-isotropy", "study-isotropy-sideways", "study-isotropy-tilted")
@@ -135,7 +135,7 @@ def run(settings: IsotropySettings, datasets: StudyDatasets) -> Result:
         *line_findings(*lines),
         *(row for name, found in edges.items() for row in edge_findings(name, found)),
     )
-    return Result(
+    return StudyResult(
         {
             "table": _noise_table(noise),
             "bounds": pl.DataFrame(
@@ -162,7 +162,7 @@ def run(settings: IsotropySettings, datasets: StudyDatasets) -> Result:
     )
 
 
-def _scene(pairs: Sequence[Pair]) -> _Scene:
+def _scene(pairs: Sequence[BaselinePair]) -> _Scene:
     first = pairs[0]
     light, (u, v) = first.lights[0], np.rint(first.uv_px[0]).astype(int)
     around = light.ambient_electrons_per_s[:, v - 4 : v + 5, u - 4 : u + 5]
@@ -170,7 +170,9 @@ def _scene(pairs: Sequence[Pair]) -> _Scene:
     return _Scene(first.rig, first.baseline_m, first.depth_m, float(first.point_m[2]), level)
 
 
-def _noise(settings: IsotropySettings, pairs: dict[str, tuple[Pair, ...]]) -> dict[str, tuple[AzimuthNoise, ...]]:
+def _noise(
+    settings: IsotropySettings, pairs: dict[str, tuple[BaselinePair, ...]]
+) -> dict[str, tuple[AzimuthNoise, ...]]:
     card, rules = sensor(settings.preset), Rules(confidence=settings.confidence, resamples=settings.resamples)
     return {
         name: tuple(azimuth_noise(pair, card, settings.draws, name, rules) for pair in each)
@@ -216,7 +218,7 @@ def _occlusion(settings: IsotropySettings, scene: _Scene) -> pl.DataFrame:
 
 def _lines(settings: IsotropySettings, scene: _Scene, true: Misalignment) -> tuple[tuple[Line, ...], tuple[Line, ...]]:
     """Epipolar lines of the aligned and of the misaligned rig."""
-    grid = Grid(settings.panorama_width_px, _LOW_RAD, _HIGH_RAD)
+    grid = PanoramaGrid(settings.panorama_width_px, _LOW_RAD, _HIGH_RAD)
     points = circle(scene.depth_m, scene.height_m, settings.line_azimuths)
     depths = np.array(settings.line_depths_m)
     found = []
@@ -229,7 +231,7 @@ def _lines(settings: IsotropySettings, scene: _Scene, true: Misalignment) -> tup
 def _edges(settings: IsotropySettings, dataset: Dataset) -> tuple[SeenEdge, ...]:
     """Upright edges in the down view's noise-free panorama, unrolled with the nominal rig."""
     sample: Sample = dataset.samples[0]
-    grid = Grid(settings.panorama_width_px, _LOW_RAD, _HIGH_RAD)
+    grid = PanoramaGrid(settings.panorama_width_px, _LOW_RAD, _HIGH_RAD)
     nominal = sample.nominal_rig.at(0.0)
     image = unrolled(np.asarray(sample.ambient("down"), float).sum(axis=0), pixels_by_model(nominal, grid))
     edges = vertical_edges(dataset.room, settings.edges)

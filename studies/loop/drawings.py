@@ -29,7 +29,7 @@ _CORNERS = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
 _TARGET, _WAY, _ROBOT = "#cc3311", "#0072b2", "#444444"
 
 
-class Numbers(Protocol):
+class ConditionNumbers(Protocol):
     """Numbers of a condition, as `study.Summary`."""
 
     @property
@@ -45,7 +45,7 @@ class Numbers(Protocol):
         """Rms pull of 1 / D."""
 
 
-def condition_drawing(found: Mapping[tuple[str, str], Numbers]) -> Drawing:
+def condition_drawing(found: Mapping[tuple[str, str], ConditionNumbers]) -> Drawing:
     """Share that was reached, time and pull of every condition."""
     names = [f"{group}: {name}" for group, name in found]
     groups = list(dict.fromkeys(group for group, _ in found))

@@ -28,7 +28,7 @@ from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.motion.vehicle import PARAMETERS, Vehicle
 from phibench.scenes.random_streams import generator
 from phibench.studies.findings import Finding, Row, number
-from phibench.studies.framework import Result, Settings, Study, StudyDatasets
+from phibench.studies.framework import Settings, Study, StudyDatasets, StudyResult
 from phibench.studies.loop.drawings import condition_drawing, process_drawing
 
 BASE, STREAM = "base", "study loop"
@@ -153,7 +153,7 @@ def covariance(size: float) -> Array:
 
 
 @dataclass(frozen=True)
-class Summary:
+class ConditionSummary:
     """Numbers of one condition: (value, low, high) each, 95 %; NaN where there are too few episodes."""
 
     reached: tuple[float, float, float]
@@ -164,7 +164,7 @@ class Summary:
     error: tuple[float, float, float]
 
 
-def summary(episodes: Sequence[Episode]) -> Summary:
+def summary(episodes: Sequence[Episode]) -> ConditionSummary:
     """Summary of episodes: all of those that were reached but for the share and the pull.
 
     The share has the exact interval of Clopper and Pearson, as every rate of this package.
@@ -173,7 +173,7 @@ def summary(episodes: Sequence[Episode]) -> Summary:
     low, high = binomtest(len(reached), len(episodes)).proportion_ci(method="exact")
     pulls = np.array([one.pull for one in episodes if math.isfinite(one.pull)])
     errors = np.array([one.stated_m / one.distance_m - 1.0 for one in episodes if math.isfinite(one.stated_m)])
-    return Summary(
+    return ConditionSummary(
         (len(reached) / len(episodes), float(low), float(high)),
         interval([one.time_s for one in reached]),
         interval([one.driven_m for one in reached]),
@@ -213,7 +213,7 @@ def delay(episodes: Sequence[Episode], base: Sequence[Episode]) -> tuple[float, 
 Runs = dict[Condition, list[Episode]]
 
 
-def run(settings: LoopSettings, datasets: StudyDatasets) -> Result:
+def run(settings: LoopSettings, datasets: StudyDatasets) -> StudyResult:
     """Run the study."""
     todo = [*conditions(settings), *pixel_conditions(settings, datasets)]
     runs: Runs = {}
@@ -227,7 +227,7 @@ def run(settings: LoopSettings, datasets: StudyDatasets) -> Result:
     if settings.sensitivity_episodes:
         shown["Vehicle: ends of every range"] = vehicle_table(runs, base)
     drawings = (condition_drawing({(c.group, c.name): s for c, s in main.items()}), process_drawing())
-    return Result({"table": frame(runs)}, tuple(_findings(runs, main, base)), drawings, shown, _notes(settings))
+    return StudyResult({"table": frame(runs)}, tuple(_findings(runs, main, base)), drawings, shown, _notes(settings))
 
 
 def frame(runs: Runs) -> pl.DataFrame:
@@ -240,7 +240,7 @@ def frame(runs: Runs) -> pl.DataFrame:
     return pl.DataFrame(rows)
 
 
-def _findings(runs: Runs, main: dict[Condition, Summary], base: Sequence[Episode]) -> Iterator[Finding]:
+def _findings(runs: Runs, main: dict[Condition, ConditionSummary], base: Sequence[Episode]) -> Iterator[Finding]:
     for condition, found in main.items():
         where = f"{condition.group} {condition.name}"
         share = Finding.ranged(f"reached, {where}", found.reached, "%", 100.0)
@@ -258,7 +258,7 @@ def _findings(runs: Runs, main: dict[Condition, Summary], base: Sequence[Episode
             )
 
 
-def condition_table(main: dict[Condition, Summary]) -> tuple[Row, ...]:
+def condition_table(main: dict[Condition, ConditionSummary]) -> tuple[Row, ...]:
     """A row per condition."""
     head = ("condition", "reached, %", "time, s", "way, m", "strokes", "pull", "rms error of D, %")
     rows = [

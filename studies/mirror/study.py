@@ -19,7 +19,7 @@ from phibench.datasets.recipe.tables import RigTable
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import Rig
 from phibench.scenes.validation import SceneError
-from phibench.studies.framework import Result, Settings, Study, StudyDatasets
+from phibench.studies.framework import Settings, Study, StudyDatasets, StudyResult
 from phibench.studies.mirror.drawings import comparison_drawing
 from phibench.studies.mirror.field import disc_shares, meridian, outline_radius_px
 from phibench.studies.mirror.measured_places import (
@@ -127,7 +127,7 @@ class MirrorSettings(Settings):
 _FINDINGS = (criteria_findings, place_findings, ratio_findings, cost_findings)
 
 
-def run(settings: MirrorSettings, datasets: StudyDatasets) -> Result:
+def run(settings: MirrorSettings, datasets: StudyDatasets) -> StudyResult:
     """Run the study; it renders nothing."""
     rigs = _rigs(settings)
     with Steps(datasets.console, "mirror, bounds and mirrors", len(settings.presets) + len(rigs)) as steps:
@@ -151,7 +151,7 @@ def run(settings: MirrorSettings, datasets: StudyDatasets) -> Result:
         f"Deviation that costs {percent} of D at the costliest distance, {spot}": tolerance_table(found),
         f"Error of D, %, by one deviation of usual size, {spot}": single_table(found, settings),
     }
-    return Result(
+    return StudyResult(
         {"table": bound_frame(found), "rays": ray_frame(found), "costs": cost_frame(found), "map": map_frame(found)},
         tuple(row for part in _FINDINGS for row in part(found, settings)),
         (comparison_drawing(found, settings),),

@@ -27,7 +27,7 @@ from phibench.scenes.random_streams import generator
 from phibench.scenes.rig import Rig
 from phibench.scenes.validation import nearest
 from phibench.studies.findings import Finding, Row
-from phibench.studies.framework import Drawing, Result, Settings, Study, StudyDatasets
+from phibench.studies.framework import Drawing, Settings, Study, StudyDatasets, StudyResult
 from phibench.studies.misaligned_rigs import (
     ALL,
     CALIBRATED,
@@ -155,7 +155,7 @@ _PARTS = 5  # table, rendered spots, tolerances, interactions, calibrations with
 _SLOPE_TARGET = 1e-3  # of D: a slope that misses by more is said to be not enough
 
 
-def run(settings: MisalignmentSettings, datasets: StudyDatasets) -> Result:
+def run(settings: MisalignmentSettings, datasets: StudyDatasets) -> StudyResult:
     """Run the study; it renders spots itself and needs no data set."""
     nominal = default_rig()
     strokes = [settings.places(stroke) for stroke in settings.strokes_m]
@@ -177,7 +177,7 @@ def run(settings: MisalignmentSettings, datasets: StudyDatasets) -> Result:
     ranks = {name: ranking(table, name, places.stroke_m) for name in (*NOMINAL, CALIBRATED)}
     pictures = rendered_table(seen, some)
     middle = float(places.depths_m[len(places.depths_m) // 2])
-    return Result(
+    return StudyResult(
         {
             "table": table.join(pictures.drop("whole_relative"), on=_KEYS, how="left"),
             "tolerance": pl.DataFrame(tolerances, infer_schema_length=None),

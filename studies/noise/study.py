@@ -18,7 +18,7 @@ from phibench.estimator.methods.registry import METHODS
 from phibench.render.sensor.settings import SensorError
 from phibench.scenes.validation import nearest
 from phibench.studies.findings import Finding, Row
-from phibench.studies.framework import Drawing, Result, Settings, Study, StudyDatasets
+from phibench.studies.framework import Drawing, Settings, Study, StudyDatasets, StudyResult
 from phibench.studies.noise.conditions import BASE, FACTORS, Cell, all_records, applied
 from phibench.studies.noise.drawings import error_drawing, ranking_drawing
 from phibench.studies.noise.tables import (
@@ -73,7 +73,7 @@ class NoiseSettings(Settings):
     levels: LevelSettings = Field(description="levels by factor; the base is added")
 
 
-def run(settings: NoiseSettings, datasets: StudyDatasets) -> Result:
+def run(settings: NoiseSettings, datasets: StudyDatasets) -> StudyResult:
     """Run the study."""
     dataset = datasets.dataset(settings.recipe)
     planned = cells(settings, dataset)
@@ -99,7 +99,7 @@ def run(settings: NoiseSettings, datasets: StudyDatasets) -> Result:
         pictures.append(error_drawing(table, settings.samples[0], preset))
     pictures.append(ranking_drawing(slopes, settings.samples[0], settings.presets))
     tables = {"table": table, "elasticities": pl.DataFrame(slope_rows)}
-    return Result(tables, tuple(findings), tuple(pictures), shown, _notes(settings))
+    return StudyResult(tables, tuple(findings), tuple(pictures), shown, _notes(settings))
 
 
 def cells(settings: NoiseSettings, dataset: Dataset) -> list[Cell]:

@@ -15,7 +15,7 @@ import polars as pl
 
 from phibench.benchmark.scores.answer_errors import Rules
 from phibench.benchmark.scores.intervals import Estimate, Statistic, estimates
-from phibench.benchmark.scores.metrics import Measured, measure, prepared
+from phibench.benchmark.scores.metrics import MetricEstimate, measure, prepared
 from phibench.scenes.frames import Array
 from phibench.scenes.random_streams import generator
 from phibench.studies.findings import Finding, Row
@@ -124,7 +124,7 @@ def _row(records: pl.DataFrame, rules: Rules, key: tuple[Any, ...]) -> dict[str,
     return {**row, "scatter_px": scatter, "bias_px": bias, "saturated": records["saturated"].mean()}
 
 
-def _columns(name: str, measured: Measured) -> dict[str, float]:
+def _columns(name: str, measured: MetricEstimate) -> dict[str, float]:
     value = measured.estimate
     return {name: value.value, f"{name}_low": value.low, f"{name}_high": value.high}
 

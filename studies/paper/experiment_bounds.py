@@ -18,7 +18,7 @@ import polars as pl
 from phibench.benchmark.scores.answer_errors import Rules
 from phibench.benchmark.scores.dataset_pairs import spot_bounds as bounds_of_spot
 from phibench.benchmark.scores.intervals import Clusters, Estimate, estimates, rate, rms_of, rms_ratio_of
-from phibench.benchmark.scores.score_tables import Grid, cell_parts
+from phibench.benchmark.scores.score_tables import TextTable, cell_parts
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.exposures.pair_draws import CachedSample
 from phibench.datasets.frames.request import Exposure
@@ -224,14 +224,14 @@ def budgets(rows: pl.DataFrame, by: str, rules: Rules | None = None) -> dict[str
     return {str(key[0]): budget(group, rules) for key, group in groups.items()}
 
 
-def budget_table(rows: pl.DataFrame, wide: bool = False) -> Grid:
+def budget_table(rows: pl.DataFrame, wide: bool = False) -> TextTable:
     """Budgets per experiment, of all rows, and of those whose bound is at most 1 % of D; `wide` adds the intervals."""
     ratios = ("predicted\n/ measured", "measured\n/ bound", "within\n95 %", "nominal\nrig")
     heads = ("rows", "n\nof all", "measured", "predicted", "bound", *ratios)
     body = tuple((name, *_cells(budget(part), wide)) for name, part in _parts(rows))
     confidence = "; 95 % intervals over samples" if wide else ""
     note = "" if wide else "95 % intervals: --wide."
-    return Grid(f"Relative errors of D in %{confidence}", heads, body, "L" + "r" * (len(heads) - 1), note)
+    return TextTable(f"Relative errors of D in %{confidence}", heads, body, "L" + "r" * (len(heads) - 1), note)
 
 
 def write_rows(rows: pl.DataFrame, path: Path) -> Path:

@@ -13,7 +13,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from phibench.benchmark.scores.score_tables import Grid
+from phibench.benchmark.scores.score_tables import TextTable
 from phibench.calibration.rig.file import Calibration
 from phibench.estimator.geometry.estimators import ESTIMATORS
 from phibench.estimator.geometry.least_squares_depth import GeneralDepth, depth_general
@@ -31,7 +31,7 @@ CENTROID_SIGMA_PX = 0.02
 """Of `find_spot` on noise-free frames: the pixels' share in the predicted error of `GENERAL` from "frame"."""
 
 
-class Sample(Protocol):
+class EstimatedSample(Protocol):
     """Part of a sample of `phibench.datasets.read` that scoring needs."""
 
     @property
@@ -46,7 +46,7 @@ class Sample(Protocol):
         """Image without noise, shape (3, H, W), electrons per second."""
 
 
-class Dataset(Protocol):
+class EstimatedDataset(Protocol):
     """Part of a data set of `phibench.datasets.read` that scoring needs."""
 
     @property
@@ -87,7 +87,7 @@ class Score:
 
 
 @dataclass(frozen=True)
-class Summary:
+class RelativeErrors:
     """Relative errors of one estimator over the samples that have an estimate."""
 
     estimator: str
@@ -116,7 +116,7 @@ class _Nominal:
     covariance: Array | None = None
 
     @classmethod
-    def of(cls, sample: Sample, calibration: Calibration | None) -> _Nominal:
+    def of(cls, sample: EstimatedSample, calibration: Calibration | None) -> _Nominal:
         """Nominal numbers, or those of a calibration."""
         if calibration is None:
             return cls(sample.nominal_rig, sample.row.nominal_stroke_m)
@@ -124,7 +124,7 @@ class _Nominal:
         return cls(calibration.rig, stroke_m, calibration.covariance)
 
 
-def score(dataset: Dataset, calibration: Calibration | None = None) -> tuple[Score, ...]:
+def score(dataset: EstimatedDataset, calibration: Calibration | None = None) -> tuple[Score, ...]:
     """Score all estimators on all samples, from true pixels and from noise-free frames.
 
     Parameters
@@ -148,7 +148,7 @@ def score(dataset: Dataset, calibration: Calibration | None = None) -> tuple[Sco
     )
 
 
-def summarise(scores: Iterable[Score]) -> tuple[Summary, ...]:
+def summarise(scores: Iterable[Score]) -> tuple[RelativeErrors, ...]:
     """Summaries per estimator and source, in the order of first appearance."""
     groups: dict[tuple[str, str], list[Score]] = {}
     for item in scores:
@@ -156,7 +156,7 @@ def summarise(scores: Iterable[Score]) -> tuple[Summary, ...]:
     return tuple(_summary(*key, items) for key, items in groups.items())
 
 
-def table(scores: Sequence[Score], source: str = "truth", wide: bool = False) -> Grid:
+def table(scores: Sequence[Score], source: str = "truth", wide: bool = False) -> TextTable:
     """The paper's tables beside ours: a row per sample, a column per estimator, relative errors.
 
     `wide` adds the estimates, the cause where there is none, and the p values of `GENERAL`.
@@ -169,7 +169,7 @@ def table(scores: Sequence[Score], source: str = "truth", wide: bool = False) ->
     return (_wide_table if wide else _narrow_table)(list(rows.values()), names, source)
 
 
-def _wide_table(rows: list[list[Score]], names: list[str], source: str) -> Grid:
+def _wide_table(rows: list[list[Score]], names: list[str], source: str) -> TextTable:
     heads = ("experiment", "h", "real D", "published", *names)
     body = []
     for items in rows:
@@ -181,10 +181,10 @@ def _wide_table(rows: list[list[Score]], names: list[str], source: str) -> Grid:
     published = "{} ({})".format(*_published_rms(rows))
     body.append(("rms relative error (n)", "", "", published, *means))
     title = f"Depth in metres, relative error in %; pixels: {source}"
-    return Grid(title, heads, tuple(body), "l" + "r" * (len(heads) - 1))
+    return TextTable(title, heads, tuple(body), "l" + "r" * (len(heads) - 1))
 
 
-def _narrow_table(rows: list[list[Score]], names: list[str], source: str) -> Grid:
+def _narrow_table(rows: list[list[Score]], names: list[str], source: str) -> TextTable:
     """Relative errors alone, for 80 columns; with a calibration the predicted error in place of the paper's estimate.
 
     The approximation goes then, too.
@@ -206,7 +206,7 @@ def _narrow_table(rows: list[list[Score]], names: list[str], source: str) -> Gri
     heads = [name.replace("_", "\n") for name in shown]
     heads = [*heads, "its\nsigma"] if calibrated else ["printed", *heads]
     note = "" if calibrated else "printed: the paper's own estimates. "
-    return Grid(
+    return TextTable(
         f"Relative error of D in %; pixels: {source}",
         ("experiment", "h\nm", "D\nm", *heads),
         tuple(body),
@@ -223,7 +223,7 @@ def _without(rows: list[list[Score]], most: int = 3) -> str:
     return f"Without an estimate: {'; '.join(found[:most])}{more}. " if found else ""
 
 
-def bias_table(scores: Sequence[Score]) -> Grid:
+def bias_table(scores: Sequence[Score]) -> TextTable:
     """Relative error of eq. (4) from true pixels per phi convention: smallest, largest, mean, rms."""
     rows = []
     for item in summarise(scores):
@@ -232,15 +232,15 @@ def bias_table(scores: Sequence[Score]) -> Grid:
             values = (_percent(value) for value in (item.minimum, item.maximum, item.mean))
             rows.append((item.estimator.removeprefix("paper_"), str(item.n), *values, _rms(item.rms)))
     title = "Bias of eq. (4) by what is taken for phi, true pixels, relative error in %"
-    return Grid(title, ("phi", "n", "min", "max", "mean", "rms"), tuple(rows), "lrrrrr")
+    return TextTable(title, ("phi", "n", "min", "max", "mean", "rms"), tuple(rows), "lrrrrr")
 
 
-def as_records(items: Iterable[Score | Summary]) -> list[dict[str, object]]:
+def as_records(items: Iterable[Score | RelativeErrors]) -> list[dict[str, object]]:
     """Scores or summaries as JSON-ready records; NaN becomes None."""
     return [{key: _json_value(value) for key, value in asdict(item).items()} for item in items]
 
 
-def _pixels(sample: Sample, source: str) -> _Pixels:
+def _pixels(sample: EstimatedSample, source: str) -> _Pixels:
     nowhere = np.full(2, np.nan)  # estimators then give NaN, and the fault says why
     for position in POSITIONS:
         spot = getattr(sample.row, position)
@@ -285,13 +285,15 @@ def _estimate(nominal: _Nominal, name: str, source: str, pixels: _Pixels) -> Dep
     return depth_general(nominal.rig, nominal.stroke_m, pixels.down, pixels.up, C, C, nominal.covariance)
 
 
-def _summary(estimator: str, source: str, items: list[Score]) -> Summary:
+def _summary(estimator: str, source: str, items: list[Score]) -> RelativeErrors:
     errors = np.array([item.relative_error for item in items if item.status == "ok"])
     missing = len(items) - len(errors)
     if not len(errors):
-        return Summary(estimator, source, 0, missing, *[float("nan")] * 4)
+        return RelativeErrors(estimator, source, 0, missing, *[float("nan")] * 4)
     rms = float(np.sqrt(np.mean(errors**2)))
-    return Summary(estimator, source, len(errors), missing, rms, *(float(f(errors)) for f in (np.mean, np.min, np.max)))
+    return RelativeErrors(
+        estimator, source, len(errors), missing, rms, *(float(f(errors)) for f in (np.mean, np.min, np.max))
+    )
 
 
 def _cell(value_m: float, relative: float, status: str) -> str:

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullFormatter
 
 from phibench.benchmark.scores.figures import COLOURS, LINES, STYLE, encoded
-from phibench.benchmark.scores.score_tables import Grid
+from phibench.benchmark.scores.score_tables import TextTable
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.store.files import write_bytes
 from phibench.estimator.limits.best_stroke import BestStroke
@@ -117,7 +117,7 @@ def _loss(best: BestStroke, stroke_m: float) -> Loss:
     return Loss(stroke_m, found, found / best.sigma_m, FREE)
 
 
-def loss_table(best: BestStroke, strokes_m: Sequence[float] | None = None) -> Grid:
+def loss_table(best: BestStroke, strokes_m: Sequence[float] | None = None) -> TextTable:
     """Table of `losses`: those that are asked for, or `USUAL_M` within the curve.
 
     Raises
@@ -133,7 +133,7 @@ def loss_table(best: BestStroke, strokes_m: Sequence[float] | None = None) -> Gr
         for loss in losses(best, wanted)
     ]
     heads = ("stroke\nm", "sigma of D\nmm", "of D\n%", "over the best", "")
-    return Grid("What another stroke loses", heads, tuple(rows), "rrrrL")
+    return TextTable("What another stroke loses", heads, tuple(rows), "rrrrL")
 
 
 def _millimetres(best: BestStroke, loss: Loss) -> tuple[str, str, str]:

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from phibench.studies.framework import COLOURS, MARKERS, Drawing, canvas, drawn, line_style
-from phibench.studies.stroke.rendered_checks import Checked, Found
+from phibench.studies.stroke.rendered_checks import Found, RenderedOutcome
 
 
 def best_drawing(found: Found, tolerances: Sequence[str], depths_m: Sequence[float]) -> Drawing:
@@ -59,7 +59,7 @@ def curves_drawing(found: Found, tolerances: Sequence[str], longest_m: Mapping[f
         return drawn("curves", figure, alt + ".")
 
 
-def check_drawing(checks: Sequence[Checked]) -> Drawing:
+def check_drawing(checks: Sequence[RenderedOutcome]) -> Drawing:
     """Measured rms beside the prediction."""
     names = tuple(dict.fromkeys(c.check.tolerance for c in checks))
     with canvas(10.0, 3.8) as figure:

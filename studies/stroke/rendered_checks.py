@@ -50,7 +50,7 @@ _TURN = 0.618033988749895  # golden: azimuths, and with them sub-pixel phases, n
 
 
 @dataclass(frozen=True)
-class Check:
+class RenderedCheck:
     """One distance, stroke and tolerance.
 
     Attributes
@@ -80,7 +80,7 @@ class Check:
 
 
 @dataclass(frozen=True)
-class Checked:
+class RenderedOutcome:
     """A check with what was measured.
 
     Attributes
@@ -90,7 +90,7 @@ class Checked:
         D of the frames minus the true one, of the pairs in which both spots were found.
     """
 
-    check: Check
+    check: RenderedCheck
     errors_m: tuple[float, ...]
 
     @property
@@ -113,7 +113,7 @@ class Checked:
         return low <= self.check.predicted_m <= high
 
 
-def run_checks(checks: Sequence[Check], datasets: StudyDatasets) -> list[Checked]:
+def run_checks(checks: Sequence[RenderedCheck], datasets: StudyDatasets) -> list[RenderedOutcome]:
     """Measure, with the workers of the data sets."""
     with Steps(datasets.console, "stroke, frames", len(checks)) as steps:
         found = []
@@ -123,20 +123,20 @@ def run_checks(checks: Sequence[Check], datasets: StudyDatasets) -> list[Checked
     return found
 
 
-def measured(check: Check) -> Checked:
+def measured(check: RenderedCheck) -> RenderedOutcome:
     """Draw and evaluate all frames of a check."""
     nominal = Rig()
     answers = [_answer(check, nominal, k) for k in range(check.draws)]
     found = [a for a in answers if a is not None]
     if not found:
-        return Checked(check, ())
+        return RenderedOutcome(check, ())
     true, down, up, C_down, C_up = (np.array(column) for column in zip(*found, strict=True))
     depth = depth_general(nominal, check.stroke_m, down, up, C_down, C_up, np.array(check.covariance)).depth_m
     errors = depth - true
-    return Checked(check, tuple(errors[np.isfinite(errors)].tolist()))
+    return RenderedOutcome(check, tuple(errors[np.isfinite(errors)].tolist()))
 
 
-def _answer(check: Check, nominal: Rig, draw: int) -> tuple[float, Array, Array, Array, Array] | None:
+def _answer(check: RenderedCheck, nominal: Rig, draw: int) -> tuple[float, Array, Array, Array, Array] | None:
     """True D, positions in the whole image and claimed covariances of one draw; None if a spot is not found."""
     names = (*_NAMES, check.tolerance, f"{check.depth_m:.6f}", f"{check.stroke_m:.6f}", draw)
     # named without the stroke: all strokes of a distance are compared on the same random rigs
@@ -167,7 +167,7 @@ def deviations(covariance: Array, names: tuple[Name, ...]) -> Array:
     return np.asarray(covariance_root(covariance) @ generator(*names, "rig").standard_normal(len(PARAMETERS)))
 
 
-def _spot(check: Check, rig: Rig, azimuth_rad: float) -> LaserSpot:
+def _spot(check: RenderedCheck, rig: Rig, azimuth_rad: float) -> LaserSpot:
     axis = rig.at(0.0).sphere_centre_m
     away = np.array([math.cos(azimuth_rad), math.sin(azimuth_rad)])
     x, y = (axis[:2] + check.depth_m * away).tolist()
@@ -245,13 +245,13 @@ def limit_findings(curves: Mapping[float, StrokeCurve]) -> Iterator[Finding]:
         yield Finding("without the carriage's limit: nothing forbids a stroke up to h", longest, unit="m")
 
 
-def check_findings(checks: Sequence[Checked]) -> Iterator[Finding]:
+def check_findings(checks: Sequence[RenderedOutcome]) -> Iterator[Finding]:
     """Measured against predicted error by tolerance, and strokes surely better or worse than the best."""
     for name in dict.fromkeys(c.check.tolerance for c in checks):
         yield from _checked(name, [c for c in checks if c.check.tolerance == name])
 
 
-def _checked(name: str, checks: Sequence[Checked]) -> Iterator[Finding]:
+def _checked(name: str, checks: Sequence[RenderedOutcome]) -> Iterator[Finding]:
     lead, cells = f"frames, {name}", f"of {len(checks)} cells"
     ratios = [c.rms_m / c.check.predicted_m for c in checks]
     yield Finding(f"{lead}: measured rms over predicted sigma, mean", math.exp(float(np.mean(np.log(ratios)))))
@@ -273,7 +273,7 @@ def best_table(found: Found, tolerances: Sequence[str], depths_m: Sequence[float
     return (head, *((f"{d:g}", *(cell for t in tolerances for cell in _cells(found[t, d]))) for d in depths_m))
 
 
-def check_table(checks: Sequence[Checked]) -> tuple[Row, ...]:
+def check_table(checks: Sequence[RenderedOutcome]) -> tuple[Row, ...]:
     """Measured against predicted."""
     head = ("tolerance", "D, m", "h / best", "h, m", "predicted, mm", "measured rms, mm", "pairs")
     return (head, *(_check_row(c) for c in checks))
@@ -297,11 +297,11 @@ def _worst(rig: Rig, depth_m: float, height_m: float, stroke_m: float) -> tuple[
     return PARAMETERS[k], float(size[k])
 
 
-def _best_of(check: Checked, checks: Sequence[Checked]) -> Checked:
+def _best_of(check: RenderedOutcome, checks: Sequence[RenderedOutcome]) -> RenderedOutcome:
     return next(c for c in checks if c.check.depth_m == check.check.depth_m and c.check.factor == 1.0)
 
 
-def _surely_better(a: Checked, b: Checked) -> bool:
+def _surely_better(a: RenderedOutcome, b: RenderedOutcome) -> bool:
     return a.interval_m[1] < b.interval_m[0]
 
 
@@ -309,7 +309,7 @@ def _cells(best: BestStroke) -> tuple[str, str, str]:
     return f"{best.stroke_m:.2f}", f"{1e3 * best.sigma_m:.3g}", ", ".join(best.limits)
 
 
-def _check_row(c: Checked) -> Row:
+def _check_row(c: RenderedOutcome) -> Row:
     low, high = c.interval_m
     rms = f"{1e3 * c.rms_m:.3g} ({1e3 * low:.3g} to {1e3 * high:.3g})"
     where = (f"{c.check.depth_m:g}", f"{c.check.factor:g}", f"{c.check.stroke_m:.3f}")

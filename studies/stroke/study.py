@@ -10,7 +10,7 @@ import numpy as np
 import polars as pl
 from pydantic import Field
 
-from phibench.calibration.outline.limb_image import Measured
+from phibench.calibration.outline.limb_image import PoseMeasurement
 from phibench.calibration.rig.bundle import calibrate
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.frames.sensor_card import SensorCard, sensor_card
@@ -22,11 +22,11 @@ from phibench.estimator.limits.stroke_curve import StrokeCurve, Surroundings, st
 from phibench.estimator.spots.spot_prediction import Laser
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import Rig
-from phibench.studies.framework import Result, Settings, Study, StudyDatasets
+from phibench.studies.framework import Settings, Study, StudyDatasets, StudyResult
 from phibench.studies.stroke.drawings import best_drawing, check_drawing, curves_drawing
 from phibench.studies.stroke.rendered_checks import (
-    Check,
-    Checked,
+    RenderedCheck,
+    RenderedOutcome,
     best_findings,
     best_table,
     check_findings,
@@ -71,7 +71,7 @@ class StrokeSettings(Settings):
     check: CheckSettings
 
 
-def run(settings: StrokeSettings, datasets: StudyDatasets) -> Result:
+def run(settings: StrokeSettings, datasets: StudyDatasets) -> StudyResult:
     """Run the study."""
     rig, card = Rig(), sensor_card(settings.preset, jpeg_quality=_QUALITY)
     around = Surroundings(heights_m=(settings.spot_height_m,))
@@ -95,7 +95,7 @@ def run(settings: StrokeSettings, datasets: StudyDatasets) -> Result:
         findings += reason_findings(rig, built.depth_m, settings.spot_height_m, (built.stroke_m, top))
     findings += limit_findings(_free_curves(rig, settings.depths_m, spot, card, around))
     findings += check_findings(checks)
-    return Result(
+    return StudyResult(
         {"table": best_frame(found), "curves": curve_frame(found), "checks": check_frame(checks)},
         tuple(findings),
         (
@@ -131,7 +131,7 @@ def _paper(settings: StrokeSettings) -> dict[float, float]:
 
 def tolerances(rig: Rig, outline_sigma_um: Sequence[float]) -> dict[str, Array]:
     """Covariances of the rig's parameters by name."""
-    outline = Measured(rig.sphere_in_camera_m, np.diag((np.array(outline_sigma_um) * 1e-6) ** 2))
+    outline = PoseMeasurement(rig.sphere_in_camera_m, np.diag((np.array(outline_sigma_um) * 1e-6) ** 2))
     return {
         AS_BUILT: np.diag(prior_sigmas() ** 2),
         CALIBRATED: calibrate(rig, outline).covariance,
@@ -139,7 +139,7 @@ def tolerances(rig: Rig, outline_sigma_um: Sequence[float]) -> dict[str, Array]:
     }
 
 
-def planned(settings: StrokeSettings, rig: Rig, rigs: Mapping[str, Array]) -> list[Check]:
+def planned(settings: StrokeSettings, rig: Rig, rigs: Mapping[str, Array]) -> list[RenderedCheck]:
     """Cells of the check that lie within the limits."""
     wanted, card = settings.check, sensor_card(settings.check.preset)
     taken = (wanted.preset, wanted.power_mw, wanted.draws)
@@ -154,7 +154,7 @@ def planned(settings: StrokeSettings, rig: Rig, rigs: Mapping[str, Array]) -> li
             strokes = np.array([f * best.stroke_m for f in wanted.factors])
             curve = stroke_curve(rig, d, strokes, exposure_s=card.exposure_s, stroke_sigma_m=0.0, **options)
             checks += [
-                Check(name, d, float(h), f, float(s), rows, settings.spot_height_m, *taken)
+                RenderedCheck(name, d, float(h), f, float(s), rows, settings.spot_height_m, *taken)
                 for f, h, s in zip(wanted.factors, strokes, curve.allowed_sigma_m, strict=True)
                 if math.isfinite(s)
             ]
@@ -182,7 +182,7 @@ def curve_frame(found: Mapping[tuple[str, float], BestStroke]) -> pl.DataFrame:
     return pl.concat([_curve(name, best) for (name, _), best in found.items()])
 
 
-def check_frame(checks: Sequence[Checked]) -> pl.DataFrame:
+def check_frame(checks: Sequence[RenderedOutcome]) -> pl.DataFrame:
     """A row per cell of the check."""
     keys = ("tolerance", "depth_m", "stroke_m", "factor", "predicted_m")
     rows = [
@@ -211,7 +211,7 @@ def _free_curves(
     return {d: stroke_curve(rig, d, grid, spot, exact, around, Laser(), card.exposure_s, 0.0) for d in ends}
 
 
-def _notes(settings: StrokeSettings, checks: Sequence[Checked]) -> tuple[str, ...]:
+def _notes(settings: StrokeSettings, checks: Sequence[RenderedOutcome]) -> tuple[str, ...]:
     notes = [
         "Predictions are for a round spot over a flat white wall at 1 mW and 1/60 s, rms over 8 "
         f"azimuths; frames of the check are {settings.check.preset} at {settings.check.power_mw:g} mW, before a "

@@ -12,7 +12,7 @@ import pytest
 from helpers.calibration_cases import apparent
 from scipy import stats
 
-from phibench.calibration.outline.limb_image import Measured
+from phibench.calibration.outline.limb_image import PoseMeasurement
 from phibench.calibration.rig.bundle import KnownSpot, calibrate
 from phibench.calibration.rig.vertical_edges import vertical_of
 from phibench.datasets.parallel import parallel_map
@@ -61,7 +61,7 @@ class Data:
     def calibrated(self, true: Rig, rng: np.random.Generator) -> Rig:
         """The nominal rig after the outline, and after four spots where a place is known."""
         noise = rng.standard_normal if self.drawn else np.zeros
-        seen = Measured(apparent(true).value + self.outline_m * noise(3), np.diag(self.outline_m) ** 2)
+        seen = PoseMeasurement(apparent(true).value + self.outline_m * noise(3), np.diag(self.outline_m) ** 2)
         spots = []
         for depth, azimuth in FOUR if math.isfinite(self.place[0]) else ():
             point = around(true, depth, azimuth)
@@ -163,7 +163,7 @@ def calibrated_errors(known: str, rigs: int) -> tuple[np.ndarray, np.ndarray]:
         rng = generator("test", "strokes", k)
         values = rng.normal(0.0, sigmas)
         true = changed(NOMINAL, values)
-        outline = Measured(apparent(true).value + OUTLINE @ rng.standard_normal(3), OUTLINE**2)
+        outline = PoseMeasurement(apparent(true).value + OUTLINE @ rng.standard_normal(3), OUTLINE**2)
         bundle = calibrate(NOMINAL, outline, drawn_spots(true, values, rng, known))
         for i, depth in enumerate((1.0, 1.8, 2.6, 3.4, 4.2)):
             point, h = around(true, depth, rng.uniform(0.0, 2.0 * np.pi)), float(stroke_of(np.array(STROKE), values))
@@ -218,8 +218,8 @@ def pull_with_vertical(rigs: int) -> tuple[float, float]:
         seen = apparent(true).value
         sphere = replace(NOMINAL.T_camera_sphere, translation_m=tuple(seen))
         up = vertical_of(upright_edges(true), replace(NOMINAL, T_camera_sphere=sphere)).up[:2]
-        outline = Measured(seen, np.diag([2e-6, 2e-6, 1e-5]) ** 2)
-        vertical = Measured(up + tilt * rng.standard_normal(2), tilt**2 * np.eye(2))
+        outline = PoseMeasurement(seen, np.diag([2e-6, 2e-6, 1e-5]) ** 2)
+        vertical = PoseMeasurement(up + tilt * rng.standard_normal(2), tilt**2 * np.eye(2))
         bundle = calibrate(NOMINAL, outline, vertical=vertical, sigmas=sigmas)
         for i, depth in enumerate((1.0, 1.8, 2.6, 3.4, 4.2)):
             point = around(true, depth, rng.uniform(0.0, 2.0 * np.pi))

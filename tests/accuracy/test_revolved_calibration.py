@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy import optimize
 
-from phibench.calibration.outline.limb_image import Measured
+from phibench.calibration.outline.limb_image import PoseMeasurement
 from phibench.calibration.rig.bundle import KnownSpot, apparent_outline, calibrate
 from phibench.datasets.recipe.build import build_rig
 from phibench.datasets.recipe.tables import RigTable
@@ -110,7 +110,7 @@ def errors_of(shape: str, k: int, names: tuple[str, ...]) -> tuple[Array, Array]
     seen, errors, pulls = seen_place(nominal, true), [depth_exact(nominal, STROKE, *uv).depth_m / DEPTHS - 1.0], []
     for name in names:
         data, noise = DATA[name], rng.standard_normal if DATA[name].drawn else np.zeros
-        outline = Measured(seen + np.array(data.outline) * noise(5), np.diag(np.square(data.outline)))
+        outline = PoseMeasurement(seen + np.array(data.outline) * noise(5), np.diag(np.square(data.outline)))
         spots = []
         for depth, azimuth in FOUR if data.pixel else ():
             down, up = (pixel(true, around(true, depth, azimuth), h) + data.pixel * noise(2) for h in (0.0, STROKE))
@@ -162,7 +162,7 @@ def test_accuracy_of_a_tilts_sign() -> None:
     sigmas[[PARAMETERS.index(name) for name in ("decentre_x_m", "decentre_y_m")]] = 1e-4  # the line of sight is known
     true = changed(nominal, np.where(np.array(PARAMETERS) == "mirror_tilt_y_rad", math.radians(1.0), 0.0))
     sigma = np.array([1e-2, 1e-2, 1e-2, 2e-3, 2e-3])  # 10 mm: the vertex tells nothing of the tilt
-    bundle = calibrate(nominal, Measured(seen_place(nominal, true), np.diag(sigma**2)), sigmas=sigmas)
+    bundle = calibrate(nominal, PoseMeasurement(seen_place(nominal, true), np.diag(sigma**2)), sigmas=sigmas)
     about_x, about_y = (math.degrees(bundle.sigmas[f"mirror_tilt_{axis}_rad"]) for axis in "xy")
     assert about_y == pytest.approx(1.0, rel=0.1)  # the prior of half a degree draws it nearer
     assert about_x < 0.2
@@ -186,11 +186,11 @@ def test_accuracy_of_moments_given_an_ellipse() -> None:
     mixed[0, 3] = mixed[3, 0] = 0.8
     C = mixed * np.outer(sigma, sigma)
     place = seen_place(nominal, true) + np.array([1e-4, 0.0, 0.0, 0.006, 0.004])
-    found = calibrate(nominal, Measured(place, C), sigmas=sigmas)
+    found = calibrate(nominal, PoseMeasurement(place, C), sigmas=sigmas)
     wide = C.copy()
     wide[3:], wide[:, 3:] = 0.0, 0.0
     wide[3, 3] = wide[4, 4] = 1e4
-    without = calibrate(nominal, Measured(place, wide), sigmas=sigmas)
+    without = calibrate(nominal, PoseMeasurement(place, wide), sigmas=sigmas)
     free = np.flatnonzero(sigmas)
     draws = np.tile(without.values, (3000, 1))
     draws[:, free] = rng.multivariate_normal(

@@ -9,7 +9,7 @@ import pytest
 from helpers.sensor_light import room
 
 from phibench.datasets.frames.request import FrameRequest
-from phibench.datasets.frames.source import FrameSource, Side
+from phibench.datasets.frames.source import FrameSource, PositionLight
 from phibench.datasets.store.layers import SpotWindow
 from phibench.render.sensor.camera_chain import Chain
 from phibench.render.sensor.electrons import _pattern
@@ -61,7 +61,7 @@ def source(region: Region, preset: str = "mjpeg", velocity: tuple[float, float] 
     s = sensor(preset, **changes)
     u0, v0, planes = moved_spot(LIGHT.spot, velocity, s.exposure_s, s.readout_s, LIGHT.size[0])
     light = replace(LIGHT, spot=SpotWindow(u0, v0, planes, 0.0 * planes, 0.0 * planes))
-    side = Side(Chain(s), light, region)
+    side = PositionLight(Chain(s), light, region)
     return FrameSource(FrameRequest(preset, overrides=changes), ("benchmark", 0, "s"), {"down": side, "up": side})
 
 

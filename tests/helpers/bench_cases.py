@@ -17,7 +17,7 @@ from scipy.linalg import block_diag
 from phibench.datasets.frames.sensor_card import sensor_card
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.estimator.interface import Answer, Outcome, Pair, Spot
-from phibench.estimator.pair_set import PairTruth, SpotTruth
+from phibench.estimator.pair_set import ImageTruth, PairTruth
 from phibench.scenes.random_streams import generator
 from phibench.scenes.rig import Rig
 
@@ -61,7 +61,7 @@ def cases(samples: int = SAMPLES, draws: int = 1) -> Cases:
     return Cases(tuple(replace(truth, number=n) for n, truth in enumerate(truths)))
 
 
-def spot_truth(offset_m: float, spot_world_m: np.ndarray, rng: np.random.Generator) -> SpotTruth:
+def spot_truth(offset_m: float, spot_world_m: np.ndarray, rng: np.random.Generator) -> ImageTruth:
     """One image: angles from the reflection point, a bound that falls with the light and is longer one way."""
     P = true_reflection(RIG, offset_m, spot_world_m, alhazen_quartic)
     camera = RIG.T_world_camera.t + [0.0, 0.0, offset_m]
@@ -77,7 +77,7 @@ def spot_truth(offset_m: float, spot_world_m: np.ndarray, rng: np.random.Generat
     axes = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
     raw = axes @ np.diag([sigma2, 2.5 * sigma2]) @ axes.T
     u, v = true_pixel(RIG, offset_m, spot_world_m)
-    return SpotTruth(
+    return ImageTruth(
         uv_px=(float(u), float(v)),
         phi_rad={name: float(x) for name, x in phi.items()},
         azimuth_rad=float(np.arctan2(normal[1], normal[0])),
@@ -92,7 +92,7 @@ def spot_truth(offset_m: float, spot_world_m: np.ndarray, rng: np.random.Generat
     )
 
 
-def image_of(spot: SpotTruth) -> np.ndarray:
+def image_of(spot: ImageTruth) -> np.ndarray:
     """Black frame with a red spot where the truth says, or without one if it is not visible."""
     image = np.zeros((RIG.camera.height_px, RIG.camera.width_px, 3), np.uint8)
     if spot.visible:
@@ -154,7 +154,7 @@ def sampler(seed: int = 0, claim: float = 1.0, spread: float = 1.0) -> Oracle:
         rng = generator("tests", "ideal sampler", seed, t.sample_id, t.draw)
         return Answer(*(drawn(s, rng) for s in (t.down, t.up)))
 
-    def drawn(s: SpotTruth, rng: np.random.Generator) -> Spot:
+    def drawn(s: ImageTruth, rng: np.random.Generator) -> Spot:
         e = spread * np.linalg.cholesky(s.bound_px2) @ rng.standard_normal(2)
         C = claim * s.bound_px2
         return Spot((s.uv_px[0] + e[0], s.uv_px[1] + e[1]), ((C[0, 0], C[0, 1]), (C[1, 0], C[1, 1])))

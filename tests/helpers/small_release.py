@@ -5,15 +5,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from phibench.benchmark.release.benchmark import Part, content_sha256
+from phibench.benchmark.release.benchmark import ReleasePart, content_sha256
 from phibench.benchmark.release.release_make import Released, ReleaseRequest
 
 ROOT = Path(__file__).parents[2]
 
 
-def part_of(name: str, recipe: str, kind: Any) -> Part:
+def part_of(name: str, recipe: str, kind: Any) -> ReleasePart:
     path = ROOT / "tests" / recipe
-    return Part(name, path, kind, content_sha256(path.read_text(encoding="utf-8")))
+    return ReleasePart(name, path, kind, content_sha256(path.read_text(encoding="utf-8")))
 
 
 SMALL, FILMS = part_of("small", "smallest.toml", "pairs"), part_of("films", "films.toml", "films")
@@ -31,7 +31,7 @@ class Made:
         return self.request.out
 
 
-def ask(folder: Path, parts: list[Part], **options: Any) -> ReleaseRequest:
+def ask(folder: Path, parts: list[ReleasePart], **options: Any) -> ReleaseRequest:
     return ReleaseRequest(
         parts, folder / "public", folder / "work", folder / "seed", workers=1, archive_bytes=100_000, **options
     )

@@ -12,7 +12,7 @@ import numpy as np
 from phibench.estimator.geometry.rig_parameters import PARAMETERS, PRIOR_SIGMA, RIG_PARAMETERS, RigBias
 from phibench.estimator.geometry.sphere_image import SphereImager
 from phibench.robot.loop.belief import Belief, TargetPrior
-from phibench.robot.loop.sensing import SEEN, Direction, Light, Reading, Sensing, direction_of
+from phibench.robot.loop.sensing import SEEN, Direction, Sensing, SpotOnSurface, SpotReading, direction_of
 from phibench.robot.loop.smoothing import belief_of
 from phibench.scenes.motion.vehicle import PlanarPose, Stance, Vehicle, rig_placement, stance
 from phibench.scenes.random_streams import generator
@@ -58,10 +58,10 @@ class Approach:
         R, t = rig_placement(VEHICLE, self.pose, Stance())
         return (self.point - t) @ R
 
-    def read(self) -> Reading | None:
+    def read(self) -> SpotReading | None:
         placement = rig_placement(VEHICLE, self.pose, self.held)
         for exposure in (4, 3, 2, 1, 0):
-            light = Light(self.point, self.normal, 1.0)
+            light = SpotOnSurface(self.point, self.normal, 1.0)
             (read,) = sensing().read([light], placement, self.stroke_m, exposure, None, self.rng)
             if read.cause == SEEN:
                 return read
@@ -83,14 +83,14 @@ class MisalignedApproach(Approach):
 
     rig: Rig = RIG
 
-    def read(self) -> Reading | None:
+    def read(self) -> SpotReading | None:
         R, t = rig_placement(VEHICLE, self.pose, self.held)
         lowered = (self.point - t) @ R - self.stroke_m * np.array(self.rig.stroke_axis_world)
         image = SphereImager(self.rig).image(*lowered.tolist())
         if image is None:
             return None
         du, dv = 0.05 * self.rng.standard_normal(2)
-        return Reading(image.u_px + du, image.v_px + dv, 0.05, 1e4, SEEN)
+        return SpotReading(image.u_px + du, image.v_px + dv, 0.05, 1e4, SEEN)
 
 
 def stroked(run: Approach, to_m: float, frames: int, moving: float = 0.0, bias: RigBias | None = None) -> Belief:

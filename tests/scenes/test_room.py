@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from helpers.oracles import TARGETS, paper_cases, true_reflection
 
-from phibench.scenes.catalog import RIGS, ROOMS, Target, dark, lab
+from phibench.scenes.catalog import RIGS, ROOMS, TargetBoard, dark, lab
 from phibench.scenes.frames import Pose, rotation_xyz
 from phibench.scenes.rig import Rig
 from phibench.scenes.room import Room, chassis, escalade360
@@ -170,7 +170,7 @@ def test_impossible_albedos_are_refused(albedo):
 @pytest.mark.parametrize("change", [{"depth_m": 0.0}, {"depth_m": NAN}, {"azimuth_rad": INF}, {"height_m": NAN}])
 def test_impossible_targets_are_refused(change):
     with pytest.raises(SceneError, match=next(iter(change))):
-        Target(**({"name": "t", "depth_m": 1.0, "azimuth_rad": 0.0, "height_m": 0.5} | change))
+        TargetBoard(**({"name": "t", "depth_m": 1.0, "azimuth_rad": 0.0, "height_m": 0.5} | change))
 
 
 def test_catalogue_builds():

@@ -16,7 +16,7 @@ from phibench.datasets.errors import DatasetError
 from phibench.scenes.frames import Array
 from phibench.scenes.random_streams import generator
 from phibench.scenes.rig import Rig
-from phibench.studies.cause.model import COMMON, NOISE, Explanation, Model, Prior, simulate, without_table
+from phibench.studies.cause.model import COMMON, NOISE, DepthModel, Explanation, Prior, simulate, without_table
 from phibench.studies.cause.nested_sampling import CauseSettings, Posterior, all_runs, pooled, sample
 from phibench.studies.cause.paper_reading import Reader, published_experiments, read
 from phibench.studies.cause.study import (
@@ -95,7 +95,7 @@ def test_the_sampler_is_asked_for_in_a_sentence(monkeypatch: pytest.MonkeyPatch,
         run_study("cause", tmp_path, quick=True, console=Console(quiet=True))
 
 
-class _Line(Model):
+class _Line(DepthModel):
     """Two unknowns with unit normal priors, each measured once: everything in closed form."""
 
     @property
@@ -180,7 +180,9 @@ def test_fit_of_right_and_wrong_residuals(settings: CauseSettings) -> None:
 
     def fit(shift: Array) -> object:
         data = DATA.with_estimates(1.0 / (inverse + shift * sigma))
-        return fit_of(Model(model.explanation, model.priors, data, model.rig, settings.depth_sigma_m), points, random)
+        return fit_of(
+            DepthModel(model.explanation, model.priors, data, model.rig, settings.depth_sigma_m), points, random
+        )
 
     exact, running, jumping = fit(np.zeros(25)), fit(np.full(25, 1.2)), fit(1.2 * (-1.0) ** np.arange(25))
     assert exact.chi2_p > 0.99  # type: ignore[attr-defined]

@@ -16,7 +16,7 @@ from phibench.benchmark.scores.report import write_report
 from phibench.cli.main import main
 from phibench.datasets.errors import DatasetError
 from phibench.studies.findings import Finding, findings_table, markdown_table, number
-from phibench.studies.framework import Result, Settings, Study, StudyDatasets, canvas, drawn, read_settings
+from phibench.studies.framework import Settings, Study, StudyDatasets, StudyResult, canvas, drawn, read_settings
 from phibench.studies.run import find_study, publish_study, read_study, section, write_study
 
 
@@ -28,12 +28,12 @@ class Counting(Settings):
     ends: tuple[float, float] | None = Field(default=None, strict=False)
 
 
-def _count(settings: Counting, datasets: StudyDatasets) -> Result:
+def _count(settings: Counting, datasets: StudyDatasets) -> StudyResult:
     numbers = list(range(0, settings.upto, settings.step))
     with canvas() as figure:
         figure.subplots().plot(numbers, numbers)
         drawing = drawn("line", figure, f"A line up to {numbers[-1]}.")
-    return Result(
+    return StudyResult(
         {"table": pl.DataFrame({"number": numbers})},
         (Finding("count of numbers", len(numbers)).judged(">=", 3),),
         (drawing,),
@@ -93,7 +93,7 @@ def test_tables_leave_empty_columns_out() -> None:
 
 def test_a_label_stands_once() -> None:
     with pytest.raises(ValueError, match="same label: a"):
-        Result({}, (Finding("a", 1.0), Finding("a", 2.0)))
+        StudyResult({}, (Finding("a", 1.0), Finding("a", 2.0)))
 
 
 @pytest.fixture

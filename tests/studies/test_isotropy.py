@@ -18,7 +18,7 @@ from phibench.benchmark.scores.intervals import Estimate
 from phibench.datasets.read import Dataset, open_dataset
 from phibench.datasets.recipe.load import find_recipe, load_recipe
 from phibench.estimator.geometry.mirror_image import up_image
-from phibench.estimator.geometry.panorama import Grid, SeenEdge
+from phibench.estimator.geometry.panorama import PanoramaGrid, SeenEdge
 from phibench.render.sensor.settings import sensor
 from phibench.scenes.catalog import default_rig
 from phibench.scenes.misalignment import Misalignment
@@ -43,7 +43,7 @@ from phibench.studies.isotropy.study import (
 )
 
 RIG = default_rig()
-GRID = Grid(1440, -0.35, 0.35)
+GRID = PanoramaGrid(1440, -0.35, 0.35)
 DEPTHS = np.array([0.8, 1.5, 4.0])
 LIGHT = np.array([3e4, 3e4, 2e4])
 

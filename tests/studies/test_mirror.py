@@ -28,7 +28,7 @@ from phibench.scenes.misalignment import PARAMETERS as MISALIGNMENT
 from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.rig import Rig
 from phibench.scenes.room import escalade360
-from phibench.studies.framework import Result, StudyDatasets, read_settings
+from phibench.studies.framework import StudyDatasets, StudyResult, read_settings
 from phibench.studies.mirror.field import disc_shares, meridian, outline_radius_px
 from phibench.studies.mirror.measured_places import (
     DIRECTIONS,
@@ -347,7 +347,7 @@ def test_tolerances_cost_what_they_may() -> None:
 
 
 @pytest.fixture(scope="module")
-def tiny(tmp_path_factory: pytest.TempPathFactory) -> tuple[MirrorSettings, Result]:
+def tiny(tmp_path_factory: pytest.TempPathFactory) -> tuple[MirrorSettings, StudyResult]:
     # some 10 s: tolerances of 17 kinds of deviations are searched for two mirrors
     folder = tmp_path_factory.mktemp("mirror")
     (folder / "mirror.toml").write_text(TINY, encoding="utf-8")
@@ -356,7 +356,7 @@ def tiny(tmp_path_factory: pytest.TempPathFactory) -> tuple[MirrorSettings, Resu
 
 
 @pytest.mark.slow
-def test_tiny_study(tiny: tuple[MirrorSettings, Result]) -> None:
+def test_tiny_study(tiny: tuple[MirrorSettings, StudyResult]) -> None:
     _, result = tiny
     table = result.tables["table"]
     far = {row["mirror"]: row for row in table.filter(depth_m=3.0, height_m=0.5).to_dicts()}
@@ -373,7 +373,7 @@ def test_tiny_study(tiny: tuple[MirrorSettings, Result]) -> None:
 
 
 @pytest.mark.slow
-def test_the_table_for_the_choice_names_best_and_worst(tiny: tuple[MirrorSettings, Result]) -> None:
+def test_the_table_for_the_choice_names_best_and_worst(tiny: tuple[MirrorSettings, StudyResult]) -> None:
     heads, *rows = tiny[1].shown["Pick a mirror"]
     assert heads == ("criterion", "unit", "ball", "dish", "best", "worst")
     ends = {row[0]: row[-2:] for row in rows}
@@ -419,5 +419,5 @@ def test_shipped_settings_are_sound() -> None:
 
 
 @pytest.mark.slow
-def test_pick_table_without_any_value(tiny: tuple[MirrorSettings, Result]) -> None:
+def test_pick_table_without_any_value(tiny: tuple[MirrorSettings, StudyResult]) -> None:
     assert pick_table({}, tiny[0])[1][-2:] == ("-", "-")

@@ -18,7 +18,7 @@ from phibench.scenes.misalignment import PARAMETERS as MISALIGNMENT
 from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.random_streams import generator
 from phibench.scenes.rig import Rig
-from phibench.studies.cause.model import NOISE, Model, brute_force, simulate
+from phibench.studies.cause.model import NOISE, DepthModel, brute_force, simulate
 from phibench.studies.cause.nested_sampling import CauseSettings
 from phibench.studies.cause.paper_reading import (
     AZIMUTHS,
@@ -156,7 +156,7 @@ def test_slopes_are_those_of_simulated_noise(settings: CauseSettings) -> None:
     values = {NOISE: 0.05, "z_c_m": 0.27, **HEIGHTS}
     point = np.array([values[name] for name in model.names])
     smooth = replace(DATA, rounding_m=np.full(25, 1e-9))
-    exact = Model(model.explanation, model.priors, smooth, model.rig, 0.0)
+    exact = DepthModel(model.explanation, model.priors, smooth, model.rig, 0.0)
     worlds = 1.0 / simulate(exact, np.repeat(point[None], 4000, axis=0), generator("test", "cause", "slopes"))
     predicted = np.sqrt(np.diagonal(exact.covariance(exact.reading(point), point)))
     ratio = worlds.std(axis=0) / predicted
@@ -168,7 +168,7 @@ def test_brute_force_agrees_with_the_likelihood_at_small_noise(settings: CauseSe
     model = settings.model("ray", DATA)
     values = {NOISE: 0.1, "z_c_m": 0.27, **HEIGHTS}
     point = np.array([values[name] for name in model.names])
-    middle = Model(
+    middle = DepthModel(
         model.explanation,
         model.priors,
         DATA.with_estimates(model.reading(point).depth_m),

@@ -19,8 +19,8 @@ from phibench.scenes.rig import Rig
 from phibench.studies.findings import Finding
 from phibench.studies.framework import StudyDatasets, read_settings
 from phibench.studies.stroke.rendered_checks import (
-    Check,
-    Checked,
+    RenderedCheck,
+    RenderedOutcome,
     best_findings,
     check_findings,
     deviations,
@@ -57,9 +57,9 @@ def _best(sigmas: list[float], limits: tuple[str, ...] = (), causes: tuple[str, 
     return BestStroke(2.0, float(strokes[k]), sigmas[k], sigmas[k], 0.0, 0.0, 0.0, limits, curve)
 
 
-def _checked(factor: float, predicted: float, size: float, n: int = 400, name: str = AS_BUILT) -> Checked:
-    check = Check(name, 1.0, 0.5 * factor, factor, predicted, (), 0.5, "bayer-raw", 0.3, n)
-    return Checked(check, tuple(np.resize([size, -size], n).tolist()))
+def _checked(factor: float, predicted: float, size: float, n: int = 400, name: str = AS_BUILT) -> RenderedOutcome:
+    check = RenderedCheck(name, 1.0, 0.5 * factor, factor, predicted, (), 0.5, "bayer-raw", 0.3, n)
+    return RenderedOutcome(check, tuple(np.resize([size, -size], n).tolist()))
 
 
 def test_drawn_rigs_have_the_covariance() -> None:
@@ -79,15 +79,18 @@ def test_drawn_rigs_have_the_covariance() -> None:
 def test_intervals_of_an_rms_cover() -> None:
     # 200 samples of 48 normal numbers: a rate of 95 % is seen to 1.5 %; 4 sigma. BCa itself lacks a per cent or two
     random = generator("test", "rms")
-    covered = [_inside(Checked(_checked(1.0, 1.0, 1.0).check, tuple(random.standard_normal(48)))) for _ in range(200)]
+    covered = [
+        _inside(RenderedOutcome(_checked(1.0, 1.0, 1.0).check, tuple(random.standard_normal(48)))) for _ in range(200)
+    ]
     assert 0.87 < np.mean(covered) <= 1.0
     wrong = [
-        _inside(Checked(_checked(1.0, 1.0, 1.0).check, tuple(1.5 * random.standard_normal(20)))) for _ in range(99)
+        _inside(RenderedOutcome(_checked(1.0, 1.0, 1.0).check, tuple(1.5 * random.standard_normal(20))))
+        for _ in range(99)
     ]
     assert np.mean(wrong) < 0.5
 
 
-def _inside(checked: Checked) -> bool:
+def _inside(checked: RenderedOutcome) -> bool:
     low, high = checked.interval_m
     return bool(low <= 1.0 <= high) and checked.fits
 
@@ -155,7 +158,7 @@ def test_reason_names_the_costliest_parameter() -> None:
     assert all(any(f"({name})" in f.label for name in PARAMETERS) for f in found[3:])
 
 
-def _of_checks(checks: list[Checked]) -> dict[str, Finding]:
+def _of_checks(checks: list[RenderedOutcome]) -> dict[str, Finding]:
     return {f.label.removeprefix(f"frames, {AS_BUILT}: "): f for f in check_findings(checks)}
 
 

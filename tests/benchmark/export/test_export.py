@@ -17,7 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from phibench.benchmark.export.export_make import Exported, export, verify_export
+from phibench.benchmark.export.export_make import ExportOutcome, export, verify_export
 from phibench.benchmark.export.pair_rows import ExportRequest, Form, pair_key, splits
 from phibench.cli.main import main
 from phibench.datasets.errors import DatasetError
@@ -36,7 +36,7 @@ def request_of(form: Form, **options: Any) -> ExportRequest:
     return ExportRequest(form, frames, **{"draws": 2, "pairs_per_shard": 3, **options})
 
 
-def exported(dataset: Path, out: Path, form: Form, **options: Any) -> Exported:
+def exported(dataset: Path, out: Path, form: Form, **options: Any) -> ExportOutcome:
     return export(dataset, request_of(form, **options), out, workers=1)
 
 

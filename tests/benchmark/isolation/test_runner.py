@@ -34,7 +34,7 @@ from phibench.benchmark.isolation.transport import (
     unpack,
 )
 from phibench.estimator.interface import FAILURES, Outcome, Pair
-from phibench.estimator.pair_set import PairTruth, SpotTruth
+from phibench.estimator.pair_set import ImageTruth, PairTruth
 
 LIMITS = RunLimits(seconds=3.0, memory_mb=1000.0)
 
@@ -333,7 +333,7 @@ def test_a_method_sees_nothing_of_the_truth(tmp_path: Path, monkeypatch: pytest.
 
 def forbidden() -> set[str]:
     """Fields of the truth that a pair does not have under the same name."""
-    truth = {field.name for kind in (PairTruth, SpotTruth) for field in fields(kind)}
+    truth = {field.name for kind in (PairTruth, ImageTruth) for field in fields(kind)}
     return truth - {"number", "stroke_m", "down", "up", "jpeg_quality", "exposure_s", "calibration_covariance"}
 
 

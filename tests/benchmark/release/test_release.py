@@ -13,7 +13,7 @@ import pytest
 import yaml
 from helpers.small_release import SMALL, Made, ask, flip, snapshot
 
-from phibench.benchmark.release.benchmark import PARTS, VERSION, Part, content_sha256
+from phibench.benchmark.release.benchmark import PARTS, VERSION, ReleasePart, content_sha256
 from phibench.benchmark.release.release_make import ReleaseRequest, _card, dry_run, release
 from phibench.benchmark.release.release_source import SOURCE
 from phibench.benchmark.sealed.sealed_set import seal
@@ -55,7 +55,7 @@ def test_comments_do_not_count_and_numbers_do(tmp_path: Path) -> None:
     text = recipe_text("bench-dev")
     changed = tmp_path / "bench-dev.toml"
     changed.write_text("# another comment\n" + text.replace("  # 4 sigma", ""))
-    part = Part("dev", changed, "pairs", PARTS[0].sha256)
+    part = ReleasePart("dev", changed, "pairs", PARTS[0].sha256)
     assert part.text()
     assert text.count("[0.25, 1.0]") == 1
     changed.write_text(text.replace("[0.25, 1.0]", "[0.25, 1.001]"))
@@ -192,7 +192,7 @@ def test_folders_and_seeds_that_will_not_do(made: Made, tmp_path: Path, smallest
 
     assert "part them" in told(work=tmp_path / "public" / "work")
     assert "to be published" in told(secret_seed=tmp_path / "public" / "seed")
-    sealed = Part("sealed", SMALL.recipe, "sealed", SMALL.sha256)
+    sealed = ReleasePart("sealed", SMALL.recipe, "sealed", SMALL.sha256)
     assert "is sealed: give --secret-seed" in told(secret_seed=None, parts=[sealed])
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "mine.txt").write_text("mine")
@@ -206,7 +206,7 @@ def test_folders_and_seeds_that_will_not_do(made: Made, tmp_path: Path, smallest
     (lacking / "dataset.json").write_text(json.dumps(info))
     refused = "1 of its samples are refused and left out, such as seen-near-h0.500, and a release has all samples"
     assert refused in told(use=[lacking])
-    sealed = Part("hidden", SMALL.recipe, "sealed", SMALL.sha256)  # the data set has the public seed
+    sealed = ReleasePart("hidden", SMALL.recipe, "sealed", SMALL.sha256)  # the data set has the public seed
     for number, mode, expected in (
         (SECRET, 0o600, "seed is not the one"),
         (SECRET, 0o644, "chmod 600"),

@@ -18,7 +18,7 @@ from phibench.benchmark.scores.answer_errors import Rules
 from phibench.benchmark.scores.causes import CAUSES
 from phibench.benchmark.scores.document import Flag, MethodCard, write_score
 from phibench.benchmark.scores.figures import (
-    Picture,
+    EmbeddedFigure,
     cause_bars,
     error_panels,
     has_open_marks,
@@ -238,7 +238,7 @@ def crowded(scores):
     section = Section(
         "Tilt of the camera",
         ("Predicted and measured.",),
-        (Picture("data:image/png;base64,AAAA", "nothing"),),
+        (EmbeddedFigure("data:image/png;base64,AAAA", "nothing"),),
         ((("tilt", "error"), ("0.5 deg", "0.9 %")),),
     )
     first = [scores[0], scores[0], scored("constant", constant), scored("silent", silent)]

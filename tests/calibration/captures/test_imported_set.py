@@ -15,7 +15,7 @@ from phibench.benchmark.scores.document import read_score
 from phibench.benchmark.scores.score import wanted_pairs
 from phibench.calibration.captures.imported_set import import_pairs, imported_pairs, open_imported
 from phibench.calibration.captures.pair_list import read_pair_list
-from phibench.calibration.outline.limb_image import Measured
+from phibench.calibration.outline.limb_image import PoseMeasurement
 from phibench.calibration.outline.outline_result import Outline
 from phibench.calibration.rig.bundle import apparent_vertical
 from phibench.calibration.rig.file import read_calibration
@@ -177,17 +177,17 @@ def test_vertical_edges_of_pictures_tell_the_tilt(
     """Two pictures that show a vertical 0.01 rad off count as one; where none shows any, one sentence says so."""
     module, seen = (
         "phibench.calibration.captures.imported_calibration",
-        Measured(np.array([0.01, 0.0]), 1e-8 * np.eye(2)),
+        PoseMeasurement(np.array([0.01, 0.0]), 1e-8 * np.eye(2)),
     )
     outline = Outline(sample.rig.sphere_in_camera_m, np.diag([4e-6, 4e-6, 2e-5]) ** 2, 1.0, 1.0, 0.7, 0.1, 1000, 5)
     monkeypatch.setattr(f"{module}.find_outline", lambda *_: outline)
     lacking = ImageError("0 vertical edges were found that agree: 3 are needed; leave the vertical out")
     told, rig = [], open_imported(imported).rig
 
-    def calibrated(answers: list[Measured | ImageError], *more: str) -> int:
+    def calibrated(answers: list[PoseMeasurement | ImageError], *more: str) -> int:
         waiting = iter(answers)
 
-        def answer(*given: object) -> Measured:
+        def answer(*given: object) -> PoseMeasurement:
             told.append(given)
             found = next(waiting)
             if isinstance(found, ImageError):

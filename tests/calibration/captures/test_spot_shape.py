@@ -10,7 +10,7 @@ import pytest
 
 from phibench.calibration.captures.spot_shape import (
     UNLIKE,
-    SpotImage,
+    SpotPicture,
     SpotShape,
     fit_shape,
     seen_through,
@@ -34,7 +34,7 @@ def true_shape(rig: Rig) -> np.ndarray:
     return np.array([rig.camera.blur_sigma_px, *rig.camera.detector.laser_filter_response[1:]])
 
 
-def drawn(folder: Path, sample: Sample, preset: str, draws: int) -> list[SpotImage]:
+def drawn(folder: Path, sample: Sample, preset: str, draws: int) -> list[SpotPicture]:
     """Pictures with a rig that says `WRONG`."""
     rig = SpotShape(WRONG, np.eye(3)).rig(sample.rig)
     places = [Spot((side.u_px, side.v_px)) for side in (sample.row.down, sample.row.up)]

@@ -11,7 +11,7 @@ from helpers.calibration_cases import OUTLINE2, RIG, STROKE, apparent
 from helpers.oracles import true_pixel
 from scipy import stats
 
-from phibench.calibration.outline.limb_image import Measured
+from phibench.calibration.outline.limb_image import PoseMeasurement
 from phibench.calibration.outline.outline_result import Outline, mean_outline
 from phibench.calibration.rig.bundle import Bundle, KnownSpot, calibrate, seen_at
 from phibench.calibration.rig.file import CalibrationError, read_calibration, write_calibration
@@ -118,7 +118,7 @@ def test_mean_of_outlines_and_their_scatter() -> None:
 
 @pytest.fixture
 def bundle() -> Bundle:
-    return calibrate(RIG, Measured(np.array([2e-4, 0.0, 0.2605]), OUTLINE2))
+    return calibrate(RIG, PoseMeasurement(np.array([2e-4, 0.0, 0.2605]), OUTLINE2))
 
 
 def test_the_file_keeps_every_number(tmp_path, bundle) -> None:

@@ -10,7 +10,7 @@ import pytest
 from helpers.limb_frames import limb_light
 from PIL import Image
 
-from phibench.calibration.outline.limb_image import Measured, planes_of
+from phibench.calibration.outline.limb_image import PoseMeasurement, planes_of
 from phibench.calibration.outline.outline import find_outline
 from phibench.calibration.outline.outline_fit import band, step_from
 from phibench.calibration.outline.outline_result import SECTORS, Outline
@@ -39,7 +39,7 @@ def light() -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def bundle() -> Bundle:
-    return calibrate(RIG, Measured(np.array([2e-4, 0.0, 0.2605]), np.diag([4e-6, 4e-6, 2e-5]) ** 2))
+    return calibrate(RIG, PoseMeasurement(np.array([2e-4, 0.0, 0.2605]), np.diag([4e-6, 4e-6, 2e-5]) ** 2))
 
 
 def test_a_good_calibration_names_what_only_the_prior_knows(bundle: Bundle) -> None:

@@ -14,7 +14,7 @@ from phibench.datasets.exposures.pair_draws import pair_draws
 from phibench.datasets.frames.sensor_card import sensor_card
 from phibench.datasets.frames.sensor_file import (
     FitTables,
-    Measured,
+    MeasuredQuantity,
     SensorFile,
     allowed_numbers,
     read_sensor_file,
@@ -28,7 +28,7 @@ CAMERA = SensorFile(
     FitTables(
         sigma={"gain_dn_per_e": 1e-4},
         not_determined={"dark_e_per_s": 'no "dark-exposure/SECONDS"'},
-        measured={"edge_sigma_px": Measured(value=0.7, sigma=0.01, unit="px")},
+        measured={"edge_sigma_px": MeasuredQuantity(value=0.7, sigma=0.01, unit="px")},
         source={"frames": 12, "folder": "capture"},
     ),
 )

@@ -12,7 +12,7 @@ import pytest
 from phibench.cli.main import main
 from phibench.datasets.read import Sample, open_dataset
 from phibench.datasets.scene import scene_check
-from phibench.datasets.scene.scene_check import Checked, Difference, check_view, chosen_samples
+from phibench.datasets.scene.scene_check import RendererDifference, ViewComparison, check_view, chosen_samples
 from phibench.scenes.mirror import ReflectanceTable
 
 
@@ -68,7 +68,7 @@ def test_a_mirror_that_no_plugin_holds_is_left_out_with_its_cause(sample: Sample
 
 @pytest.mark.parametrize(("value", "fault"), [(0.004, False), (-0.0079, False), (0.0081, True), (float("nan"), True)])
 def test_faults_begin_beyond_tolerance_and_three_errors(value: float, fault: bool) -> None:
-    assert Difference(value, 0.001, 0.005, "1").fault == fault
+    assert RendererDifference(value, 0.001, 0.005, "1").fault == fault
 
 
 def test_samples_are_spread(smallest_dataset: Path) -> None:
@@ -85,9 +85,9 @@ def test_command(
     value: float,
     code: int,
 ) -> None:
-    def checks(one: Sample) -> Iterator[Checked]:
-        found = {"light in the mirror": Difference(value, 0.001, 0.005, "1")}
-        yield Checked(one.row.sample_id, "down", found, ())
+    def checks(one: Sample) -> Iterator[ViewComparison]:
+        found = {"light in the mirror": RendererDifference(value, 0.001, 0.005, "1")}
+        yield ViewComparison(one.row.sample_id, "down", found, ())
 
     monkeypatch.setattr(scene_check, "check_sample", checks)
     name = open_dataset(smallest_dataset)[0].row.sample_id

@@ -15,7 +15,7 @@ from phibench.cli.main import main
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.read import open_dataset
 from phibench.estimator.geometry.panorama import (
-    Grid,
+    PanoramaGrid,
     RoomEdge,
     panorama,
     pixels_by_model,
@@ -32,7 +32,7 @@ from phibench.scenes.catalog import default_rig, lab
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.misalignment import Misalignment
 
-GRID = Grid(360, math.radians(-60.0), math.radians(30.0))
+GRID = PanoramaGrid(360, math.radians(-60.0), math.radians(30.0))
 
 
 def test_grid_directions_and_places_are_inverse() -> None:
@@ -101,7 +101,7 @@ def test_model_and_truth_layer_agree_on_mirrors_of_revolution(shape: str) -> Non
 
     A ray that starts 5 mm aside meets a wall at 2 m at 2.5e-3 rad, and a pixel of this image is 1e-2 rad or more.
     """
-    grid = Grid(160, GRID.low_rad, GRID.high_rad)
+    grid = PanoramaGrid(160, GRID.low_rad, GRID.high_rad)
     view = revolved(shape, aligned=False, **QUARTER).at(0.0)
     truth = truth_layer(view, lab().shapes(view))
     by_model, by_truth = pixels_by_model(view, grid), pixels_by_truth(ray_directions(truth, view), grid)
@@ -135,7 +135,7 @@ def test_unrolled_is_bilinear_and_empty_where_nothing_is_seen() -> None:
     assert unrolled(np.stack([image] * 3, axis=-1), where).shape == (1, 3, 3)
 
 
-def _striped(grid: Grid, edge_px: np.ndarray, blur_px: float) -> np.ndarray:
+def _striped(grid: PanoramaGrid, edge_px: np.ndarray, blur_px: float) -> np.ndarray:
     """A panorama with one upright edge at the columns `edge_px`, one per row, blurred."""
     from scipy.special import ndtr
 
@@ -146,7 +146,7 @@ def _striped(grid: Grid, edge_px: np.ndarray, blur_px: float) -> np.ndarray:
 @pytest.mark.parametrize("lean", [0.0, -0.7, 1.9])
 def test_edge_is_measured_where_it_is(lean: float) -> None:
     """A blurred step that leans by a known number of columns; levels at 4 blurs are off by 3e-5 of the step."""
-    grid = Grid(720, -0.3, 0.3)
+    grid = PanoramaGrid(720, -0.3, 0.3)
     rows = np.arange(grid.height_px)
     edge = 200.3 + lean * (rows - rows.mean()) / np.ptp(rows)
     expected = np.array([[200.0, rows[-1]], [200.0, rows[0]]])
@@ -159,7 +159,7 @@ def test_edge_is_measured_where_it_is(lean: float) -> None:
 
 
 def test_edge_without_contrast_is_not_measured() -> None:
-    grid = Grid(720, -0.3, 0.3)
+    grid = PanoramaGrid(720, -0.3, 0.3)
     expected = np.array([[200.0, grid.height_px - 1.0], [200.0, 0.0]])
     assert seen_edge(np.ones((grid.height_px, grid.width_px)), grid, "none", expected) is None
 

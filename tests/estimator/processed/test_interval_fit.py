@@ -8,7 +8,7 @@ from helpers.chain_scenes import drawn
 from numpy.polynomial.legendre import leggauss
 
 from phibench.estimator.processed.interval_fit import _Belief, _propagated
-from phibench.estimator.processed.interval_moments import Sites, Steps, truncated_moments
+from phibench.estimator.processed.interval_moments import QuantiserSteps, Sites, truncated_moments
 from phibench.render.sensor.settings import sensor
 from phibench.scenes.frames import Array
 from phibench.scenes.random_streams import generator
@@ -64,7 +64,7 @@ def test_posterior_against_drawn_outputs() -> None:
     the intervals are off by 14 and 26 %, and fail.
     """
     belief, low, high = _coarse()
-    steps = Steps(high - low, low, np.ones((1, 6)), 1)
+    steps = QuantiserSteps(high - low, low, np.ones((1, 6)), 1)
     mean, covariance = belief.posterior(_propagated(belief, Sites(*np.zeros((2, 6))), steps, np.zeros(6), 20))
     joint = np.block([[belief.covariance, belief.cross], [belief.cross.T, belief.outputs]])
     rng, L, kept = generator("interval", "drawn"), np.linalg.cholesky(joint + 1e-12 * np.eye(8)), []
@@ -105,7 +105,7 @@ def test_site_of_several_frames_against_draws(spread: float, shared: float, fram
     x = 0.37 + shared * rng.normal(size=(400_000, 1))
     y = x + spread * rng.normal(size=(len(x), frames))
     z = np.sort(np.rint(y), axis=1)
-    steps, kept = Steps.of(z[7][:, None], np.ones(1)), (z == z[7]).all(axis=1)
+    steps, kept = QuantiserSteps.of(z[7][:, None], np.ones(1)), (z == z[7]).all(axis=1)
     found, places = y.mean(axis=1)[kept], x[kept, 0]
     assert len(found) > 2000
     variance = shared**2 + spread**2 / frames

@@ -11,7 +11,7 @@ from phibench.render.film.moving_rows import chief_uv_px, exposure_nodes, parted
 from phibench.render.optics.room_tracer import room_geometry
 from phibench.render.optics.spot_layer import spot_layer
 from phibench.render.optics.truth import spot_truth
-from phibench.scenes.catalog import Target, lab
+from phibench.scenes.catalog import TargetBoard, lab
 from phibench.scenes.frames import Array, Pose, as_matrix, as_vector
 from phibench.scenes.holder import fitted
 from phibench.scenes.laser import LaserSpot
@@ -24,7 +24,7 @@ from phibench.scenes.motion.vehicle import PlanarPose, Vehicle, rig_placement, s
 from phibench.scenes.rig import Rig, View
 from phibench.scenes.room import Room
 
-TARGET = Target("t", 1.5, 0.6, 0.5)
+TARGET = TargetBoard("t", 1.5, 0.6, 0.5)
 ROOM = lab((TARGET,))
 SPOT = LaserSpot(TARGET.position_world_m, TARGET.normal_world, 4.5e-3)
 TIMES = FilmTimes(20, 30.0, 1 / 60, 0.03, 720)

@@ -12,7 +12,7 @@ from helpers.oracles import TARGETS
 from phibench.datasets.scene.scene_export import as_radiance
 from phibench.render.optics.ray_tracer import trace_pixels
 from phibench.render.plugins.mirror_plugins import mirror_bsdf
-from phibench.render.plugins.plugin_tree import Picture, Plugin, Rgb, Triangles, mitsuba_dict
+from phibench.render.plugins.plugin_tree import BitmapPlugin, Plugin, Rgb, Triangles, mitsuba_dict
 from phibench.render.plugins.sensor_plugin import carried, etendue, sensor_plugin
 from phibench.render.plugins.standard_scene import standard_scene
 from phibench.render.room.scene import to_scene_mm
@@ -132,7 +132,7 @@ def test_a_picture_reads_back_in_its_order(tmp_path: Path) -> None:
     """Rows and columns as they were: a file and an array make the same texture."""
     values = np.random.default_rng(0).uniform(size=(3, 5, 3)).astype(np.float32)
     path = tmp_path / "picture.pfm"
-    path.write_bytes(Picture("picture", values).data())
+    path.write_bytes(BitmapPlugin("picture", values).data())
     assert np.array_equal(np.array(activate().Bitmap(str(path))), values)
 
 

@@ -29,7 +29,7 @@ from phibench.render.room.noise_budget import (
     webcam,
 )
 from phibench.render.room.refinement import _cells
-from phibench.render.room.subpixel_grid import Film, FilmGrid, Samples, _chunks, golden_steps, shifts
+from phibench.render.room.subpixel_grid import CellSampler, FilmGrid, Samples, _chunks, golden_steps, shifts
 from phibench.render.setup.variant import activate
 from phibench.scenes.catalog import default_rig, lab
 from phibench.scenes.laser import LaserSpot, beam_diameter_m
@@ -148,12 +148,12 @@ def test_every_pixel_in_the_mirror_keeps_its_budget(light: LightMap, repeated: t
 
 
 @pytest.fixture(scope="module")
-def film(light: LightMap) -> Film:
+def film(light: LightMap) -> CellSampler:
     return view_film(VIEW, ROOM, light, SETTINGS, 1, 0, view_surfaces(VIEW, ROOM))
 
 
 @pytest.fixture(scope="module")
-def outline(film: Film) -> tuple[np.ndarray, np.ndarray]:
+def outline(film: CellSampler) -> tuple[np.ndarray, np.ndarray]:
     """100 cells of which one of two samples met a lamp, and the lamps' numbers."""
     numbers = film.grid.numbers((0, 0, RIG.camera.width_px, RIG.camera.height_px)).ravel()
     assert film.lamps is not None
@@ -164,7 +164,7 @@ def outline(film: Film) -> tuple[np.ndarray, np.ndarray]:
     return numbers[cut], np.maximum(one, other)[cut]
 
 
-def test_what_lamps_cover_is_what_samples_meet(film: Film, outline: tuple[np.ndarray, np.ndarray]) -> None:
+def test_what_lamps_cover_is_what_samples_meet(film: CellSampler, outline: tuple[np.ndarray, np.ndarray]) -> None:
     """Cells cut by a lamp's outline, the covered part computed, against 20 times 32 x 32 samples that meet it or not.
 
     The samples' own error is some 5e-4 of the lamp's light by cell. The bend of the map costs up to 3e-4 by cell.
@@ -189,7 +189,7 @@ def test_what_lamps_cover_is_what_samples_meet(film: Film, outline: tuple[np.nda
     assert np.median(ours.std(axis=0)) < 0.1 * np.median(met.std(axis=0))
 
 
-def test_cells_at_lamps_need_few_samples(film: Film, outline: tuple[np.ndarray, np.ndarray]) -> None:
+def test_cells_at_lamps_need_few_samples(film: CellSampler, outline: tuple[np.ndarray, np.ndarray]) -> None:
     """Noise of 6 x 6 samples with the covered part known is below that of 32 x 32 samples without."""
     numbers, lamp = outline
 
@@ -230,12 +230,12 @@ def test_a_lamp_that_something_hides_is_left_to_chance(monkeypatch: pytest.Monke
     least, over = found()
     assert least >= 0.0
     assert over < 0.005
-    monkeypatch.setattr(Film, "hidden", lambda self, numbers, stream, lamp: np.zeros(len(numbers), dtype=bool))
+    monkeypatch.setattr(CellSampler, "hidden", lambda self, numbers, stream, lamp: np.zeros(len(numbers), dtype=bool))
     monkeypatch.setattr(refinement, "_without_hidden_lamps", lambda film, cells, turn: None)
     assert found()[1] > 0.02
 
 
-def test_samples_of_a_cell_are_shared_among_lanes(film: Film) -> None:
+def test_samples_of_a_cell_are_shared_among_lanes(film: CellSampler) -> None:
     """Each sample is one lane's, and a cell gets the same whichever cells are sampled with it."""
     side = np.array([1, 40, 2, 16, 17, 128], dtype=np.int32)
     cell, start, stop = _chunks(side)
@@ -249,7 +249,7 @@ def test_samples_of_a_cell_are_shared_among_lanes(film: Film) -> None:
 
 
 def test_cells_sampled_in_parts_get_the_same_bits(
-    film: Film, outline: tuple[np.ndarray, np.ndarray], monkeypatch: pytest.MonkeyPatch
+    film: CellSampler, outline: tuple[np.ndarray, np.ndarray], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Seven cells at a time, the last part shorter, against all at once: one sample each, and refined ones."""
     numbers, lamp = outline[0][:40], outline[1][:40].astype(np.int32)
@@ -266,7 +266,7 @@ def test_cells_sampled_in_parts_get_the_same_bits(
 
 
 def test_pixels_that_look_full_by_chance_are_refined(
-    light: LightMap, film: Film, outline: tuple[np.ndarray, np.ndarray]
+    light: LightMap, film: CellSampler, outline: tuple[np.ndarray, np.ndarray]
 ) -> None:
     """Around a corner of a lamp against even sampling: hardly a pixel is off by more than three budgets.
 

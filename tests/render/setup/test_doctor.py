@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from phibench.render.setup import doctor, selftest
-from phibench.render.setup.doctor import Finding
+from phibench.render.setup.doctor import Diagnosis
 from phibench.render.setup.llvm_library import fault_of
 
 Python = Callable[..., subprocess.CompletedProcess[str]]
@@ -137,7 +137,7 @@ def test_the_status_is_that_of_the_worst_finding(
 ) -> None:
     path = "/a/very/long/[bold]path/" + "x" * 300
     for state, status in (("ok", 0), ("warning", 0), ("fault", 1)):
-        findings = [Finding("a", "fine"), Finding("b", path, state, f"look at {path}.")]  # type: ignore[arg-type]
+        findings = [Diagnosis("a", "fine"), Diagnosis("b", path, state, f"look at {path}.")]  # type: ignore[arg-type]
         monkeypatch.setattr(doctor, "examine", lambda findings=findings: iter(findings))
         assert doctor.main() == status
         assert f"{state}: look at {path}.\n" in capsys.readouterr().out

@@ -29,7 +29,7 @@ from phibench.robot.film.film_positions import FilmPositions, fit_positions, ste
 from phibench.robot.film.processed_film import processed_positions
 from phibench.robot.film.spot_tracks import FrameSearch, SpotTrack, fitted_positions
 from phibench.robot.loop.belief import PairTracker
-from phibench.robot.loop.sensing import Reading
+from phibench.robot.loop.sensing import SpotReading
 from phibench.robot.loop.smoothing import film_beliefs
 from phibench.scenes.frames import Array
 from phibench.scenes.laser import Beam
@@ -395,7 +395,7 @@ def nees_and_pair(seed: int) -> tuple[float, float, float, float]:
     for uv, noise, h in zip(seen.positions.uv_px, seen.positions.noise_px2, seen.offsets_m, strict=True):
         if np.isfinite(uv).all():
             sigma = float(np.sqrt(np.trace(noise) / 2.0))
-            pair.update(Reading(float(uv[0]), float(uv[1]), sigma, 1.0, ""), float(h))
+            pair.update(SpotReading(float(uv[0]), float(uv[1]), sigma, 1.0, ""), float(h))
     print(seed, *np.round([*nees, *claims, pair.distance_m, pair.distance_sigma_m], 4), flush=True)
     return nees[0], nees[1], pair.distance_m, pair.distance_sigma_m
 

@@ -10,7 +10,7 @@ from scipy import stats
 from phibench.datasets.errors import DatasetError
 from phibench.estimator.geometry.rig_parameters import PARAMETERS
 from phibench.render.film.moving_rows import chief_uv_px
-from phibench.robot.film.driving_depth import Way, driving_depth
+from phibench.robot.film.driving_depth import RobotWay, driving_depth
 from phibench.robot.film.film_positions import FilmPositions
 from phibench.scenes.frames import Array
 from phibench.scenes.motion.carriage import Carriage
@@ -43,7 +43,7 @@ def test_motion_stereo_is_consistent(understated: bool) -> None:
         noisy = uv + NOISE_PX * generator("drives", number).standard_normal(uv.shape)
         noisy[5] = np.nan
         positions = FilmPositions(noisy, np.broadcast_to(each, (count, 2, 2)), np.zeros((count, 2, count, 2)))
-        way = Way(vehicle, drive.readings_m(AT_S, "drives", number), drive.state(AT_S)[:, 3])
+        way = RobotWay(vehicle, drive.readings_m(AT_S, "drives", number), drive.state(AT_S)[:, 3])
         found = driving_depth(SCENE.rig, way, positions)
         error = found.point_world_m - POINT
         pulls.append(error @ np.linalg.solve(found.covariance_m2, error))
@@ -67,10 +67,10 @@ def test_motion_stereo_from_exact_readings_is_exact() -> None:
     exact_one = replace(NOMINAL, slip=drive.slip, skid=drive.skid, slip_sigma=1e-6, skid_sigma=1e-6, track_noise=1e-6)
     each = np.broadcast_to(NOISE_PX**2 * np.eye(2), (len(AT_S), 2, 2))
     positions = FilmPositions(uv, each, np.zeros((len(AT_S), 2, len(AT_S), 2)))
-    found = driving_depth(SCENE.rig, Way(exact_one, drive.tracks_m(AT_S)[0], drive.state(AT_S)[:, 3]), positions)
+    found = driving_depth(SCENE.rig, RobotWay(exact_one, drive.tracks_m(AT_S)[0], drive.state(AT_S)[:, 3]), positions)
     # an arc is reckoned exactly, and priors of 1e-6 hold the rest
     np.testing.assert_allclose(found.point_world_m, POINT, atol=1e-6)
     np.testing.assert_allclose(found.depth_m, depth_m, atol=1e-6)
     still = replace(positions, uv_px=uv[:1].repeat(len(AT_S), 0))
     with pytest.raises(DatasetError, match="drive farther, or make a stroke"):
-        driving_depth(SCENE.rig, Way(NOMINAL, np.zeros((len(AT_S), 2)), drive.state(AT_S)[:, 3]), still)
+        driving_depth(SCENE.rig, RobotWay(NOMINAL, np.zeros((len(AT_S), 2)), drive.state(AT_S)[:, 3]), still)

@@ -25,8 +25,8 @@ from phibench.robot.loop.episodes import (
     with_own_rig,
 )
 from phibench.robot.loop.foreign_policies import PolicyFile, policy_of
-from phibench.robot.loop.policies import CODED, POLICIES, Identifier, Plan
-from phibench.robot.loop.sensing import SEEN, Reading
+from phibench.robot.loop.policies import CODED, POLICIES, ApproachPlan, Identifier
+from phibench.robot.loop.sensing import SEEN, SpotReading
 from phibench.robot.loop.simulator import CODES, Action, Observation, Setup, Simulator, Task
 from phibench.scenes.motion.vehicle import PlanarPose
 from phibench.scenes.validation import SceneError
@@ -57,7 +57,7 @@ def test_the_same_stream_gives_the_same_episodes() -> None:
 
 
 def frame(step: int, lit: bool, *places: float) -> Observation:
-    spots = tuple(Reading(u, 100.0, 0.1, 1e4, SEEN) for u in places)
+    spots = tuple(SpotReading(u, 100.0, 0.1, 1e4, SEEN) for u in places)
     return Observation(step, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, lit, spots)
 
 
@@ -86,7 +86,7 @@ def test_greedy_plans_a_stroke_because_driving_leaves_the_slip_unknown() -> None
     while policy.belief is None:
         observation = simulator.act(policy.act(observation))
     policy._track(policy.belief, observation)
-    none, some = (policy.expected(Plan(*plan)) for plan in ((0.0, 0.0), (0.0, 0.2)))
+    none, some = (policy.expected(ApproachPlan(*plan)) for plan in ((0.0, 0.0), (0.0, 0.2)))
     slip = simulator.setup.vehicle.slip_sigma
     assert none.sigma_m > 0.5 * slip  # of a metre
     assert some.sigma_m < 0.5 * none.sigma_m

@@ -17,7 +17,7 @@ from phibench.render.room.texel_grid import TexelGrid
 from phibench.robot.loop.arena import Arena, arena_of, baked_arenas, plain_arena
 from phibench.robot.loop.environment import ENVIRONMENT, ApproachTarget, flat_observation, register
 from phibench.robot.loop.episodes import run_episodes
-from phibench.robot.loop.sensing import SEEN, Light
+from phibench.robot.loop.sensing import SEEN, SpotOnSurface
 from phibench.robot.loop.simulator import Action, Setup, Simulator, Task
 from phibench.scenes.room import Room
 from phibench.scenes.shapes import cuboid
@@ -49,7 +49,7 @@ def test_spots_in_windows_lie_where_the_exact_model_has_them(arena) -> None:
     simulator, pulls = Simulator(pixels(arena, task=Task(lights=0))), []
     for episode in range(12):
         simulator.start("test pixels", episode)
-        light = [Light(*simulator.target, 1.0)]
+        light = [SpotOnSurface(*simulator.target, 1.0)]
         (at,) = simulator._sensing.unhidden(light, simulator.placement, 0.0, arena)
         if isinstance(at, str):
             continue
@@ -67,7 +67,7 @@ def test_hidden_lights_have_no_window(arena) -> None:
     simulator.start("test pixels", 1)
     assert simulator.act(Action(code=0)).windows == ()  # laser off
     assert len(simulator.act(Action()).windows) == 1
-    behind = Light(
+    behind = SpotOnSurface(
         simulator.target.point_m + 3.0 * (simulator.target.point_m - [0, 0, 0.8]), simulator.target.normal, 1.0
     )
     (cause,) = simulator._sensing.unhidden([behind], simulator.placement, 0.0, arena)

@@ -20,8 +20,8 @@ from phibench.robot.loop.sensing import (
     HIDDEN,
     OUTSIDE,
     SEEN,
-    Light,
-    Reading,
+    SpotOnSurface,
+    SpotReading,
 )
 from phibench.scenes.frames import Pose, as_matrix, as_vector
 from phibench.scenes.motion.vehicle import Obstacle, PlanarPose, Stance, rig_placement, stance
@@ -32,8 +32,8 @@ LEVEL = rig_placement(VEHICLE, PlanarPose(), Stance())
 FACING = np.array([-1.0, 0.0, 0.0])
 
 
-def read(point, exposure=4, arena=None, rng=None, placement=LEVEL, stroke=0.0, power=1.0, normal=FACING) -> Reading:
-    (found,) = sensing().read([Light(np.array(point), normal, power)], placement, stroke, exposure, arena, rng)
+def read(point, exposure=4, arena=None, rng=None, placement=LEVEL, stroke=0.0, power=1.0, normal=FACING) -> SpotReading:
+    (found,) = sensing().read([SpotOnSurface(np.array(point), normal, power)], placement, stroke, exposure, arena, rng)
     return found
 
 
