@@ -62,7 +62,7 @@ from phibench.datasets.build.run_tasks import (
     write_documents,
 )
 from phibench.datasets.build.task_list import plan_tasks
-from phibench.datasets.build.tasks import Task
+from phibench.datasets.build.tasks import BuildTask
 from phibench.datasets.build.workers import Environment, NoRendererError, WorkerPool, versions
 from phibench.datasets.errors import DatasetError, IncompleteError
 from phibench.datasets.input_files import InputFile
@@ -289,7 +289,7 @@ def _export(
     return held
 
 
-def _keys(tasks: Mapping[str, Task]) -> dict[str, str]:
+def _keys(tasks: Mapping[str, BuildTask]) -> dict[str, str]:
     return {name: task.key for name, task in tasks.items()}
 
 
@@ -389,12 +389,12 @@ def _lost(out: Path, keys: Mapping[str, str], journal: Journal, info: DatasetInf
 def _part(
     whole: Plan,
     left_out: Mapping[str, str],
-    every: dict[str, Task],
+    every: dict[str, BuildTask],
     environment: Environment,
     recipe: str,
     journal: Journal,
     out: Path,
-) -> tuple[Plan, dict[str, Task], FolderHead]:
+) -> tuple[Plan, dict[str, BuildTask], FolderHead]:
     """Plan without some samples, its tasks, and the head of its folder."""
     plan = whole.without(left_out)
     tasks = plan_tasks(plan, versions(environment)) if left_out else every

@@ -1,6 +1,6 @@
 """Tables of scores: for a terminal of 80 columns, or as CSV, Markdown, LaTeX and JSON.
 
-A `Grid` holds the cells of a table as text; `written` gives it one of the forms. Units are those of `Metric.shown`:
+A `TextTable` holds the cells of a table as text; `written` gives it one of the forms. Units are those of `shown`:
 mrad for phi, per cent for rates and relative errors. CSV and JSON hold the numbers of the files instead: SI, in full.
 """
 

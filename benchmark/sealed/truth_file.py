@@ -68,7 +68,7 @@ class AnglesRow(Document):
 
 
 class SpotTruthRow(Document):
-    """A `SpotTruth` in the truth's file."""
+    """A `ImageTruth` in the truth's file."""
 
     uv_px: _Place
     phi_rad: AnglesRow

@@ -22,7 +22,7 @@ import numpy as np
 from phibench.datasets.build.bake_task import bake_settings
 from phibench.datasets.build.light_map_cache import is_cached
 from phibench.datasets.build.scheduler import Executor, Outcome
-from phibench.datasets.build.tasks import Done, Task
+from phibench.datasets.build.tasks import BuildTask, Done
 from phibench.datasets.plan.plan import PairPlan, Plan
 from phibench.render.optics.room_tracer import room_geometry
 from phibench.render.optics.truth import EDGE, NO_REFLECTION, SpotTruth, depth_m, spot_truth
@@ -105,7 +105,7 @@ class Forecast:
         return f"{number} {what} ({'cached' if self.light == 'cached' else duration(pace.seconds(kind)) + each})"
 
 
-def forecast(plan: Plan, tasks: Collection[Task]) -> Forecast:
+def forecast(plan: Plan, tasks: Collection[BuildTask]) -> Forecast:
     """Cost of these tasks of a plan."""
     counts = Counter(task.kind for task in tasks)
     pixels = plan.rig.camera.width_px * plan.rig.camera.height_px
@@ -284,7 +284,7 @@ class TaskProgress:
     another one may ask for the rest.
     """
 
-    def __init__(self, tasks: Iterable[Task], pace: Pace) -> None:
+    def __init__(self, tasks: Iterable[BuildTask], pace: Pace) -> None:
         self._executor: Executor | None = None
         self._pace, self._lock, self._width = pace, threading.Lock(), 1
         self._left = {task.name: task.kind for task in tasks}
@@ -305,7 +305,7 @@ class TaskProgress:
         assert self._executor is not None, "watch an executor first"
         return self._executor
 
-    def submit(self, task: Task) -> None:
+    def submit(self, task: BuildTask) -> None:
         """Begin a task, or queue it."""
         with self._lock:
             self._submitted[task.name] = None
@@ -322,7 +322,7 @@ class TaskProgress:
                 self._pace.add(task.kind, outcome.seconds)
         return task, outcome
 
-    def settle(self, task: Task) -> None:
+    def settle(self, task: BuildTask) -> None:
         """Count a task that will not be done again."""
         with self._lock:
             self._left.pop(task.name, None)

@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 
 from phibench.datasets.build.journal import Journal
 from phibench.datasets.build.task_list import sample_task_name
-from phibench.datasets.build.tasks import Task
+from phibench.datasets.build.tasks import BuildTask
 from phibench.datasets.plan.plan import Plan
 from phibench.datasets.store import schema
 from phibench.datasets.store.documents import parse_info
@@ -23,14 +23,14 @@ OPTION = "--leave-out-refused"
 _TOLD = 20  # samples or failures that are told in full
 
 
-def forget_others(journal: Journal, tasks: Mapping[str, Task]) -> None:
+def forget_others(journal: Journal, tasks: Mapping[str, BuildTask]) -> None:
     """Forget refusals of tasks that are not among these, or are made from other values now."""
     journal.keep_refusals(
         name for name, task in tasks.items() if name in journal.refusals and journal.refusals[name].key == task.key
     )
 
 
-def refused_samples(plan: Plan, tasks: Mapping[str, Task], journal: Journal) -> dict[str, str]:
+def refused_samples(plan: Plan, tasks: Mapping[str, BuildTask], journal: Journal) -> dict[str, str]:
     """Cause by id of all samples that cannot be drawn or made, in the order of the recipe.
 
     Of several refused tasks of a sample the first one counts, by the order of `needs` from its last task on.
@@ -43,7 +43,7 @@ def refused_samples(plan: Plan, tasks: Mapping[str, Task], journal: Journal) -> 
     return {name: found[name] for name in plan.sample_ids if name in found}
 
 
-def settled_samples(plan: Plan, tasks: Mapping[str, Task], journal: Journal) -> dict[str, str]:
+def settled_samples(plan: Plan, tasks: Mapping[str, BuildTask], journal: Journal) -> dict[str, str]:
     """Cause by id of those refused samples without which the folder was finished."""
     try:
         held = {} if journal.head is None else parse_info(journal.head.info).causes
@@ -52,12 +52,12 @@ def settled_samples(plan: Plan, tasks: Mapping[str, Task], journal: Journal) -> 
     return {name: cause for name, cause in refused_samples(plan, tasks, journal).items() if name in held}
 
 
-def possible(names: Sequence[str], tasks: Mapping[str, Task], journal: Journal) -> list[str]:
+def possible(names: Sequence[str], tasks: Mapping[str, BuildTask], journal: Journal) -> list[str]:
     """Names of those tasks that are not refused, nor is what they need."""
     return [name for name in names if _culprit(name, tasks, journal) is None] if journal.refusals else list(names)
 
 
-def _culprit(name: str, tasks: Mapping[str, Task], journal: Journal) -> str | None:
+def _culprit(name: str, tasks: Mapping[str, BuildTask], journal: Journal) -> str | None:
     """First refused task among a task and what it needs."""
     for need in tasks[name].needs:
         if (found := _culprit(need, tasks, journal)) is not None:

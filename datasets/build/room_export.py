@@ -20,7 +20,7 @@ from phibench.datasets.build.bake_task import bake_settings
 from phibench.datasets.build.light_map_cache import light_map
 from phibench.datasets.build.run_tasks import missing_room_files
 from phibench.datasets.build.scheduler import schedule
-from phibench.datasets.build.tasks import Failed, Made, Task
+from phibench.datasets.build.tasks import BuildTask, Failed, Made
 from phibench.datasets.build.workers import WorkerPool
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.plan.room_draws import BOX, room_files
@@ -241,10 +241,10 @@ def stale_exports(out: Path, files: RoomFiles) -> list[str]:
     return sorted(name for name in names if name not in wanted)
 
 
-def export_task(source: UnexportedRoom, ambient: AmbientTable) -> Task:
+def export_task(source: UnexportedRoom, ambient: AmbientTable) -> BuildTask:
     """Task that writes the file of a room. It has no key: its file's name tells it from all others."""
     kind = source.kind.removeprefix("unexported ")
-    return Task(f"{kind} {source.settings.path.stem}", "", write_room_file, (source, ambient))
+    return BuildTask(f"{kind} {source.settings.path.stem}", "", write_room_file, (source, ambient))
 
 
 def write_room_file(out: Path, source: UnexportedRoom, ambient: AmbientTable) -> Made:

@@ -23,7 +23,7 @@ from phibench.datasets.build.journal import Entry, FolderHead, Journal, Refusal
 from phibench.datasets.build.refusals import listed
 from phibench.datasets.build.scheduler import schedule
 from phibench.datasets.build.task_list import bake_task_name, sample_task_name, spot_task_name
-from phibench.datasets.build.tasks import Done, Failed, Task, log_entry
+from phibench.datasets.build.tasks import BuildTask, Done, Failed, log_entry
 from phibench.datasets.build.workers import WorkerPool
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.input_files import InputFile
@@ -157,7 +157,7 @@ def held_head(out: Path) -> FolderHead | None:
     return FolderHead(info.text(), recipe.text() if recipe.path.is_file() else "")
 
 
-def unfinished(tasks: Mapping[str, Task], journal: Journal, out: Path) -> list[str]:
+def unfinished(tasks: Mapping[str, BuildTask], journal: Journal, out: Path) -> list[str]:
     """Names of the tasks whose entry is missing, of another key, or belies the files."""
     known = [name for name, task in tasks.items() if (e := journal.entries.get(name)) is not None and e.key == task.key]
     with ThreadPoolExecutor(2) as pool:  # hashing lets go of the interpreter
@@ -172,7 +172,7 @@ def is_intact(entry: Entry, out: Path) -> bool:
 
 def run_tasks(
     plan: Plan,
-    tasks: Mapping[str, Task],
+    tasks: Mapping[str, BuildTask],
     todo: list[str],
     journal: Journal,
     head: FolderHead,
@@ -207,7 +207,7 @@ def run_tasks(
 
 
 def _run(
-    tasks: list[Task], pace: Pace, journal: Journal, out: Path, pool: WorkerPool, console: Console
+    tasks: list[BuildTask], pace: Pace, journal: Journal, out: Path, pool: WorkerPool, console: Console
 ) -> dict[str, Failed]:
     failures: dict[str, Failed] = {}
     progress = TaskProgress(tasks, pace)

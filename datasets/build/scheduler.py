@@ -11,11 +11,11 @@ from collections import defaultdict, deque
 from collections.abc import Iterable, Iterator
 from typing import Protocol
 
-from phibench.datasets.build.tasks import Done, Failed, Task
+from phibench.datasets.build.tasks import BuildTask, Done, Failed
 
 AHEAD = 3  # tasks submitted per worker: one runs, two wait, so that no worker is idle
 TRIALS = 3  # of a task whose worker died
-Outcome = tuple[Task, Done | Failed]
+Outcome = tuple[BuildTask, Done | Failed]
 
 
 class Executor(Protocol):
@@ -24,16 +24,16 @@ class Executor(Protocol):
     def width(self) -> int:
         """Return the number of tasks that run at a time."""
 
-    def submit(self, task: Task) -> None:
+    def submit(self, task: BuildTask) -> None:
         """Begin a task, or queue it."""
 
     def next(self) -> Outcome:
         """Wait for any submitted task; `Failed.lethal` means that its worker died."""
 
 
-def schedule(tasks: Iterable[Task], executor: Executor) -> Iterator[Outcome]:
+def schedule(tasks: Iterable[BuildTask], executor: Executor) -> Iterator[Outcome]:
     """Yield every task with its outcome, as they end. Needs that are not among `tasks` count as done."""
-    queue, suspects, flying = _Queue(tasks), deque[Task](), 0
+    queue, suspects, flying = _Queue(tasks), deque[BuildTask](), 0
     while True:
         while flying < AHEAD * executor.width() and queue.ready:
             executor.submit(queue.ready.popleft())
@@ -53,7 +53,7 @@ def schedule(tasks: Iterable[Task], executor: Executor) -> Iterator[Outcome]:
         yield from queue.settle(task, outcome)
 
 
-def _alone(task: Task, executor: Executor) -> Done | Failed:
+def _alone(task: BuildTask, executor: Executor) -> Done | Failed:
     """Do a suspect while nothing else runs; it has seen one worker die already."""
     cause = ""
     for _ in range(TRIALS - 1):
@@ -70,19 +70,19 @@ def _alone(task: Task, executor: Executor) -> Done | Failed:
 class _Queue:
     """Tasks that wait, and those whose needs are met, in the given order."""
 
-    def __init__(self, tasks: Iterable[Task]) -> None:
+    def __init__(self, tasks: Iterable[BuildTask]) -> None:
         tasks = list(tasks)
         names = {task.name for task in tasks}
         self._missing = {task.name: sum(need in names for need in task.needs) for task in tasks}
-        self._readers = defaultdict[str, list[Task]](list)
+        self._readers = defaultdict[str, list[BuildTask]](list)
         for task in tasks:
             for need in task.needs:
                 self._readers[need].append(task)
         self.ready = deque(task for task in tasks if not self._missing[task.name])
 
-    def settle(self, task: Task, outcome: Done | Failed) -> Iterator[Outcome]:
+    def settle(self, task: BuildTask, outcome: Done | Failed) -> Iterator[Outcome]:
         """Let those go that waited for a task; if it failed, yield them as failed, and what waits for them."""
-        released = list[Task]()
+        released = list[BuildTask]()
         for reader in self._readers.pop(task.name, ()):
             if isinstance(outcome, Failed):
                 if self._missing.pop(reader.name, None) is not None:

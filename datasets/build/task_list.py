@@ -18,14 +18,14 @@ from typing import Any, TypeVar
 from phibench.datasets.build.bake_task import bake_room, bake_settings
 from phibench.datasets.build.sample_task import finish_sample
 from phibench.datasets.build.spot_task import make_spot
-from phibench.datasets.build.tasks import Task, task_key
+from phibench.datasets.build.tasks import BuildTask, task_key
 from phibench.datasets.build.view_task import render_view
 from phibench.datasets.plan.plan import PairPlan, Plan, PosePlan
 from phibench.datasets.store.documents import to_json
 from phibench.datasets.store.provenance import code_behind
 from phibench.scenes.rig import POSITIONS
 
-Tasks = dict[str, Task]
+Tasks = dict[str, BuildTask]
 P = TypeVar("P", PairPlan, PosePlan)
 
 
@@ -80,30 +80,30 @@ class _Makers:
         self._rigs = {name: _digest(to_json(rig)) for name, rig in plan.rigs.items()}
         self._spots = {name: to_json(spot) for name, spot in plan.spots.items()}
 
-    def spot(self, pair: PairPlan) -> Task:
+    def spot(self, pair: PairPlan) -> BuildTask:
         plan = self._plan
         name, rig, spot = plan.recipe.dataset.name, plan.rigs[pair.rig], plan.spots[pair.spot]
         key = self._key(
             ["spot", name, self._rigs[pair.rig], self._rooms[pair.room], self._spots[pair.spot], asdict(pair)],
             make_spot,
         )
-        return Task(spot_task_name(pair), key, make_spot, (name, rig, plan.rooms[pair.room], spot, pair))
+        return BuildTask(spot_task_name(pair), key, make_spot, (name, rig, plan.rooms[pair.room], spot, pair))
 
-    def bake(self, room_id: str) -> Task:
+    def bake(self, room_id: str) -> BuildTask:
         plan, ambient = self._plan, self._plan.recipe.ambient
         scene = [_digest(to_json(plan.rig)), room_id, self._rooms[room_id]]
         key = self._key(["bake", *scene, asdict(bake_settings(ambient))], bake_room)
-        return Task(bake_task_name(room_id), key, bake_room, (plan.rig, room_id, plan.rooms[room_id], ambient))
+        return BuildTask(bake_task_name(room_id), key, bake_room, (plan.rig, room_id, plan.rooms[room_id], ambient))
 
-    def view(self, pose: PosePlan, bake: Task) -> Task:
+    def view(self, pose: PosePlan, bake: BuildTask) -> BuildTask:
         plan = self._plan
         name, ambient = plan.recipe.dataset.name, plan.recipe.ambient
         inputs = ["view", name, self._rigs[pose.rig], self._rooms[pose.room], asdict(pose), ambient.model_dump()]
         key = self._key(inputs, render_view, (bake.key,))
         arguments = (name, plan.rigs[pose.rig], plan.rooms[pose.room], pose, ambient)
-        return Task(f"view {pose.pose_id}", key, render_view, arguments, (bake.name,))
+        return BuildTask(f"view {pose.pose_id}", key, render_view, arguments, (bake.name,))
 
-    def sample(self, pair: PairPlan, spot: Task, views: Mapping[str, Task]) -> Task:
+    def sample(self, pair: PairPlan, spot: BuildTask, views: Mapping[str, BuildTask]) -> BuildTask:
         needs = list(
             {views[pair.pose_id(position)].name: views[pair.pose_id(position)] for position in POSITIONS}.values()
         )
@@ -113,7 +113,7 @@ class _Makers:
         quality = self._plan.recipe.ambient.quality
         plan = self._plan
         arguments = (pair, plan.rigs[pair.rig], plan.rooms[pair.room], plan.spots[pair.spot], quality)
-        return Task(sample_task_name(pair), key, finish_sample, arguments, names)
+        return BuildTask(sample_task_name(pair), key, finish_sample, arguments, names)
 
     def _key(self, inputs: Any, function: Any, needs: tuple[str, ...] = ()) -> str:
         return task_key(inputs, code_behind(function.__module__), self._versions, needs)

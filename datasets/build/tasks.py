@@ -34,7 +34,7 @@ class Made:
 
 
 @dataclass(frozen=True)
-class Task:
+class BuildTask:
     """One piece of work.
 
     Attributes
@@ -99,7 +99,7 @@ def task_key(inputs: Any, code: str, versions: Mapping[str, Any], needs: tuple[s
     return hashlib.sha256(json.dumps(document, sort_keys=True, allow_nan=False).encode()).hexdigest()
 
 
-def perform(task: Task, out: Path, code: str | None = None) -> Done | Failed:
+def perform(task: BuildTask, out: Path, code: str | None = None) -> Done | Failed:
     """Do a task in this process. Errors meant for people come back as their message, others with their traceback.
 
     `code` is the hash of the code that the sender runs; another one here is refused.
@@ -132,7 +132,7 @@ def _is_refusal(error: Exception) -> bool:
     return isinstance(error, DatasetError | SceneError) and not isinstance(error, RoomError)
 
 
-def log_entry(task: Task, outcome: Done | Failed) -> dict[str, Any]:
+def log_entry(task: BuildTask, outcome: Done | Failed) -> dict[str, Any]:
     """One line of `log.jsonl`, without the time."""
     entry = {"task": task.name, "key": task.key, "ok": isinstance(outcome, Done), **asdict(outcome)}
     return {key: value for key, value in entry.items() if key not in ("files", "result", "lethal", "refused")}

@@ -25,7 +25,7 @@ from types import TracebackType
 from typing import Any
 
 from phibench.datasets.build.scheduler import Executor, Outcome
-from phibench.datasets.build.tasks import Done, Failed, Task, fault_text, perform, worker_name
+from phibench.datasets.build.tasks import BuildTask, Done, Failed, fault_text, perform, worker_name
 from phibench.datasets.build.view_task import start_renderer
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.frames.request import whole_number
@@ -55,7 +55,7 @@ class DaskExecutor:
 
         self.client = client
         self._out, self._code = out.resolve(), code_sha256()
-        self._ended, self._tasks = as_completed(loop=client.loop), dict[str, Task]()
+        self._ended, self._tasks = as_completed(loop=client.loop), dict[str, BuildTask]()
         self._count, self._counted, self._number = 0, -_CENSUS_S, 0
 
     def width(self) -> int:
@@ -64,7 +64,7 @@ class DaskExecutor:
             self._count, self._counted = len(self.client.nthreads()), time.monotonic()
         return max(self._count, 1)
 
-    def submit(self, task: Task) -> None:
+    def submit(self, task: BuildTask) -> None:
         """Send a task; it is not repeated by dask."""
         self._number += 1
         # dask takes tasks of one key for one task: a task that is sent again needs a key of its own
@@ -118,14 +118,14 @@ class LocalExecutor:
 
     def __init__(self, count: int, out: Path) -> None:
         self._count, self._out, self._code = count, out.resolve(), code_sha256()
-        self._idle, self._waiting = list[_Worker](), deque[Task]()
-        self._busy = dict[object, tuple[_Worker, Task]]()  # by the end of the pipe
+        self._idle, self._waiting = list[_Worker](), deque[BuildTask]()
+        self._busy = dict[object, tuple[_Worker, BuildTask]]()  # by the end of the pipe
 
     def width(self) -> int:
         """Number of workers; those that are not needed yet are not started."""
         return self._count
 
-    def submit(self, task: Task) -> None:
+    def submit(self, task: BuildTask) -> None:
         """Give a task to a worker that is free, or queue it."""
         self._waiting.append(task)
         self._deal_out()
@@ -159,7 +159,7 @@ class LocalExecutor:
             worker.end()
 
 
-Do = Callable[[Task, Path, str | None], Done | Failed]
+Do = Callable[[BuildTask, Path, str | None], Done | Failed]
 
 
 class _Worker:
@@ -171,7 +171,7 @@ class _Worker:
         # a daemon: it ends with this process wherever that ends, and no task starts processes of its own
         self._process = context.Process(target=_serve, args=(self._far, do, out, code), daemon=True)
 
-    def begin(self, task: Task) -> None:
+    def begin(self, task: BuildTask) -> None:
         """Send a task, the first one to a new process; if the worker has just died, `outcome` tells."""
         if self._process.pid is None:
             with _signals_kept_from_children(), environment_of_children({**_MEMORY, **ONE_THREAD}):

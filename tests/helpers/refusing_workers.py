@@ -6,14 +6,14 @@ from typing import Any
 from unittest.mock import patch
 
 from phibench.datasets.build import spot_task
-from phibench.datasets.build.tasks import Done, Failed, Task
+from phibench.datasets.build.tasks import BuildTask, Done, Failed
 from phibench.datasets.build.tasks import perform as do
 from phibench.render.optics.certificate import Certificate, certify
 
 REFUSED = "random-000001"
 
 
-def perform(task: Task, out: Path, code: str | None = None) -> Done | Failed:
+def perform(task: BuildTask, out: Path, code: str | None = None) -> Done | Failed:
     """Do a task as a worker does; the chief rays of one sample are out of tolerance by a hundredth of a pixel."""
     if task.name != f"spot {REFUSED}":
         return do(task, out, code)

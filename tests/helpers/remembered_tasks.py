@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from phibench.datasets.build.tasks import Made, Task
+from phibench.datasets.build.tasks import BuildTask, Made
 from phibench.datasets.store.files import write_bytes
 
 # what tasks run, and not what runs tasks
@@ -38,7 +38,7 @@ def _state() -> int:
 class Remembered:
     """Function of a task that is called once for each name and key."""
 
-    task: Task
+    task: BuildTask
 
     def __call__(self, out: Path, *arguments: Any) -> Made:
         """Write the files that the task wrote before, or do it."""

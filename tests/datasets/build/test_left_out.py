@@ -20,7 +20,7 @@ from phibench.benchmark.sealed.sealed_set import seal
 from phibench.cli.main import main
 from phibench.datasets.build import sample_task, spot_task, tasks, workers
 from phibench.datasets.build.journal import Journal
-from phibench.datasets.build.tasks import Done, Failed, Task
+from phibench.datasets.build.tasks import BuildTask, Done, Failed
 from phibench.datasets.errors import DatasetError, IncompleteError
 from phibench.datasets.frames.request import FrameOptions
 from phibench.datasets.make import dry_run, make
@@ -86,7 +86,7 @@ def refusing() -> pytest.MonkeyPatch:
     """
     patch, (certified, view), do = pytest.MonkeyPatch(), refused(), tasks.perform
 
-    def perform(task: Task, *rest: Any) -> Done | Failed:
+    def perform(task: BuildTask, *rest: Any) -> Done | Failed:
         return Failed("its room cannot be built", refused=True) if task.name == view else do(task, *rest)
 
     patch.setattr(spot_task, "certify", certified)

@@ -12,15 +12,15 @@ import pytest
 from phibench.datasets.build.forecast import Pace, TaskProgress
 from phibench.datasets.build.journal import Entry, FolderHead, Journal
 from phibench.datasets.build.scheduler import AHEAD, TRIALS, schedule
-from phibench.datasets.build.tasks import Done, Failed, Made, Task
+from phibench.datasets.build.tasks import BuildTask, Done, Failed, Made
 
 
 def nothing(out: Path) -> Made:
     return Made(())
 
 
-def task(name: str, *needs: str) -> Task:
-    return Task(name, "key", nothing, (), needs)
+def task(name: str, *needs: str) -> BuildTask:
+    return BuildTask(name, "key", nothing, (), needs)
 
 
 class Simulated:
@@ -31,16 +31,16 @@ class Simulated:
     ) -> None:
         self._poison, self._bugs, self._seconds = set(poison), set(bugs), seconds
         self._free = [(0.0, worker) for worker in range(workers)]
-        self._queues: dict[int, list[tuple[float, Task]]] = {worker: [] for worker in range(workers)}
+        self._queues: dict[int, list[tuple[float, BuildTask]]] = {worker: [] for worker in range(workers)}
         self._events: list[tuple[float, int, int]] = []
-        self._ready: list[tuple[Task, Done | Failed]] = []
+        self._ready: list[tuple[BuildTask, Done | Failed]] = []
         self._count = 0
         self.now, self.flying, self.most, self.runs = 0.0, 0, 0, Counter[str]()
 
     def width(self) -> int:
         return len(self._queues)
 
-    def submit(self, task: Task) -> None:
+    def submit(self, task: BuildTask) -> None:
         self.flying += 1
         self.most = max(self.most, self.flying)
         at, worker = heapq.heappop(self._free)
@@ -50,7 +50,7 @@ class Simulated:
         self._count += 1
         heapq.heappush(self._events, (end, self._count, worker))
 
-    def next(self) -> tuple[Task, Done | Failed]:
+    def next(self) -> tuple[BuildTask, Done | Failed]:
         while not self._ready:
             self.now, _, worker = heapq.heappop(self._events)
             queue = self._queues[worker]
@@ -59,7 +59,7 @@ class Simulated:
         self.flying -= 1
         return self._ready.pop(0)
 
-    def _end(self, queue: list[tuple[float, Task]]) -> None:
+    def _end(self, queue: list[tuple[float, BuildTask]]) -> None:
         _, task = queue.pop(0)
         self.runs[task.name] += 1
         if task.name in self._poison:

@@ -21,7 +21,7 @@ from helpers.processes import SMALLEST, left_of, living, quiet, said, wait_for
 
 from phibench.datasets.build import workers
 from phibench.datasets.build.scheduler import schedule
-from phibench.datasets.build.tasks import Done, Failed, Made, Task
+from phibench.datasets.build.tasks import BuildTask, Done, Failed, Made
 from phibench.datasets.build.workers import _checked, describe, local_environment, local_workers
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.make import make
@@ -76,16 +76,16 @@ if __name__ == "__main__":
 """A program with two workers, both in tasks that do not end."""
 
 
-def tasks() -> list[Task]:
+def tasks() -> list[BuildTask]:
     """Twelve innocents, two that kill their worker, two with faults, one that needs a killer."""
-    innocent = [Task(f"square {i}", "", square, (i,)) for i in range(12)]
+    innocent = [BuildTask(f"square {i}", "", square, (i,)) for i in range(12)]
     guilty = [
-        Task("kill 9", "", die, (9,)),
-        Task("kill 11", "", die, (11,)),
-        Task("bug", "", bug),
-        Task("told", "", told),
+        BuildTask("kill 9", "", die, (9,)),
+        BuildTask("kill 11", "", die, (11,)),
+        BuildTask("bug", "", bug),
+        BuildTask("told", "", told),
     ]
-    return [*innocent[:3], *guilty, *innocent[3:], Task("reader", "", square, (1,), ("kill 9",))]
+    return [*innocent[:3], *guilty, *innocent[3:], BuildTask("reader", "", square, (1,), ("kill 9",))]
 
 
 @pytest.mark.parametrize("count", [pytest.param(1, marks=pytest.mark.slow), 2])  # each: 6 deaths of a worker
@@ -105,10 +105,10 @@ def test_who_kills_workers_is_named_and_all_others_finish(tmp_path: Path, count:
 def test_a_death_costs_its_own_task_alone_and_another_worker_comes(tmp_path: Path) -> None:
     """Its neighbours neither die nor wait; whoever lets go of its pipe counts as dead, and so does one that exits."""
     with local_workers(2, tmp_path) as pool:
-        for task in (Task("kill", "", die, (9,)), *(Task(f"square {i}", "", square, (i,)) for i in range(4))):
+        for task in (BuildTask("kill", "", die, (9,)), *(BuildTask(f"square {i}", "", square, (i,)) for i in range(4))):
             pool.submit(task)
         outcomes = {task.name: outcome for task, outcome in (pool.next() for _ in range(5))}
-        pool.submit(Task("leave", "", leave, (3,)))
+        pool.submit(BuildTask("leave", "", leave, (3,)))
         assert pool.next()[1] == Failed("exited with status 3", lethal=True)
     assert outcomes.pop("kill") == Failed("was killed by signal 9", lethal=True)
     assert {name: outcome.result for name, outcome in outcomes.items() if isinstance(outcome, Done)} == {
@@ -328,7 +328,7 @@ def test_workers_that_all_go_away(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         first.enter_context(running(worker))
         pool = stack.enter_context(workers.remote_workers(scheduler[-1], tmp_path / "out"))
         first.close()
-        pool.submit(Task("view x", "", dict))
+        pool.submit(BuildTask("view x", "", dict))
         with pytest.raises(DatasetError, match="no workers for 5 s; start some and run the same command again"):
             pool.next()
 
