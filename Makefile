@@ -3,6 +3,7 @@
 VENV   := .venv
 BIN    := $(VENV)/bin
 READY  := $(VENV)/.phibench-ready
+COMPLETE := $(VENV)/.phibench-complete
 RECIPE ?= datasets/recipes/paper.toml
 OUT    ?= out/paper
 SAMPLES ?= 12
@@ -22,10 +23,13 @@ unexport PYTHONDONTWRITEBYTECODE
 # together; `make test PARALLEL=` runs them one after the other.
 PARALLEL ?= --numprocesses 2 --dist worksteal
 
-# All extras but those of networks and of the site.
+# What renders, and all extras but those of networks and of the site.
+RENDERING := --editable '.[render]'
 EVERYTHING := --editable '.[render,cluster,study,film,export,test,check]'
-# `$(call install,FOLDER OF PYTHON,WHAT)`: pip says nothing, but for everything that it had to say where it fails.
-install = $(1)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt $(2) \
+# `$(call install,FOLDER OF PYTHON,WHAT)`: by uv where it is there and reaches a registry, else by pip, which says nothing
+# but for everything that it had to say where it fails.
+install = (command -v uv && uv pip install --quiet --python $(1)/python --constraint constraints.txt $(2)) >/dev/null 2>&1 || \
+    $(1)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt $(2) \
     > $(1)/../pip.log 2>&1 || { cat $(1)/../pip.log >&2; exit 1; }
 
 .DEFAULT_GOAL := help
@@ -34,8 +38,8 @@ install = $(1)/python -m pip install --quiet --disable-pip-version-check --const
 .PHONY: docs dist test test-base test-wheel test-slow proof test-all attack mutants benchmark
 
 help:
+	@echo "make dataset    render $(RECIPE) into $(OUT); installs what renders, in .venv"
 	@echo "make setup      make .venv with everything in it, and make sure of LLVM"
-	@echo "make dataset    render $(RECIPE) into $(OUT)"
 	@echo "make bench      $(SAMPLES) samples of bench-dev, all built-in methods on them, a report, in out/"
 	@echo "make studies    the eight studies, reduced, and a report on them, in out/studies"
 	@echo "make studies-full  the same in full (hours), published to docs/studies"
@@ -53,7 +57,7 @@ help:
 	@echo "make lint       ruff and mypy"
 	@echo "make clean      remove caches and builds; .venv and out/ stay"
 
-setup: $(READY)
+setup: $(COMPLETE)
 
 # The stamp comes last, so that an interrupted set-up is taken up again; every step may be repeated.
 $(READY): pyproject.toml constraints.txt
@@ -70,9 +74,14 @@ $(READY): pyproject.toml constraints.txt
 	    fi; \
 	    echo "Making $(VENV) with $$python"; \
 	    "$$python" -m venv --clear $(VENV) )
-	@echo "Installing phibench and what it needs (some minutes the first time)"
-	@$(call install,$(BIN),$(EVERYTHING))
+	@echo "Installing phibench and what it renders with (a minute the first time)"
+	@$(call install,$(BIN),$(RENDERING))
 	@$(BIN)/python -m phibench.render.setup.llvm
+	@touch $@
+
+$(COMPLETE): $(READY)
+	@echo "Installing what tests, checks and studies need (a minute the first time)"
+	@$(call install,$(BIN),$(EVERYTHING))
 	@touch $@
 
 dataset: $(READY)
@@ -85,7 +94,7 @@ bench: $(READY)
 	$(BIN)/phibench bench $(BENCH) --out $(BENCH)-report
 
 # One after the other; the data sets are shared and kept.
-studies: $(READY)
+studies: $(COMPLETE)
 	@set -e; for name in $(STUDIES_ALL); do \
 	    echo "== $$name"; $(BIN)/phibench study $$name --quick --out $(STUDIES)/$$name --data $(STUDIES)/data; \
 	done
@@ -93,13 +102,13 @@ studies: $(READY)
 
 # Hours. The documents beside the pages are replaced; tests/studies/test_study_pages.py then names every
 # number of a page that has to be edited.
-studies-full: $(READY)
+studies-full: $(COMPLETE)
 	@set -e; for name in $(STUDIES_ALL); do \
 	    echo "== $$name"; \
 	    $(BIN)/phibench study $$name --out $(STUDIES)-full/$$name --data $(STUDIES)/data --publish docs/studies; \
 	done
 
-test: $(READY)
+test: $(COMPLETE)
 	$(BIN)/python -m pytest $(PARALLEL)
 
 # Scoring, reading and geometry as they are installed without Mitsuba, for any Python: `make test-base PYTHON=python3.13`.
@@ -110,28 +119,28 @@ test-base:
 	$(BASE)/bin/python -m pytest $(BASE_TESTS)
 
 # The wheel alone in a clean environment: it fetches a released set of three kinds of rooms, verifies and scores it.
-test-wheel: $(READY)
+test-wheel: $(COMPLETE)
 	$(BIN)/python -m pytest --slow tests/test_distribution.py
 
-test-slow: $(READY)
+test-slow: $(COMPLETE)
 	$(BIN)/python -m pytest --slow --study -m "slow or study"
 
-proof: $(READY)
+proof: $(COMPLETE)
 	$(BIN)/python -m pytest $(PARALLEL) --slow -m slow -k accuracy $(PROOFS)
 
-test-all: $(READY)
+test-all: $(COMPLETE)
 	$(BIN)/python -m pytest --slow --study
 
-attack: $(READY)
+attack: $(COMPLETE)
 	$(BIN)/python -m pytest $(PARALLEL) --slow tests/attack
 
-mutants: $(READY)
+mutants: $(COMPLETE)
 	$(BIN)/python tests/mutants/run.py
 
-benchmark: $(READY)
+benchmark: $(COMPLETE)
 	$(BIN)/python -m pytest --benchmark-enable --benchmark-only
 
-docs: $(READY)
+docs: $(COMPLETE)
 	@echo "Installing what the site needs"
 	@$(call install,$(BIN),--editable '.[docs]')
 	@echo "Building the site: half a minute, and some minutes more where the tutorials are to be run"
@@ -139,11 +148,11 @@ docs: $(READY)
 	@echo "out/site/index.html"
 
 # Source distribution, and the wheel built from it.
-dist: $(READY)
+dist: $(COMPLETE)
 	@$(call install,$(BIN),build)
 	$(BIN)/python -m build --outdir dist .
 
-lint: $(READY)
+lint: $(COMPLETE)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy --num-workers 2 -p phibench

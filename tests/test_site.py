@@ -149,7 +149,8 @@ def test_make_docs_tells_what_it_does_and_shows_pip_where_it_fails(tmp_path: Pat
     for name, text in {"python": f"echo WARNING: a location; exit {int(fails)}", "mkdocs": "exit 0"}.items():
         (tmp_path / "bin" / name).write_text(f"#!/bin/sh\n{text}\n")
         (tmp_path / "bin" / name).chmod(0o755)
-    (tmp_path / ".phibench-ready").touch()
+    for stamp in (".phibench-ready", ".phibench-complete"):  # in this order: the second needs the first
+        (tmp_path / stamp).touch()
     child = subprocess.run(
         ["make", "--no-print-directory", "docs", f"VENV={tmp_path}"],
         cwd=ROOT,
