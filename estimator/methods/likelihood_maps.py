@@ -22,10 +22,12 @@ from phibench.estimator.spots.fit_raw import SpotData
 from phibench.scenes.frames import Array
 
 _AT_ONCE = 48  # hypotheses, whose arrays take some 50 MB
-_WIDE_PX = 1.25  # half side of the first map: the next minimum of a Bayer grid lies a pixel off
+_WIDE_PX = (1.25, 2.25, 3.25)  # half sides of the first map, the next one where a posterior reaches its sides
 _WIDE_STEP_PX = 0.25
+_AT_SIDES = 1e-3  # part of a posterior on the outermost places of the first map, above which the next one is made
 _SIGMAS = 4.5
 _STEP_SIGMAS = 0.6  # of the second map: cubic splines between are within 1 % of a unit of misfit
+_MOST_STEP_PX = 0.2  # of the second map: where a place is flat to its curvature, what surrounds it is steeper
 _MOST_SIDE = 41
 # least variance of a coefficient that counts, in steps squared: one that changes in fewer than 2 % of the frames says
 # next to nothing, and when it changes a Gaussian's square is 50 and more, far beyond the logarithm of its chance
@@ -33,7 +35,6 @@ _LIVE = 0.02
 _OUTLIER = 3.0  # of a residual in standard deviations
 _STEPS = 12  # of the scoring from a place that a fit has found
 _WORTH = 1.5 * MISFIT_RANGE  # of a first guess of the misfit, above the least
-_SIDE = np.arange(-_WIDE_PX, _WIDE_PX + 1e-9, _WIDE_STEP_PX)
 _PLACE = 2  # unknowns u, v, the first ones
 _LEAST_FLUX = 1e-3  # of the fit's flux, below which a hypothesis has no spot
 
@@ -121,55 +122,95 @@ def place_covariance(one: SpotLikelihood) -> Array:
 
 
 def likelihood_map(one: SpotLikelihood) -> LikelihoodMap | None:
-    """Map of all places near the fit whose misfit is within the range of the least; None if the fit has no place."""
+    """Map of all places near the fit whose misfit is within the range of the least; None if the fit has no place.
+
+    The next minimum of a Bayer grid lies a pixel from the fit, and may be the true one: of a faint spot between red
+    pixels the posterior then reaches 2 px from the fit.
+    """
     misfit, _, fisher = (part[0] for part in one.scores(one.theta[None], 0))
     C = covariance_bound(fisher) * one.excess
     if not np.isfinite(C).all():
         return None
-    wide = _wide(one)
-    low, high = _ends(wide, float(misfit) / one.excess, _SIGMAS * np.sqrt(np.diag(C)))
-    steps = _STEP_SIGMAS * np.sqrt(np.diag(C))
+    least = float(misfit) / one.excess
+    wide = _wide_enough(one, least, C)
+    # the curvature at a flat place says nothing of what lies outside the wide map
+    low, high = _ends(wide, least, np.minimum(_SIGMAS * np.sqrt(np.diag(C)), wide.side[-1]))
+    steps = np.minimum(_STEP_SIGMAS * np.sqrt(np.diag(C)), _MOST_STEP_PX)
     counts = np.clip(np.ceil((high - low) / steps) + 1, 5, _MOST_SIDE).astype(int)
     u, v = (np.linspace(*ends) for ends in zip(low, high, counts, strict=True))
     off = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, _PLACE)
-    parabola = float(misfit) / one.excess + np.einsum("mi,ij,mj->m", off, np.linalg.inv(C), off)
-    coarse = _between(wide, off)
+    parabola = least + np.einsum("mi,ij,mj->m", off, np.linalg.inv(C), off)
+    coarse = wide.between(off)
     theta = one.theta + np.where((parabola < coarse[:, 0])[:, None], _along(fisher, off), coarse[:, 1:])
     values = np.minimum(parabola, coarse[:, 0])
-    worth = np.flatnonzero(values < min(float(values.min()), float(wide[..., 0].min())) + _WORTH)
+    worth = np.flatnonzero(values < min(float(values.min()), float(wide.misfit.min())) + _WORTH)
     values[worth], _ = _profiled(one, theta[worth], 1)
     corner = one.corner_px + one.theta[:_PLACE]
     return LikelihoodMap(u + corner[0], v + corner[1], values.reshape(len(v), len(u)))
 
 
-def _wide(one: SpotLikelihood) -> Array:
-    """Profiled misfit and hypotheses less the best one, shape (s, s, 1 + k), at the places `_SIDE` x `_SIDE`."""
-    off = np.stack(np.meshgrid(_SIDE, _SIDE), axis=-1).reshape(-1, _PLACE)
+@dataclass(frozen=True)
+class _Wide:
+    """Profiled misfits and hypotheses on places `side` x `side` from the fit's.
+
+    Attributes
+    ----------
+    side : shape (s,), pixels
+    values : shape (s, s, 1 + k), misfit, and hypothesis less the best one
+    """
+
+    side: Array
+    values: Array
+
+    @property
+    def misfit(self) -> Array:
+        return self.values[..., 0]
+
+    def at_sides(self, least: float, peak_px2: float) -> float:
+        """Part of the posterior that lies on the outermost places; at the fit it has `least` on an area `peak_px2`."""
+        weight = np.exp(-0.5 * (self.misfit - min(float(self.misfit.min()), least)))
+        inside = float(weight[1:-1, 1:-1].sum())
+        whole = max(float(weight.sum()), peak_px2 / _WIDE_STEP_PX**2)
+        return (float(weight.sum()) - inside) / whole
+
+    def between(self, off: Array) -> Array:
+        """Values at places from the fit's, shape (m, 1 + k), linear; beyond the last places as on them."""
+        at = RegularGridInterpolator((self.side, self.side), self.values)
+        values = np.asarray(at(np.clip(off[:, ::-1], self.side[0], self.side[-1])))
+        values[:, 1 : 1 + _PLACE] = off
+        return values
+
+
+def _wide_enough(one: SpotLikelihood, least: float, C: Array) -> _Wide:
+    """The smallest of the wide maps that holds the posterior; the largest one if none does."""
+    peak_px2 = 2.0 * np.pi * float(np.sqrt(max(np.linalg.det(C), 0.0)))
+    for half in _WIDE_PX:
+        wide = _wide(one, half)
+        if wide.at_sides(least, peak_px2) <= _AT_SIDES:
+            break
+    return wide
+
+
+def _wide(one: SpotLikelihood, half_px: float) -> _Wide:
+    side = np.arange(-half_px, half_px + 1e-9, _WIDE_STEP_PX)
+    off = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, _PLACE)
     theta = np.repeat(one.theta[None], len(off), axis=0)
     theta[:, :_PLACE] += off
     misfit, theta = _profiled(one, theta, 2)
-    return np.column_stack([misfit, theta - one.theta]).reshape(len(_SIDE), len(_SIDE), -1)
+    return _Wide(side, np.column_stack([misfit, theta - one.theta]).reshape(len(side), len(side), -1))
 
 
-def _ends(wide: Array, least: float, reach: Array) -> tuple[Array, Array]:
+def _ends(wide: _Wide, least: float, reach: Array) -> tuple[Array, Array]:
     """Sides, shape (2,) each, of what is worth a closer look, from the fit's place."""
-    near = wide[..., 0] < min(float(wide[..., 0].min()), least) + MISFIT_RANGE
-    near[len(_SIDE) // 2, len(_SIDE) // 2] = False  # the fit's own place, about which `reach` is enough
+    near = wide.misfit < min(float(wide.misfit.min()), least) + MISFIT_RANGE
+    near[len(wide.side) // 2, len(wide.side) // 2] = False  # the fit's own place, about which `reach` is enough
     low, high = -reach, reach.copy()
     for axis in range(_PLACE):
         index = np.flatnonzero(near.any(axis=axis))
         if index.size:
-            low[axis] = min(low[axis], _SIDE[index[0]] - _WIDE_STEP_PX)
-            high[axis] = max(high[axis], _SIDE[index[-1]] + _WIDE_STEP_PX)
+            low[axis] = min(low[axis], wide.side[index[0]] - _WIDE_STEP_PX)
+            high[axis] = max(high[axis], wide.side[index[-1]] + _WIDE_STEP_PX)
     return low, high
-
-
-def _between(wide: Array, off: Array) -> Array:
-    """Values of the wide map at places from the fit's, shape (m, 1 + k); linear, carried on outside."""
-    at = RegularGridInterpolator((_SIDE, _SIDE), wide, bounds_error=False, fill_value=None)
-    values = np.asarray(at(off[:, ::-1]))
-    values[:, 1 : 1 + _PLACE] = off
-    return values
 
 
 def _along(fisher: Array, off: Array) -> Array:

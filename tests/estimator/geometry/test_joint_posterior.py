@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -127,3 +128,40 @@ def test_two_minima_of_a_single_image_are_both_in_its_moments() -> None:
 def test_a_single_image_whose_map_ends_at_the_minimum_has_no_moments() -> None:
     whole = gaussian(np.array([640.3, 250.7]), C_DOWN)
     assert single_posterior(LikelihoodMap(whole.u_px[12:], whole.v_px, whole.misfit[:, 12:])) is None
+
+
+def _two_minima(off: np.ndarray) -> np.ndarray:
+    """The farther one is flatter and the deeper one, and reaches 2 px from the fit."""
+    first = np.sum((off / 0.12) ** 2, axis=-1)
+    second = np.sum(((off - [0.0, 1.33]) / [0.2, 0.35]) ** 2, axis=-1)
+    return np.asarray(-2.0 * np.logaddexp(-0.5 * first, -0.5 * second + 0.7))
+
+
+def _flat(off: np.ndarray) -> np.ndarray:
+    """A place between red pixels: hardly any curvature, then walls up to the misfit of an image without a spot."""
+    beyond = np.maximum(np.abs(off) - 0.5, 0.0)
+    return np.asarray(60.0 * (1.0 - np.exp(-np.sum((off / 0.9) ** 2 + (beyond / 0.12) ** 2, axis=-1) / 60.0)))
+
+
+@pytest.mark.parametrize(("misfit", "sigma_px"), [(_two_minima, 0.12), (_flat, 0.9)])
+def test_a_faint_spot_has_all_of_its_posterior(misfit: Callable[[np.ndarray], np.ndarray], sigma_px: float) -> None:
+    """What the curvature at the fit does not say: a minimum more than 1.25 px away, and walls within its own sigma."""
+
+    def scores(theta: np.ndarray, first: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        F = np.diag([sigma_px**-2, sigma_px**-2, 1.0])[first:, first:]
+        score = np.column_stack([np.zeros((len(theta), 2)), 900.0 - theta[:, 2]])[:, first:]
+        value = misfit(theta[:, :2] - [7.0, 8.0]) + (theta[:, 2] - 900.0) ** 2
+        return value, score, np.repeat(F[None], len(theta), axis=0)
+
+    places = likelihood_map(SpotLikelihood(scores, np.array([7.0, 8.0, 900.0]), np.array([100.0, 200.0]), 1.0))
+    assert places is not None
+    found, covariance = single_posterior(places) or (None, None)
+    # by sums over a fine grid that holds everything
+    side = np.arange(-4.0, 4.0, 0.02)
+    off = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
+    weight = np.exp(-0.5 * misfit(off))
+    mean = weight @ off / weight.sum()
+    expected = ((off - mean).T * weight) @ (off - mean) / weight.sum()
+    # splines between nodes 0.2 px apart follow a wall of 0.12 px to 5 % of the posterior's width
+    np.testing.assert_allclose(found - [107.0, 208.0], mean, atol=0.05 * math.sqrt(np.trace(expected)))
+    np.testing.assert_allclose(covariance, expected, rtol=0.05, atol=0.05 * np.trace(expected))

@@ -29,9 +29,6 @@ def pulls(answer: Answer, row: object) -> list[np.ndarray]:
     return found
 
 
-@pytest.mark.xfail(
-    reason="missed: pull 1.96 at a signal to noise of 10 to 13 since the robot's size changed the sample"
-)
 @pytest.mark.slow  # 14 pairs of whole frames, detection included: 15 s
 def test_accuracy_of_what_faint_spots_claim(bench_dataset: Path) -> None:
     """Raw spots of 6 to 8 sigma: 1.6 at the fit's own covariance, 1.05 at the posterior's, of 38 images once.
