@@ -250,7 +250,7 @@ class Sample(ShortForm):
 
     def __repr__(self) -> str:
         places = (f"{p} {_place(self.row.position(p))}" for p in POSITIONS)
-        numbers = (f"D = {self.row.depth_m:.3f} m", f"h = {self.row.stroke_m:.3f} m", *places)
+        numbers = (f"D = {self.row.centre_depth_m:.3f} m", f"h = {self.row.stroke_m:.3f} m", *places)
         return f"Sample('{self.row.sample_id}': {', '.join(numbers)})"
 
     def truth_row(self, position: str) -> SpotRow:
@@ -393,7 +393,7 @@ class Sample(ShortForm):
 
 def _place(spot: SpotRow) -> str:
     """Position of a spot in its image, or why there is none."""
-    return f"({spot.u_px:.2f}, {spot.v_px:.2f}) px" if spot.visible else f"not visible: {spot.cause}"
+    return f"({spot.centre.u_px:.2f}, {spot.centre.v_px:.2f}) px" if spot.visible else f"not visible: {spot.cause}"
 
 
 def _renamed(old: str, new: str) -> None:

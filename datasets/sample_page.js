@@ -289,12 +289,14 @@ function writeTexts() {
     const line = table.insertRow();
     for (const text of cells) line.appendChild(document.createElement(tag)).textContent = text;
   };
-  row(["true spot", "u (px)", "v (px)", "phi_ray (rad)", "visible", "exposure (ms)"], "th");
+  row(["centre of the light", "u (px)", "v (px)", "from the axis (px)", "phi_ray (rad)", "visible", "exposure (ms)"],
+    "th");
   for (const position of ["down", "up"]) {
     const view = data.views[position];
     const numbers = view.mark ? view.mark.map((x) => x.toFixed(4)) : ["-", "-"];
     const phi = view.phi_ray_rad === null ? "-" : view.phi_ray_rad.toFixed(7);
-    row([position, ...numbers, phi, view.visible ? "yes" : view.cause, (1e3 * view.exposure_s).toFixed(2)], "td");
+    const apart = view.mark ? Math.hypot(view.mark[0] - view.axis[0], view.mark[1] - view.axis[1]).toFixed(4) : "-";
+    row([position, ...numbers, apart, phi, view.visible ? "yes" : view.cause, (1e3 * view.exposure_s).toFixed(2)], "td");
     byId(`note-${position}`).textContent = view.visible ? "" : `spot not visible: ${view.cause}`;
   }
   const planes = Object.entries(data.views.down.planes).filter(([name]) => name !== "object_id");

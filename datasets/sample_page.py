@@ -93,7 +93,7 @@ def page_data(sample: Sample) -> dict[str, Any]:
     return {
         "id": row.sample_id,
         "dataset": sample.dataset.info.name,
-        "depth_m": row.depth_m,
+        "depth_m": row.centre_depth_m,
         "stroke_m": row.stroke_m,
         "objects": list(sample.object_names),
         "views": {p: _view(sample, p, frames[p], frames[f"{p}_off"]) for p in POSITIONS},
@@ -103,6 +103,7 @@ def page_data(sample: Sample) -> dict[str, Any]:
 
 def _view(sample: Sample, position: str, on: Frame, off: Frame) -> dict[str, Any]:
     row, camera = sample.truth_row(position), sample.rig.camera
+    light = row.centre  # what scores refer to
     assert on.jpeg is not None
     assert off.jpeg is not None
     other = next(p for p in POSITIONS if p != position)
@@ -114,8 +115,9 @@ def _view(sample: Sample, position: str, on: Frame, off: Frame) -> dict[str, Any
         "exposure_s": on.sensor.exposure_s,
         "visible": row.visible,
         "cause": row.cause,
-        "mark": [row.u_px, row.v_px] if np.isfinite(row.u_px) else None,
-        "phi_ray_rad": row.phi_ray_rad if np.isfinite(row.phi_ray_rad) else None,
+        "mark": [light.u_px, light.v_px] if np.isfinite(light.u_px) else None,
+        "axis": [row.u_px, row.v_px] if np.isfinite(row.u_px) else None,
+        "phi_ray_rad": light.phi_ray_rad if np.isfinite(light.phi_ray_rad) else None,
         "outline": _pixels(sample.rig.outline_px(180)),  # camera and mirror move as one
         "line": epipolar_line(sample, other),
         "spot": _spot(sample, position),
@@ -125,9 +127,9 @@ def _view(sample: Sample, position: str, on: Frame, off: Frame) -> dict[str, Any
 
 
 def epipolar_line(sample: Sample, position: str) -> dict[str, Any] | None:
-    """Curve, in the other image, of the ray that the mirror sends towards the spot at `position`.
+    """Curve, in the other image, of the ray that the mirror sends towards the spot's light at `position`.
 
-    The ray is the last straight part of the way to the spot, prolonged to 1000 m. None without a reflection.
+    The ray is the last straight part of the way to the light, prolonged to 1000 m. None without a reflection.
 
     Returns
     -------
@@ -135,7 +137,8 @@ def epipolar_line(sample: Sample, position: str) -> dict[str, Any] | None:
     """
     view = sample.view(position)
     other = sample.view(next(p for p in POSITIONS if p != position))
-    spot = np.array([sample.row.spot_world_m])
+    light = np.array([sample.truth_row(position).centre.place_world_m])
+    spot = light if np.isfinite(light).all() else np.array([sample.row.spot_world_m])
     found = mirror_points(view, spot, view.camera_centre_m[None])
     if not np.isfinite(found.points_m).all():
         return None

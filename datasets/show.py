@@ -107,7 +107,10 @@ def _console() -> Console:
 
 
 def table(dataset: Dataset) -> Table:
-    """Table of all samples; each one's room takes the place of its experiment where there are several."""
+    """Table of all samples; each one's room takes the place of its experiment where there are several.
+
+    Places, phi and D are those of the centre of the light, which scores refer to.
+    """
     result = Table(title=_title(dataset), box=box.SIMPLE)
     several = len({row.room for row in dataset.rows}) > 1
     for heading in ("sample", "room" if several else "experiment"):
@@ -127,7 +130,7 @@ def narrow_table(dataset: Dataset) -> Table:
             heading, justify="right" if heading in ("D (m)", "h (m)", "u, v (px)") else "left", no_wrap=True
         )
     for row in dataset.rows:
-        numbers = (row.sample_id, f"{row.depth_m:.3f}", f"{row.stroke_m:.3f}")
+        numbers = (row.sample_id, f"{row.centre_depth_m:.3f}", f"{row.stroke_m:.3f}")
         for position, cells in zip(POSITIONS, (numbers, ("", "", "")), strict=True):
             spot = row.position(position)
             result.add_row(*cells, position, _pixel(spot), "yes" if spot.visible else spot.cause)
@@ -148,7 +151,7 @@ def _print_table(dataset: Dataset, console: Console) -> None:
 
 
 def contact_sheet(dataset: Dataset, console: Console) -> Picture:
-    """One strip per sample: both frames with a cross at the true spot, and the spot's surroundings enlarged."""
+    """One strip per sample: both frames with a cross at the centre of the light, and the surroundings enlarged."""
     strips = []
     with Steps(console, "contact sheet", len(dataset)) as steps:
         for sample in dataset:
@@ -166,7 +169,7 @@ def _title(dataset: Dataset) -> str:
 
 
 def _pixel(spot: SpotRow) -> str:
-    return f"{spot.u_px:.2f}, {spot.v_px:.2f}" if np.isfinite(spot.u_px) else "-"
+    return f"{spot.centre.u_px:.2f}, {spot.centre.v_px:.2f}" if np.isfinite(spot.u_px) else "-"
 
 
 def _certificate(spot: SpotRow) -> str:
@@ -180,10 +183,10 @@ def _cells(row: ManifestRow, group: str) -> tuple[str, ...]:
     return (
         row.sample_id,
         group,
-        f"{row.depth_m:.3f}",
+        f"{row.centre_depth_m:.3f}",
         f"{row.stroke_m:.3f}",
         *(_pixel(spot) for spot in spots),
-        " / ".join(f"{np.degrees(spot.phi_ray_rad):.3f}" for spot in spots),
+        " / ".join(f"{np.degrees(spot.centre.phi_ray_rad):.3f}" for spot in spots),
         " / ".join("yes" if spot.visible else spot.cause for spot in spots),
         " / ".join(_certificate(spot) for spot in spots),
     )
@@ -194,7 +197,7 @@ def _strip(sample: Sample) -> Picture:
     strip = np.concatenate([np.pad(part, ((0, _height(parts) - len(part)), (0, 4), (0, 0))) for part in parts], axis=1)
     image = Image.fromarray(np.pad(strip, ((_CAPTION_PX, 4), (0, 0), (0, 0))))
     row = sample.row
-    caption = f"{row.sample_id}   D = {row.depth_m:.3f} m   h = {row.stroke_m:.3f} m   left: down, right: up"
+    caption = f"{row.sample_id}   D = {row.centre_depth_m:.3f} m   h = {row.stroke_m:.3f} m   left: down, right: up"
     ImageDraw.Draw(image).text((4, 2), caption, fill=TEXT)
     return np.asarray(image)
 
@@ -207,8 +210,8 @@ def _pictures(sample: Sample, position: str) -> tuple[Picture, Picture]:
     detector, spot = sample.rig.camera.detector, sample.truth_row(position)
     frame = sample.expected_image(position)
     exposure = display_exposure_s(halved(sample.ambient(position)), detector)
-    overview = marked(to_srgb(halved(halved(frame)), detector, exposure), spot, 4)
-    window = crop(frame, spot)
+    overview = marked(to_srgb(halved(halved(frame)), detector, exposure), spot.centre, 4)
+    window = crop(frame, spot.centre)
     peak = float(window[1].max(initial=1.0))
-    close = enlarged(to_srgb(window, detector, min(exposure, 1.0 / peak)), spot, _ZOOM)
+    close = enlarged(to_srgb(window, detector, min(exposure, 1.0 / peak)), spot.centre, _ZOOM)
     return overview, close if spot.visible else captioned(close, f"{position}: not visible\n{spot.cause}")

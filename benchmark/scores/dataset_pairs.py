@@ -46,8 +46,8 @@ from phibench.scenes.rig import Rig
 TASK_VERSION = 6
 """Version of the task: what a method is given, what it must answer and what is counted. A change of any raises it.
 
-6: every preset exposes by itself, unless the recipe's `[frames]` says otherwise; positions, phi and D refer to the
-   centre of the light, no longer to the beam's axis; signal to noise is one definition for all presets.
+6: every preset exposes by itself, unless the recipe's `[frames]` says otherwise; positions, phi, D and boxes refer to
+   the centre of the light, no longer to the beam's axis; signal to noise is one definition for all presets.
 5: spots may be hidden in one image, and a D of such a pair is false.
 4: a missed pair counts as the best constant depth would; a sealed set shows each sample once.
 """

@@ -6,6 +6,7 @@ sample's spot and of its two views.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -44,7 +45,7 @@ def finish_sample(out: Path, pair: PairPlan, rig: Rig, source: RoomSource, spot:
         rows[position] = None if budget is None else noise_row(budget).model_dump(mode="json")
         frame = planes.astype(float)
         window.add_to(frame)
-        sides.append(PositionImages(position, truth, frame, planes))
+        sides.append(PositionImages(position, _at_light(truth, window), frame, planes))
     file = schema.preview_file(pair.sample_id)
     save_png(out / file, sample_picture(sides, rig.camera.detector))
     return Made((file,), rows)
@@ -70,6 +71,15 @@ def _check(position: str, budget: NoiseBudget | None, allowed: float) -> None:
             f"the rendering noise of its view {position} is an error of phi of {budget.phi_render_rad:.2g} rad, more "
             f"than {allowed:g} of the sensor's {budget.phi_sensor_rad:.2g} rad: raise ambient.cells_per_pixel"
         )
+
+
+def _at_light(truth: SpotTruth, window: SpotWindow) -> SpotTruth:
+    """Truth with the place of the light that reaches the image: the layer's centroid."""
+    light = window.electrons_per_s.sum(axis=0)
+    if not truth.visible or not light.sum() > 0.0:
+        return truth
+    v, u = (float(np.average(np.indices(light.shape)[axis], weights=light)) for axis in (0, 1))
+    return replace(truth, u_px=window.u0_px + u, v_px=window.v0_px + v)
 
 
 def _window(out: Path, pair: PairPlan, position: str) -> SpotWindow:

@@ -32,7 +32,7 @@ from phibench.scenes.random_streams import generator
 from phibench.scenes.rig import POSITIONS, Rig, View
 
 BOX_MARGIN_PX = 4
-"""A hinted spot is at least this far from the edges of its box."""
+"""The light of a hinted spot has its centre at least this far from the edges of its box."""
 _ORDER_STREAM = "takes"  # name of a random stream: another name would draw another order
 
 
@@ -138,11 +138,12 @@ def search_boxes(sample: Sample, side_px: int) -> tuple[Region, Region]:
 
 
 def _box(sample: Sample, position: str, side_px: int) -> Region:
-    """Box that holds the spot anywhere with the same probability, as far as the image has room for it."""
+    """Box that holds the centre of the spot's light anywhere alike, as far as the image has room for it."""
     camera, row = sample.rig.camera, sample.truth_row(position)
     sizes = camera.width_px, camera.height_px
     random = sample_stream(sample.stream_names, "box", position)
-    place = (row.u_px, row.v_px) if has_place(row, (camera.height_px, camera.width_px)) else (None, None)
+    light = row.centre
+    place = (light.u_px, light.v_px) if has_place(row, (camera.height_px, camera.width_px)) else (None, None)
     u, v = (_start(random, centre, side_px, size) for centre, size in zip(place, sizes, strict=True))
     return Region(u, v, u + min(side_px, sizes[0]), v + min(side_px, sizes[1]))
 
@@ -152,7 +153,7 @@ def _start(random: np.random.Generator, centre_px: float | None, side_px: int, s
     last = max(size_px - side_px, 0)
     if centre_px is None:
         return int(random.integers(0, last + 1))
-    # the spot is at least the margin from the box's edges, which lie half a pixel beyond its outer pixels
+    # the light is at least the margin from the box's edges, which lie half a pixel beyond its outer pixels
     low = int(np.ceil(centre_px + BOX_MARGIN_PX + 0.5 - side_px))
     high = int(np.floor(centre_px - BOX_MARGIN_PX + 0.5))
     low, high = (min(max(edge, 0), last) for edge in (low, high))

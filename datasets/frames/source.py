@@ -300,7 +300,7 @@ def _region(row: ManifestRow, position: str, wanted: int | Region | None, size: 
             f"{row.sample_id} {position}: no image of the spot ({spot.cause}) to put a region of {wanted} px around; "
             "ask for whole frames or give a Region"
         )
-    return Region.around(spot.u_px, spot.v_px, size, wanted)
+    return Region.around(spot.centre.u_px, spot.centre.v_px, size, wanted)
 
 
 def has_place(spot: SpotRow, size: tuple[int, int]) -> bool:

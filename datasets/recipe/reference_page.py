@@ -264,8 +264,8 @@ image, and `spot.hidden` among what was drawn. Without the key nothing is asked.
 in a finished data set, and making it again writes `dataset.json` anew and nothing else. Each number is drawn
 per sample from a random stream of its own, and is the same in all presets. It keeps the preset's value where it is
 not given. A number that a preset does not use (`jpeg_quality` before MJPEG) does nothing. Down and up share all of
-it. A box holds its spot anywhere, at least 4 px from its edges, so that its centre tells nothing. It stays in the
-image. Where the image has no place of the spot, the box is anywhere. `hint` gives both boxes or none.
+it. A box holds the centre of its spot's light anywhere, at least 4 px from its edges: its own centre tells nothing. It
+stays in the image. Where the image has no place of the spot, the box is anywhere. `hint` gives both boxes or none.
 
 `[frames.sensor]` holds numbers of a measured camera, as `phibench sensor fit` writes them: the lines of the sensor file
 above its first table, but for `preset`. They go before the preset's, and no key stands there and in `[frames]`.

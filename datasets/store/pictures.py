@@ -10,7 +10,7 @@ import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,6 @@ from PIL import Image, ImageDraw
 
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.store.files import write_bytes
-from phibench.datasets.store.schema import SpotRow
 from phibench.render.optics.truth import SpotTruth
 from phibench.render.sensor.processing import eight_bit
 from phibench.render.sensor.srgb import srgb_encoded
@@ -81,8 +80,19 @@ def _balanced(planes: NDArray[Any], detector: Detector) -> NDArray[Any]:
 
 
 CROP_PX = 24  # the enlarged window measures 24 x 24 pixels
-SpotPlace = SpotRow | SpotTruth
 MARK, TEXT = (0, 255, 80), (255, 255, 255)
+
+
+class SpotPlace(Protocol):
+    """Place of a spot in its image: of its light, which scores refer to; NaN where there is none."""
+
+    @property
+    def u_px(self) -> float:
+        """To the right."""
+
+    @property
+    def v_px(self) -> float:
+        """Downwards."""
 
 
 def marked(picture: Picture, spot: SpotPlace, scale: int) -> Picture:
@@ -146,10 +156,10 @@ _LARGEST_ZOOM = 6
 
 @dataclass(frozen=True)
 class PositionImages:
-    """One position of a sample: where its spot is, its frame and its ambient layer, shape (3, H, W), electrons/s."""
+    """One position of a sample: where its spot's light is, its frame and its ambient layer, (3, H, W), electrons/s."""
 
     position: str
-    spot: SpotPlace
+    spot: SpotTruth
     frame: NDArray[np.float64]
     ambient: NDArray[np.float32]
 
@@ -161,7 +171,7 @@ def sample_picture(sides: Sequence[PositionImages], detector: Detector) -> Pictu
 
 
 def _picture(
-    frame: NDArray[np.float64], position: str, spot: SpotPlace, detector: Detector, exposure: float
+    frame: NDArray[np.float64], position: str, spot: SpotTruth, detector: Detector, exposure: float
 ) -> Picture:
     picture = marked(to_srgb(halved(frame), detector, exposure), spot, 2)
     if not spot.visible:

@@ -11,6 +11,7 @@ import shutil
 import subprocess
 import zlib
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +20,15 @@ import pytest
 from PIL import Image
 
 from phibench.cli.main import main
+from phibench.datasets.build.sample_task import _at_light
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.read import Sample, open_dataset
 from phibench.datasets.sample_page import STEPS, epipolar_line, page_data, sample_of, sample_page, write_sample_page
+from phibench.datasets.show import _cells
+from phibench.datasets.store.layers import SpotWindow
 from phibench.render.optics.ray_tracer import trace_pixels
+from phibench.render.optics.room_tracer import room_geometry
+from phibench.render.optics.truth import spot_truth
 from phibench.scenes.rig import POSITIONS
 
 CHROMIUM = next((name for name in ("chromium", "chromium-browser", "google-chrome") if shutil.which(name)), "")
@@ -67,9 +73,36 @@ def test_the_spot_layer_of_the_page_has_its_place_and_electrons(sample: Sample) 
     red = window.electrons_per_s[0]
     assert np.abs(codes * spot["step"] - red).max() <= 0.5 * ROUNDING * red.max() / 65_534
     v, u = np.unravel_index(np.argmax(codes), codes.shape)
-    mark = sample.row.down
+    mark = sample.row.down.centre
     # the brightest pixel holds the spot's centre or touches the pixel that does
     assert np.hypot(u + spot["u0"] - mark.u_px, v + spot["v0"] - mark.v_px) < 1.0
+
+
+def test_the_page_and_the_table_show_the_light_that_scores_refer_to(sample: Sample) -> None:
+    """Of a torn spot: its light is 0.5 px from the beam's axis, and so are cross, numbers and enlarged window."""
+    row = sample.row
+    assert row.down.light is not None
+    light = row.down.light.model_copy(update={"u_px": row.down.u_px + 0.4, "v_px": row.down.v_px - 0.3})
+    down = row.down.model_copy(update={"light": light})
+    torn = replace(sample, row=row.model_copy(update={"down": down, "light_depth_m": 2.5}))
+    data = page_data(torn)
+    assert (data["depth_m"], data["views"]["down"]["mark"]) == (2.5, [light.u_px, light.v_px])
+    assert data["views"]["down"]["axis"] == [row.down.u_px, row.down.v_px]
+    shown = f"{light.u_px:.2f}, {light.v_px:.2f}"
+    assert shown in _cells(torn.row, "")
+    assert f"({shown}) px" in repr(torn)
+    assert "D = 2.500 m" in repr(torn)
+
+
+def test_crosses_of_previews_are_on_the_light(sample: Sample) -> None:
+    """The layer's centroid is the manifest's centre, whatever the beam's axis; its derivative planes are not asked."""
+    row = sample.row.up
+    axis = spot_truth(sample.view("up"), sample.laser_spot, room_geometry(sample.room, sample.view("up")))
+    shown = _at_light(replace(axis, u_px=axis.u_px + 0.6), sample.spot("up"))
+    assert row.light is not None
+    # what the window cuts of the blur moves the centroid by 2e-5 px at most
+    assert (shown.u_px, shown.v_px) == pytest.approx((row.light.u_px, row.light.v_px), abs=2e-4)
+    assert _at_light(axis, SpotWindow.empty()) == axis
 
 
 @pytest.mark.parametrize("place", [0, 1])
@@ -80,7 +113,7 @@ def test_an_epipolar_line_is_the_image_of_the_other_ray_accuracy(misaligned_data
     line = epipolar_line(sample, position)
     assert line is not None
     points = np.array([p for p in line["points"] if p is not None])
-    spot = sample.truth_row(other)
+    spot = sample.truth_row(other).centre
     assert np.hypot(*(points - [spot.u_px, spot.v_px]).T).min() < 1e-3  # written to a thousandth of a pixel
     row = sample.truth_row(position)
     start = np.array(row.reflection_point_world_m)
