@@ -1,9 +1,10 @@
 """Pictures of cameras: one reader with one list of formats, for every command that takes one.
 
-* JPEG: colour or grey, with its quantisation tables and the subsampling of its chroma.
+* JPEG: colour or grey, with its quantisation tables and the subsampling of its chroma. One of R, G, B without chroma
+  is colour like any other. Of a multi-picture file of a telephone the first one is taken; others are its previews.
 * PNG and TIFF of 8 bits: colour, grey or a palette; a grey picture has three equal colours.
 * PNG and TIFF of 16 bits: one channel is the mosaic's DN; of colours the upper 8 bits are taken, as viewers do.
-* PPM of 8 bits, and PGM, whose values are the mosaic's DN as they stand.
+* PPM of 8 bits, and PGM, binary or plain, whose values are the mosaic's DN as they stand.
 * PNG of grey with a second plane of 8 bits: YUYV, as `phibench dataset frames` writes it.
 
 Pictures are turned upright as their EXIF orientation says. Other formats are refused by name, with what converts them.
@@ -18,20 +19,23 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, JpegImagePlugin
+from PIL import Image
 
 from phibench.datasets.input_files import PICTURE_PIXELS, InputFile
 from phibench.scenes.validation import printable_line
 
+_JPEG = ("JPEG", "MPO")  # Pillow calls a JPEG with previews after it MPO
 FORMATS = ("JPEG", "PNG", "TIFF", "PPM")
 IN_WORDS = "JPEG, PNG, TIFF, PPM or PGM"
 Kind = Literal["jpeg", "rgb", "yuyv", "raw"]
 Subsampling = Literal["4:4:4", "4:2:2", "4:2:0"]
 
 _ORIENTATION, _MAKE, _MODEL, _DNG = 0x0112, 0x010F, 0x0110, 0xC612  # EXIF and TIFF tags
-_SAMPLING: dict[int, Subsampling] = {-1: "4:4:4", 0: "4:4:4", 1: "4:2:2", 2: "4:2:0"}  # -1: of grey
+_WHITE_IS_0 = 0  # TIFF's photometric interpretation
+_PHOTOMETRIC = 0x0106
+_SAMPLING: dict[tuple[int, int], Subsampling] = {(1, 1): "4:4:4", (2, 1): "4:2:2", (2, 2): "4:2:0"}
 _SIXTEEN = ("I;16", "I;16B", "I;16L", "I")
-_PGM = re.compile(rb"P5(?:\s+|\s*#[^\n]*\n\s*)+(\d+)(?:\s+|\s*#[^\n]*\n\s*)+(\d+)(?:\s+|\s*#[^\n]*\n\s*)+(\d+)\s")
+_PGM = re.compile(rb"P[25](?:\s+|\s*#[^\n]*\n\s*)+(\d+)(?:\s+|\s*#[^\n]*\n\s*)+(\d+)(?:\s+|\s*#[^\n]*\n\s*)+(\d+)\s")
 
 
 @dataclass(frozen=True)
@@ -44,7 +48,7 @@ class CameraPicture:
         By `kind`: "jpeg" and "rgb" (H, W, 3) uint8; "raw" (H, W) uint16, DN; "yuyv" (H, W, 2) uint8.
     kind : "jpeg", "rgb", "yuyv" or "raw"
     grey : bool
-        The file has one channel of 8 bits, which stands three times in the pixels.
+        The file has one channel of 8 bits, or three that are equal everywhere.
     camera : str
         Maker and model of EXIF; "" where there is none.
     orientation : int
@@ -75,7 +79,7 @@ def read_camera_picture(file: InputFile, data: bytes | None = None) -> CameraPic
     data = file.read() if data is None else data
     if other := _other_format(data, file.path.suffix.lower()):
         raise file.fault(other)
-    if data[:2] == b"P5":
+    if data[:2] in (b"P5", b"P2"):
         return CameraPicture(_sealed(_pgm(file, data)), "raw")
     picture = file.picture(FORMATS, data)
     with (
@@ -83,29 +87,40 @@ def read_camera_picture(file: InputFile, data: bytes | None = None) -> CameraPic
         warnings.catch_warnings(),
     ):  # what a decoder has not looked at yet: texts, tags and tables
         warnings.simplefilter("ignore", UserWarning)  # of damaged tags, without the name of the file
-        return _of_decoded(file, picture)
+        found = _of_decoded(file, picture)
+        # Pillow turns a TIFF as it decodes it, and forgets so
+        told = _directory(data).get(_ORIENTATION, 1) if found.kind == "raw" and picture.format == "TIFF" else 1
+        _orientation(file, told, found.kind)
+    return found
 
 
 def _of_decoded(file: InputFile, picture: Image.Image) -> CameraPicture:
-    if getattr(picture, "n_frames", 1) > 1 and picture.format != "JPEG":  # a JPEG's others are its previews
+    if getattr(picture, "n_frames", 1) > 1 and picture.format not in _JPEG:
         raise file.fault(f"holds {picture.n_frames} pictures: one is read")  # type: ignore[attr-defined]
     with file.decoding("has damaged EXIF data; `exiftool -all= FILE` removes them"):
         exif = picture.getexif()
     camera = printable_line(" ".join(str(exif[tag]) for tag in (_MAKE, _MODEL) if tag in exif), 80)
     kind, pixels = _pixels(file, picture)
     orientation = _orientation(file, exif.get(_ORIENTATION, 1), kind)
-    found = CameraPicture(
-        _sealed(upright(pixels, orientation)), kind, picture.mode in ("L", "LA", "1"), camera, orientation
-    )
+    grey = picture.mode in ("L", "LA", "1") or (kind in ("jpeg", "rgb") and _is_grey(pixels))
+    found = CameraPicture(_sealed(upright(pixels, orientation)), kind, grey, camera, orientation)
     return _with_tables(file, picture, found) if kind == "jpeg" else found
+
+
+def _is_grey(pixels: NDArray[Any]) -> bool:
+    """Tell whether a picture's three colours are equal everywhere; of a black one they say nothing."""
+    red = pixels[..., :1]
+    return bool(np.ptp(red) > 0 and (pixels == red).all())
 
 
 def _with_tables(file: InputFile, picture: Image.Image, found: CameraPicture) -> CameraPicture:
     """JPEG with its tables; one that was turned off the grid of its blocks is R, G, B like any other."""
     tables = tuple(np.array(table, float).reshape(8, 8) for _, table in sorted(picture.quantization.items()))  # type: ignore[attr-defined]
-    sampling = _SAMPLING.get(JpegImagePlugin.get_sampling(picture))
+    sampling = _sampling(picture)
     if sampling is None or not tables:
-        raise file.fault("is a JPEG with another chroma than 4:4:4, 4:2:2 or 4:2:0")
+        raise file.fault("is a JPEG with another chroma than 4:4:4, 4:2:2 or 4:2:0; `djpeg FILE > out.ppm` decodes it")
+    if _without_chroma(picture):
+        return replace(found, kind="rgb")
     if found.orientation > 1:
         down, across = {"4:4:4": (8, 8), "4:2:2": (8, 16), "4:2:0": (16, 16)}[sampling]
         aside = found.orientation > 4
@@ -113,6 +128,24 @@ def _with_tables(file: InputFile, picture: Image.Image, found: CameraPicture) ->
             return replace(found, kind="rgb")
         tables = tuple(table.T for table in tables) if aside else tables
     return replace(found, tables=tables, subsampling=sampling)
+
+
+def _sampling(picture: Image.Image) -> Subsampling | None:
+    """Subsampling of the chroma by the factors of the components, luma's over the others'; None of any other kind."""
+    factors = [(h, v) for _, h, v, _ in picture.layer]  # type: ignore[attr-defined]
+    if len(factors) == 1:
+        return "4:4:4"
+    (h, v), *others = factors
+    ratios = {(h / x, v / y) for x, y in others}
+    return _SAMPLING.get(ratios.pop()) if len(ratios) == 1 else None  # type: ignore[call-overload, no-any-return]
+
+
+def _without_chroma(picture: Image.Image) -> bool:
+    """Tell whether a JPEG holds R, G, B: by Adobe's mark, or by its components' names (libjpeg's rule)."""
+    if picture.mode == "L" or "jfif" in picture.info:
+        return False
+    names = [number for number, *_ in picture.layer]  # type: ignore[attr-defined]
+    return bool(picture.info.get("adobe_transform", 1) == 0 or ("adobe" not in picture.info and names == [82, 71, 66]))
 
 
 def upright(pixels: NDArray[Any], orientation: int) -> NDArray[Any]:
@@ -141,26 +174,36 @@ def _pixels(file: InputFile, picture: Image.Image) -> tuple[Kind, NDArray[Any]]:
         values = np.array(picture)
         if values.min(initial=0) < 0 or values.max(initial=0) > 65535:
             raise file.fault("has pixels beyond 16 bits")
+        if picture.format == "TIFF" and picture.tag_v2.get(_PHOTOMETRIC) == _WHITE_IS_0:  # type: ignore[attr-defined]
+            raise file.fault("is a TIFF of 16 bits in which 0 is white: save it with 0 as black")
         return "raw", values.astype(np.uint16)
     if (picture.format, picture.mode) == ("PNG", "LA") and np.asarray(picture)[..., 1].min(initial=255) < 255:
         return "yuyv", np.array(picture)  # a plane that is full everywhere is no chroma, but says: opaque
     if picture.mode not in ("RGB", "RGBA", "RGBX", "L", "LA", "P", "PA", "1"):
         raise file.fault(f"is a {picture.format} file of mode {picture.mode}: grey or R, G, B of 8 or 16 bits is read")
-    return ("jpeg" if picture.format == "JPEG" else "rgb"), np.array(picture.convert("RGB"))
+    return ("jpeg" if picture.format in _JPEG else "rgb"), np.array(picture.convert("RGB"))
 
 
 def _pgm(file: InputFile, data: bytes) -> NDArray[np.uint16]:
-    """DN of a binary PGM; Pillow would stretch them to 16 bits."""
+    """DN of a PGM, binary (P5) or plain (P2); Pillow would stretch them to 16 bits."""
     head = _PGM.match(data[:1000])
     if head is None or any(len(text) > 6 for text in head.groups()):
         raise file.fault("is not a picture of the format PGM")
     width, height, top = (int(text) for text in head.groups())
     if not (0 < width * height <= PICTURE_PIXELS and 0 < top < 65536):
         raise file.fault(f"is a PGM of {width} x {height} pixels up to {top}: no picture of a camera")
-    kind = np.dtype(np.uint8) if top < 256 else np.dtype(">u2")
-    if len(data) - head.end() != width * height * kind.itemsize:
+    body = data[head.end() :]
+    if data[:2] == b"P2":
+        with file.decoding("is a damaged PGM"):
+            values = np.array(re.sub(rb"#[^\n]*", b"", body).split(), np.int64)
+    else:
+        kind = np.dtype(np.uint8) if top < 256 else np.dtype(">u2")
+        values = np.frombuffer(body[: len(body) // kind.itemsize * kind.itemsize], kind)
+    if len(values) != width * height or (data[:2] == b"P5" and len(body) != width * height * values.itemsize):
         raise file.fault(f"is a PGM of another size than the {width} x {height} pixels that it tells")
-    return np.frombuffer(data, kind, offset=head.end()).reshape(height, width).astype(np.uint16)
+    if values.min() < 0 or values.max() > top:
+        raise file.fault(f"is a PGM with values beyond {top}, which it tells as the largest")
+    return values.reshape(height, width).astype(np.uint16)
 
 
 # -- formats that are not read ---------------------------------------------------------------------------------------
@@ -223,11 +266,14 @@ def _raw_format(data: bytes, suffix: str) -> str:
         return ""
     if data[8:10] == b"CR":
         return "Canon CR2"
+    return "DNG" if _DNG in _directory(data) else _RAW_SUFFIXES.get(suffix, "")
+
+
+def _directory(data: bytes) -> Image.Exif:
+    """Tags of a TIFF's first picture; none of a damaged one, which the decoder tells."""
+    directory = Image.Exif()
     try:
-        directory = Image.Exif()
         directory.load(b"Exif\0\0" + data)
-        if _DNG in directory:
-            return "DNG"
-    except Exception:  # what is damaged is told by the decoder
-        return ""
-    return _RAW_SUFFIXES.get(suffix, "")
+        return directory if len(directory) else Image.Exif()
+    except Exception:
+        return Image.Exif()

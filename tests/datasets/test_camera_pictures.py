@@ -86,6 +86,68 @@ def test_a_plane_of_opacity_is_no_chroma(tmp_path: Path) -> None:
         assert read(tmp_path / "a.png").kind == kind
 
 
+def test_a_jpeg_says_how_its_chroma_lies(tmp_path: Path) -> None:
+    """4:4:4 stands only for equal factors; R, G, B without chroma are no JPEG of a camera; previews are passed over."""
+    smooth = cv2.GaussianBlur(COLOUR, (0, 0), 2.0)
+    for factors, sampling in (
+        (0x111111, "4:4:4"),
+        (0x211111, "4:2:2"),
+        (0x221111, "4:2:0"),
+        (0x121111, ""),
+        (0x411111, ""),
+    ):
+        done, data = cv2.imencode(".jpg", smooth, [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, factors])
+        assert done
+        (tmp_path / "a.jpg").write_bytes(data.tobytes())
+        if sampling:
+            assert read(tmp_path / "a.jpg").subsampling == sampling
+        else:
+            with pytest.raises(DatasetError, match="another chroma"):
+                read(tmp_path / "a.jpg")
+    Image.fromarray(smooth).save(tmp_path / "b.jpg", keep_rgb=True, quality=90)
+    assert (read(tmp_path / "b.jpg").kind, read(tmp_path / "b.jpg").tables) == ("rgb", ())
+    preview = Image.fromarray(smooth[:8, :8])
+    Image.fromarray(smooth).save(tmp_path / "c.jpg", "MPO", save_all=True, append_images=[preview], quality=90)
+    found = read(tmp_path / "c.jpg")
+    assert (found.kind, found.pixels.shape, len(found.tables)) == ("jpeg", smooth.shape, 2)
+
+
+def test_plain_pgm_holds_dn_like_a_binary_one(tmp_path: Path) -> None:
+    values = DEEP >> 6  # 10 bits, which Pillow stretches to 16
+    rows = "\n".join(" ".join(map(str, row)) + " # a row" for row in values)
+    (tmp_path / "a.pgm").write_text(f"P2\n# DN\n32 16\n1023\n{rows}\n")
+    found = read(tmp_path / "a.pgm")
+    assert found.kind == "raw"
+    np.testing.assert_array_equal(found.pixels, values)
+    for text, words in (
+        ("P2 2 1 1023 5 1024", "values beyond 1023"),
+        ("P2 2 1 255 5", "another size"),
+        ("P2 2 1 9 a b", "damaged"),
+    ):
+        (tmp_path / "b.pgm").write_text(text)
+        with pytest.raises(DatasetError, match=words):
+            read(tmp_path / "b.pgm")
+
+
+def test_grey_is_known_by_its_pixels(tmp_path: Path) -> None:
+    """A monochrome camera's driver may write R, G, B that are equal; a black picture tells nothing."""
+    for suffix in ("png", "jpg"):
+        Image.fromarray(np.repeat(GREY[..., None], 3, axis=2)).save(tmp_path / f"a.{suffix}")
+        assert read(tmp_path / f"a.{suffix}").grey
+    Image.fromarray(np.zeros_like(COLOUR)).save(tmp_path / "black.png")
+    assert not read(tmp_path / "black.png").grey
+
+
+def test_dn_of_a_tiff_are_as_stored_or_refused(tmp_path: Path) -> None:
+    """Pillow turns a TIFF by its tag without a word, and does not invert 16 bits in which 0 is white."""
+    for tags, words in (({0x0112: 3}, "orientation 3"), ({0x0106: 0}, "0 is white")):
+        Image.fromarray(DEEP).save(tmp_path / "a.tif", tiffinfo=tags)
+        with pytest.raises(DatasetError, match=words):
+            read(tmp_path / "a.tif")
+    Image.fromarray(COLOUR).save(tmp_path / "b.tif", tiffinfo={0x0112: 3})
+    np.testing.assert_array_equal(read(tmp_path / "b.tif").pixels, COLOUR[::-1, ::-1])
+
+
 def _tiff_with_tag(tag: int) -> bytes:
     entries = ((256, 1), (257, 1), (tag, 0x00000401))
     body = b"".join(struct.pack("<HHII", key, 4, 1, value) for key, value in entries)

@@ -92,6 +92,49 @@ def test_a_dumped_matrix_is_known(tmp_path: Path) -> None:
         assert words in text
 
 
+_ONE_ROW = "1432.5 1431.75 640.25 355.5"
+LINES = {
+    "EuRoC": "sensor_type: camera\nT_BS:\n  cols: 4\n  data: [0.1, 0.9, 0.2, 3.0]\nrate_hz: 20\n"
+    "resolution: [1280, 720]\nintrinsics: [1432.5, 1431.75, 640.25, 355.5] #fu, fv, cu, cv\n"
+    "distortion_model: radial-tangential\ndistortion_coefficients: [-0.026, 1.06, 0.001, -0.002]\n",
+    "Kalibr": "Calibration results\n=====\ncam0 (/cam0):\n    distortion: [-0.026 1.06 0.001 -0.002] "
+    "+- [0.1 0.1 0.1 0.1]\n"
+    f"    projection: [{_ONE_ROW}] +- [0.5 0.5 0.6 0.4]\n",
+    "ORB-SLAM": '%YAML:1.0\nCamera.type: "PinHole"\nCamera.fx: 1432.5\nCamera.fy: 1431.75\nCamera.cx: 640.25\n'
+    "Camera.cy: 355.5\nCamera.k1: -0.026\nCamera.k2: 1.06\nCamera.p1: 0.001\nCamera.p2: -0.002\n",
+    "COLMAP": "# cameras\n1 OPENCV 1280 720 1432.5 1431.75 640.75 356.0 -0.026 1.06 0.001 -0.002\n",
+    "Bouguet": "fc = [ 1432.5 ; 1431.75 ];\ncc = [ 640.25 ; 355.5 ];\nalpha_c = 0.0;\n"
+    "kc = [ -0.026 ; 1.06 ; 0.001 ; -0.002 ; 0.0 ];\nnx = 1280;\nny = 720;\n",
+    "ROS": "[image]\n\nwidth\n1280\n\nheight\n720\n\n[c310]\n\ncamera matrix\n1432.5 0.0 640.25\n0.0 1431.75 355.5\n"
+    "0.0 0.0 1.0\n\ndistortion\n-0.026 1.06 0.001 -0.002 0.0\n\nrectification\n1.0 0.0 0.0\n",
+    "CamOdoCal": "model_type: PINHOLE\nprojection_parameters:\n   fx: 1432.5\n   fy: 1431.75\n   cx: 640.25\n"
+    "   cy: 355.5\ndistortion_parameters:\n   k1: -0.026\n   k2: 1.06\n   p1: 0.001\n   p2: -0.002\n",
+}
+
+
+@pytest.mark.parametrize("program", LINES)
+def test_other_programs_write_what_is_copied(tmp_path: Path, program: str) -> None:
+    """Numbers of one camera as each program's own documentation writes them; COLMAP's first pixel is at 0.5."""
+    text = said(tmp_path, LINES[program])
+    for words in (f"of {program}", *NUMBERS, *LENS):
+        assert words in text
+
+
+def test_what_a_matrix_may_hide(tmp_path: Path) -> None:
+    """Columns before rows (Open3D), a skew, the size as one list, a second camera."""
+    by_columns = json.dumps({"width": 1280, "height": 720, "intrinsic_matrix": K.T.ravel().tolist()})
+    assert all(words in said(tmp_path, by_columns) for words in (*SIZE, *NUMBERS))
+    skewed = K.copy()
+    skewed[0, 1] = 2.5
+    assert "its skew of 2.5" in said(tmp_path, json.dumps({"camera_matrix": skewed.tolist()}))
+    two = said(tmp_path, json.dumps({"imageSize": [1280, 720], "M1": K.tolist(), "M2": (2 * K).tolist()}))
+    assert all(words in two for words in (*SIZE, *NUMBERS, "first camera of 2"))
+
+
+def test_a_key_outside_its_table_is_told(tmp_path: Path) -> None:
+    assert "begin the file with a line [rig]" in said(tmp_path, "fx_px = 1430.0\n")
+
+
 OMNI = {**KALIBR["cam0"], "camera_model": "omni", "intrinsics": [1.7, 1432.5, 1431.75, 640.25, 355.5]}
 IN_ONE = {
     "OCamCalib": "#polynomial coefficients for the DIRECT mapping function (ocam_model.ss).\n\n5 -2.6e+02 0.0",
@@ -116,5 +159,8 @@ def test_what_is_none_of_them_is_no_toml(tmp_path: Path) -> None:
     for text in ("nonsense", "rig:\n  fx_px: 1430\n", "[rig\nfx_px = 3"):
         assert "is not valid TOML" in said(tmp_path, text)
     (tmp_path / "calib.mat").write_bytes(b"MATLAB 5.0 MAT-file" + bytes(range(256)))
-    with pytest.raises(DatasetError, match="cannot be split"):
+    with pytest.raises(DatasetError, match=r"Bouguet.*fc as fx_px.*OCamCalib.*cannot be split"):
         read_rig_file(tmp_path / "calib.mat")
+    np.savez(tmp_path / "calib.npz", mtx=K)
+    with pytest.raises(DatasetError, match="NumPy"):
+        read_rig_file(tmp_path / "calib.npz")
