@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import base64
 import binascii
+import urllib.parse
 from typing import Any
 
 import numpy as np
@@ -140,10 +141,13 @@ class GltfDocument:
         if not uri.startswith("data:"):
             return self.companions.named(uri).read()
         head, comma, text = uri.partition(",")
-        if not comma or not head.endswith(";base64"):
+        if not comma:
             raise damaged(self.file)
+        raw = urllib.parse.unquote_to_bytes(text)  # RFC 2397: bytes as %XX, or base64
+        if not head.endswith(";base64"):
+            return raw
         try:
-            return base64.b64decode(text, validate=True)
+            return base64.b64decode(raw, validate=True)
         except (binascii.Error, ValueError) as error:
             raise damaged(self.file) from error
 

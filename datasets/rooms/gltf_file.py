@@ -1,8 +1,9 @@
 """glTF files (.glb, .gltf): nodes, meshes and materials of the scene that the file shows.
 
 glTF 2.0 (Khronos Group, 2021; ISO/IEC 12113:2022). Lists, strips and fans of triangles are read; points and lines have
-no surface. Base colours, emission and their pictures are read, each by its own coordinates. Metal, gloss, relief and
-transparency are not kept. Skins, instances and compressed arrays are refused by name.
+no surface. Base colours, emission and their pictures are read, each by its own coordinates. Metal, gloss and relief are
+not kept. What is wholly transparent is not there; a picture with holes is refused, and what is half transparent counts
+as opaque. Skins, instances and compressed arrays are refused by name.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from phibench.datasets.rooms.mesh_parts import (
     WHITE,
     Companions,
     MeshPart,
+    Opacity,
     Paint,
     Picture,
     check_count,
@@ -30,6 +32,7 @@ from phibench.datasets.rooms.mesh_parts import (
     is_no_picture,
     leaves_picture,
     mirrored_repeat,
+    opacities,
     three_numbers,
 )
 from phibench.scenes.frames import Array, Vector
@@ -40,6 +43,7 @@ _READ_EXTENSIONS = (
     "KHR_lights_punctual",
     "KHR_mesh_quantization",
     "EXT_texture_webp",
+    "KHR_node_visibility",
     "KHR_materials_",
 )
 _CONVERTERS = {
@@ -71,6 +75,9 @@ class _Material:
     light: Vector = BLACK
     light_picture: _Texture | None = None
     two_sided: bool = False
+    opacity: float = 1.0
+    cutoff: float | None = None
+    """Opacity below which nothing is seen; 0 of what blends, None of what is opaque whatever its alpha is."""
 
 
 def gltf_parts(file: InputFile, companions: Companions) -> list[MeshPart]:
@@ -105,6 +112,8 @@ class _Reader:
             if number in self._seen or depth > _DEPTH:
                 raise self.file.fault("is damaged: its nodes are no trees")
             self._seen.add(number)
+            if self._is_hidden(node):
+                continue
             transform = outer @ self._transform(node)
             if "mesh" in node:
                 found += self._of_node(number, node, transform)
@@ -122,6 +131,11 @@ class _Reader:
         rows = document.rows("nodes")
         children = {child for node in rows for child in node.get("children", [])}
         return [number for number in range(len(rows)) if number not in children]
+
+    def _is_hidden(self, node: dict[str, Any]) -> bool:
+        """Tell whether a node and what hangs on it are not shown (KHR_node_visibility)."""
+        extensions = self.document.table(node, "extensions")
+        return self.document.table(extensions, "KHR_node_visibility").get("visible", True) is False
 
     def _refuse_unread(self) -> None:
         names = [str(name) for name in self.document.tree.get("extensionsRequired", [])]
@@ -196,9 +210,12 @@ class _Reader:
             return None
         self._count += len(triangles)
         check_count(self.file, self._count)
+        material = self._material_of(primitive)
+        triangles = self._visible(label, material, attributes, triangles, len(points))
+        if not len(triangles):
+            return None
         if np.linalg.det(transform[:3, :3]) < 0.0:
             triangles = triangles[:, ::-1]  # a mirrored node turns its triangles around
-        material = self._material_of(primitive)
         paint, light = self._paints(label, attributes, triangles, material, len(points))
         name = f"{label}/{material.name}" if material is not None and material.name else label
         placed = points @ transform[:3, :3].T + transform[:3, 3]
@@ -257,6 +274,10 @@ class _Reader:
             raise self.file.fault(
                 f"has a material '{shown}' with a colour or emission that is not three numbers from 0 up"
             )
+        mode, opacity = row.get("alphaMode", "OPAQUE"), document.numbers(base, factor, (1.0, 1.0, 1.0, 1.0))[3]
+        cutoffs = {"OPAQUE": None, "MASK": float(row.get("alphaCutoff", 0.5)), "BLEND": 0.0}
+        if mode not in cutoffs:
+            raise self.file.fault(f"has the alphaMode {printable_line(str(mode), 20)}, which glTF does not know")
         return _Material(
             str(row.get("name", "")),
             tuple(min(x, 1.0) for x in colour),
@@ -264,7 +285,41 @@ class _Reader:
             tuple(min(x, BRIGHTEST) for x in light),
             self._texture(row, "emissiveTexture"),
             bool(row.get("doubleSided", False)),
+            opacity,
+            cutoffs[mode],
         )
+
+    def _visible(
+        self,
+        label: str,
+        material: _Material | None,
+        attributes: dict[str, Any],
+        triangles: NDArray[np.int64],
+        count: int,
+    ) -> NDArray[np.int64]:
+        """Triangles of which something is seen; one with holes is refused."""
+        if material is None or material.cutoff is None:
+            return triangles
+        uv = alpha = corners = None
+        if material.picture is not None and (alpha := self._opacity(material)) is not None:
+            uv = self._corners(label, material, material.picture, attributes, triangles)
+            uv = np.stack([uv[..., 0], 1.0 - uv[..., 1]], axis=-1)
+        if (colours := self._vertex_colours(attributes, count)) is not None and colours.shape[1] == 4:
+            corners = colours[triangles][..., 3]
+        least, most = opacities(len(triangles), material.opacity, corners, uv, alpha).T
+        hidden = most < material.cutoff if material.cutoff else most <= 0.0
+        holes = ~hidden & (least < material.cutoff if material.cutoff else least <= 0.0)
+        if holes.any():
+            shown = printable_line(f"{label}/{material.name}", 60)
+            raise self.file.fault(f"has holes in '{shown}' (alphaMode): cut the surface along them, or make it OPAQUE")
+        return triangles[~hidden]
+
+    def _opacity(self, material: _Material) -> Opacity | None:
+        """Alpha of the picture of a material's base colour."""
+        assert material.picture is not None
+        image = self._image(self.document.row("textures", material.picture.index))
+        owner, data = self._encoded(image)
+        return self.document.companions.opacity(owner, data)
 
     def _texture(self, owner: dict[str, Any], key: str) -> _Texture | None:
         if not owner.get(key):
@@ -285,7 +340,7 @@ class _Reader:
         colours = self._vertex_colours(attributes, count)
         if material is None:
             # without a material the definition takes a white one; a file that states no colour gets the plain one
-            return (None if colours is None else Paint(face_colours=colours[triangles].mean(axis=1))), None
+            return (None if colours is None else Paint(face_colours=colours[triangles][..., :3].mean(axis=1))), None
         paint = self._paint(label, material, material.colour, material.picture, attributes, triangles)
         if colours is not None:
             paint = self._tinted(label, paint, colours, triangles)
@@ -296,20 +351,20 @@ class _Reader:
     def _tinted(self, label: str, paint: Paint, colours: Array, triangles: NDArray[np.int64]) -> Paint:
         """Vertex colours multiply the material's."""
         if paint.picture is None:
-            return Paint(face_colours=colours[triangles].mean(axis=1) * np.array(paint.colour))
-        used = colours[triangles].reshape(-1, 3)
+            return Paint(face_colours=colours[triangles][..., :3].mean(axis=1) * np.array(paint.colour))
+        used = colours[triangles][..., :3].reshape(-1, 3)
         if np.ptp(used, axis=0).max() > 0.5 / 255.0:
             shown = printable_line(label, 60)
             raise self.file.fault(f"has '{shown}' with vertex colours that tint a picture: put them into the picture")
         return replace(paint, colour=tuple(float(a * b) for a, b in zip(paint.colour, used.mean(axis=0), strict=True)))
 
     def _vertex_colours(self, attributes: dict[str, Any], count: int) -> Array | None:
-        """Linear colours of vertices, shape (N, 3)."""
+        """Linear colours of vertices, shape (N, 3), or (N, 4) with their opacity."""
         if "COLOR_0" not in attributes:
             return None
         stored = self.document.raw_array(attributes["COLOR_0"], (3, 4))
         scale = float(np.iinfo(stored.dtype).max) if stored.dtype.kind in "iu" else 1.0
-        colours = stored[:, :3].astype(float) / scale
+        colours = stored.astype(float) / scale
         if len(colours) != count or not np.isfinite(colours).all() or colours.min(initial=0.0) < 0.0:
             raise self.file.fault("is damaged: colours of vertices are not one for each, from 0 up")
         return np.minimum(colours, 1.0)
@@ -325,6 +380,20 @@ class _Reader:
     ) -> Paint:
         if texture is None:
             return Paint(colour)
+        corners = self._corners(label, material, texture, attributes, triangles)
+        row = self.document.row("textures", texture.index)
+        picture, corners = self._repeated(row, self._picture(material, row), corners, label)
+        return Paint(colour, picture, np.stack([corners[..., 0], 1.0 - corners[..., 1]], axis=-1))
+
+    def _corners(
+        self,
+        label: str,
+        material: _Material,
+        texture: _Texture,
+        attributes: dict[str, Any],
+        triangles: NDArray[np.int64],
+    ) -> Array:
+        """Texture coordinates of the triangles' corners, v downwards, shape (M, 3, 2)."""
         name = f"TEXCOORD_{texture.uv_set}"
         if name not in attributes:
             shown = printable_line(f"{label}/{material.name}", 60)
@@ -332,10 +401,7 @@ class _Reader:
         uv = self._moved(self.document.array(attributes[name], 2), texture.transform)
         if triangles.max() >= len(uv):
             raise self.file.fault("is damaged: texture coordinates are not one for each vertex")
-        corners = uv[triangles]
-        row = self.document.row("textures", texture.index)
-        picture, corners = self._repeated(row, self._picture(material, row), corners, label)
-        return Paint(colour, picture, np.stack([corners[..., 0], 1.0 - corners[..., 1]], axis=-1))
+        return np.asarray(uv[triangles])
 
     def _moved(self, uv: Array, stated: dict[str, Any]) -> Array:
         """Coordinates after KHR_texture_transform: scale, then turn, then shift."""
@@ -360,28 +426,41 @@ class _Reader:
         flipped, moved = mirrored_repeat(picture[::-1], uv, axes)
         return flipped[::-1], moved
 
-    def _picture(self, material: _Material, texture: dict[str, Any]) -> Picture:
+    def _image(self, texture: dict[str, Any]) -> int:
+        """Number of the image of a texture."""
         extensions = self.document.table(texture, "extensions")
         source = self.document.table(extensions, "EXT_texture_webp").get("source", texture.get("source"))
         if source is None and "KHR_texture_basisu" in extensions:
             how = _CONVERTERS["KHR_texture_basisu"]
             raise self.file.fault(f"has pictures as KTX2 (KHR_texture_basisu), which is not read: {how}")
-        image = self.document.row("images", source)
-        number = int(source or 0)
+        if source is None and extensions:
+            shown = printable_line(str(next(iter(extensions))), 60)
+            raise self.file.fault(f"has pictures of the glTF extension {shown}, which is not read")
+        self.document.row("images", source)
+        return int(source)
+
+    def _picture(self, material: _Material, texture: dict[str, Any]) -> Picture:
+        number = self._image(texture)
         if number not in self._pictures:
-            self._pictures[number] = self._decoded(material, image)
+            self._pictures[number] = self._decoded(material, number)
         return self._pictures[number]
 
-    def _decoded(self, material: _Material, image: dict[str, Any]) -> Picture:
-        companions, uri = self.document.companions, image.get("uri")
+    def _encoded(self, number: int) -> tuple[InputFile, bytes]:
+        """Bytes of an image, and the file that they are from."""
+        image, companions = self.document.row("images", number), self.document.companions
+        uri = image.get("uri")
         if "bufferView" not in image and isinstance(uri, str) and not uri.startswith("data:"):
-            return companions.picture(uri)
+            found = companions.named(uri)
+            return found, found.read()
         inside = "bufferView" in image
-        data = self.document.view(image["bufferView"])[0] if inside else self.document.of_uri(uri)
+        return self.file, self.document.view(image["bufferView"])[0] if inside else self.document.of_uri(uri)
+
+    def _decoded(self, material: _Material, number: int) -> Picture:
+        owner, data = self._encoded(number)
         try:
-            return companions.pixels(self.file, data)
+            return self.document.companions.pixels(owner, data)
         except DatasetError as error:
-            if not is_no_picture(error):
+            if owner is not self.file or not is_no_picture(error):
                 raise
             shown = printable_line(material.name, 60)
             raise self.file.fault(f"has a material '{shown}' whose texture is missing or damaged") from error

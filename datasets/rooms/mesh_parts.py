@@ -37,6 +37,7 @@ _OF_8_BITS = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBX")
 _OUTSIDE = 1e-5  # by which coordinates may leave a picture that does not repeat
 
 Picture = NDArray[np.uint8]
+Opacity = NDArray[np.uint8]
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,6 +105,7 @@ class Companions:
     def __init__(self, file: InputFile, one_file: bool) -> None:
         self.file, self.one_file = file, one_file
         self._pictures: dict[str, Picture] = {}
+        self._opacities: dict[str, Opacity | None] = {}
 
     def is_there(self, name: str) -> bool:
         """Tell whether a name is that of a file below the folder."""
@@ -150,6 +152,15 @@ class Companions:
                 most = f"{_MOST_PICTURES:.0e} pixels"
                 raise self.file.fault(f"has pictures of more than {most} together: make them smaller")
         return self._pictures[digest]
+
+    def opacity(self, owner: InputFile, data: bytes) -> Opacity | None:
+        """Alpha of an encoded picture, 8 bits; None where it has none."""
+        digest = hashlib.sha256(data).hexdigest()
+        if digest not in self._opacities:
+            image = owner.picture(PICTURES, data)
+            has = image.mode in ("RGBA", "LA", "PA") or "transparency" in image.info
+            self._opacities[digest] = np.asarray(image.convert("RGBA"))[..., 3].copy() if has else None
+        return self._opacities[digest]
 
 
 def _plain(name: str) -> str:
@@ -200,6 +211,34 @@ def mirrored_repeat(picture: Picture, uv: Array, axes: Iterable[int]) -> tuple[P
 def leaves_picture(uv: Array, axis: int) -> bool:
     """Tell whether coordinates along an axis leave the picture, so that a clamped one would not repeat."""
     return bool(uv.size) and bool(uv[..., axis].min() < -_OUTSIDE or uv[..., axis].max() > 1.0 + _OUTSIDE)
+
+
+_STEPS = 16  # of a triangle's sides, at whose places its opacity is looked at
+_INSIDE = np.array([(i + 1 / 3, j + 1 / 3) for i in range(_STEPS) for j in range(_STEPS - i)]) / _STEPS
+_WEIGHTS = np.column_stack([1.0 - _INSIDE.sum(axis=1), _INSIDE])
+
+
+def opacities(triangles: int, uniform: float, corners: Array | None, uv: Array | None, alpha: Opacity | None) -> Array:
+    """Least and largest opacity within each triangle, shape (M, 2): of the material, its corners and its picture.
+
+    Parameters
+    ----------
+    triangles : int, M
+    uniform : float
+    corners : shape (M, 3), or None for 1
+    uv : shape (M, 3, 2), places of the corners on the picture, v upwards, or None
+    alpha : picture's alpha, or None for 1
+    """
+    found = np.full((triangles, 1), uniform)
+    if corners is not None:
+        found = found * (corners @ _WEIGHTS.T)
+    if uv is not None and alpha is not None:
+        places = np.einsum("sk,mkd->msd", _WEIGHTS, uv)
+        height, width = alpha.shape
+        column = np.floor(places[..., 0] * width).astype(int) % width
+        row = height - 1 - np.floor(places[..., 1] * height).astype(int) % height
+        found = found * (alpha[row, column] / 255.0)
+    return np.stack([found.min(axis=1), found.max(axis=1)], axis=1)
 
 
 def check_count(file: InputFile, count: int) -> None:

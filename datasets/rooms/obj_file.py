@@ -34,6 +34,10 @@ from phibench.scenes.validation import printable_line
 
 _FREE_FORM = ("curv", "curv2", "surf", "cstype", "bmat", "deg", "step", "parm", "trim", "hole", "scrv", "sp", "con")
 _SCRIPTS = ("call", "csh")
+_OF_NO_SHAPE = (
+    "vn", "vp", "p", "l", "s", "mg", "end", "bevel", "c_interp", "d_interp", "lod", "shadow_obj", "trace_obj", "ctech",
+    "stech", "maplib",
+)  # fmt: skip
 _MOST_CORNERS = 10_000
 _MOST_VERTICES = 3 * MOST_TRIANGLES  # and as many texture coordinates
 _MOST_LINES = 4 * _MOST_VERTICES
@@ -61,6 +65,7 @@ class _Material:
     emission: Vector = ()
     picture: _Map | None = None
     light_picture: _Map | None = None
+    mask: _Map | None = None
 
 
 @dataclass
@@ -103,6 +108,12 @@ class _Reader:
             raise self.file.fault(f"has free-form curves or surfaces (`{key}`), which are not read: export triangles")
         elif key in _SCRIPTS:
             raise self.file.fault(f"calls other files (`{key}`), which is not done")
+        elif key == "usemap" and values[:1] != ["off"]:
+            raise self.file.fault(
+                "names pictures without materials (`usemap`), which is not read: use map_Kd of an MTL"
+            )
+        elif key not in _OF_NO_SHAPE and key != "usemap":
+            raise self.file.fault(f"has a line that OBJ does not know, '{printable_line(' '.join(words), 60)}'")
 
     _has_objects = False
 
@@ -180,7 +191,11 @@ def _lines(file: InputFile) -> Iterator[str]:
     data = file.read()
     if data.count(b"\n") + data.count(b"\r") > 2 * _MOST_LINES:
         raise file.fault(f"has more than {_MOST_LINES} lines")
-    text = data.decode("utf-8", errors="replace").replace("\r\n", "\n").replace("\r", "\n").replace("\\\n", " ")
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError:  # written before UTF-8: names that differ stay different
+        text = data.decode("latin-1")
+    text = text.replace("\r\n", "\n").replace("\r", "\n").replace("\\\n", " ")
     return (line.partition("#")[0] for line in text.split("\n"))
 
 
@@ -208,6 +223,7 @@ def _part(
     uv = places[numbers] if len(places) and numbers.min() >= 0 else None
     paint = light = None
     if material is not None:
+        _check_holes(file, companions, material)
         paint = _paint(file, companions, material, uv)
         light = _light(file, companions, material, uv)
     if paint is None and colours is not None:
@@ -216,6 +232,13 @@ def _part(
         paint = Paint(face_colours=srgb_decoded(colours)[triangles].mean(axis=1))
     used, own = np.unique(triangles, return_inverse=True)  # a thousand parts do not carry all vertices each
     return MeshPart(title, points[used], own.reshape(-1, 3), paint, light)
+
+
+def _check_holes(file: InputFile, companions: Companions, material: _Material) -> None:
+    """Refuse a picture of the opacity that has holes: what is half transparent counts as opaque."""
+    if material.mask is not None and companions.picture(material.mask.name).min() == 0:
+        shown = printable_line(material.name, 60)
+        raise file.fault(f"has holes in the material '{shown}' (map_d): cut its faces along them, or take map_d away")
 
 
 def _paint(file: InputFile, companions: Companions, material: _Material, uv: Array | None) -> Paint | None:
@@ -282,7 +305,9 @@ def _with_line(file: InputFile, material: _Material, key: str, values: list[str]
     if key in ("map_kd", "map_ke"):
         found = _map(file, material.name, key, values)
         return replace(material, picture=found) if key == "map_kd" else replace(material, light_picture=found)
-    return material  # gloss, transparency and relief are not kept
+    if key == "map_d":
+        return replace(material, mask=_map(file, material.name, key, values))
+    return material  # gloss and relief are not kept, nor is a half transparency
 
 
 def _colour(file: InputFile, name: str, key: str, values: list[str]) -> Vector:

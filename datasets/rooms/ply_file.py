@@ -1,13 +1,15 @@
 """PLY files: ASCII and binary of either byte order, faces and strips, colours of vertices or faces, a named picture.
 
 Greg Turk's definition, "The PLY Polygon File Format" (1994): a header names elements, their counts and properties. What
-names mean is custom: x, y, z; red, green, blue; vertex_indices; s, t with a picture in `comment TextureFile`. Elements
-and properties of other names are passed over. Texture coordinates without a picture colour nothing.
+names mean is custom: x, y, z; red, green, blue; vertex_indices; s, t with a picture in `comment TextureFile`; colours
+of an element `material` by the `material_index` of faces or vertices. Elements and properties of other names are
+passed over. Texture coordinates without a picture colour nothing.
 """
 
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -112,12 +114,20 @@ def ply_parts(file: InputFile, companions: Companions) -> list[MeshPart]:
 
 def _header(file: InputFile, data: bytes) -> tuple[str, list[_Element], list[str], int]:
     """Byte order, elements, names of pictures, and where the body begins."""
-    end = data.find(b"end_header")
-    stop = data.find(b"\n", end) if end >= 0 else -1
-    if not data.startswith(b"ply") or stop < 0 or end > 100_000:
+    # a comment may hold the word, and a header may end its lines as a body does not: by a carriage return alone
+    last = re.search(rb"[\r\n]end_header[ \t]*(\r\n|\n|\r)", data[:100_000])
+    if not data.startswith(b"ply") or last is None:
         raise damaged(file)
+    end, stop = last.start() + 1, last.end() - 1
+    if last[1] == b"\r\n" and b"\n" not in data[:end]:
+        stop -= 1
+    text = data[:end]
     order, elements, pictures = None, list[_Element](), list[str]()
-    for line in data[:end].decode("latin-1").replace("\r", "\n").split("\n")[1:]:
+    try:
+        shown = text.decode("utf-8")
+    except UnicodeDecodeError:
+        shown = text.decode("latin-1")
+    for line in shown.replace("\r", "\n").split("\n")[1:]:
         words = line.split()
         if not words or words[0] == "obj_info":
             continue
@@ -333,12 +343,29 @@ def _face_places(file: InputFile, rows: Any, faces: _Faces) -> Array:
 def _colour_paint(
     file: InputFile, tables: dict[str, Table], kinds: dict[str, dict[str, str]], faces: _Faces
 ) -> Paint | None:
-    """Paint of the colours of faces, else of vertices."""
-    if faces.of_faces and (of_faces := _colours(file, tables.get("face", {}), kinds.get("face", {}))) is not None:
+    """Paint of the colours of faces, else of vertices; each its own, or that of its material."""
+    of_faces = _own_colours(file, "face", tables, kinds) if faces.of_faces else None
+    if of_faces is not None:
         return Paint(face_colours=of_faces[faces.owner])
-    if (of_vertices := _colours(file, tables["vertex"], kinds["vertex"])) is not None:
-        return Paint(face_colours=of_vertices[faces.triangles].mean(axis=1))
-    return None
+    of_vertices = _own_colours(file, "vertex", tables, kinds)
+    return None if of_vertices is None else Paint(face_colours=of_vertices[faces.triangles].mean(axis=1))
+
+
+def _own_colours(
+    file: InputFile, name: str, tables: dict[str, Table], kinds: dict[str, dict[str, str]]
+) -> Array | None:
+    """Linear colours of the entries of an element, shape (N, 3), or None where the file states none."""
+    table = tables.get(name, {})
+    own = _colours(file, table, kinds.get(name, {}))
+    if own is not None or "material_index" not in table or not len(table["material_index"]):
+        return own
+    colours = _colours(file, tables.get("material", {}), kinds.get("material", {}))
+    index = np.asarray(table["material_index"], float)
+    if colours is None:
+        raise file.fault(f"gives each {name} a material, and no material a colour that is read (diffuse_red, red)")
+    if index.min() < 0 or index.max() >= len(colours) or (index != np.floor(index)).any():
+        raise file.fault(f"names materials that are not there: it has {len(colours)}")
+    return np.asarray(colours[index.astype(int)])
 
 
 def _colours(file: InputFile, table: Table, kinds: dict[str, str]) -> Array | None:

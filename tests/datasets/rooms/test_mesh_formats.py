@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import base64
-import io
 import json
 import struct
+import urllib.parse
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import trimesh
+from helpers.gltf_documents import SQUARE, UV, Gltf
 from helpers.mesh_files import scene, write_glb, write_obj, write_ply, y_up
 from PIL import Image
 
@@ -20,8 +19,6 @@ from phibench.datasets.rooms.mesh_files import read_mesh
 from phibench.datasets.rooms.mesh_parts import MeshPart
 from phibench.datasets.rooms.polygons import Cutting, triangulated
 from phibench.datasets.rooms.room_files import RoomError
-
-SQUARE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], np.float32)
 
 
 def area(parts: tuple[MeshPart, ...] | list[MeshPart]) -> float:
@@ -38,59 +35,6 @@ def normals(part: MeshPart) -> np.ndarray:
 
 # -- glTF ----------------------------------------------------------------------------------------------------------
 
-
-class Gltf:
-    """Document of one square that a test fills."""
-
-    def __init__(self) -> None:
-        self.data = b""
-        self.tree: dict[str, Any] = {"asset": {"version": "2.0"}, "bufferViews": [], "accessors": [], "materials": []}
-        self.tree |= {"images": [], "textures": [], "samplers": [], "nodes": [{"name": "square", "mesh": 0}]}
-        self.tree |= {"scenes": [{"nodes": [0]}], "scene": 0}
-        self.primitive: dict[str, Any] = {"attributes": {"POSITION": self.array(SQUARE)}, "mode": 6}
-        self.tree["meshes"] = [{"primitives": [self.primitive]}]
-
-    def view(self, data: bytes, **more: Any) -> int:
-        self.data += b"\0" * (-len(self.data) % 4)
-        self.tree["bufferViews"].append({"buffer": 0, "byteOffset": len(self.data), "byteLength": len(data), **more})
-        self.data += data
-        return len(self.tree["bufferViews"]) - 1
-
-    def array(self, values: Any, **more: Any) -> int:
-        values = np.asarray(values)
-        kinds = {"f4": 5126, "u1": 5121, "u2": 5123, "u4": 5125, "i1": 5120, "i2": 5122}
-        shape = ["SCALAR", "VEC2", "VEC3", "VEC4"][0 if values.ndim == 1 else values.shape[1] - 1]
-        accessor = {"componentType": kinds[values.dtype.str[1:]], "count": len(values), "type": shape, **more}
-        accessor.setdefault("bufferView", self.view(values.tobytes()))
-        self.tree["accessors"].append(accessor)
-        return len(self.tree["accessors"]) - 1
-
-    def texture(self, pixels: np.ndarray, **sampler: Any) -> int:
-        stream = io.BytesIO()
-        Image.fromarray(pixels).save(stream, "PNG")
-        self.tree["images"].append({"bufferView": self.view(stream.getvalue()), "mimeType": "image/png"})
-        self.tree["samplers"].append(sampler)
-        row = {"source": len(self.tree["images"]) - 1, "sampler": len(self.tree["samplers"]) - 1}
-        self.tree["textures"].append(row)
-        return len(self.tree["textures"]) - 1
-
-    def material(self, **row: Any) -> None:
-        self.tree["materials"].append(row)
-        self.primitive["material"] = 0
-
-    def read(self, folder: Path) -> tuple[MeshPart, ...]:
-        uri = "data:application/octet-stream;base64," + base64.b64encode(self.data).decode()
-        tree = {**self.tree, "buffers": [{"byteLength": len(self.data), "uri": uri}]}
-        tree = {key: value for key, value in tree.items() if value != []}
-        (folder / "one.gltf").write_text(json.dumps(tree))
-        return read_mesh(folder / "one.gltf")
-
-    def one(self, folder: Path) -> MeshPart:
-        [part] = self.read(folder)
-        return part
-
-
-UV = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32)
 CORNERS = np.array([[0, 1, 2], [0, 2, 3]])  # of the fan, each triangle's first corner last by the definition
 
 
@@ -345,6 +289,39 @@ def test_trimesh_reads_the_same_of_what_it_wrote(tmp_path: Path) -> None:
     assert compared == 8
 
 
+@pytest.mark.parametrize("base64_", [True, False])
+def test_a_data_uri_is_base64_or_bytes_by_percent(tmp_path: Path, base64_: bool) -> None:
+    """RFC 2397 has both."""
+    document = Gltf()
+    document.read(tmp_path)
+    tree = json.loads((tmp_path / "one.gltf").read_text())
+    if not base64_:
+        tree["buffers"][0]["uri"] = "data:application/gltf-buffer," + urllib.parse.quote(document.data)
+    (tmp_path / "two.gltf").write_text(json.dumps(tree))
+    assert area(read_mesh(tmp_path / "two.gltf")) == pytest.approx(1.0)
+
+
+def test_interleaved_whole_numbers_have_their_values(tmp_path: Path) -> None:
+    """One view of 20 bytes a vertex: floats, 16 bits for coordinates and 8 for colours, as gltfpack writes them."""
+    document = Gltf()
+    rows = np.zeros(4, dtype=[("place", "<f4", 3), ("uv", "<u2", 2), ("colour", "<u1", 4)])
+    rows["place"], rows["uv"], rows["colour"] = 2 * SQUARE, 65535 * UV, (128, 64, 32, 255)
+    view = document.view(rows.tobytes(), byteStride=20)
+    for name, offset, kind, shape in (
+        ("POSITION", 0, 5126, "VEC3"),
+        ("TEXCOORD_0", 12, 5123, "VEC2"),
+        ("COLOR_0", 16, 5121, "VEC4"),
+    ):
+        accessor = {"bufferView": view, "byteOffset": offset, "componentType": kind, "count": 4, "type": shape}
+        document.tree["accessors"].append(accessor | {"normalized": kind != 5126})
+        document.primitive["attributes"][name] = len(document.tree["accessors"]) - 1
+    document.material(pbrMetallicRoughness={})
+    part = document.one(tmp_path)
+    assert area([part]) == pytest.approx(4.0)
+    assert part.paint is not None
+    np.testing.assert_allclose(part.paint.face_colours, [[128 / 255, 64 / 255, 32 / 255]] * 2)
+
+
 # -- OBJ -----------------------------------------------------------------------------------------------------------
 
 
@@ -434,6 +411,29 @@ def test_trimesh_reads_the_same_obj(tmp_path: Path) -> None:
     assert area(read_mesh(path)) == pytest.approx(trimesh.load_mesh(path, process=False).area, rel=1e-6)
 
 
+@pytest.mark.parametrize("head", ["\ufeff", ""])
+def test_a_byte_order_mark_is_no_part_of_the_first_line(tmp_path: Path, head: str) -> None:
+    """Of a first vertex it made another mesh: all indices were off by one."""
+    text = head + "v 9 9 9\nv 0 0 0\nv 1 0 0\nv 1 1 0\nf 2 3 4\n"
+    assert area(obj(tmp_path, text)) == pytest.approx(0.5)
+
+
+def test_names_before_utf_8_stay_different(tmp_path: Path) -> None:
+    (tmp_path / "a.mtl").write_bytes("newmtl W\xe4nd\nKd 1 0 0\nnewmtl W\xf6nd\nKd 0 1 0\n".encode("latin-1"))
+    text = "mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 1 1 0\nusemtl W\xe4nd\nf 1 2 3\nusemtl W\xf6nd\nf 1 2 3\n"
+    (tmp_path / "a.obj").write_bytes(text.encode("latin-1"))
+    assert [part.paint.colour for part in read_mesh(tmp_path / "a.obj") if part.paint] == [(1, 0, 0), (0, 1, 0)]
+
+
+@pytest.mark.parametrize(("line", "words"), [("usemap wood", "usemap"), ("vx 1 2 3", "OBJ does not know, 'vx 1 2 3'")])
+def test_a_line_that_is_not_read_is_told(tmp_path: Path, line: str, words: str) -> None:
+    """Lines without a shape are passed over."""
+    plain = "vn 0 0 1\ns off\nlod 1\np 1\nl 1 2\nv 0 0 0\nv 1 0 0\nv 1 1 0\nf 1 2 3\n"
+    assert area(obj(tmp_path, plain)) == pytest.approx(0.5)
+    with pytest.raises(RoomError, match=words):
+        obj(tmp_path, f"{line}\n{plain}")
+
+
 # -- PLY -----------------------------------------------------------------------------------------------------------
 
 PLACES = "property float s\nproperty float t\n"
@@ -513,3 +513,42 @@ def test_trimesh_reads_the_same_ply(tmp_path: Path) -> None:
     [part], other = read_mesh(path), trimesh.load_mesh(path, process=False)
     np.testing.assert_allclose(part.vertices, other.vertices)
     np.testing.assert_array_equal(part.triangles, other.faces)
+
+
+@pytest.mark.parametrize("order", ["little", "big"])
+@pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
+def test_a_header_ends_at_its_own_line_end(tmp_path: Path, order: str, end: str) -> None:
+    """The first byte of the body is a line feed here, and a comment holds the last word of the header."""
+    sign = "<" if order == "little" else ">"
+    first = np.frombuffer(b"\n\n\n\n", f"{sign}f4")[0]  # 6.6e-33, as good as 0
+    points = np.array([[first, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], f"{sign}f4")
+    lines = ["ply", f"format binary_{order}_endian 1.0", "comment end_header", "element vertex 4"]
+    lines += [f"property float {axis}" for axis in "xyz"]
+    lines += ["element face 1", "property list uchar int vertex_indices", "end_header"]
+    body = points.tobytes() + bytes([4]) + np.arange(4, dtype=f"{sign}i4").tobytes()
+    (tmp_path / "a.ply").write_bytes(end.join([*lines, ""]).encode() + body)
+    assert area(read_mesh(tmp_path / "a.ply")) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("owner", ["vertex", "face"])
+def test_materials_of_a_ply_colour_what_names_them(tmp_path: Path, owner: str) -> None:
+    """An element `material` as Turk defines it; without a material's colour the file is refused."""
+    own = "property int material_index\n"
+    text = (
+        "ply\nformat ascii 1.0\nelement material 2\n"
+        + "".join(f"property uchar diffuse_{name}\n" for name in ("red", "green", "blue"))
+        + "element vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+        + (own if owner == "vertex" else "")
+        + "element face 1\nproperty list uchar int vertex_indices\n"
+        + (own if owner == "face" else "")
+        + "end_header\n255 0 0\n0 255 0\n"
+    )
+    index = " 1" if owner == "vertex" else ""
+    text += f"0 0 0{index}\n1 0 0{index}\n1 1 0{index}\n3 0 1 2{' 1' if owner == 'face' else ''}\n"
+    (tmp_path / "a.ply").write_text(text)
+    [part] = read_mesh(tmp_path / "a.ply")
+    assert part.paint is not None
+    np.testing.assert_allclose(part.paint.face_colours, [[0.0, 1.0, 0.0]])
+    (tmp_path / "a.ply").write_text(text.replace("diffuse_", "some_"))
+    with pytest.raises(RoomError, match="no material a colour"):
+        read_mesh(tmp_path / "a.ply")
