@@ -26,6 +26,7 @@ from phibench.scenes.validation import printable_line
 
 _JPEG = ("JPEG", "MPO")  # Pillow calls a JPEG with previews after it MPO
 FORMATS = ("JPEG", "PNG", "TIFF", "PPM")
+PGM = (b"P5", b"P2")
 IN_WORDS = "JPEG, PNG, TIFF, PPM or PGM"
 Kind = Literal["jpeg", "rgb", "yuyv", "raw"]
 Subsampling = Literal["4:4:4", "4:2:2", "4:2:0"]
@@ -79,8 +80,8 @@ def read_camera_picture(file: InputFile, data: bytes | None = None) -> CameraPic
     data = file.read() if data is None else data
     if other := _other_format(data, file.path.suffix.lower()):
         raise file.fault(other)
-    if data[:2] in (b"P5", b"P2"):
-        return CameraPicture(_sealed(_pgm(file, data)), "raw")
+    if data[:2] in PGM:
+        return CameraPicture(_sealed(pgm_values(file, data)), "raw")
     picture = file.picture(FORMATS, data)
     with (
         file.decoding("is a damaged picture"),
@@ -137,7 +138,7 @@ def _sampling(picture: Image.Image) -> Subsampling | None:
         return "4:4:4"
     (h, v), *others = factors
     ratios = {(h / x, v / y) for x, y in others}
-    return _SAMPLING.get(ratios.pop()) if len(ratios) == 1 else None  # type: ignore[call-overload, no-any-return]
+    return _SAMPLING.get(ratios.pop()) if len(ratios) == 1 else None
 
 
 def _without_chroma(picture: Image.Image) -> bool:
@@ -184,8 +185,14 @@ def _pixels(file: InputFile, picture: Image.Image) -> tuple[Kind, NDArray[Any]]:
     return ("jpeg" if picture.format in _JPEG else "rgb"), np.array(picture.convert("RGB"))
 
 
-def _pgm(file: InputFile, data: bytes) -> NDArray[np.uint16]:
-    """DN of a PGM, binary (P5) or plain (P2); Pillow would stretch them to 16 bits."""
+def pgm_values(file: InputFile, data: bytes) -> NDArray[np.uint16]:
+    """DN of a PGM, binary (P5) or plain (P2); Pillow would stretch them to 16 bits.
+
+    Raises
+    ------
+    DatasetError
+        Of the file's own kind, if it is damaged; in one sentence.
+    """
     head = _PGM.match(data[:1000])
     if head is None or any(len(text) > 6 for text in head.groups()):
         raise file.fault("is not a picture of the format PGM")

@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from pydantic import Field
 
+from phibench.datasets.camera_pictures import PGM, pgm_values
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.input_files import SETTINGS_BYTES, InputFile
 from phibench.datasets.store.schema import Document
@@ -214,11 +215,12 @@ def read_frame(path: Path, notes: CaptureNotes) -> tuple[Kind, NDArray[Any]]:
     file = InputFile(path, "give the camera's own frame", CaptureError, _FRAME_BYTES)
     if path.suffix.lower() == ".yuyv":
         return "yuyv", _yuyv(file, notes)
-    picture = file.picture(("PNG", "PPM", "JPEG", "TIFF", "BMP"))
-    if picture.format == "JPEG":
+    data = file.read()
+    picture = None if data[:2] in PGM else file.picture(("PNG", "PPM", "JPEG", "TIFF", "BMP"), data)
+    if picture is not None and picture.format in ("JPEG", "MPO"):
         return "mjpeg", np.asarray(picture.convert("RGB"))
-    if picture.mode in ("I;16", "I", "I;16B", "L"):
-        values = np.asarray(picture).astype(np.uint16)
+    if picture is None or picture.mode in ("I;16", "I", "I;16B", "I;16L", "L"):
+        values = pgm_values(file, data) if picture is None else np.asarray(picture).astype(np.uint16)
         if notes.format in (None, *RAW):
             return ("mono-raw" if notes.format == "mono-raw" else "bayer-raw"), values
         raise file.fault(f"has one plane, and {MANIFEST} says {notes.format}")

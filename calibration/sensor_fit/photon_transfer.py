@@ -34,6 +34,8 @@ from phibench.scenes.frames import Array
 
 _MARGIN_SIGMAS = 6.0  # a level is used if so many deviations of its noise lie below saturation
 _HIDDEN_DN = 0.15  # noise below it leaves too few codes to be told from rounding
+_THIRD_CODE = 30.0  # values of a third code, below which the noise is that of any width
+_ROUNDING_DN = 12.0**-0.5  # of a level that rounding hides
 _CUT = 1e-3  # of dark values at the converter's lower end: below, their variance lacks less than 1 %
 _FAINT = 0.02  # of the range: below, a level's noise over its signal says nothing
 _BY_GAIN = ("gain_dn_per_e", "dark_e_per_s", "read_noise_e", "row_noise_e", "dsnu_e", "full_well_e")
@@ -160,6 +162,10 @@ class _Fit:
         self.timed, self.common = timed, common
         moments = before_rounding(dark, common.seen_frame_dn2)
         self.black, self.dark_dn2, self.offset_dn2 = moments.T
+        self.is_hidden = self._is_hidden()
+        if self.is_hidden:  # one or two codes fit to any narrow noise
+            self.black, self.offset_dn2 = dark.mean_dn, np.zeros_like(self.black)
+            self.dark_dn2 = np.maximum(dark.temporal_dn2 - 1.0 / 12.0, 0.0)
         self.values: dict[str, Array] = {}
         self.extra: dict[str, float] = {}
         self.reasons: dict[str, str] = {}
@@ -197,6 +203,8 @@ class _Fit:
     def _usable(self) -> list[_Level]:
         ceiling = self._ceiling()
         used = [one for one in self.levels if self._reach(one) < ceiling and self._signal(one)[0] > 0.0]
+        if not used and any(self._reach(one) < self.top for one in self._plateau()):
+            raise self._no_growth()
         if not used:
             raise CaptureError(
                 f"{self.folder}: every level of flat/ is saturated or dark; take levels from 5 to 90 % of full scale"
@@ -245,12 +253,18 @@ class _Fit:
             )
             for one in used
         ]
+        no_dark = self._is_cut or self.is_hidden  # the dark frames' own variance says nothing
+        dark_dn2 = _intercept(levels) if no_dark and len({one.name for one in used}) > 1 else self.dark_dn2
         try:
-            found = fit_response(levels, self.dark_dn2, self._range)
+            found = fit_response(levels, dark_dn2, self._range)
         except ValueError:
-            raise CaptureError(
-                f"{self.folder}: the noise of flat/ does not grow with its level; are these raw frames?"
-            ) from None
+            raise self._no_growth() from None
+        signal = np.array([float(one.signal_dn[0]) for one in levels])
+        unknown = float(found.gain[0]) * self._unknown_black() * float(signal.sum() / np.sum(signal**2))
+        if no_dark and found.is_bent:  # a line through levels that bend has another intercept
+            other = fit_response(levels, self.dark_dn2, self._range)
+            unknown = float(np.hypot(unknown, other.gain[0] - found.gain[0]))
+        self.extra["gain_dn_per_e"] = unknown / self.notes.analogue_gain
         if (said := found.finding()) is not None:
             self.findings["photon_transfer"] = said
         if found.is_bent:
@@ -264,11 +278,35 @@ class _Fit:
             )
         return found
 
+    def _no_growth(self) -> CaptureError:
+        return CaptureError(
+            f"{self.folder}: the noise of flat/ does not grow with its level; are these raw frames, without a curve?"
+        )
+
+    @property
+    def _is_cut(self) -> bool:
+        return self._cut_share() > _CUT
+
+    def _unknown_black(self) -> float:
+        """Standard deviation of the black level that the dark frames' own codes leave: cut, or hidden by rounding."""
+        if self._is_cut:
+            return max(float(self.black[0]), _ROUNDING_DN)
+        return _ROUNDING_DN if self.is_hidden else 0.0
+
+    def _is_hidden(self) -> bool:
+        """Rounding hides the noise of dark frames: it is small, or their values are two codes alone."""
+        place = float(self.dark.mean_dn[0]) % 1.0
+        spread = float(self.dark.temporal_dn2[0] + self.dark.spatial_dn2[0]) + self.common.seen_frame_dn2
+        third = spread - place * (1.0 - place)  # two codes alone have no more than that
+        values = float(self.dark.pixels[0]) * self.dark.frames
+        return bool(self.dark_dn2[0] < _HIDDEN_DN**2 or third * values < _THIRD_CODE)
+
     def _dark_current(self, gain: Array) -> Array:
         """Growth of the dark level, DN per second; 0 where no series tells."""
         at = self.notes.exposure_s
         self.values["black_level_dn"] = self.black
-        self.extra["black_level_dn"] = float(np.sqrt(self.common.level_dn2 / self.dark.frames))
+        unknown = self._unknown_black()
+        self.extra["black_level_dn"] = float(np.hypot(unknown, np.sqrt(self.common.level_dn2 / self.dark.frames)))
         times = [seconds for seconds, _ in self.timed] + ([at] if at is not None else [])
         if len(set(times)) < 2:
             self.reasons["dark_e_per_s"] = "needs dark-exposure/SECONDS with two exposure times or more"
@@ -286,7 +324,8 @@ class _Fit:
         frames = np.array([sums.frames for _, sums in self.timed] + [self.dark.frames])[: len(t), None]
         jitter2 = self.common.level_dn2 / frames  # of each level as a whole
         slope_sigma = float(np.sqrt(np.sum((weights * slope_share) ** 2 * jitter2)))
-        self.extra["black_level_dn"] = float(np.sqrt(np.sum((weights * black_share) ** 2 * jitter2)))
+        jitter = float(np.sqrt(np.sum((weights * black_share) ** 2 * jitter2)))
+        self.extra["black_level_dn"] = float(np.hypot(unknown, jitter))
         self.values["black_level_dn"] = np.sum(weights * (means - slope * t), axis=0) / weights.sum()
         if slope[0] > 0.0:
             self.values["dark_e_per_s"] = slope / gain
@@ -297,12 +336,14 @@ class _Fit:
         return np.asarray(slope)
 
     def _noise(self, gain: Array, dark_rate: Array) -> None:
-        if self._cut_share() > _CUT:
+        if self._is_cut:
             reason = "dark frames are cut at code 0; raise the camera's offset (brightness)"
             self.reasons |= {"read_noise_e": reason, "dsnu_e": reason, "row_noise_e": reason}
-            self.findings["dark"] = f"{reason}; the black level and all that is counted from it are too high by it"
+            self.findings["dark"] = (
+                f"{reason}; the black level is too high by it, and the gain is that of the slope between the levels"
+            )
             return
-        if self.dark_dn2[0] < _HIDDEN_DN**2:
+        if self.is_hidden:
             reason = f"below {_HIDDEN_DN} DN: rounding hides it; take dark frames at a higher gain"
             self.reasons |= {"read_noise_e": reason, "dsnu_e": reason, "row_noise_e": reason}
             return
@@ -328,7 +369,8 @@ class _Fit:
         if self.dark.zero > 0.5:
             return 1.0
         spread = np.sqrt(max(float(self.dark_dn2[0] + self.offset_dn2[0]), 1e-6))
-        return float(ndtr((-0.5 - float(self.black[0])) / spread))
+        # no more than the zeros that are there: hot pixels have a spread that is no Gaussian's
+        return min(float(ndtr((-0.5 - float(self.black[0])) / spread)), self.dark.zero)
 
     def _prnu(self, used: list[_Level], response: Response) -> None:
         shown = np.stack([self._signal(one) for one in used])
@@ -337,8 +379,13 @@ class _Fit:
         temporal = np.array([one.sums.temporal_dn2[0] / one.sums.frames for one in used])
         weights = (signal[:, 0] ** 2 / (np.maximum(pattern[:, 0], 0.0) + temporal)) ** 2
         square = np.sum(weights[:, None] * pattern / signal**2, axis=0) / weights.sum()
-        if square[0] > 3.0 * jackknife_sigma(square):
+        if self._is_cut and response.is_bent:
+            self.reasons["prnu"] = "dark frames are cut at code 0, and levels bend: the signal is not known"
+        elif square[0] > 3.0 * jackknife_sigma(square):
             self.values["prnu"] = np.sqrt(np.maximum(square, 0.0))
+            # x / x' of a bend a_1 differs by a_1 u
+            bend = response.unseen_bend * response.reach_dn / response.range_dn
+            self.extra["prnu"] = float(self.values["prnu"][0]) * bend
         else:
             self.reasons["prnu"] = "lost in temporal noise: take more frames of the brighter levels"
 
@@ -395,3 +442,13 @@ class _Fit:
 
     def _point(self, one: _Level, used: bool) -> TransferPoint:
         return TransferPoint(one.name, one.site, float(self._signal(one)[0]), self._excess(one), used)
+
+
+def _intercept(levels: list[NoiseOfLevel]) -> Array:
+    """Variance at no light by the line through the levels alone, DN^2, at least 0, shape (replicates,)."""
+    y = np.stack([one.signal_dn for one in levels])
+    v = np.stack([one.temporal_dn2 for one in levels]) - 1.0 / 12.0
+    weight = v[:, :1] ** -2.0
+    y0, v0 = ((weight * x).sum(axis=0) / weight.sum() for x in (y, v))
+    slope = np.sum(weight * (y - y0) * (v - v0), axis=0) / np.sum(weight * (y - y0) ** 2, axis=0)
+    return np.asarray(np.maximum(v0 - slope * y0, 0.0))

@@ -9,7 +9,8 @@ with D the variance of dark frames. K is the gain of the smallest signals. Eight
 (the straight line of EMVA 1288) to all three. Each has the weight of its Bayes factor in Schwarz's approximation,
 the straight line's prior being 0.5. The result is the weighted mean; its sigma holds the spread of the sets. Where no
 set fits within counting noise, all sigmas grow by the root of the least mean square (Birge's ratio). A straight line
-has a bend of 0 +- 0.3 % at full range, as far as the noise leaves it open: 0.3 % move K by 0.5 %.
+has a bend of 0 +- 0.3 % at full range, as far as the noise leaves it open: 0.3 % move K by 0.5 %. One level shows no
+bend at all, so that its own is 0 +- 3 %.
 
 Where light or exposure times are stated, the signal is compared with them: a straight line with an offset and the
 weights 1 / signal^2, over signals from 5 to 95 % of the brightest (EMVA 1288, release 4.0, section 6.7). A deviation
@@ -33,6 +34,7 @@ _TERMS = (1, 2, 3)
 _STRAIGHT_PRIOR = 0.5
 _BENT = 0.95  # posterior share of the bent sets from which on the response is said to bend
 _UNSEEN = 0.003  # standard deviation of the bend at u = 1 that a response has which is taken for straight
+_UNSEEN_BY_ONE = 0.03  # the same where one level cannot show a bend: sensors of the EMVA sets bend by 2 to 5 %
 _CHANCE = 1e-4  # of counting noise alone, below which a fit is a misfit
 _STEEPEST = 0.2  # least slope of x(y): flatter ones are no response
 _ROUNDS = 4  # of the rounding, which depends on the noise
@@ -76,6 +78,7 @@ class Response:
     bent : posterior share of the bent sets
     reach_dn : brightest signal used
     levels : number of levels of different names
+    unseen_bend : standard deviation of a_1 that a straight line leaves open
     """
 
     gain: Array
@@ -91,6 +94,7 @@ class Response:
     bent: float
     reach_dn: float
     levels: int
+    unseen_bend: float
 
     @property
     def sigma(self) -> float:
@@ -242,7 +246,8 @@ def _mean(sets: list[_Set], count: int, names: int, range_dn: float, reach_dn: f
     x = np.stack([_padded(one) for one in sets])
     mean = np.tensordot(weight, x, axes=1)
     spread2 = weight @ (x[:, 0] - mean[0]) ** 2
-    spread2[0] += weight[0] * (sets[0].gain_by_bend * _unseen_bend(sets)) ** 2
+    unseen = _unseen_bend(sets, names)
+    spread2[0] += weight[0] * (sets[0].gain_by_bend * unseen) ** 2
     noise2 = (birge - 1.0) * np.array([jackknife_sigma(column) ** 2 for column in mean.T])
     sigmas = np.sqrt(np.array([jackknife_sigma(column) ** 2 for column in mean.T]) + spread2 + noise2)
     straight = sets[0].x[:, 0]
@@ -260,11 +265,14 @@ def _mean(sets: list[_Set], count: int, names: int, range_dn: float, reach_dn: f
         bent=float(1.0 - weight[0]),
         reach_dn=reach_dn,
         levels=names,
+        unseen_bend=float(np.sqrt(weight[0])) * unseen,
     )
 
 
-def _unseen_bend(sets: list[_Set]) -> float:
+def _unseen_bend(sets: list[_Set], names: int) -> float:
     """Standard deviation of a_1 where none is found: what is usual, or less where the noise would show it."""
+    if names == 1:
+        return _UNSEEN_BY_ONE
     shown = [jackknife_sigma(one.x[:, 1]) for one in sets if one.terms == _TERMS[:1]]
     return float(sum(sigma**-2 for sigma in [_UNSEEN, *shown] if sigma > 0.0) ** -0.5)
 

@@ -437,7 +437,7 @@ class _Reader:
             shown = printable_line(str(next(iter(extensions))), 60)
             raise self.file.fault(f"has pictures of the glTF extension {shown}, which is not read")
         self.document.row("images", source)
-        return int(source)
+        return int(source or 0)
 
     def _picture(self, material: _Material, texture: dict[str, Any]) -> Picture:
         number = self._image(texture)

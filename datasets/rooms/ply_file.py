@@ -115,11 +115,11 @@ def ply_parts(file: InputFile, companions: Companions) -> list[MeshPart]:
 def _header(file: InputFile, data: bytes) -> tuple[str, list[_Element], list[str], int]:
     """Byte order, elements, names of pictures, and where the body begins."""
     # a comment may hold the word, and a header may end its lines as a body does not: by a carriage return alone
-    last = re.search(rb"[\r\n]end_header[ \t]*(\r\n|\n|\r)", data[:100_000])
-    if not data.startswith(b"ply") or last is None:
+    ending = re.search(rb"[\r\n]end_header[ \t]*(\r\n|\n|\r)", data[:100_000])
+    if not data.startswith(b"ply") or ending is None:
         raise damaged(file)
-    end, stop = last.start() + 1, last.end() - 1
-    if last[1] == b"\r\n" and b"\n" not in data[:end]:
+    end, stop = ending.start() + 1, ending.end() - 1
+    if ending[1] == b"\r\n" and b"\n" not in data[:end]:
         stop -= 1
     text = data[:end]
     order, elements, pictures = None, list[_Element](), list[str]()

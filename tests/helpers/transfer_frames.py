@@ -23,6 +23,7 @@ class BentCamera:
     power: float = 3.0
     prnu: float = 0.005
     jitter_dn: float = 0.0
+    hot: int = 0  # pixels that have 3000 electrons more, on the mean
     size: tuple[int, int] = (128, 128)
 
     @property
@@ -34,11 +35,17 @@ class BentCamera:
         """Derivative of the code by electrons at black."""
         return self.gain * (1.0 - (1.0 + self.power) * self.bend * (self.black / self.top) ** self.power)
 
+    @property
+    def _hot_e(self) -> NDArray[Any]:
+        draw, result = np.random.default_rng(98), np.zeros(self.size)
+        result.flat[draw.choice(result.size, self.hot, replace=False)] = draw.exponential(3000.0, self.hot)
+        return result
+
     def frames(self, electrons: float, count: int, rng: np.random.Generator) -> list[NDArray[Any]]:
         pattern = 1.0 + self.prnu * np.random.default_rng(99).standard_normal(self.size)
         result = []
         for _ in range(count):
-            e = rng.poisson(electrons * pattern) + self.read_noise_e * rng.standard_normal(self.size)
+            e = rng.poisson(electrons * pattern + self._hot_e) + self.read_noise_e * rng.standard_normal(self.size)
             y = self.black + self.gain * e + self.jitter_dn * rng.standard_normal()
             codes = y * (1.0 - self.bend * (np.maximum(y, 0.0) / self.top) ** self.power)
             kind = np.uint16 if self.bits > 8 else np.uint8

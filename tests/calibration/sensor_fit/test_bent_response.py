@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.transfer_frames import BentCamera, write_stack, write_transfer
+from PIL import Image
 
 from phibench.calibration.sensor_fit.block_sums import before_rounding, block_sums
 from phibench.calibration.sensor_fit.capture_folder import CaptureError
@@ -106,6 +107,17 @@ def test_a_bend_that_noise_does_not_show_is_in_sigma() -> None:
 def test_one_level_says_that_it_cannot_tell(tmp_path: Path) -> None:
     found = fit_sensor(write_transfer(tmp_path / "c", TWELVE_BITS, 1, (0.5,), frames=4)).file
     assert "one level does not show" in found.tables.findings["photon_transfer"]
+    # 3 % at full range move K by 3 a_1 u at u = 0.5, less what the dark frames' noise holds
+    assert 0.03 < found.tables.sigma["gain_dn_per_e"] / found.numbers["gain_dn_per_e"] < 0.06
+
+
+@pytest.mark.parametrize("bend", [0.0, 0.05])
+def test_one_level_of_a_bent_camera_is_within_its_sigma(tmp_path: Path, bend: float) -> None:
+    """Its gain was 22 sigma off without a bend in sigma; so was the PRNU by 10."""
+    camera = BentCamera(0.1, 30.0, 29.4, bend=bend)
+    found = fit_sensor(write_transfer(tmp_path / "c", camera, 3, (0.73,), frames=4)).file
+    for name, true in (("gain_dn_per_e", camera.gain_at_black), ("prnu", camera.prnu)):
+        assert abs(found.numbers[name] - true) < 4.0 * found.tables.sigma[name]
 
 
 # -- dark levels -----------------------------------------------------------------------------------------------------
@@ -135,6 +147,67 @@ def test_dark_frames_that_are_cut_are_said_to_be(tmp_path: Path, black: float, i
     tables = fit_sensor(write_transfer(tmp_path / "c", camera, 2, SHARES, frames=4)).file.tables
     assert ("cut at code 0" in tables.findings.get("dark", "")) == is_cut
     assert ("read_noise_e" in tables.not_determined) == is_cut
+
+
+@pytest.mark.parametrize(("shares", "bend"), [(SHARES, 0.0), ((0.2, 0.6), 0.0), (SHARES, 0.05)])
+def test_cut_dark_frames_do_not_spoil_the_gain(tmp_path: Path, shares: tuple[float, ...], bend: float) -> None:
+    """Their variance is too small: taken for the line's first point it made K 25 % too large, 7 sigma.
+
+    Where levels bend as well, the intercept of a line through them is no better: sigma holds what both choices are
+    apart.
+    """
+    camera = BentCamera(0.1, 30.0, 0.0, bend=bend)
+    found = fit_sensor(write_transfer(tmp_path / "c", camera, 4, shares)).file
+    value, sigma = found.numbers, found.tables.sigma
+    assert abs(value["gain_dn_per_e"] - 0.1) < 4.0 * sigma["gain_dn_per_e"]
+    assert abs(value["black_level_dn"]) < 2.0 * sigma["black_level_dn"]
+    assert "cut at code 0" in found.tables.findings["dark"]
+    if bend:
+        assert "levels bend" in found.tables.not_determined["prnu"]
+    else:
+        assert sigma["gain_dn_per_e"] < 0.002
+
+
+@pytest.mark.parametrize("black", [3.0, 3.3, 3.45])
+def test_a_black_level_between_two_codes_has_their_distance_for_sigma(tmp_path: Path, black: float) -> None:
+    """Noise of 0.06 DN: all values are one code, or two whose shares tell no width. Sigma was 0, and 0.018."""
+    camera = BentCamera(0.02, 3.0, black, bits=8)
+    found = fit_sensor(write_transfer(tmp_path / "c", camera, 5, SHARES)).file
+    assert found.tables.sigma["black_level_dn"] == pytest.approx(12.0**-0.5, rel=0.05)
+    assert abs(found.numbers["black_level_dn"] - black) < 0.5
+    assert abs(found.numbers["gain_dn_per_e"] - 0.02) < 4.0 * found.tables.sigma["gain_dn_per_e"]
+    assert "rounding hides it" in found.tables.not_determined["read_noise_e"]
+
+
+def test_hot_pixels_are_not_called_cut(tmp_path: Path) -> None:
+    """Their spread is no Gaussian's: 1 % of hot pixels made 15 % of all values lie below code 0."""
+    tables = fit_sensor(write_transfer(tmp_path / "c", BentCamera(0.1, 30.0, 29.4, hot=160), 6, SHARES)).file.tables
+    assert "dark" not in tables.findings
+    assert "read_noise_e" in tables.sigma
+
+
+@pytest.mark.parametrize("power", [0.5, 1.0 / 2.2])
+def test_codes_of_a_curve_are_told_from_saturated_ones(tmp_path: Path, power: float) -> None:
+    """A square root makes the noise equal everywhere; gamma 2.2 makes it fall."""
+    folder = write_transfer(tmp_path / "c", TWELVE_BITS, 1, SHARES, frames=4)
+    for path in folder.rglob("*.png"):
+        codes = np.asarray(Image.open(path)) / TWELVE_BITS.top
+        Image.fromarray(np.rint(255.0 * codes**power).astype(np.uint8)).save(path)
+    (folder / "capture.toml").write_text('format = "mono-raw"\nbits = 8\n')
+    with pytest.raises(CaptureError, match=r"does not grow with its level.*without a curve"):
+        fit_sensor(folder)
+
+
+def test_a_pgm_of_twelve_bits_has_its_own_codes(tmp_path: Path) -> None:
+    """Pillow stretches them to 16 bits."""
+    folder = write_transfer(tmp_path / "c", TWELVE_BITS, 1, SHARES, frames=2)
+    expected = fit_sensor(folder).file.numbers
+    for path in folder.rglob("*.png"):
+        codes = np.asarray(Image.open(path))
+        head = f"P5\n{codes.shape[1]} {codes.shape[0]}\n{TWELVE_BITS.top}\n".encode()
+        path.with_suffix(".pgm").write_bytes(head + codes.astype(">u2").tobytes())
+        path.unlink()
+    assert fit_sensor(folder).file.numbers == expected
 
 
 def test_dark_frames_that_drift_are_not_called_auto_exposure(tmp_path: Path) -> None:
