@@ -5,7 +5,8 @@ A pair is simulated when it is asked for: the same bytes every time. Its truth i
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -59,8 +60,22 @@ class DrawnPairs:
         """Pair of images (down, up) as a method sees it; the arrays are read-only."""
         return self.pair_and_frames(number)[0]
 
+    @contextmanager
+    def named(self, number: int) -> Iterator[None]:
+        """Name the sample of a pair in the message of what cannot be read."""
+        try:
+            yield
+        except DatasetError as error:
+            if not 0 <= number < len(self._pair_draws):
+                raise
+            raise DatasetError(f"sample '{self._pair_draws[number].sample_id}': {error}") from error
+
     def pair_and_frames(self, number: int) -> tuple[Pair, Frames]:
         """Pair as a method sees it, and the first frame of each image, with the camera's JPEG file."""
+        with self.named(number):
+            return self._pair_and_frames(number)
+
+    def _pair_and_frames(self, number: int) -> tuple[Pair, Frames]:
         pair_draw, sample, source = self.drawn_from(number)
         frames = source.frames(pair_draw.draw, laser_off=pair_draw.laser_off)
         images = {name: _each(source, pair_draw, frame) for name, frame in frames.by_name.items()}

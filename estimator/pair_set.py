@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import threading
 import time
+from collections import deque
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -180,17 +181,23 @@ def truth_folders(pairs: object) -> tuple[Path, ...]:
     return tuple(getattr(pairs, "folders", ()))
 
 
+def tell_answered(pairs: object, number: int) -> bool:
+    """Tell a set that all methods have answered a pair; whether the set then makes its truth by itself."""
+    told = getattr(pairs, "answered", None)
+    return bool(told(number)) if callable(told) else False
+
+
 class CachedPairs:
     """Pairs and truths of another set, each asked for once and kept; make a new one for the next part of a set.
 
-    Both begin with the layers of the same sample, of which a set keeps the last. A pair's truth is made before the next
-    pair, not with its own: it takes longer where both spots are seen, and the method would tell by the clock.
+    A pair's truth is made when all methods have answered it, before the next pair. It takes longer where both spots are
+    seen: a method that waits for it, or looks how busy the machine is, would know by the clock.
 
     Parameters
     ----------
     pairs : PairSet
     before : CachedPairs, optional
-        The part before, of the same set: its last truth is made first. Threads may ask both.
+        The part before, of the same set. Threads may ask both.
 
     Attributes
     ----------
@@ -199,13 +206,19 @@ class CachedPairs:
     """
 
     def __init__(self, pairs: PairSet, before: CachedPairs | None = None) -> None:
-        self._pairs, self._before = pairs, before
+        self._pairs = pairs
         self.folders = truth_folders(pairs)
         self.truth_seconds = self.late_seconds = 0.0
         self._lock: threading.RLock = threading.RLock() if before is None else before._lock
-        self._last: int | None = None
+        self._answered: deque[tuple[CachedPairs, int]] = deque() if before is None else before._answered
         self._made: dict[int, Pair] = {}
         self._truths: dict[int, PairTruth] = {}
+
+    def answered(self, number: int) -> bool:
+        """Let the truth of a pair be made from now on."""
+        if not tell_answered(self._pairs, number):
+            self._answered.append((self, number))
+        return True
 
     def pair(self, number: int) -> Pair:
         """Images of a pair."""
@@ -213,10 +226,9 @@ class CachedPairs:
             return found
         with self._lock:
             if number not in self._made:
-                for part in (self._before, self):
-                    if part is not None and part._last is not None:
-                        part._truth(part._last)
-                self._before, self._last = None, number
+                while self._answered:
+                    part, answered = self._answered.popleft()
+                    part._truth(answered)
                 self._made[number] = self._pairs.pair(number)
             return self._made[number]
 

@@ -200,6 +200,14 @@ def bench_dataset(shared: SharedFolder) -> Path:
 
 
 @pytest.fixture(scope="session")
+def secret_dataset(bench_dataset: Path, shared: SharedFolder) -> Path:
+    """The same with a seed of 128 bits, which sealing asks for. Read only."""
+    from helpers.sealed_sets import with_secret_seed
+
+    return shared.made("secret", lambda out: with_secret_seed(bench_dataset, out))
+
+
+@pytest.fixture(scope="session")
 def kinds_dataset(shared: SharedFolder) -> Path:
     """Data set of `tests/tiny_kinds.toml`: a generated room, a panorama and a mesh. Read only."""
     return rendered(shared, "kinds", ROOT / "tests" / "tiny_kinds.toml")
@@ -216,14 +224,14 @@ def method(tmp_path_factory: pytest.TempPathFactory) -> str:
 
 
 @pytest.fixture(scope="session")
-def sealed(bench_dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Any:
+def sealed(secret_dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Any:
     """Sealed set of 3 pairs, one of each sample, with its truth. Read only: copy it to change it."""
     from rich.console import Console
 
     from phibench.benchmark.sealed.sealed_set import seal
 
     folder = tmp_path_factory.mktemp("private")
-    shutil.copytree(bench_dataset, folder / "set")
+    shutil.copytree(secret_dataset, folder / "set")
     return seal(folder / "set", folder / "public", console=Console(quiet=True))
 
 

@@ -7,9 +7,10 @@ thread starts.
 Linux 5.13 and later have Landlock, see landlock(7): rules allow folders, the rest is denied. A seccomp filter denies
 sockets other than those between a process and its children. Landlock keeps signals within from Linux 6.12 on only, and
 never limits: the filter denies signals to the parent, which is the supervisor, and limits (prlimit) of other processes.
-Landlock has no rule for permissions, owners, times and attributes of files, nor for watching them: the filter denies
-those calls. Where the system gives a process its own view of the mounts, all but its folder is read-only there, and
-hidden folders are empty: they have neither names nor sizes nor times.
+Landlock has no rule for permissions, owners, times and attributes of files, nor for watching them, nor for
+priorities, cores and processor time of others: the filter denies those calls. Where the system gives a process its
+own view of the mounts, all but its folder is read-only there, and hidden folders are empty: they have neither names
+nor sizes nor times.
 
 Nothing here needs privileges or imports NumPy. `bwrap` and the package `landlock` were tried: docs/method.md.
 """
@@ -347,16 +348,22 @@ By descriptors too: who may read a file may have one, and its owner needs no mor
 """
 _DENIED = {machine: _ELSEWHERE[machine] + _PAST_RULES[machine] + _MARKS[machine] for machine in _MARKS}
 _SIGNALS = ("kill", "tkill", "tgkill", "rt_sigqueueinfo", "rt_tgsigqueueinfo")  # to their first argument
+_SCHEDULING = ("sched_setparam", "sched_setscheduler", "sched_setaffinity", "sched_setattr")  # of their first argument
+_CLOCKS = ("timer_create", "clock_gettime", "clock_nanosleep")
 _NUMBERS = {
     "x86_64": {
         **dict(zip(_SIGNALS, (62, 200, 234, 129, 297), strict=True)),
         **{"machine": 0xC000003E, "socket": 41, "socketpair": 53, "sendto": 44},
-        **{"prlimit64": 302, "fcntl": 72, "ioctl": 16},
+        **{"prlimit64": 302, "fcntl": 72, "ioctl": 16, "setpriority": 141, "ioprio_set": 251},
+        **dict(zip(_SCHEDULING, (142, 144, 203, 314), strict=True)),
+        **dict(zip(_CLOCKS, (222, 228, 230), strict=True)),
     },
     "aarch64": {
         **dict(zip(_SIGNALS, (129, 130, 131, 138, 240), strict=True)),
         **{"machine": 0xC00000B7, "socket": 198, "socketpair": 199, "sendto": 206},
-        **{"prlimit64": 261, "fcntl": 25, "ioctl": 29},
+        **{"prlimit64": 261, "fcntl": 25, "ioctl": 29, "setpriority": 140, "ioprio_set": 30},
+        **dict(zip(_SCHEDULING, (118, 119, 122, 274), strict=True)),
+        **dict(zip(_CLOCKS, (107, 113, 115), strict=True)),
     },
 }
 _LOAD, _EQUAL, _AT_LEAST, _AND, _RETURN = 0x20, 0x15, 0x35, 0x54, 0x06
@@ -365,11 +372,14 @@ _NUMBER, _MACHINE, _ARGUMENT = 0, 4, 16  # places in seccomp_data; an argument h
 _X32 = 0x40000000
 _AF_UNIX, _SOCK_DGRAM, _TYPE = 1, 2, 0xF
 _REQUESTS = {
-    # F_SETOWN(_EX), F_NOTIFY; FIOSETOWN, SIOCSPGRP; FS_IOC_SETFLAGS (two sizes), FSSETXATTR, SETVERSION, ENABLE_VERITY
-    "fcntl": (8, 15, 1026),
-    "ioctl": (0x8901, 0x8902, 0x40086602, 0x40046602, 0x401C5820, 0x40087602, 0x40806685),
+    # F_SETOWN(_EX), F_SETLEASE, F_NOTIFY, F_SET_(FILE_)RW_HINT; FIOSETOWN, SIOCSPGRP
+    "fcntl": (8, 15, 1024, 1026, 1036, 1038),
+    "ioctl": (0x8901, 0x8902),
 }
 """Second arguments that let the kernel signal any process when a file is ready, watch a folder, or mark a file."""
+_OF_FILE_SYSTEMS = tuple(kind << 8 for kind in (0x66, 0x76, 0x58, 0x94, 0xF5))
+"""Bits 8 to 15 of requests to file systems: flags, versions, attributes and clones, most of them for an owner without
+a right to write. "f" and "v" are ext4's and what is common, "X" those of XFS, then those of btrfs and F2FS."""
 _Line = tuple[int, int, int, int]
 
 
@@ -406,6 +416,10 @@ def _outward(numbers: dict[str, int], supervisor: int) -> list[_Line]:
         return [(_EQUAL, 0, len(body), numbers[name]), *body]
 
     lines = [line for name in _SIGNALS for line in denied(name, 0, (supervisor, -os.getpgid(supervisor), -1))]
+    lines += _of_other_processes(numbers)
+    kinds = [line for kind in _OF_FILE_SYSTEMS for line in ((_EQUAL, 0, 1, kind), deny)]
+    kinds = [(_LOAD, 0, 0, _ARGUMENT + 8), (_AND, 0, 0, 0xFF00), *kinds]
+    lines += [(_EQUAL, 0, len(kinds), numbers["ioctl"]), *kinds, (_LOAD, 0, 0, _NUMBER)]
     for name, requests in _REQUESTS.items():
         lines += denied(name, 1, requests)
     # prlimit(pid, resource, new, old): one's own limits have pid 0
@@ -413,6 +427,31 @@ def _outward(numbers: dict[str, int], supervisor: int) -> list[_Line]:
     for half in (0, 4):  # limits may be read: there is no pointer to new ones
         own += [(_LOAD, 0, 0, _ARGUMENT + 16 + half), (_EQUAL, 1, 0, 0), deny]
     return [*lines, (_EQUAL, 0, len(own) + 1, numbers["prlimit64"]), *own, allow]
+
+
+def _of_other_processes(numbers: dict[str, int]) -> list[_Line]:
+    """Part of the filter about priorities, cores and processor time of other processes, such as those of the run.
+
+    A process may change its own, by the number 0 or its own; a thread of it only itself. Changes of others would stay
+    from pair to pair, and their processor time tells what is being worked on.
+    """
+    deny, allow, own = (_RETURN, *_DENY), (_RETURN, *_ALLOW), (0, os.getpid())
+    lines: list[_Line] = []
+    for name in _SCHEDULING:
+        body = [(_LOAD, 0, 0, _ARGUMENT), (_EQUAL, 1, 0, own[0]), (_EQUAL, 0, 1, own[1]), allow, deny]
+        lines += [(_EQUAL, 0, len(body), numbers[name]), *body]
+    for name, of_process in (("setpriority", 0), ("ioprio_set", 1)):  # then the process, as a process and no group
+        body = [(_LOAD, 0, 0, _ARGUMENT), (_EQUAL, 1, 0, of_process), deny]
+        body += [(_LOAD, 0, 0, _ARGUMENT + 8), (_EQUAL, 1, 0, own[0]), (_EQUAL, 0, 1, own[1]), allow, deny]
+        lines += [(_EQUAL, 0, len(body), numbers[name]), *body]
+    for name in _CLOCKS:
+        # a negative clock is ~process << 3, with 4 for a thread, which must be one of the caller's; above 0 are clocks
+        # of the system and the caller's own; 3 in the lowest bits is that of a device
+        body = [(_LOAD, 0, 0, _ARGUMENT), (_AT_LEAST, 1, 0, 1 << 31), allow, (_AND, 0, 0, 4), (_EQUAL, 0, 1, 4), allow]
+        mine = [(_LOAD, 0, 0, _ARGUMENT), (_AND, 0, 0, 0xFFFFFFF8)]
+        mine += [line for one in own for line in ((_EQUAL, 0, 1, ~one << 3 & 0xFFFFFFFF), allow)]
+        lines += [(_EQUAL, 0, len(body) + len(mine) + 1, numbers[name]), *body, *mine, deny]
+    return lines
 
 
 def isolated_by(stream: TextIO) -> dict[str, Any]:

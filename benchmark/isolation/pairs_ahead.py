@@ -13,8 +13,9 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
-from dataclasses import dataclass
+from collections import deque
 from types import TracebackType
 from typing import Any
 
@@ -35,9 +36,10 @@ from phibench.estimator.pair_set import PairSet, PairTruth, truth_folders
 
 
 class PairsAhead:
-    """Pairs of a set and their truths, made by other processes before they are asked for in the order of their numbers.
+    """Pairs of a set and their truths, made by other processes; pairs before they are asked for, in order.
 
-    Making a pair takes as long as all built-in methods take on it. A context manager; its processes end with this one.
+    Making a pair takes as long as all built-in methods take on it. Its truth is made after all methods have answered it
+    (`pair_set.CachedPairs`). A context manager; its processes end with this one.
 
     Parameters
     ----------
@@ -53,13 +55,12 @@ class PairsAhead:
 
     def __init__(self, pairs: PairSet, processes: int) -> None:
         self._pairs, self.folders = pairs, truth_folders(pairs)
-        self._truths: dict[int, PairTruth] = {}
         self.seconds = {"draw": 0.0, "bounds": 0.0}
         told = pickle.dumps(pairs)
         self._makers: list[_Maker] = []
         try:
             for _ in range(min(processes, len(pairs))):
-                self._makers.append(_Maker())
+                self._makers.append(_Maker(self.seconds))
         except OSError as error:
             self._end()
             what = f"no process that draws pairs can be started: {error.strerror or error}; take --workers 1"
@@ -82,40 +83,47 @@ class PairsAhead:
 
     def pair(self, number: int) -> Pair:
         """Pair of a number; the one that comes after those in the making is asked for."""
-        maker = self._makers[number % len(self._makers)]
+        maker = self._maker(number)
         following = number + len(self._makers)
-        made = maker.made(number, following if following < len(self) else None)
-        self._truths[number] = made.truth
-        self.seconds["draw"] += made.draw_seconds
-        self.seconds["bounds"] += made.truth_seconds
-        return made.pair
+        made: Pair = maker.pair(number, following if following < len(self) else None)
+        return made
+
+    def answered(self, number: int) -> bool:
+        """Have the truth of a pair made; nobody waits for it here."""
+        with contextlib.suppress(TransportError):  # told when the truth is wanted
+            self._maker(number).ask(_TRUTH, number)
+        return True
 
     def truth(self, number: int) -> PairTruth:
-        """Exact answer of a pair, made with it."""
-        return self._truths.pop(number) if number in self._truths else self._pairs.truth(number)
+        """Exact answer of a pair."""
+        truth: PairTruth = self._maker(number).result(_TRUTH, number)
+        return truth
+
+    def _maker(self, number: int) -> _Maker:
+        return self._makers[number % len(self._makers)]
 
     def document(self) -> dict[str, Any]:
         """Provenance of the set."""
         return self._pairs.document()
 
 
-@dataclass(frozen=True)
-class _Made:
-    pair: Pair
-    truth: PairTruth
-    draw_seconds: float
-    truth_seconds: float
-
-
-_NOTHING = -1  # is asked for
+_PAIR, _TRUTH = "draw", "bounds"  # what a process is asked for, and what its time is counted as
 
 
 class _Maker:
-    """A process that makes one pair at a time; images come through shared memory, the rest over a socket."""
+    """A process that makes what it is asked for; images come through shared memory, the rest over a socket.
 
-    def __init__(self) -> None:
+    One pair at a time is asked for, as there is one memory for images. Threads may ask.
+    """
+
+    def __init__(self, seconds: dict[str, float]) -> None:
+        self._seconds = seconds
         self._socket, theirs = socket.socketpair()
-        self._line, self._reader, self._asked = Connection(self._socket), -1, _NOTHING
+        self._line, self._reader = Connection(self._socket), -1
+        self._sending, self._receiving = threading.Lock(), threading.Lock()
+        self._asked = deque[tuple[str, int]]()
+        self._ahead: int | None = None
+        self._results: dict[tuple[str, int], Any] = {}
         code = f"from {__name__} import make_pairs; make_pairs()"
         with theirs:
             self._process = subprocess.Popen(
@@ -129,24 +137,41 @@ class _Maker:
         """Give the pickled set, and ask for the first pair."""
         with contextlib.suppress(TransportError):  # told when the pair is wanted
             self._line.send(told)
-            self._ask(first)
+        self._ask_ahead(first)
 
-    def made(self, number: int, following: int | None) -> _Made:
-        """Pair of a number; then the next one is asked for.
+    def pair(self, number: int, following: int | None) -> Any:
+        """Pair of a number; then the next one is asked for. Raises as `result`."""
+        ahead, self._ahead = self._ahead, None
+        if ahead not in (number, None):  # nobody wants it any more
+            with contextlib.suppress(Exception):
+                self.result(_PAIR, ahead)
+        made = self.result(_PAIR, number)
+        if following is not None:
+            self._ask_ahead(following)
+        return made
+
+    def _ask_ahead(self, number: int) -> None:
+        self._ahead = number
+        with contextlib.suppress(TransportError):  # told when the pair is wanted
+            self.ask(_PAIR, number)
+
+    def result(self, kind: str, number: int) -> Any:
+        """A pair or a truth that was asked for, or is asked for now.
 
         Raises
         ------
         DatasetError
             If the process has died. What it raised itself is raised here.
         """
+        wanted = kind, number
         try:
-            if self._asked not in (number, _NOTHING):
-                self._received()  # nobody wants it any more
-            if self._asked != number:
-                self._ask(number)
-            made = self._received()
-            if following is not None:
-                self._ask(following)
+            self.ask(*wanted)
+            with self._receiving:
+                while wanted not in self._results:
+                    found = self._received()
+                    self._results[self._asked[0]] = found
+                    self._asked.popleft()
+                made = self._results.pop(wanted)
         except TransportError as error:
             what = "a process that draws pairs died; most often memory has run out: take fewer --workers"
             raise DatasetError(what) from error
@@ -154,23 +179,25 @@ class _Maker:
             raise made
         return made
 
-    def _ask(self, number: int) -> None:
-        self._line.send(str(number).encode())
-        self._asked = number
+    def ask(self, kind: str, number: int) -> None:
+        """Ask for a pair or a truth, unless it is asked for or there."""
+        with self._sending:
+            if (kind, number) not in self._results and (kind, number) not in self._asked:
+                self._asked.append((kind, number))
+                self._line.send(f"{kind} {number}".encode())
 
-    def _received(self) -> _Made | BaseException:
+    def _received(self) -> Any:
         kind, *told = pickle.loads(self._line.receive())
         if kind == "error":
-            self._asked, error = _NOTHING, told[0]
-            return error if isinstance(error, BaseException) else DatasetError(str(error))
+            return told[0] if isinstance(told[0], BaseException) else DatasetError(str(told[0]))
         if kind == "memory":
             _, handles, _, _ = socket.recv_fds(self._socket, 1, 1)
             self._give_back()
             self._reader, self._pages = handles[0], SharedPages(handles[0])
             return self._received()
-        self._asked = _NOTHING
-        message, *others = told
-        return _Made(unpack(message, self._pages).pair, *others)
+        made, seconds = told
+        self._seconds[kind] += seconds
+        return unpack(made, self._pages).pair if kind == _PAIR else made
 
     def _give_back(self) -> None:
         if self._reader >= 0:
@@ -203,26 +230,25 @@ class _Making:
     def answer_all(self) -> None:
         told, pairs = self._line.receive(most=1 << 30), None
         while True:
-            number = int(self._line.receive())
+            kind, _, number = self._line.receive().decode().partition(" ")
             try:
                 pairs = pairs or pickle.loads(told)
-                self._answer(pairs, number)
+                start = time.process_time()
+                made = pairs.pair(int(number)) if kind == _PAIR else pairs.truth(int(number))
+                seconds = time.process_time() - start
+                self._send(kind, self._packed(made) if kind == _PAIR else made, seconds)
             except TransportError:
                 raise
             except Exception as error:
                 self._send("error", _picklable(error))
 
-    def _answer(self, pairs: PairSet, number: int) -> None:
-        start = time.process_time()
-        pair = pairs.pair(number)
-        drawn = time.process_time()
-        truth = pairs.truth(number)
-        seconds = drawn - start, time.process_time() - drawn
+    def _packed(self, pair: Pair) -> bytes:
+        """The message of a pair, whose images lie in the memory that both sides have."""
         if self._memory is None or self._memory.size < needed_bytes(pair):
             self._memory = MemoryFile(max(needed_bytes(pair), LEAST_BYTES))
             self._send("memory")
             socket.send_fds(self._socket, [b"m"], [self._memory.reader])
-        self._send("pair", pack(pair, self._memory), truth, *seconds)
+        return pack(pair, self._memory)
 
     def _send(self, *told: object) -> None:
         self._line.send(pickle.dumps(told, protocol=5))

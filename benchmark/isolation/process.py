@@ -145,8 +145,9 @@ def _last_stack(text: str) -> Iterator[tuple[str, str, str]]:
 
 _KEPT = re.compile(
     r"PATH|HOME|USER|LOGNAME|SHELL|LANG|LC_\w+|TZ|VIRTUAL_ENV|PYTHONHOME|LD_LIBRARY_PATH|DYLD_LIBRARY_PATH|XDG_CACHE_HOME"
-    r"|(OMP|MKL|OPENBLAS|NUMBA|CUDA|NVIDIA|TORCH|TF|JAX|XLA)_\w+"
+    r"|(OMP(?!_PROC_BIND|_PLACES)|MKL|OPENBLAS|NUMBA|CUDA|NVIDIA|TORCH|TF|JAX|XLA)_\w+"
 )
+"""Of OpenMP not what binds threads to cores: a process may bind its first thread alone."""
 
 
 def environment(folder: str, inherited: Mapping[str, str]) -> dict[str, str]:

@@ -8,13 +8,15 @@ rest is readable. The same holds for what is found in the method's folder: folde
 from __future__ import annotations
 
 import os
+import site
 import sys
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 from phibench.benchmark.isolation.isolation import Access
 from phibench.benchmark.isolation.resolve import MethodError, Reference, RunLimits
-from phibench.datasets.store.schema import SEALED_TRUTH, TruthFile, TruthFolder
+from phibench.datasets.store.schema import RECORDS_SO_FAR, SEALED_TRUTH, TruthFile, TruthFolder
 
 
 def access_of(reference: Reference, limits: RunLimits, hidden: Sequence[Path] = ()) -> Access:
@@ -46,6 +48,8 @@ def access_of(reference: Reference, limits: RunLimits, hidden: Sequence[Path] = 
         if told := sorted(_FOLDERS & {entry.name for entry in _entries(folder)}):
             raise MethodError(f"{title} lies in {folder}, which holds the truth ({told[0]}): move it out")
         secret += truth_near(folder, secret)
+    for place in _search_places():  # Python may read them whole
+        secret += truth_near(place, secret, f"PYTHONPATH or a .pth file names {place}, which", "leave it out")
     for name in (sys.prefix, sys.base_prefix, __file__):
         _outside(Path(name), secret, f"Python's {name}")
     return Access(tuple(map(str, readable)), tuple(map(str, secret)), limits.fresh)
@@ -66,7 +70,27 @@ _FILES = frozenset(str(name) for name in TruthFile)
 _HEAD_BYTES = 256  # of a score's JSON, whose first field is its kind
 
 
-def truth_near(folder: Path, secret: Sequence[Path] = ()) -> list[Path]:
+def _search_places() -> list[Path]:
+    """Folders that `PYTHONPATH` and .pth files name, but installations: a checkout may have data sets in it."""
+    named = [part for part in os.environ.get("PYTHONPATH", "").split(os.pathsep) if part]
+    for folder in map(Path, site.getsitepackages()):
+        for file in folder.glob("*.pth"):
+            with suppress(OSError):
+                named += [line for line in file.read_text(errors="replace").splitlines() if line.startswith("/")]
+    places = [Path(name).resolve() for name in dict.fromkeys(named)]
+    prefixes = {Path(name).resolve() for name in (sys.prefix, sys.base_prefix)}
+    return [
+        place
+        for place in places
+        if place.is_dir()
+        and not place.name.endswith("-packages")  # site-packages, dist-packages
+        and not any(place.is_relative_to(prefix) for prefix in prefixes)
+    ]
+
+
+def truth_near(
+    folder: Path, secret: Sequence[Path] = (), title: str = "", advice: str = "put the method into one of its own"
+) -> list[Path]:
     """Folders and files with truth in a folder and all below it; files of `secret` by other names.
 
     Raises
@@ -92,7 +116,7 @@ def truth_near(folder: Path, secret: Sequence[Path] = ()) -> list[Path]:
             below += [path / entry.name for entry in entries if entry.is_dir(follow_symlinks=False)]
         if left < 0:
             most = f"more than {_MOST_ENTRIES} files, too many to look for the truth in"
-            raise MethodError(f"the folder of the method, {folder}, holds {most}: put the method into one of its own")
+            raise MethodError(f"{title or f'the folder of the method, {folder},'} holds {most}: {advice}")
         level = [path for path in below if path not in passed]
     return [*found, *(_same_files(linked, secret) if linked else ())]
 
@@ -105,9 +129,9 @@ def _entries(path: Path) -> list[os.DirEntry[str]]:
 
 
 def _holds_truth(folder: Path, name: str, names: set[str]) -> bool:
-    """Tell a file of the store's list, a sealed truth, and the two files of a score."""
+    """Tell a file of the store's list, a sealed truth, and the files of a score."""
     stem, _, kind = name.rpartition(".")
-    if name in _FILES or name.endswith(SEALED_TRUTH):
+    if name in _FILES or name.endswith((SEALED_TRUTH, RECORDS_SO_FAR)):
         return True
     if kind not in ("json", "parquet") or not {f"{stem}.json", f"{stem}.parquet"} <= names:
         return False

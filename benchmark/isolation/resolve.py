@@ -142,7 +142,7 @@ def _of_file(reference: str) -> Reference:
         raise MethodError(f"method '{reference}': the file {path} {what}; {advice}")
     if path.name != printable_line(path.name):
         raise MethodError(f"method '{printable_line(path.name)}': give the file a name of at most 200 printable signs")
-    _require_python(path)
+    parsed(path)
     hashed, modules = sha256(path), tuple((name, sha256(path.parent / name)) for name in modules_beside(path))
     # names of files may hold bytes that are no text, and what a terminal obeys
     return Reference(f"{printable_line(path.stem)}:{function}", "file", str(path), function, hashed, modules=modules)
@@ -180,8 +180,8 @@ def modules_beside(path: Path) -> list[str]:
 def _imported(file: Path, folder: Path) -> Iterator[Path]:
     """Files below a folder that a file imports, packages with their `__init__.py`."""
     try:
-        nodes = list(ast.walk(ast.parse(file.read_bytes())))
-    except (SyntaxError, ValueError, RecursionError, MemoryError, OSError):
+        nodes = list(ast.walk(parsed(file)))
+    except (MethodError, OSError):
         return  # the worker says what is wrong with it
     package = file.parent.relative_to(folder).parts
     for node in nodes:
@@ -210,10 +210,18 @@ def _files_of(name: tuple[str, ...], folder: Path) -> Iterator[Path]:
 _MOST_BYTES = 16 * MIB  # of a method's file
 
 
-def _require_python(path: Path) -> None:
-    """Compile the file, which runs nothing of it."""
+def parsed(path: Path) -> ast.Module:
+    """Syntax tree of a Python file that can be compiled; nothing of it is run.
+
+    Raises
+    ------
+    MethodError
+        If Python cannot read the file.
+    """
     try:
-        compile(InputFile(path, "give a Python file", limit_bytes=_MOST_BYTES).read(), str(path), "exec", 0, True)
+        tree = ast.parse(InputFile(path, "give a Python file", limit_bytes=_MOST_BYTES).read(), str(path))
+        compile(tree, str(path), "exec", 0, True)
+        return tree
     except SyntaxError as error:
         line = "" if error.lineno is None else f", line {error.lineno}"
         raise MethodError(f"{path.name}{line}: {error.msg}: Python cannot read the file") from error

@@ -24,7 +24,7 @@ from phibench.benchmark.isolation.process import MethodProcess, outcome_of
 from phibench.benchmark.isolation.resolve import MethodError, Reference, RunLimits, resolve
 from phibench.benchmark.isolation.worker import reply_of, require_method
 from phibench.estimator.interface import Method, Outcome, Pair
-from phibench.estimator.pair_set import PairSet, truth_folders
+from phibench.estimator.pair_set import PairSet, tell_answered, truth_folders
 
 T = TypeVar("T")
 
@@ -172,6 +172,7 @@ class Harness:
                 raise
             asked = zip(self._pools, self._turns, strict=True)
             done = self._in_order([pool.ask(pair, turns, place) for pool, turns in asked])
+            tell_answered(pairs, number)
             for failed, outcome in zip(self._failed, done, strict=True):
                 if outcome.failure and outcome.output:
                     failed[number] = outcome.output

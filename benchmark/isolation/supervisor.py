@@ -53,6 +53,8 @@ def _be_worker(supervisor: int, line: int, reader: int) -> None:
     _prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != supervisor:  # it died before it could have told
         os._exit(1)
+    with contextlib.suppress(OSError):  # where memory runs out, the system ends this process first, and not the run
+        Path("/proc/self/oom_score_adj").write_text("1000")
     from phibench.benchmark.isolation.isolation import isolated_by  # after the fork: the supervisor stays small
 
     isolation = isolated_by(sys.stdin)

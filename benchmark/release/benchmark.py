@@ -117,14 +117,16 @@ def drawn_numbers(text: str) -> tuple[int, int | None]:
 
 
 def _sha256(values: dict[str, Any]) -> str:
-    return hashlib.sha256(json.dumps(values, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+    text = json.dumps(values, sort_keys=True, separators=(",", ":"), default=str)  # TOML has dates
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _without_numbers(values: dict[str, Any]) -> dict[str, Any]:
-    left_out = {"dataset": "seed", "random": "samples"}
-    plain = {name: table for name, table in values.items() if name not in left_out}
-    tables = {name: values[name] for name in left_out if name in values}
-    return plain | {name: {k: v for k, v in table.items() if k != left_out[name]} for name, table in tables.items()}
+    found = dict(values)
+    for name, left_out in (("dataset", "seed"), ("random", "samples")):
+        if isinstance(table := values.get(name), dict):
+            found[name] = {key: value for key, value in table.items() if key != left_out}
+    return found
 
 
 # Documents of a release.

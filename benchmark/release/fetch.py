@@ -16,7 +16,7 @@ import shutil
 import tarfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import IO, TYPE_CHECKING, Any
 
 from rich.console import Console
@@ -258,7 +258,10 @@ def unpack(archive: Path, folder: Path, title: str, most: int, files: int) -> No
             members[name] = (place, size)
             if len(members) > files:
                 raise DatasetError(f"{archive.name} holds more files {_SAID}")
-        if len(there | set(members)) > files:
+        names = there | set(members)
+        if twice := sorted(names & {parent.as_posix() for name in names for parent in PurePosixPath(name).parents}):
+            raise DatasetError(f"{archive.name} holds {twice[0]} as a file and as a folder; ask who made the release")
+        if len(names) > files:
             raise DatasetError(f"{archive.name} and {folder} hold more files {_SAID}, or move away what is yours there")
         held = sum((folder / name).lstat().st_size for name in there - set(members))
         if held + sum(size for _, size in members.values()) > most:

@@ -250,7 +250,9 @@ def _misfit(request: ReleaseRequest, part: ReleasePart, folder: Path) -> str:
     info = FILM_INFO if part.kind == "films" else schema.INFO
     if not (folder / info).is_file() or not (folder / schema.RECIPE).is_file():
         return _OTHER
-    text = InputFile(folder / schema.RECIPE, "mend it").text()
+    file = InputFile(folder / schema.RECIPE, "put the right one back")
+    text = file.text()
+    file.toml_of(text)
     if not same_but_drawn(text, part.text()):
         return _OTHER
     if not (folder / schema.CHECKSUMS).is_file():
@@ -401,8 +403,11 @@ def _sample_count(part: ReleasePart, folder: Path) -> int:
     name, key = {"pairs": (schema.INFO, "samples"), "sealed": (_SEAL, "pairs"), "films": (FILM_INFO, "films")}[
         part.kind
     ]
-    value = InputFile(folder / name, "run `phibench dataset repair`").json()[key]
-    return len(value) if isinstance(value, list) else int(value)
+    file = InputFile(folder / name, "run `phibench dataset repair`")
+    value = file.json().get(key)
+    if isinstance(value, bool) or not isinstance(value, int | list):
+        raise file.fault(f"does not say how many {key} there are")
+    return len(value) if isinstance(value, list) else value
 
 
 # What lies beside the archives.

@@ -35,7 +35,15 @@ from phibench.estimator.limits.off_frame_bound import FrameCounts, on_off_limit,
 from phibench.estimator.limits.position_bound import SpotLimit, spot_limit
 from phibench.estimator.limits.processed_bound import chain_limit
 from phibench.estimator.limits.spot_snr import processed_snr, raw_snr
-from phibench.estimator.pair_set import LEAST_BOX_PX, Distraction, ImageTruth, PairSet, PairTruth, truth_folders
+from phibench.estimator.pair_set import (
+    LEAST_BOX_PX,
+    Distraction,
+    ImageTruth,
+    PairSet,
+    PairTruth,
+    tell_answered,
+    truth_folders,
+)
 from phibench.estimator.spots.gaussian_spot import SpotBlur
 from phibench.estimator.spots.image_planes import PROCESSED
 from phibench.estimator.spots.spot_prediction import spot_blur
@@ -97,6 +105,10 @@ class DatasetPairs(DrawnPairs, ShortForm):
 
     def truth(self, number: int) -> PairTruth:
         """The exact answer, with the bounds of the image and of the raw pixels behind it."""
+        with self.named(number):
+            return self._truth(number)
+
+    def _truth(self, number: int) -> PairTruth:
         pair_draw, sample, source = self.drawn_from(number)
         sensor = source.sides["down"].chain.sensor
         return PairTruth(
@@ -278,7 +290,7 @@ def _distractions(sample: CachedSample, side: PositionLight, position: str) -> t
 
 @dataclass(frozen=True)
 class SpotBounds:
-    """Light and bounds of one spot in one image; the attributes are those of `pair_set.SpotTruth`."""
+    """Light and bounds of one spot in one image; the attributes are those of `pair_set.ImageTruth`."""
 
     electrons: float
     peak_e: float
@@ -428,6 +440,10 @@ class CalibratedPairs:
             stroke_m=self._stroke_m(seen.stroke_m),
             calibration_covariance=self._covariance,
         )
+
+    def answered(self, number: int) -> bool:
+        """Tell the set that all methods have answered a pair."""
+        return tell_answered(self.pairs, number)
 
     def truth(self, number: int) -> PairTruth:
         """The exact answer."""

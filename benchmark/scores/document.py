@@ -10,7 +10,8 @@ import hashlib
 import io
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -28,7 +29,7 @@ from phibench.datasets.errors import DatasetError
 from phibench.datasets.input_files import InputFile, Name
 from phibench.datasets.store.files import sha256, write_bytes, write_text
 from phibench.datasets.store.provenance import code_behind, provenance
-from phibench.datasets.store.schema import Document
+from phibench.datasets.store.schema import RECORDS_SO_FAR, Document
 from phibench.datasets.version import program_version
 from phibench.estimator.limits.beyond_images import excesses
 from phibench.scenes.validation import printable_line
@@ -366,12 +367,46 @@ def write_score(path: Path, document: ScoreDocument, records: pl.DataFrame) -> S
     """Write records, then the document that names their hash; both complete or not at all."""
     if path.suffix != ".json":
         raise DatasetError(f"{path}: a score is a JSON file; give a name that ends in .json")
-    buffer = io.BytesIO()
-    records.write_parquet(buffer)
-    target = write_bytes(parquet_path(path), buffer.getvalue())
+    target = write_bytes(parquet_path(path), _parquet(records))
     complete = document.model_copy(update={"records": target.name, "records_sha256": sha256(target)})
     write_text(path, json.dumps(complete.model_dump(mode="json"), indent=1, allow_nan=False) + "\n")
     return complete
+
+
+class UnfinishedError(DatasetError):
+    """A data set that became unreadable in the middle of a run; `records` are of the pairs before, by method."""
+
+    def __init__(self, reason: str, records: Sequence[pl.DataFrame], pairs: int) -> None:
+        super().__init__(reason)
+        self.records, self.pairs = records, pairs
+
+
+@contextmanager
+def records_kept(files: Sequence[Path | None]) -> Iterator[None]:
+    """Write the records of a run that ends before its time, beside the files of its scores.
+
+    Raises
+    ------
+    DatasetError
+        With the sample that could not be read, and the files.
+    """
+    try:
+        yield
+    except UnfinishedError as error:
+        written = [
+            write_bytes(file.with_suffix(RECORDS_SO_FAR), _parquet(records))
+            for file, records in zip(files, error.records, strict=True)
+            if file is not None and error.pairs
+        ]
+        kept = f"the records of the {error.pairs} pairs before it are in {', '.join(map(str, written))}; "
+        advice = "run `phibench dataset repair`, then " if str(error).startswith("sample") else ""
+        raise DatasetError(f"{error}; {kept if written else ''}{advice}score again") from error
+
+
+def _parquet(records: pl.DataFrame) -> bytes:
+    buffer = io.BytesIO()
+    records.write_parquet(buffer)
+    return buffer.getvalue()
 
 
 def read_score(path: Path) -> ScoreDocument:

@@ -11,7 +11,7 @@ import sys
 import time
 import webbrowser
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -34,8 +34,10 @@ from phibench.benchmark.scores.dataset_pairs import (
 from phibench.benchmark.scores.document import (
     MethodCard,
     ScoreDocument,
+    UnfinishedError,
     Worst,
     document_of,
+    records_kept,
     write_score,
 )
 from phibench.benchmark.scores.records import in_order, missed_relative, record_table, with_missed
@@ -129,15 +131,15 @@ def score_methods(
     while following is not None:
         # the next pairs are asked for first: methods work on them while these are examined
         (held, asked), following = following, next(batches, None)
-        answers = []
-        for outcomes in asked:
-            answers.append(outcomes)
-            told(answered + len(answers))
+        answers: list[tuple[Outcome, ...]] = []
+        try:
+            for outcomes in asked:
+                answers.append(outcomes)
+                told(answered + len(answers))
+            _examine_each(parts, held, answers, rules, stages)
+        except DatasetError as error:
+            raise _unfinished(error, parts, held, answers, rules) from error
         answered += len(answers)
-        fits = KeptFits()
-        for part, outcomes in zip(parts, zip(*answers, strict=True), strict=True):
-            with _timed("statistics", stages):
-                part.append(examine(held, outcomes, rules, part[-1].leading if part else None, fits))
         if stages is not None:
             for stage, seconds in (("bounds", held.truth_seconds), (_LATE, held.late_seconds)):
                 stages[stage] = stages.get(stage, 0.0) + seconds
@@ -145,6 +147,39 @@ def score_methods(
         return [
             _scored(method, pairs, part, rules, seed, limits or {}) for method, part in zip(methods, parts, strict=True)
         ]
+
+
+def _examine_each(
+    parts: list[list[Examined]],
+    held: CachedPairs,
+    answers: Sequence[tuple[Outcome, ...]],
+    rules: Rules,
+    stages: dict[str, float] | None = None,
+) -> None:
+    """Examine the answers of every method on the same pairs; all are added, or none."""
+    fits, added = KeptFits(), []
+    for part, outcomes in zip(parts, zip(*answers, strict=True), strict=True):
+        with _timed("statistics", stages):
+            added.append(examine(held, outcomes, rules, part[-1].leading if part else None, fits))
+    for part, one in zip(parts, added, strict=True):
+        part.append(one)
+
+
+def _unfinished(
+    error: DatasetError,
+    parts: list[list[Examined]],
+    held: CachedPairs,
+    answers: Sequence[tuple[Outcome, ...]],
+    rules: Rules,
+) -> DatasetError:
+    """The error with the records of the pairs before; of a pair whose truth cannot be read there are none."""
+    with suppress(DatasetError):
+        if answers:
+            _examine_each(parts, held, answers, rules)
+    if not all(parts):
+        return error
+    records = [pl.concat([part.records for part in own]) for own in parts]
+    return UnfinishedError(str(error), records, records[0]["number"].n_unique())
 
 
 def _asked(pairs: PairSet, ask: Ask) -> Iterator[tuple[CachedPairs, Iterable[tuple[Outcome, ...]]]]:
@@ -284,7 +319,8 @@ def score(
         require_writable(Path(out))
     chosen = wanted_pairs(opened, preset, draws, pairs, hints, calibration, boxes_px, sensor, frames)
     if isinstance(method, str):
-        (scored,) = run_and_score([method], chosen, workers, console, "pairs", seed, limits)
+        with records_kept([None if out is None else Path(out)]):
+            (scored,) = run_and_score([method], chosen, workers, console, "pairs", seed, limits)
     else:
         if limits is not None or workers != 1:
             raise MethodError("limits and workers are for methods in a process of their own: give FILE.py:FUNCTION")
@@ -377,9 +413,10 @@ def bench(
         notes += [f"{name} is left out on {preset}: {why}" for name, why in refusals.items() if why]
         names = [name for name, why in refusals.items() if not why]
         stages: dict[str, float] = {}
-        done = run_and_score(names, taken, workers, console, preset, limits=limits, stages=stages)
-        times[preset] = {stage: seconds / len(taken) for stage, seconds in stages.items()}
         paths = [out / f"{preset}-{name}.json" for name in names]
+        with records_kept(paths):
+            done = run_and_score(names, taken, workers, console, preset, limits=limits, stages=stages)
+        times[preset] = {stage: seconds / len(taken) for stage, seconds in stages.items()}
         saved_each(done, paths)
         scores += paths
     if not scores:

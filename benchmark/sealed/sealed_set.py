@@ -173,7 +173,9 @@ def seal(folder: str | Path, public: str | Path, preset: str | None = None, cons
         If the data set or the folder will not do; then nothing is left behind.
     """
     public, console = Path(public), console or progress_console()
-    pairs = single_pairs(dataset_pairs(open_finished(folder), preset))
+    dataset = open_finished(folder)
+    check_seed(Path(folder), dataset.recipe.dataset.seed)
+    pairs = single_pairs(dataset_pairs(dataset, preset))
     _check_folder(public, Path(folder))
     try:
         with folder_for_work(public.parent), OwnedFolder("seal", public.parent) as work:
@@ -226,19 +228,17 @@ def sequence_warnings(recipe: Recipe) -> tuple[str, ...]:
     )
 
 
-def seed_warnings(name: str, seed: int) -> tuple[str, ...]:
-    """Sentences about a seed that everybody knows or can find; none about a good one."""
-    if (RECIPES / f"{name}.toml").is_file() and load_recipe(name).dataset.seed == seed:
-        return (
-            f"seed {seed} is that of the shipped recipe '{name}': whoever has phibench can render the same truth, so "
-            "seal a set that was made with --secret-seed FILE",
-        )
+def check_seed(folder: Path, seed: int) -> None:
+    """Refuse a seed that can be found: that of a shipped recipe, or any short one.
+
+    Public strokes and rigs confirm a guess without a judge (`secret_seed`).
+    """
     if seed < LEAST_SECRET_SEED:
-        return (
-            f"seed {seed} is short: the rigs in {PAIRS} show which seed they were drawn from to whoever tries all, so "
-            "seal a set that was made with --secret-seed FILE, which has 128 bits of the system",
+        raise DatasetError(
+            f"{folder} cannot be sealed: its seed is shorter than 128 bits, and the rigs in {PAIRS} would show it to "
+            "whoever tries all; make the data set anew with `phibench dataset make RECIPE --secret-seed FILE --out "
+            "FOLDER`, where the system draws the seed"
         )
-    return ()
 
 
 def _seal(pairs: DatasetPairs, folder: Path, work: Path, public: Path, console: Console) -> Sealed:
@@ -269,11 +269,7 @@ def _seal(pairs: DatasetPairs, folder: Path, work: Path, public: Path, console: 
     truth_file = write_secret(folder / _TRUTH_FILE.format(document.id), text)  # first: no seal without its truth
     _publish(work, public)
     name, recipe = pairs.dataset.info.name, pairs.dataset.recipe
-    warnings += (
-        *seed_warnings(name, recipe.dataset.seed),
-        *sequence_warnings(recipe),
-        *board_warnings(name, recipe),
-    )
+    warnings += (*sequence_warnings(recipe), *board_warnings(name, recipe))
     return Sealed(public, truth_file, document, warnings)
 
 

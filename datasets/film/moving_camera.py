@@ -19,7 +19,7 @@ from rich.console import Console
 
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.frames.request import in_one_sentence
-from phibench.datasets.input_files import InputFile
+from phibench.datasets.input_files import FileName, InputFile
 from phibench.datasets.parallel import parallel_map
 from phibench.datasets.progress import Steps, progress_console
 from phibench.datasets.rooms.room_sources import GeneratedRoom
@@ -51,7 +51,7 @@ _TRIES = 20  # properties that leave no place for a lamp are drawn again
 class BakedRoomInfo(Document):
     """One room of `rooms.json`."""
 
-    name: str = described("-", "name of the room")
+    name: FileName = described("-", "name of the room")
     source: dict[str, Any] = described("-", "what the room is made from, field by field")
     digest: str = described("-", "SHA-256 of all that the room is")
     texel_m: float = described("m", "size of the light map's texels")

@@ -120,7 +120,7 @@ class FrameRow(Document):
     kind: Literal["frame", "preview"] = described("-", "'frame', or 'preview': a picture for people")
     values: str = described("-", "meaning of the numbers in the file")
     dataset: str = described("-", "name of the data set")
-    dataset_seed: int = described("-", "its seed")
+    dataset_seed: int = described("-", "its seed; in `frames.parquet` a text if it has 128 bits")
     sample_id: str = described("-", "id of the sample, in the data set's manifest")
     position: Position = described("-", "stroke position, 'down' or 'up'")
     laser: Literal["on", "off"] = described("-", "'on' or 'off'")

@@ -289,8 +289,14 @@ def to_table(rows: Sequence[ManifestRow]) -> DataFrame:
     return model_table(ManifestRow, rows).with_columns(drawn)
 
 
+_LARGEST_INTEGER = 2**63 - 1
+
+
 def model_table(model: type[Document], rows: Sequence[Document]) -> DataFrame:
-    """Documents of one model as a polars table; free-form objects, such as a sensor's numbers, are JSON texts."""
+    """Documents of one model as a polars table; free-form objects, such as a sensor's numbers, are JSON texts.
+
+    A column with a secret seed, of 128 bits, is one of texts.
+    """
     import polars
 
     documents = [row.model_dump(mode="json") for row in rows]
@@ -299,6 +305,8 @@ def model_table(model: type[Document], rows: Sequence[Document]) -> DataFrame:
         types[name] = _column_type(field.annotation)
         values = [_leaf(document, name) for document in documents]
         data[name] = [json.dumps(value) if isinstance(value, dict) else value for value in values]
+        if types[name] == polars.Int64 and any(value is not None and value > _LARGEST_INTEGER for value in values):
+            types[name], data[name] = polars.String, [str(value) for value in values]
     return polars.DataFrame(data, schema=types)
 
 

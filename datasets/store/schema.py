@@ -364,6 +364,8 @@ class TruthFile(StrEnum):
 
 SEALED_TRUTH = ".truth.json"
 """Ending of the names of files with the truth of a sealed set."""
+RECORDS_SO_FAR = ".so-far.parquet"
+"""Ending of the names of files with the records of a score that could not be finished."""
 INFO = TruthFolder.DATASET.value
 MANIFEST = TruthFile.MANIFEST.value
 TABLE = TruthFile.TABLE.value

@@ -104,7 +104,7 @@ def score(
         JSON file for the score, records beside it as Parquet; with several methods their names are added to it.
     """
     from phibench.benchmark.isolation.resolve import resolve
-    from phibench.benchmark.scores.document import MethodCard
+    from phibench.benchmark.scores.document import MethodCard, records_kept
     from phibench.benchmark.scores.score import open_scored, run_and_score, saved_each, wanted_pairs
     from phibench.benchmark.scores.score_tables import print_scores
     from phibench.datasets.errors import DatasetError
@@ -121,7 +121,9 @@ def score(
     for target in filter(None, files):
         require_writable(target)
     pair_set = wanted_pairs(open_scored(directory), preset, draws, pairs, hints, calibration, boxes, sensor, frames)
-    scored = run_and_score(method, pair_set, workers, progress_console(), "pairs", _seed(bootstrap_seed), run_limits)
+    console, number = progress_console(), _seed(bootstrap_seed)
+    with records_kept(files):
+        scored = run_and_score(method, pair_set, workers, console, "pairs", number, run_limits)
     if targets := [file for file in files if file is not None]:
         scored = saved_each(scored, targets)
     print_scores(scored, form, rank, output.wide, calibration is not None)

@@ -20,7 +20,7 @@ from phibench.benchmark.isolation.answers import plain, to_bytes
 from phibench.benchmark.isolation.isolation import Isolation
 from phibench.benchmark.isolation.process import GuestProcess, advised
 from phibench.benchmark.isolation.readable_files import access_of
-from phibench.benchmark.isolation.resolve import MethodError, Reference, RunLimits, resolve
+from phibench.benchmark.isolation.resolve import MethodError, Reference, RunLimits, parsed, resolve
 from phibench.benchmark.isolation.transport import Connection, TransportError
 from phibench.benchmark.isolation.worker import function_of_file, limited, sentence_of, size_bytes
 from phibench.robot.loop.policies import Policy
@@ -86,9 +86,9 @@ def _names(path: Path) -> set[str]:
         If it is no Python.
     """
     try:
-        tree = ast.parse(path.read_bytes())
-    except (SyntaxError, ValueError) as error:
-        raise SceneError(f"{path} is no Python file: {error}") from error
+        tree = parsed(path)
+    except MethodError as error:
+        raise SceneError(f"policy in {error}") from error
     found: set[str] = set()
     for node in tree.body:
         if isinstance(node, ast.FunctionDef | ast.ClassDef):

@@ -9,7 +9,9 @@ from __future__ import annotations
 import contextlib
 import json
 import random
+import resource
 import signal
+import sys
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -37,7 +39,10 @@ from phibench.datasets.read import open_finished
 from phibench.datasets.store.checksums import checksums_text, read_checksums
 from phibench.datasets.store.documents import differences
 
-PATIENCE_S = 60  # far above the slowest case, 0.3 s, on a machine with other work
+PATIENCE_S = 60  # far above the slowest case, on a machine with other work
+CPU_S = 10.0  # of one case
+MOST_BYTES = 2e9  # resident, of the whole process
+RSS_BYTES = 1 if sys.platform == "darwin" else 1024  # unit of ru_maxrss
 KINDS = (
     *("recipe.toml", "settings.toml", "calibration.json", "score.json", "records.parquet", "layer.exr", "picture.png"),
     *("submission.json", "truth.json", "study.json", "frames.jsonl", "journal.txt"),
@@ -50,18 +55,26 @@ KEPT = {"database": None, "deadline": None, "derandomize": True, "suppress_healt
 
 @contextlib.contextmanager
 def soon() -> Iterator[None]:
-    """A case that does not end fails."""
+    """A case that waits or works without end fails, and one that takes too much memory."""
 
-    def late(*_: object) -> None:
-        raise AssertionError(f"no end after {PATIENCE_S} s")
+    def late(number: int, _: object) -> None:
+        raise AssertionError(f"no end: {signal.Signals(number).name}")
 
-    before = signal.signal(signal.SIGALRM, late)
-    signal.alarm(PATIENCE_S)
+    clocks = {
+        signal.SIGALRM: (signal.ITIMER_REAL, float(PATIENCE_S)),
+        signal.SIGPROF: (signal.ITIMER_PROF, CPU_S),
+    }
+    before = {number: signal.signal(number, late) for number in clocks}
     try:
+        for clock, seconds in clocks.values():
+            signal.setitimer(clock, seconds)
         yield
     finally:
-        signal.alarm(0)
-        signal.signal(signal.SIGALRM, before)
+        for clock, _ in clocks.values():
+            signal.setitimer(clock, 0.0)
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * RSS_BYTES < MOST_BYTES
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,7 @@ from helpers.hostile_policies import DEEDS, HEADER, REACHES, deeds
 from helpers.listeners import accepting
 from helpers.processes import processes_under
 
-from phibench.benchmark.isolation.resolve import RunLimits
+from phibench.benchmark.isolation.resolve import MethodError, RunLimits, resolve
 from phibench.robot.loop.episodes import LOST, Episode, run_foreign
 from phibench.robot.loop.foreign_policies import PolicyFile, _action
 from phibench.robot.loop.simulator import Action, Setup, Task
@@ -38,6 +38,26 @@ def test_a_forged_answer_is_seven_numbers_or_refused() -> None:
         with pytest.raises(SceneError, match="the policy answered"):
             _action(answer)
     assert len(wrong) > 40
+
+
+DEEP = [
+    "-" * 100_000 + "1",
+    "a" + ".b" * 200_000,
+    "1+" * 200_000 + "1",
+    "not " * 100_000 + "1",
+    "lambda:" * 20_000 + "1",
+]
+
+
+@pytest.mark.parametrize("text", [*(f"act = {deep}" for deep in DEEP), "#" * (17 << 20), "act = 1\0"])
+def test_a_file_that_python_cannot_read_is_a_sentence(text: str, tmp_path: Path) -> None:
+    """The judge reads it, and runs nothing of it."""
+    path = tmp_path / "policy.py"
+    path.write_text(text)
+    with pytest.raises(SceneError, match=r"^policy in policy\.py.*: Python cannot read the file$"):
+        PolicyFile.of(f"{path}:act")
+    with pytest.raises(MethodError, match=r"Python cannot read the file$"):
+        resolve(f"{path}:act")
 
 
 @pytest.mark.skipif(not Path("/proc/self").is_dir(), reason="needs /proc")

@@ -363,3 +363,14 @@ def test_files_of_others_beside_the_growing_set_stay(name: str, begun: bool, tmp
         if name.startswith(".hidden"):
             (stage / ".hidden").rmdir()
         assert fetch("tiny", tmp_path / "set", str(release)).archives == 1
+
+
+@pytest.mark.parametrize("names", [("a", "a/b"), ("a/b", "a"), ("a/b/c", "a/b")])
+def test_a_file_that_is_a_folder_too_is_no_reason_to_try_again(names: tuple[str, ...], tmp_path: Path) -> None:
+    files = dict.fromkeys(names, b"x")
+    sums = "".join(f"{digest(data)}  {name}\n" for name, data in sorted(files.items())).encode()
+    members = [*(member(f"{TITLE}/{name}", data) for name, data in files.items()), member(f"{TITLE}/SHA256SUMS", sums)]
+    release = tiny_release(tmp_path / "release", files, sums=sums, archive=packed(members))
+    message = told(release, tmp_path / "set")
+    assert f"holds {min(names, key=len)} as a file and as a folder; ask who made the release" in message
+    assert "again" not in message

@@ -46,8 +46,8 @@ def test_make(tmp_path: Path, stop: int) -> None:
     assert left_by_phibench(out) == []
 
 
-def test_seal(bench_dataset: Path, tmp_path: Path) -> None:
-    shutil.copytree(bench_dataset, tmp_path / "set")
+def test_seal(secret_dataset: Path, tmp_path: Path) -> None:
+    shutil.copytree(secret_dataset, tmp_path / "set")
     beside = tmp_path / "beside"
     beside.mkdir()
     order = ("seal", "make", tmp_path / "set", "--out", beside / "public")

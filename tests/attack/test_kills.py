@@ -105,10 +105,10 @@ def without_times(document: Any) -> Any:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", JOBS)
-def test_killed_commands_end_in_the_same_bytes(name: str, bench_dataset: Path, tmp_path: Path) -> None:
+def test_killed_commands_end_in_the_same_bytes(name: str, secret_dataset: Path, tmp_path: Path) -> None:
     """Half of the kills hit the command alone, half its whole process group; nothing is left beside the result."""
     job, moments, met = JOBS[name], random.Random(name), 0
-    given = Path(shutil.copytree(bench_dataset, tmp_path / "given"))
+    given = Path(shutil.copytree(secret_dataset, tmp_path / "given"))
     (tmp_path / "whole").mkdir()
     lasts = finished(job, given, tmp_path / "whole")
     expected = result(job, tmp_path / "whole")

@@ -7,11 +7,17 @@ import stat
 from pathlib import Path
 
 import numpy as np
+import polars as pl
 import pytest
+from helpers.sealed_sets import SECRET_SEED
 
+from phibench.benchmark.export.export_make import export
+from phibench.benchmark.export.pair_rows import ExportRequest
 from phibench.benchmark.release.secret_seed import secret_seed
 from phibench.cli.main import main
 from phibench.datasets.errors import DatasetError
+from phibench.datasets.exposures.draw import draw_frames
+from phibench.datasets.frames.frame_files import read_index
 from phibench.datasets.frames.request import FrameOptions
 from phibench.datasets.frames.sample_request import sample_request
 from phibench.datasets.recipe.load import load_recipe, parse_recipe, with_numbers
@@ -75,6 +81,15 @@ def camera_of(seed: int, sample: str = "s0") -> int:
 def test_public_sets_keep_their_cameras(seed: int, camera: int) -> None:
     """As version 0.2 drew them."""
     assert camera_of(seed) == camera
+
+
+def test_a_set_with_a_secret_seed_is_drawn_and_exported(secret_dataset: Path, tmp_path: Path) -> None:
+    """A seed of 128 bits is no integer of a Parquet file."""
+    drawn = draw_frames(secret_dataset, FrameOptions("srgb8"), 1, out=tmp_path / "drawn", workers=1).folder
+    assert {row.dataset_seed for row in read_index(drawn).values()} == {SECRET_SEED}
+    assert set(pl.read_parquet(drawn / "frames.parquet")["dataset_seed"]) == {str(SECRET_SEED)}
+    request = ExportRequest("frames", FrameOptions("srgb8"), 1)
+    assert export(secret_dataset, request, tmp_path / "export", workers=1).folder.is_dir()
 
 
 def test_the_root_enters_the_fixed_pattern() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,8 @@ import pytest
 
 from phibench.benchmark.sealed.submission import unseal
 from phibench.datasets.errors import DatasetError
+from phibench.datasets.store.checksums import checksums_text, read_checksums
+from phibench.datasets.store.files import sha256
 
 METHOD = """\
 import numpy as np
@@ -24,6 +27,21 @@ def extract(pair):  # brightest pixel: deterministic, and of this pair; pair 1 f
     found = Spot((float(u), float(v)), ((0.1, 0.01), (0.01, 0.2)), 0.5, "normal")
     return Answer(found, Spot.missing("not looked for"), 2.0)
 """
+
+
+SECRET_SEED = 506190453285116840605544309743580276109
+"""Of 128 bits above 2^128, as a set that is sealed must have; drawn once."""
+
+
+def with_secret_seed(folder: Path, out: Path) -> Path:
+    """Copy of a data set whose frames are drawn from a secret seed; the layers are those of the old one."""
+    shutil.copytree(folder, out)
+    document = json.loads((out / "dataset.json").read_text())
+    document["recipe"]["dataset"]["seed"] = SECRET_SEED
+    (out / "dataset.json").write_text(json.dumps(document, indent=1) + "\n")
+    listed = {**read_checksums(out), "dataset.json": sha256(out / "dataset.json")}
+    (out / "SHA256SUMS").write_text(checksums_text(listed))
+    return out
 
 
 def tampered(change: Callable[[dict[str, Any]], Any], path: Path, out: Path) -> Path:

@@ -16,6 +16,7 @@ from functools import cache
 from pathlib import Path
 
 import pytest
+from helpers.districts import DISTRICTS
 from helpers.listeners import as_nobody
 from helpers.sandbox_pairs import GOOD, HEADER, SmallPairs, method_file
 
@@ -25,7 +26,7 @@ from phibench.benchmark.isolation.readable_files import access_of, truth_near
 from phibench.benchmark.isolation.resolve import MethodError, RunLimits, resolve
 from phibench.benchmark.isolation.runner import Harness, run_method
 from phibench.benchmark.scores.score import score
-from phibench.datasets.store.schema import SEALED_TRUTH, TruthFile, TruthFolder
+from phibench.datasets.store.schema import RECORDS_SO_FAR, SEALED_TRUTH, TruthFile, TruthFolder
 from phibench.estimator.interface import Answer, Spot
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -117,10 +118,14 @@ ATTACKS = {
     "flags of its own file": "fcntl.ioctl(os.open(__file__, os.O_RDONLY), 0x40086602, struct.pack('l', 0x40))",
     "watching": "called('inotify_init1', 0)",
     "watching the whole system": "called('fanotify_init', 0x200, 0)",
+    "hint of its own file": "fcntl.fcntl(os.open(__file__, os.O_RDONLY), 1036, struct.pack('Q', 3))",
+    "generation of its own file": "fcntl.ioctl(os.open(__file__, os.O_RDONLY), 0x40086604, struct.pack('l', 7))",
+    "lease of its own file": "fcntl.fcntl(os.open(__file__, os.O_RDONLY), fcntl.F_SETLEASE, fcntl.F_RDLCK)",
+    "processor time of the run": "time.clock_gettime((~RUNNER << 3) | 2)",
     "a signal when a folder changes": "fcntl.fcntl(os.open(HERE, os.O_RDONLY), fcntl.F_NOTIFY, fcntl.DN_ACCESS)",
 }
 HELPERS = """
-import ctypes, fcntl, multiprocessing, os, resource, socket, struct, subprocess
+import ctypes, fcntl, multiprocessing, os, resource, socket, struct, subprocess, time
 from pathlib import Path
 
 HERE = Path(__file__).parent
@@ -188,6 +193,7 @@ def attacked(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, str
             "DATA": str(data),
             "PORT": server.getsockname()[1],
             "SERVER": str(base / "server"),
+            "RUNNER": os.getpid(),
         }
         header = HEADER + HELPERS + "".join(f"{name} = {value!r}\n" for name, value in names.items())
         # a line of output for each pair: an outcome keeps the last lines only
@@ -228,6 +234,18 @@ OUTWARD = {
     "the same of a socket": "fcntl.ioctl(FILE, 0x8901, struct.pack('i', PARENT))",
     "its older name": "fcntl.ioctl(FILE, 0x8902, struct.pack('i', PARENT))",
     "limits": "resource.prlimit(PARENT, resource.RLIMIT_NOFILE, (0, 0))",
+    "priority": "os.setpriority(os.PRIO_PROCESS, PARENT, 19)",
+    "priority of its group": "os.setpriority(os.PRIO_PGRP, os.getpgid(PARENT), 19)",
+    "priority of all of the user": "os.setpriority(os.PRIO_USER, 0, 19)",
+    "cores": "os.sched_setaffinity(PARENT, {0})",
+    "way of scheduling": "os.sched_setscheduler(PARENT, os.SCHED_IDLE, os.sched_param(0))",
+    "parameters of scheduling": "os.sched_setparam(PARENT, os.sched_param(0))",
+    "the same by attributes": "called('sched_setattr', PARENT, struct.pack('IIQiIQQQ', 48, 5, 0, 0, 0, 0, 0, 0), 0)",
+    "priority at the disk": "called('ioprio_set', 1, PARENT, 3 << 13)",
+    "priority of its group at the disk": "called('ioprio_set', 2, os.getpgid(PARENT), 3 << 13)",
+    "processor time": "time.clock_gettime((~PARENT << 3) | 2)",
+    "waiting for processor time": "called('clock_nanosleep', (~PARENT << 3 | 2) & 0xFFFFFFFF, 0, bytes(16), 0)",
+    "a timer of processor time": "called('timer_create', (~PARENT << 3 | 2) & 0xFFFFFFFF, None, bytes(8))",
 }
 INWARD = {
     "terminate a program": "ended(subprocess.Popen(['sleep', '60']))",
@@ -239,10 +257,22 @@ INWARD = {
     "own limits": "resource.setrlimit(resource.RLIMIT_CORE, (0, 0))",
     "limits that are read": "resource.prlimit(os.getpid(), resource.RLIMIT_CORE)",
     "flags of a file": "fcntl.fcntl(FILE, fcntl.F_SETFL, os.O_NONBLOCK)",
+    "bytes that wait": "fcntl.ioctl(FILE, 0x541B, bytes(4))",
+    "own priority": "os.setpriority(os.PRIO_PROCESS, 0, 19)",
+    "own priority by its number": "os.setpriority(os.PRIO_PROCESS, os.getpid(), 19)",
+    "own cores": "os.sched_setaffinity(0, os.sched_getaffinity(0))",
+    "own way of scheduling": "os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))",
+    "own priority at the disk": "called('ioprio_set', 1, 0, 3 << 13)",
+    "own processor time": "(time.process_time(), time.thread_time(), time.clock_gettime((~os.getpid() << 3) | 2))",
+    "processor time of its thread": "time.clock_gettime(time.pthread_getcpuclockid(threading.get_ident()))",
+    "a timer of its own": "called('timer_create', 1, None, bytes(8))",
 }
-OLD_KERNEL = """
-import ctypes, fcntl, multiprocessing, os, resource, signal, socket, struct, subprocess, sys, threading, time
+IMPORTED = """
+import ctypes, fcntl, multiprocessing.connection, multiprocessing.popen_fork, os, resource, signal, socket, struct
+import subprocess, sys, threading, time
 from phibench.benchmark.isolation import isolation
+"""
+OLD_KERNEL = """
 isolation._ABI_SCOPE = 99
 numbers = isolation._NUMBERS[os.uname().machine]
 PARENT, FILE, INFORMATION = os.getpid(), socket.socketpair()[0], struct.pack('iii', 10, 0, -1) + bytes(116)
@@ -281,10 +311,20 @@ print(os.wait()[1], resource.getrlimit(resource.RLIMIT_NOFILE)[0] > 0)
 
 
 @pytest.mark.skipif(sys.platform != "linux" or os.uname().machine not in _NUMBERS, reason="no filter of calls here")
-def test_without_rules_for_signals_the_supervisor_is_out_of_reach() -> None:
-    """Signals of any kind, its limits of files; what honest methods do to themselves and to their own goes on."""
-    command = [sys.executable, "-c", OLD_KERNEL, repr(OUTWARD | INWARD)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+@pytest.mark.parametrize("user", ["this one", "nobody"])
+def test_without_rules_for_signals_the_supervisor_is_out_of_reach(user: str) -> None:
+    """Signals, limits, priorities, cores, clocks; what honest methods do to themselves and to their own goes on.
+
+    Root may set no priority here without the filter either, an ordinary user may.
+    """
+    if user == "nobody" and os.getuid() != 0:
+        pytest.skip("only root can become another user")
+    command = [sys.executable, "-c", IMPORTED + OLD_KERNEL, repr(OUTWARD | INWARD)]
+    done = (
+        as_nobody(OLD_KERNEL, repr(OUTWARD | INWARD), imports=IMPORTED)
+        if user == "nobody"
+        else subprocess.run(command, capture_output=True, text=True, timeout=120)
+    )
     expected = [f"{name} PermissionError" for name in OUTWARD] + [f"{name} reached" for name in INWARD]
     assert done.stdout.splitlines() == [*expected, "0 True"], done.stderr
 
@@ -517,13 +557,35 @@ def test_truth_near_a_method_is_found(tmp_path: Path) -> None:
     for name in (
         *(f"whole/{kind.name}/{kind}" for kind in TruthFolder),
         *(f"single/{kind}" for kind in TruthFile),
-        *("weights.parquet", "config.json", "a/seal_1.truth.json", "a/one.parquet", f"{FAR}/frames.jsonl"),
+        *(
+            "weights.parquet",
+            "config.json",
+            "a/seal_1.truth.json",
+            "a/one.parquet",
+            "a/b.so-far.parquet",
+            f"{FAR}/frames.jsonl",
+        ),
     ):
         (tmp_path / name).write_text("{}")
     (tmp_path / "a" / "one.json").write_text('{\n "kind": "phibench score"')
     (tmp_path / "config.parquet").write_text("not a score's: its JSON says nothing of one")
     found = {path.relative_to(tmp_path).as_posix() for path in truth_near(tmp_path)}
-    assert found == {"a/seal_1.truth.json", "a/one.json", "a/one.parquet", f"{FAR}/frames.jsonl", *hidden}
+    single = {"a/seal_1.truth.json", "a/one.json", "a/one.parquet", "a/b.so-far.parquet", f"{FAR}/frames.jsonl"}
+    assert found == {*single, *hidden}
+
+
+def test_truth_in_a_folder_of_the_search_path_is_hidden(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A checkout in PYTHONPATH is readable, and the scores and sets that lie in it are not."""
+    method = method_file(tmp_path, f"return {GOOD}")
+    checkout = tmp_path.parent / f"{tmp_path.name}-checkout"
+    (checkout / "out" / "set").mkdir(parents=True)
+    for name in ("dataset.json", "a.so-far.parquet", "module.py"):
+        (checkout / "out" / ("set" if name == "dataset.json" else ".") / name).write_text("{}")
+    assert str(checkout / "out" / "set") not in access_of(resolve(method), RunLimits()).hidden
+    monkeypatch.setenv("PYTHONPATH", str(checkout))
+    hidden = access_of(resolve(method), RunLimits()).hidden
+    assert {str(checkout / "out" / name) for name in ("set", "a.so-far.parquet")} <= set(hidden)
+    assert str(checkout / "out" / "module.py") not in hidden
 
 
 def test_a_method_beside_what_makes_a_folder_one_of_truth_is_refused(tmp_path: Path) -> None:
@@ -559,6 +621,7 @@ OPEN = {
     "fetch.json": "state of a download",
     "archives.jsonl": "names and hashes of archives",
     "MANIFEST.json": "the same, of a release",
+    "direct_url.json": "an installer's",
     "published.csv": "table of the paper, shipped with this package",
     "{preset}-{name}.json": "a score: told by its content",
 }
@@ -567,10 +630,10 @@ OPEN = {
 
 def test_every_file_that_is_written_is_on_the_list_or_open() -> None:
     """A new format has to be put into one of the two; the list is that of the store."""
-    listed = {SEALED_TRUTH, *map(str, TruthFolder), *map(str, TruthFile)}
+    listed = {SEALED_TRUTH, RECORDS_SO_FAR, *map(str, TruthFolder), *map(str, TruthFile)}
     named = set()
-    for file in sorted(path for folder in ("datasets", "estimator") for path in (ROOT / folder).rglob("*.py")):
-        if file.parts[-2] in ("cli", "studies", "sandbox") or "studies" in file.parts:
+    for file in sorted(path for folder in DISTRICTS for path in (ROOT / folder).rglob("*.py")):
+        if "studies" in file.parts:
             continue
         for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
             if isinstance(node, ast.Assign | ast.AnnAssign) and node.value is not None:

@@ -5,6 +5,7 @@ Honest methods beside them are not marked. Cheats on the files of a score are in
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 from functools import cache
 from itertools import product
@@ -24,8 +25,10 @@ from helpers.bench_cases import (
     silent,
     truth_itself,
 )
+from helpers.sandbox_pairs import GOOD, SmallPairs, method_file
 from scipy.stats import norm
 
+from phibench.benchmark.isolation.runner import Harness
 from phibench.benchmark.scores.answer_errors import Rules
 from phibench.benchmark.scores.dataset_pairs import dataset_pairs
 from phibench.benchmark.scores.metrics import measure, prepared
@@ -226,32 +229,62 @@ def test_clipped_covariances_and_the_number_of_tests() -> None:
 # -- time --------------------------------------------------------------------------------------------------------------
 
 
-def test_no_pair_waits_for_its_own_truth() -> None:
+class Told(Cases):
+    """Pairs that tell what is asked for."""
+
+    def pair(self, number):
+        self.asked.append(("pair", number))
+        return super().pair(number)
+
+    def truth(self, number):
+        self.asked.append(("truth", number))
+        return super().truth(number)
+
+
+def told(asked: list[tuple[str, int]]) -> Told:
+    made = Told(pairs(60).truths)
+    object.__setattr__(made, "asked", asked)
+    return made
+
+
+def test_a_truth_is_made_when_its_pair_is_answered_and_before_the_next_one() -> None:
     """Bounds take 1 s longer where both spots are seen: a method would know by the clock which spot is hidden."""
     asked: list[tuple[str, int]] = []
+    first = CachedPairs(told(asked))
+    second = CachedPairs(first._pairs, first)
+    for number in (0, 1):
+        first.pair(number)
+    assert asked == [("pair", 0), ("pair", 1)]  # the second is made while the first is looked at
+    first.answered(0)
+    first.pair(2)
+    assert asked[2:] == [("truth", 0), ("pair", 2)]
+    for number in (2, 1):
+        first.answered(number)
+    second.pair(3)
+    assert asked[4:] == [("truth", 2), ("truth", 1), ("pair", 3)]
+    assert first.late_seconds == second.late_seconds == 0.0
+    assert second.truth(3) is second.truth(3)
+    assert second.pair(3) is second.pair(3)
+    assert asked[7:] == [("truth", 3)]
+    assert second.late_seconds > 0.0
 
-    class Told(Cases):
-        def pair(self, number):
-            asked.append(("pair", number))
-            return super().pair(number)
 
+@pytest.mark.parametrize("workers", [1, 2, 3])
+def test_no_truth_is_made_while_its_pair_is_looked_at(workers: int, tmp_path: Path) -> None:
+    """In a run: the method says when it answers, and the set when a truth is begun."""
+    body = "import time\ntime.sleep(0.05 * (pair.number % 3))\nprint(time.monotonic())\nreturn " + GOOD
+    made: dict[int, float] = {}
+
+    class Timed(SmallPairs):
         def truth(self, number):
-            asked.append(("truth", number))
-            return super().truth(number)
+            made[number] = time.monotonic()
+            return pairs(20).truth(number)
 
-    told, before, due = Told(pairs(60).truths), None, list[tuple[str, int]]()
-    for start in (0, 3):
-        held = CachedPairs(told, before)
-        for number in range(start, start + 3):
-            held.pair(number)
-            due += [("truth", number - 1)] * (number > 0) + [("pair", number)]
-            assert asked == due
-        before = held
-    assert held.late_seconds == 0.0
-    assert held.truth(5) is held.truth(5)
-    assert held.pair(4) is held.pair(4)
-    assert asked == [*due, ("truth", 5)]
-    assert held.late_seconds > 0.0
+    held = CachedPairs(Timed(20))
+    with Harness([method_file(tmp_path, body)], workers=workers) as harness:
+        ended = [float(outcome.output) for (outcome,) in harness.outcomes(held, range(20))]
+    assert len(made) >= 20 - workers - 1  # those of the last pairs are made late
+    assert all(made[number] > ended[number] for number in made)
 
 
 def test_the_order_of_pairs_is_that_of_a_stream(bench_dataset: Path) -> None:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import shutil
 import textwrap
 from dataclasses import replace
 from importlib.metadata import EntryPoint
 from pathlib import Path
 
+import polars as pl
 import pytest
 from helpers.processes import quiet
 from helpers.sandbox_pairs import HEADER, method_file
@@ -19,6 +21,7 @@ from phibench.benchmark.scores import score as scoring
 from phibench.benchmark.scores.dataset_pairs import dataset_pairs
 from phibench.benchmark.scores.document import read_score
 from phibench.benchmark.scores.score import bench, score
+from phibench.cli import main as cli
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.read import open_finished
 from phibench.estimator.methods import locate
@@ -139,3 +142,28 @@ def test_a_shared_process_that_ends_is_started_anew(bench_dataset: Path) -> None
     assert (repr(first.answer), repr(second.answer)) == tuple(
         repr(METHODS[n](pair)) for n in ("red_centroid", "detect")
     )
+
+
+def test_a_data_set_that_becomes_unreadable_in_the_middle_keeps_the_records_so_far(
+    bench_dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of every method; the sentence names sample, file and what was written."""
+    damaged = Path(shutil.copytree(bench_dataset, tmp_path / "set"))
+    order = [one.sample_id for one in dataset_pairs(open_finished(damaged)).pair_draws]
+    first = {name: order.index(name) for name in set(order)}
+    name = max(first, key=lambda sample: first[sample])
+    layer = damaged / "spots" / f"{name}-up.exr"
+    layer.write_bytes(layer.read_bytes()[:200])
+    mine = method_file(tmp_path, "return Answer(Spot.missing('-'), Spot.missing('-'))")
+    tokens = ["score", str(damaged), "--method", mine, "--method", "red_centroid", "--out", str(tmp_path / "x.json")]
+    assert cli.main(tokens) == 2
+    said = capsys.readouterr().err
+    assert f"sample '{name}': " in said
+    assert "is damaged" in said
+    assert f"the records of the {first[name]} pairs before it are in" in said
+    assert "run `phibench dataset repair`, then score again" in said
+    kept = sorted(tmp_path.glob("*.so-far.parquet"))
+    assert [path.name.removesuffix(".so-far.parquet") for path in kept] == ["x-my_phi-extract", "x-red_centroid"]
+    for path in kept:
+        assert sorted(pl.read_parquet(path)["number"].unique()) == list(range(first[name]))
+    assert not list(tmp_path.glob("x*.json"))

@@ -23,9 +23,9 @@ from phibench.benchmark.scores.score import show
 from phibench.benchmark.sealed.sealed_set import (
     Sealed,
     board_warnings,
+    check_seed,
     earlier_warnings,
     seal,
-    seed_warnings,
     sequence_warnings,
     single_pairs,
 )
@@ -48,8 +48,8 @@ def copy(sealed: Sealed, tmp_path: Path) -> Path:
 # What goes out
 
 
-def test_the_public_pairs_are_the_pairs(bench_dataset: Path, sealed: Sealed) -> None:
-    here, there = single_pairs(dataset_pairs(open_dataset(bench_dataset))), SealedPairs(sealed.public)
+def test_the_public_pairs_are_the_pairs(secret_dataset: Path, sealed: Sealed) -> None:
+    here, there = single_pairs(dataset_pairs(open_dataset(secret_dataset))), SealedPairs(sealed.public)
     assert len(here) == len(there) == 3
     for i in range(3):
         ours, theirs = here.pair(i), there.pair(i)
@@ -83,9 +83,9 @@ def secrets_of(truth: PairTruth) -> list[list[str]]:
     return [[truth.sample_id], *(texts for number in numbers if (texts := digits(number)))]
 
 
-def test_no_public_file_holds_a_number_of_the_truth(bench_dataset: Path, sealed: Sealed) -> None:
+def test_no_public_file_holds_a_number_of_the_truth(secret_dataset: Path, sealed: Sealed) -> None:
     """Chance: 7 digits of 100 numbers in the 150 hexadecimal digits that the salt makes random, 1e-4."""
-    pairs = single_pairs(dataset_pairs(open_dataset(bench_dataset)))
+    pairs = single_pairs(dataset_pairs(open_dataset(secret_dataset)))
     secret = {tuple(texts) for i in range(3) for texts in secrets_of(pairs.truth(i))}
     assert len(secret) > 50
     checked = 0
@@ -100,8 +100,8 @@ def test_no_public_file_holds_a_number_of_the_truth(bench_dataset: Path, sealed:
     assert [texts for texts in secret if not any(text in found for text in texts)] == []  # it finds them where they are
 
 
-def test_no_name_says_what_it_is_of(bench_dataset: Path, sealed: Sealed) -> None:
-    words = {word for row in open_dataset(bench_dataset).rows for word in (row.sample_id, row.target, "tinybench")}
+def test_no_name_says_what_it_is_of(secret_dataset: Path, sealed: Sealed) -> None:
+    words = {word for row in open_dataset(secret_dataset).rows for word in (row.sample_id, row.target, "tinybench")}
     for path in sealed.public.rglob("*"):
         assert not any(word in path.name for word in words)
     text = (sealed.public / "pairs.jsonl").read_text() + (sealed.public / "seal.json").read_text()
@@ -143,8 +143,8 @@ def test_the_sums_are_of_every_file(sealed: Sealed) -> None:
         assert hashlib.sha256((sealed.public / name).read_bytes()).hexdigest() == digest
 
 
-def test_the_salt_makes_every_seal_another(bench_dataset: Path, sealed: Sealed, tmp_path: Path) -> None:
-    again = seal(shutil.copytree(bench_dataset, tmp_path / "set"), tmp_path / "public", console=quiet())
+def test_the_salt_makes_every_seal_another(secret_dataset: Path, sealed: Sealed, tmp_path: Path) -> None:
+    again = seal(shutil.copytree(secret_dataset, tmp_path / "set"), tmp_path / "public", console=quiet())
     assert again.seal.public_sha256 == sealed.seal.public_sha256  # the same frames to the byte
     assert again.seal.truth_sha256 != sealed.seal.truth_sha256
     salts = {json.loads(one.truth_file.read_text())["salt"] for one in (again, sealed)}
@@ -160,8 +160,8 @@ def test_a_sealed_set_has_no_truth(sealed: Sealed) -> None:
         SealedPairs(sealed.public).pair(3)
 
 
-def test_truth_survives_its_file_to_the_bit(bench_dataset: Path) -> None:
-    pairs = dataset_pairs(hidden(open_dataset(bench_dataset), "up"))
+def test_truth_survives_its_file_to_the_bit(secret_dataset: Path) -> None:
+    pairs = dataset_pairs(hidden(open_dataset(secret_dataset), "up"))
     for i in range(len(pairs)):
         truth = pairs.truth(i)
         document = json.loads(json.dumps(truth_document(truth), allow_nan=False))
@@ -173,31 +173,35 @@ def test_truth_survives_its_file_to_the_bit(bench_dataset: Path) -> None:
             assert np.array_equal(np.array(spot.raw_bound_px2), np.array(other.raw_bound_px2))
 
 
-def test_truth_of_version_1_is_read(bench_dataset: Path) -> None:
+def test_truth_of_version_1_is_read(secret_dataset: Path) -> None:
     """Version 1 said "believed" for "nominal"."""
-    truth = dataset_pairs(open_dataset(bench_dataset)).truth(0)
+    truth = dataset_pairs(open_dataset(secret_dataset)).truth(0)
     document = truth_document(truth)
     old = {name.replace("nominal", "believed"): value for name, value in document.items()}
     assert {"believed_rig", "believed_stroke_m"} <= set(old)
     assert truth_document(truth_of(TruthRow.model_validate(old))) == document
 
 
-def test_seeds_that_can_be_found_are_warned_of() -> None:
-    [known] = seed_warnings("bench-test", 1)
-    assert "seed 1 is that of the shipped recipe 'bench-test'" in known
-    [short] = seed_warnings("bench-test", 123456)
-    assert "seed 123456 is short" in short
-    assert seed_warnings("bench-test", 2**128 + 12345) == ()
-    assert "128 bits" in seed_warnings("bench-test", 2**127)[0]
-    assert "short" in seed_warnings("mine", 0)[0]
+@pytest.mark.parametrize("seed", [0, 1, 123456, 2**63 - 1, 2**127, 2**128 - 1])
+def test_a_set_with_a_seed_that_can_be_found_is_not_sealed(seed: int, secret_dataset: Path) -> None:
+    with pytest.raises(DatasetError, match=r"shorter than 128 bits.*--secret-seed FILE") as caught:
+        check_seed(Path("mine"), seed)
+    assert seed < 10 or str(seed) not in str(caught.value)
+    check_seed(secret_dataset, open_dataset(secret_dataset).recipe.dataset.seed)
 
 
-def test_a_sealed_set_shows_each_sample_once(bench_dataset: Path, sealed: Sealed) -> None:
+def test_a_refused_set_leaves_nothing_behind(tiny_dataset: Path, tmp_path: Path) -> None:
+    tokens = ["seal", "make", str(tiny_dataset), "--out", str(tmp_path / "public")]
+    assert cli.main(tokens) == 2
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_sealed_set_shows_each_sample_once(secret_dataset: Path, sealed: Sealed) -> None:
     """The attack of issue 13: a cache keyed by the rig averages over presets and draws. Here it never hits."""
     public = SealedPairs(sealed.public)
     keys = [(pair.rig, pair.stroke_m) for pair in map(public.pair, range(len(public)))]
     assert len(set(keys)) == len(keys) == 3
-    dataset = open_dataset(bench_dataset)
+    dataset = open_dataset(secret_dataset)
     for preset, draws in ((None, 1), (None, 4), ("mjpeg", 3)):
         everything = dataset_pairs(dataset, preset, draws)
         chosen = single_pairs(everything).pair_draws
@@ -243,8 +247,8 @@ def test_a_set_of_the_old_kind_is_read_and_says_what_it_is(
     assert "note: this set was sealed for task version 3, when a set could show" in capsys.readouterr().err
 
 
-def test_samples_of_a_sobol_sequence_are_warned_of(bench_dataset: Path) -> None:
-    recipe = open_dataset(bench_dataset).recipe
+def test_samples_of_a_sobol_sequence_are_warned_of(secret_dataset: Path) -> None:
+    recipe = open_dataset(secret_dataset).recipe
     assert recipe.random is not None
     [warning] = sequence_warnings(with_random(recipe, "sobol"))
     assert 'sequence = "independent"' in warning
@@ -301,19 +305,19 @@ def test_a_spoiled_set_is_refused(sealed: Sealed, submitted: Path, copy: Path, s
     assert words in refusal(copy, sealed.truth_file, submitted)
 
 
-def test_a_folder_that_will_not_do_is_refused(bench_dataset: Path, tmp_path: Path) -> None:
+def test_a_folder_that_will_not_do_is_refused(secret_dataset: Path, tmp_path: Path) -> None:
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "x").write_text("x")
-    for out, words in ((tmp_path / "full", "not an empty folder"), (bench_dataset / "public", "lies inside")):
+    for out, words in ((tmp_path / "full", "not an empty folder"), (secret_dataset / "public", "lies inside")):
         with pytest.raises(DatasetError, match=words):
-            seal(bench_dataset, out, console=quiet())
-    assert not list(bench_dataset.glob("seal_*"))
+            seal(secret_dataset, out, console=quiet())
+    assert not list(secret_dataset.glob("seal_*"))
 
 
 def test_an_interrupted_seal_leaves_nothing(
-    bench_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    secret_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    copy = shutil.copytree(bench_dataset, tmp_path / "set")
+    copy = shutil.copytree(secret_dataset, tmp_path / "set")
 
     def fail(*_: object) -> None:
         raise KeyboardInterrupt
@@ -344,14 +348,12 @@ def test_the_commands_say_what_they_did(
     assert not show(score)  # no terminal here
 
 
-def test_seal_on_the_command_line_warns_of_its_seed(
-    bench_dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    copy = shutil.copytree(bench_dataset, tmp_path / "set")
+def test_seal_on_the_command_line(secret_dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    copy = shutil.copytree(secret_dataset, tmp_path / "set")
     tokens = ["seal", "make", str(copy), "--out", str(tmp_path / "public"), "--preset", "mjpeg"]
     assert cli.main(tokens) == 0
     said = capsys.readouterr()
-    assert "warning: seed 0 is short" in said.err
+    assert "warning: the boards" not in said.err
     assert "3 pairs, seal" in said.out
     assert "shipped recipe" not in said.err
     assert len(list(copy.glob("seal_*.truth.json"))) == 1

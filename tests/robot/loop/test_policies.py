@@ -153,7 +153,7 @@ def test_policies_of_files_are_named_in_one_sentence(tmp_path) -> None:
         (f"{file}", "give FILE.py:NAME"),
         ("nowhere.py:make", "no file nowhere.py"),
         (f"{file}:mke", r"mine.py has no mke; did you mean 'make'\? known: P, make, three"),
-        (f"{tmp_path / 'broken.py'}:make", "is no Python file"),
+        (f"{tmp_path / 'broken.py'}:make", "Python cannot read the file"),
     ):
         with pytest.raises(SceneError, match=words):
             PolicyFile.of(text)
