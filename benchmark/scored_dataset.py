@@ -12,11 +12,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from phibench.benchmark.pair_sets.frames_set import FramesSet
 from phibench.datasets import read
 from phibench.datasets.frames.sensor_file import SensorFile
+from phibench.datasets.store.pair_files import is_frames_set
 
 if TYPE_CHECKING:
-    from phibench.benchmark.scores.dataset_pairs import DatasetPairs
+    from phibench.benchmark.pair_sets.dataset_pairs import DatasetPairs
 
 
 class ScoredDataset(read.Dataset):
@@ -53,18 +55,20 @@ class ScoredDataset(read.Dataset):
         DatasetError
             If neither recipe nor caller names a preset, or a number is out of its range.
         """
-        from phibench.benchmark.scores.dataset_pairs import dataset_pairs
+        from phibench.benchmark.pair_sets.dataset_pairs import dataset_pairs
 
         return dataset_pairs(self, preset, draws, hints=hints, boxes_px=boxes_px, sensor=sensor)
 
 
-def open_dataset(folder: str | Path) -> ScoredDataset:
-    """Open a data set; layers are read when they are asked for.
+def open_dataset(folder: str | Path) -> ScoredDataset | FramesSet:
+    """Open a data set, or a frames set; layers and frames are read when they are asked for.
 
     Raises
     ------
     DatasetError
         If the folder is missing, not a data set, of another schema version, or its manifest or rigs are damaged.
     """
+    if is_frames_set(folder):
+        return FramesSet(folder)
     opened = read.open_dataset(folder)
     return ScoredDataset(opened.folder, opened.info, opened.rigs, opened.rooms, opened.rows)

@@ -26,7 +26,9 @@ from phibench.datasets.frames.sensor_card import SensorCard, card_of
 from phibench.datasets.frames.source import FrameSource
 from phibench.datasets.read import Dataset, Sample, open_finished
 from phibench.datasets.recipe.tables import FramesTable
+from phibench.datasets.store.documents import from_json
 from phibench.datasets.store.layers import SpotWindow
+from phibench.datasets.store.pair_files import IMAGES_OFF, FramesRow, PairFiles, is_frames_set
 from phibench.datasets.store.short_form import ShortForm
 from phibench.render.sensor.camera_chain import Chain, auto_exposed
 from phibench.render.sensor.light import Light, Region
@@ -34,7 +36,7 @@ from phibench.render.sensor.noise_tiles import NoiseStream
 from phibench.render.sensor.rolling_shutter import layer_spectra
 from phibench.scenes.frames import Array
 from phibench.scenes.random_streams import generator
-from phibench.scenes.rig import POSITIONS
+from phibench.scenes.rig import POSITIONS, Rig
 
 Item = dict[str, Any]
 PERIOD_PX = 16  # of JPEG units with chroma of half resolution; a multiple of the mosaic's 2
@@ -52,7 +54,7 @@ class PairDataset(ShortForm):
     Parameters
     ----------
     folder : str or Path
-        Of a finished data set.
+        Of a finished data set, or of a frames set, whose draws are the epochs: epoch 0 is draw 0.
     preset : str
         As for `Sample.frame_source`.
     **options : Any
@@ -78,10 +80,17 @@ class PairDataset(ShortForm):
         **options: Any,
     ) -> None:
         self.folder, self.options = Path(folder), FrameOptions(preset, options)
+        self.laser_off, self.epoch = laser_off, 0
+        self._files = _files_of(self.folder, self.options) if is_frames_set(self.folder) else None
+        if self._files is not None:
+            known = list(dict.fromkeys(row.truth.sample_id for row in self._files.rows))
+            if strange := sorted(set(samples or ()) - set(known)):
+                raise DatasetError(f"{folder} has no sample '{strange[0]}': {', '.join(known[:3])}, ... are there")
+            self.sample_ids = tuple(known if samples is None else samples)
+            return
         dataset = _opened(self.folder)
         names = [row.sample_id for row in dataset.rows] if samples is None else list(samples)
         self.sample_ids = tuple(dataset[name].row.sample_id for name in names)
-        self.laser_off, self.epoch = laser_off, 0
 
     def _shown(self) -> dict[str, Any]:
         return {
@@ -100,6 +109,8 @@ class PairDataset(ShortForm):
         return len(self.sample_ids)
 
     def __getitem__(self, index: int) -> Item:
+        if self._files is not None:
+            return _held_item(self._files, self.sample_ids[_place(index, len(self))], self.epoch, self.laser_off)
         source = _source(self.folder, self.sample_ids[_place(index, len(self))], _Hashed(self.options))
         row = _opened(self.folder)[source.names[2]].row
         item: Item = {"sample_id": row.sample_id, "depth_m": row.centre_depth_m, "stroke_m": row.stroke_m}
@@ -114,6 +125,35 @@ class PairDataset(ShortForm):
 
 
 _TRUTH = ("u_px", "v_px", "phi_ray_rad", "visible")
+
+
+def _files_of(folder: Path, options: FrameOptions) -> PairFiles[FramesRow]:
+    """Lines and images of a frames set, which has one preset and no options."""
+    if options.given:
+        raise DatasetError(f"{folder} holds frames that are drawn: leave {', '.join(sorted(options.given))} out")
+    files = PairFiles(folder, FramesRow)
+    if (preset := files.rows[0].truth.preset) != options.preset:
+        raise DatasetError(f"{folder} holds frames of '{preset}', none of '{options.preset}': ask for '{preset}'")
+    return files
+
+
+def _held_item(files: PairFiles[FramesRow], sample_id: str, draw: int, laser_off: bool) -> Item:
+    """Item of a frames set."""
+    found = [row for row in files.rows if (row.truth.sample_id, row.truth.draw) == (sample_id, draw)]
+    if not found:
+        raise DatasetError(f"{files.folder} has no draw {draw} of '{sample_id}': its draws are its epochs")
+    row, truth = found[0], found[0].truth
+    if laser_off and not IMAGES_OFF <= set(row.files):
+        raise DatasetError(f"{files.folder} has no frames with the laser off: leave laser_off out")
+    camera = from_json(Rig, row.rig).camera
+    wanted = {name: file for name, file in row.files.items() if laser_off or name in POSITIONS}
+    item: Item = {"sample_id": sample_id, "depth_m": truth.depth_m, "stroke_m": truth.stroke_m}
+    item |= {name: files.image(file, camera) for name, file in wanted.items()}
+    for position, spot in (("down", truth.down), ("up", truth.up)):
+        values = (*spot.uv_px, spot.phi_rad.ray, spot.visible)
+        item |= {f"{position}_{name}": value for name, value in zip(_TRUTH, values, strict=True)}
+        item |= {f"{position}_u0_px": 0, f"{position}_v0_px": 0}
+    return item
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,6 @@
 """Pairs of images (down, up) of a data set, with random sensor noise, as a method sees them.
 
-A pair is simulated when it is asked for: the same bytes every time. Its truth is in `scores.dataset_pairs`.
+A pair is simulated when it is asked for: the same bytes every time. Its truth is in `pair_sets.dataset_pairs`.
 """
 
 from __future__ import annotations

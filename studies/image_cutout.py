@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from phibench.benchmark.scores.dataset_pairs import SpotBounds, spot_bounds
+from phibench.benchmark.pair_sets.dataset_pairs import SpotBounds, spot_bounds
 from phibench.datasets.frames.sensor_card import card_of
 from phibench.datasets.frames.source import PositionLight
 from phibench.estimator.interface import Box, Pair

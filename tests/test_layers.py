@@ -57,12 +57,13 @@ calibration/sensor_fit
 calibration/outline
 calibration/rig
 calibration/captures
-benchmark/export
 benchmark/release
 benchmark/isolation
+benchmark/pair_sets
 benchmark/scores
 benchmark/scored_dataset
 benchmark/sealed
+benchmark/export
 robot/film
 robot/loop
 studies/paper

@@ -10,7 +10,7 @@ import hashlib
 import json
 import os
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,18 @@ from rich.console import Console
 
 from phibench.benchmark.export.containers import NEEDS_PYARROW, image_name, shard_name, write_shard
 from phibench.benchmark.export.dataset_card import card, croissant
-from phibench.benchmark.export.pair_rows import INDEX, SPLITS, ExportRequest, drawn_pair, pair_key, pair_table, splits
+from phibench.benchmark.export.pair_rows import (
+    INDEX,
+    SPLITS,
+    DrawnPair,
+    ExportRequest,
+    drawn_pair,
+    pair_key,
+    pair_table,
+    splits,
+)
+from phibench.benchmark.pair_sets.dataset_pairs import DatasetPairs, dataset_pairs
+from phibench.benchmark.pair_sets.frames_set import frames_row, write_frames_set
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.exposures.draw import require_outside, sample_key
 from phibench.datasets.frames.request import whole_number
@@ -27,6 +38,7 @@ from phibench.datasets.input_files import InputFile
 from phibench.datasets.parallel import parallel_map
 from phibench.datasets.progress import Steps, progress_console
 from phibench.datasets.read import Dataset, open_dataset, open_finished
+from phibench.datasets.recipe.tables import FramesTable
 from phibench.datasets.store import schema
 from phibench.datasets.store.checksums import checksums_text, differing_files, read_checksums
 from phibench.datasets.store.croissant import LICENSE_TEXT
@@ -59,6 +71,7 @@ class ShardRow(Document):
     key: str = described("-", "hash of all that it depends on")
     files: dict[str, str] = described("-", "SHA-256 by file")
     drawn: list[tuple[str, dict[str, Any]]] = described("-", "sample id, and what its draw adds, in order")
+    scored: list[dict[str, Any]] = described("-", "lines of the pairs of a frames set", default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -139,18 +152,52 @@ def perform(shard: Shard) -> tuple[ShardRow, bool]:
     key = _key(dataset, shard)
     if (held := shard.known.get(shard.name)) and held.key == key and not differing_files(shard.out, held.files):
         return held, False
+    if shard.request.scored:
+        pairs, scored = _scored_pairs(dataset, shard)
+    else:
+        pairs, scored = _drawn_pairs(dataset, shard), []
+    drawn = [(pair.sample_id, {"key": pair.key, "split": shard.split, **pair.added}) for pair in pairs]
+    with working(shard.out):
+        files = write_shard(shard.out, shard.name, shard.request, pairs, pair_table(dataset.rows, drawn))
+    hashes = {name: sha256(shard.out / name) for name in files}
+    return ShardRow(name=shard.name, key=key, files=hashes, drawn=drawn, scored=scored), True
+
+
+def _drawn_pairs(dataset: Dataset, shard: Shard) -> list[DrawnPair]:
     pairs, source, last = [], None, ""
     for sample_id, draw in shard.pairs:
         sample = dataset[sample_id]
         if source is None or sample_id != last:
             source, last = FrameSource.from_request(sample, sample.frame_request(shard.request.frames)), sample_id
         pairs.append(drawn_pair(source, sample.row, draw, shard.request))
-    drawn = [(pair.sample_id, {"key": pair.key, "split": shard.split, **pair.added}) for pair in pairs]
-    with working(shard.out):
-        files = write_shard(shard.out, shard.name, shard.request, pairs, pair_table(dataset.rows, drawn))
-    return ShardRow(
-        name=shard.name, key=key, files={name: sha256(shard.out / name) for name in files}, drawn=drawn
-    ), True
+    return pairs
+
+
+def _scored_pairs(dataset: Dataset, shard: Shard) -> tuple[list[DrawnPair], list[dict[str, Any]]]:
+    """Pairs as they are scored, with the lines of a frames set: the frames of `Dataset.pairs`."""
+    request, pairs, lines = shard.request, [], []
+    taken = scored_pairs(dataset, request)
+    for sample_id, draw in shard.pairs:
+        number = taken.number_of(sample_id, draw)
+        pair, frames = taken.pair_and_frames(number)
+        source = taken.drawn_from(number)[2]
+        pairs.append(drawn_pair(source, dataset[sample_id].row, draw, request, frames))
+        names = {column: image_name(request, pairs[-1].key, column) for column in pairs[-1].images}
+        files = {column.removeprefix("image_"): f"{shard.name}/{name}" for column, name in names.items()}
+        lines.append(frames_row(pair, taken.truth(number), files))
+    return pairs, lines
+
+
+def scored_with_laser_off(folder: Path) -> bool:
+    """True if the pairs that `score` shows of a data set have frames with the laser off."""
+    return (open_finished(folder).recipe.frames or FramesTable()).laser_off
+
+
+def scored_pairs(dataset: Dataset, request: ExportRequest) -> DatasetPairs:
+    """Pairs of a data set as `score` numbers them, with or without frames with the laser off."""
+    taken = dataset_pairs(dataset, request.frames.preset, request.draws)
+    draws = (replace(one, laser_off=request.laser_off) for one in taken.pair_draws)
+    return DatasetPairs(dataset, tuple(draws))
 
 
 def verify_export(folder: str | Path) -> list[str]:
@@ -195,7 +242,8 @@ def _shards(dataset: Dataset, request: ExportRequest, out: Path) -> tuple[list[S
 def _key(dataset: Dataset, shard: Shard) -> str:
     samples = dict.fromkeys(sample_id for sample_id, _ in shard.pairs)
     keys = [sample_key(dataset[sample_id], shard.request.frames) for sample_id in samples]
-    code = [code_behind(f"phibench.benchmark.export.{name}") for name in ("pair_rows", "containers")]
+    modules = ["export.pair_rows", "export.containers", *(["pair_sets.frames_set"] if shard.request.scored else [])]
+    code = [code_behind(f"phibench.benchmark.{name}") for name in modules]
     parts = [shard.name, shard.split, shard.pairs, shard.request.document(), keys, code, _versions(shard.request)]
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
 
@@ -264,10 +312,15 @@ def _finish(
     for name in _COPIED:
         write_bytes(out / name, InputFile(dataset.folder / name, "run `phibench dataset repair`").read())
     write_text(out / "LICENSE", LICENSE_TEXT)
+    of_frames_set: tuple[str, ...] = ()
+    if request.scored:
+        lines = [line for shard in shards for line in rows[shard.name].scored]
+        taken = scored_pairs(dataset, request)
+        of_frames_set = write_frames_set(out, taken, request.frames.preset, request.draws, lines)
     hashes = {name: digest for shard in shards for name, digest in rows[shard.name].files.items()}
     write_text(out / schema.CROISSANT, croissant(dataset, request, table, out, hashes))
     write_text(out / "README.md", card(dataset, request, table))
-    for name in (INFO, INDEX, schema.CROISSANT, "README.md", "LICENSE", *_COPIED):
+    for name in (INFO, INDEX, schema.CROISSANT, "README.md", "LICENSE", *_COPIED, *of_frames_set):
         hashes[name] = sha256(out / name)
     write_text(out / schema.CHECKSUMS, checksums_text(hashes))
 

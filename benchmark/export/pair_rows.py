@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.frames.frame_files import png_bytes, suffix
 from phibench.datasets.frames.request import FrameOptions, whole_number
-from phibench.datasets.frames.source import FrameSource
+from phibench.datasets.frames.source import Frames, FrameSource
 from phibench.datasets.read import Dataset
 from phibench.datasets.store.documents import to_table
 from phibench.datasets.store.schema import ManifestRow, TruthFile
@@ -47,6 +47,8 @@ class ExportRequest:
         Draws 0 to draws - 1 of every pair.
     laser_off : bool
         Also every image without the spot.
+    scored : bool
+        Pairs as they are scored, with their truth: a frames set. Of plain files with the recipe's own frames.
     split_by : "both", "rig" or "room"
         What no two splits share.
     validation, test : float
@@ -63,6 +65,7 @@ class ExportRequest:
     validation: float = 0.1
     test: float = 0.1
     pairs_per_shard: int = 64
+    scored: bool = False
 
     def __post_init__(self) -> None:
         for name, value, kinds in (("to", self.form, Form), ("split_by", self.split_by, SplitBy)):
@@ -73,6 +76,8 @@ class ExportRequest:
         if not (0.0 <= self.validation and 0.0 <= self.test and self.validation + self.test < 1.0):
             shares = f"validation = {self.validation:g}, test = {self.test:g}"
             raise DatasetError(f"{shares}: give shares from 0 on, below 1 together")
+        if self.scored and (self.form != "frames" or self.frames.given):
+            raise DatasetError("pairs that are scored are plain files with the recipe's own frames: leave options out")
         if self.frames.sensor().output == "electrons":
             raise DatasetError(f"preset '{self.frames.preset}' has no image file that others read: give another preset")
 
@@ -116,14 +121,17 @@ def pair_key(sample_id: str, draw: int) -> str:
     return f"{sample_id.translate(_DOTLESS)}-{draw:04d}"
 
 
-def drawn_pair(source: FrameSource, row: ManifestRow, draw: int, request: ExportRequest) -> DrawnPair:
-    """Draw one pair."""
+def drawn_pair(
+    source: FrameSource, row: ManifestRow, draw: int, request: ExportRequest, frames: Frames | None = None
+) -> DrawnPair:
+    """Draw one pair, or take its frames."""
     images: dict[str, bytes] = {}
     asked = source.request
     added: dict[str, float | int | str | None] = {"draw": draw, "preset": asked.preset}
     added |= {"jpeg_quality": source.jpeg_quality, "laser_level": asked.laser_level, "lamp_level": asked.lamp_level}
     for column, position, laser in request.images:
-        frame = source.frame(position, draw, laser)
+        name = position if laser else f"{position}_off"
+        frame = source.frame(position, draw, laser) if frames is None else frames.by_name[name]
         images[column] = frame.jpeg if frame.jpeg is not None else png_bytes(frame.image)
         added |= {f"{position}.{name}": value for name, value in _numbers(frame.sensor, frame.region).items()}
     return DrawnPair(pair_key(row.sample_id, draw), row.sample_id, draw, images, added)

@@ -56,7 +56,7 @@ COMPARED = (
 _KEY = ("number", "image")
 _TRUTH = ("sample_id", "draw", "depth_m", "u_true_px", "v_true_px", "visible")
 # of a pair set: how much of it was taken, with which versions
-_MAY_DIFFER = ("pairs", "samples", "hinted", "provenance")
+_MAY_DIFFER = ("pairs", "samples", "hinted", "provenance", "frames_set_sha256")
 
 _TOLD = 3  # methods that a note names
 

@@ -22,15 +22,16 @@ from rich.console import Console
 from phibench.benchmark.isolation.pairs_ahead import PairsAhead
 from phibench.benchmark.isolation.resolve import MethodError, RunLimits, code_of_function, installed, resolve
 from phibench.benchmark.isolation.runner import Harness, Ran, asked_here, function_name, ran_here
-from phibench.benchmark.scores.answer_errors import Rules
-from phibench.benchmark.scores.causes import with_causes
-from phibench.benchmark.scores.dataset_pairs import (
+from phibench.benchmark.pair_sets.dataset_pairs import (
     TASK_VERSION,
     CalibratedPairs,
     DatasetPairs,
     dataset_pairs,
     of_calibration,
 )
+from phibench.benchmark.pair_sets.frames_set import FramesSet
+from phibench.benchmark.scores.answer_errors import Rules
+from phibench.benchmark.scores.causes import with_causes
 from phibench.benchmark.scores.document import (
     MethodCard,
     ScoreDocument,
@@ -52,6 +53,7 @@ from phibench.datasets.frames.sensor_file import read_sensor_file
 from phibench.datasets.progress import Steps, progress_console
 from phibench.datasets.read import Dataset, open_finished
 from phibench.datasets.store.files import require_writable
+from phibench.datasets.store.pair_files import is_frames_set
 from phibench.datasets.store.short_form import ShortForm
 from phibench.estimator.interface import Box, Method, Outcome
 from phibench.estimator.limits.off_frame_bound import FrameCounts
@@ -261,7 +263,7 @@ def _scored(
 
 
 def score(
-    dataset: str | Path | Dataset,
+    dataset: str | Path | Dataset | FramesSet,
     method: str | Method,
     preset: str | None = None,
     *,
@@ -282,7 +284,7 @@ def score(
 
     Parameters
     ----------
-    dataset : folder of a finished data set, or an opened one (also a slice of one)
+    dataset : folder of a finished data set or frames set, or an opened one (also a slice of one)
     method : str or function
         Name of a built-in method, or "FILE.py:FUNCTION": it runs in a process of its own, with limits. A function runs
         in this process: no limits, and it can be stopped with a debugger.
@@ -314,7 +316,7 @@ def score(
         If the method cannot be found or imported.
     """
     console = console or progress_console()
-    opened = dataset if isinstance(dataset, Dataset) else open_scored(dataset)
+    opened = dataset if isinstance(dataset, Dataset | FramesSet) else open_scored(dataset)
     if out is not None:
         require_writable(Path(out))
     chosen = wanted_pairs(opened, preset, draws, pairs, hints, calibration, boxes_px, sensor, frames)
@@ -491,13 +493,15 @@ def ran_with(scored: Scored, ran: Ran) -> Scored:
     return replace(scored, document=scored.document.model_copy(update={"method": card}))
 
 
-def open_scored(folder: str | Path) -> Dataset | ImportedSet:
-    """Finished data set, or a set of real pairs."""
+def open_scored(folder: str | Path) -> Dataset | ImportedSet | FramesSet:
+    """Finished data set, a frames set, or a set of real pairs."""
+    if is_frames_set(folder):
+        return FramesSet(folder)
     return open_imported(folder) if is_imported(folder) else open_finished(folder)
 
 
 def wanted_pairs(
-    dataset: Dataset | ImportedSet,
+    dataset: Dataset | ImportedSet | FramesSet,
     preset: str | None,
     draws: int | None = None,
     pairs: int | None = None,
@@ -516,6 +520,13 @@ def wanted_pairs(
     DatasetError
         As `dataset_pairs`, or if the calibration cannot be read or is that of another rig.
     """
+    if isinstance(dataset, FramesSet):
+        if any(one is not None for one in (calibration, boxes_px, sensor, frames)):
+            raise DatasetError(
+                f"{dataset.folder} holds frames that are drawn: leave --calibration, --boxes, --sensor and --frames "
+                "out, or score the data set that it comes from"
+            )
+        return dataset.pairs(preset, draws, pairs=pairs, hints=hints)
     if isinstance(dataset, ImportedSet):
         if boxes_px is not None or sensor is not None or frames is not None:
             raise DatasetError(
@@ -582,8 +593,8 @@ def show(page: Path) -> bool:
     return sys.stdout.isatty() and display and webbrowser.open(page.resolve().as_uri())
 
 
-def _presets(dataset: Dataset | ImportedSet) -> tuple[str, ...]:
-    if isinstance(dataset, ImportedSet):
+def _presets(dataset: Dataset | ImportedSet | FramesSet) -> tuple[str, ...]:
+    if isinstance(dataset, ImportedSet | FramesSet):
         return (dataset.preset,)
     frames = dataset.recipe.frames
     return PRESETS if frames is None else frames.presets

@@ -19,8 +19,8 @@ import polars as pl
 from rich.console import Console
 
 from phibench.benchmark.isolation.resolve import RunLimits
+from phibench.benchmark.pair_sets.dataset_pairs import TASK_VERSION, DatasetPairs, dataset_pairs
 from phibench.benchmark.scores.answer_errors import Rules, usable_covariance, whitened
-from phibench.benchmark.scores.dataset_pairs import TASK_VERSION, DatasetPairs, dataset_pairs
 from phibench.benchmark.scores.document import (
     ScoreDocument,
     Worst,

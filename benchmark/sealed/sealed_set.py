@@ -15,40 +15,40 @@ import json
 import os
 import secrets
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
-from pydantic import Field, field_validator
+from pydantic import Field
 from rich.console import Console
 
-from phibench.benchmark.scores.dataset_pairs import TASK_VERSION, DatasetPairs, dataset_pairs
-from phibench.benchmark.sealed.truth_file import MOST_PAIRS, Digest, truth_text
+from phibench.benchmark.pair_sets.dataset_pairs import TASK_VERSION, DatasetPairs, dataset_pairs
+from phibench.benchmark.pair_sets.truth_file import Digest, truth_text
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.frames.frame_files import png_bytes
 from phibench.datasets.frames.source import Frames
-from phibench.datasets.input_files import SETTINGS_BYTES, FileName, InputFile, Name
+from phibench.datasets.input_files import SETTINGS_BYTES, InputFile, Name
 from phibench.datasets.progress import Steps, progress_console
 from phibench.datasets.read import open_finished
 from phibench.datasets.recipe.load import RECIPES, load_recipe
 from phibench.datasets.recipe.tables import Recipe
 from phibench.datasets.store.checksums import checksums_text, read_checksums
-from phibench.datasets.store.documents import to_json
-from phibench.datasets.store.files import WriteError, read_rows, sha256, write_bytes, write_secret, write_text
+from phibench.datasets.store.files import WriteError, sha256, write_bytes, write_secret, write_text
 from phibench.datasets.store.leftovers import OwnedFolder, folder_for_work
-from phibench.datasets.store.schema import SEALED_TRUTH, Document
-from phibench.estimator.interface import Box, Pair
-from phibench.scenes.camera import LARGEST_SIDE_PX
+from phibench.datasets.store.pair_files import (
+    FRAMES,
+    MOST_PAIRS,
+    PAIRS,
+    PublicPair,
+    public_fields,
+)
+from phibench.datasets.store.schema import CHECKSUMS, SEALED_TRUTH, Document
+from phibench.estimator.interface import Pair
 from phibench.scenes.random_streams import LEAST_SECRET_SEED, generator
 
-SEAL, PAIRS, FRAMES, CHECKSUMS = "seal.json", "pairs.jsonl", "frames", "SHA256SUMS"
+SEAL = "seal.json"
 FORMAT = "phibench sealed set 1"
-IMAGES = {"down", "up"}
-
-
-_Pixel = Annotated[int, Field(ge=-LARGEST_SIDE_PX, le=LARGEST_SIDE_PX)]
-_Side = Annotated[int, Field(ge=1, le=LARGEST_SIDE_PX)]
 
 
 class Seal(Document):
@@ -66,37 +66,6 @@ class Seal(Document):
     public_sha256: Digest
     truth_sha256: Digest
     phibench: Name | None
-
-
-class PublicBox(Document):
-    """A region hint, as `interface.Box`."""
-
-    u0_px: _Pixel
-    v0_px: _Pixel
-    width_px: _Side
-    height_px: _Side
-
-
-class PublicPair(Document):
-    """One line of `pairs.jsonl`; `files` by image name: "down", "up", and "down_off", "up_off" where they are."""
-
-    number: Annotated[int, Field(ge=0, lt=MOST_PAIRS)]
-    files: dict[str, FileName]
-    stroke_m: Annotated[float, Field(gt=0.0, le=1000.0)]
-    rig: dict[str, Any]
-    card: dict[str, Any]
-    box_down: PublicBox | None
-    box_up: PublicBox | None
-    beam: dict[str, Any] | None = None
-
-    @field_validator("files")
-    @classmethod
-    def _both_images(cls, files: dict[str, str]) -> dict[str, str]:
-        if set(files) not in (IMAGES, IMAGES | {"down_off", "up_off"}):
-            raise ValueError("the images down and up are needed, and down_off and up_off both or neither")
-        if strange := [name for name in files.values() if not name.startswith(f"{FRAMES}/")]:
-            raise ValueError(f"the image {strange[0]} does not lie in {FRAMES}/")
-        return files
 
 
 def seal_id(public_sha256: str, truth_sha256: str) -> str:
@@ -130,11 +99,6 @@ def read_seal(folder: Path) -> Seal:
             f"{folder}: {SEAL} and {CHECKSUMS} do not belong together, one was changed; download the set again"
         )
     return seal
-
-
-def read_pairs(folder: Path) -> list[PublicPair]:
-    """Lines of `pairs.jsonl`, by number."""
-    return read_rows(folder / PAIRS, PublicPair)
 
 
 _FILE_TIME_S = 315532800  # 1980-01-01: a file's own time would tell the order of the work
@@ -284,20 +248,7 @@ def _write_pair(work: Path, pair: Pair, frames: Frames) -> PublicPair:
         end = "png" if frame.jpeg is None else "jpg"
         files[name] = f"{FRAMES}/{pair.number:06d}-{name}.{end}"
         write_bytes(work / files[name], png_bytes(frame.image) if frame.jpeg is None else frame.jpeg)
-    return PublicPair(
-        number=pair.number,
-        files=files,
-        stroke_m=pair.stroke_m,
-        rig=to_json(pair.rig),
-        card=to_json(pair.card),
-        box_down=_public_box(pair.box_down),
-        box_up=_public_box(pair.box_up),
-        beam=None if pair.beam is None else to_json(pair.beam),
-    )
-
-
-def _public_box(box: Box | None) -> PublicBox | None:
-    return None if box is None else PublicBox(**asdict(box))
+    return PublicPair(**public_fields(pair, files))
 
 
 def _hashes(folder: Path) -> dict[str, str]:

@@ -6,7 +6,6 @@ Unsealing proves that truth and submission belong to the seal, and gives truths 
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 import re
@@ -17,44 +16,28 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
 from pydantic import Field
 
 from phibench.benchmark.isolation.answers import AnswerError, checked
 from phibench.benchmark.isolation.resolve import Reference, RunLimits, resolve
 from phibench.benchmark.isolation.runner import Harness, Ran
+from phibench.benchmark.pair_sets.frames_set import pair_of_files
+from phibench.benchmark.pair_sets.truth_file import read_truth_file
 from phibench.benchmark.scores.document import MethodCard
-from phibench.benchmark.sealed.sealed_set import (
-    CHECKSUMS,
-    FRAMES,
-    PAIRS,
-    SEAL,
-    PublicBox,
-    PublicPair,
-    Seal,
-    read_pairs,
-    read_seal,
-)
-from phibench.benchmark.sealed.truth_file import MOST_PAIRS, read_truth_file
+from phibench.benchmark.sealed.sealed_set import SEAL, Seal, read_seal
 from phibench.datasets.errors import DatasetError
-from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.datasets.input_files import InputFile, Name, Text
-from phibench.datasets.store.checksums import read_checksums
-from phibench.datasets.store.documents import from_json
 from phibench.datasets.store.files import write_text
+from phibench.datasets.store.pair_files import MOST_PAIRS, PairFiles, PublicPair
 from phibench.datasets.store.provenance import provenance
 from phibench.datasets.store.schema import Document, Number, Vector2
-from phibench.estimator.interface import FAILURES, Box, Image, Outcome, Pair, Spot
+from phibench.estimator.interface import FAILURES, Outcome, Pair, Spot
 from phibench.estimator.pair_set import PairTruth, truth_folders
-from phibench.scenes.camera import Camera
-from phibench.scenes.laser import Beam
-from phibench.scenes.rig import Rig
 
 FORMAT = "phibench submission 1"
 SINGLE_PAIRS = 4
 """Version of the task from which on a sealed set shows each sample once."""
 Matrix = Annotated[tuple[Vector2, Vector2], Field(strict=False)]
-_MODES = ("RGB", "I;16", "L", "LA")  # of PNG and JPEG as `phibench seal make` writes them
 
 
 # -- pairs ---------------------------------------------------------------------------------------------------------
@@ -74,23 +57,17 @@ class SealedPairs:
     """
 
     def __init__(self, folder: Path) -> None:
-        self._folder, self._seal, self._listed = folder, read_seal(folder), read_checksums(folder)
+        self._seal = read_seal(folder)
+        self._files = PairFiles(folder, PublicPair, self._seal.pairs, first=(SEAL,))
         self._truths: tuple[PairTruth, ...] | None = None
-        for name in (SEAL, PAIRS):
-            self._read(name)
-        self._rows = read_pairs(folder)
-        if [row.number for row in self._rows] != list(range(self._seal.pairs)):
-            raise DatasetError(
-                f"{folder / PAIRS} does not hold the pairs 0 to {self._seal.pairs - 1}; download it again"
-            )
 
     def __len__(self) -> int:
-        return len(self._rows)
+        return len(self._files.rows)
 
     @property
     def folders(self) -> tuple[Path, ...]:
         """Folder of the set: the other pairs of a sample help."""
-        return (self._folder,)
+        return (self._files.folder,)
 
     @property
     def seal(self) -> Seal:
@@ -109,30 +86,7 @@ class SealedPairs:
 
     def pair(self, number: int) -> Pair:
         """Images of a pair, with what a user knows of the rig."""
-        row = self._row(number)
-        try:
-            return self._pair(row)
-        except DatasetError as error:
-            if str(error).startswith(str(self._folder)):
-                raise
-            raise DatasetError(f"{self._folder / PAIRS} line {number + 1}: {error}; download the set again") from error
-
-    def _pair(self, row: PublicPair) -> Pair:
-        number, rig = row.number, from_json(Rig, row.rig)
-        images = {name: self._image(file, rig.camera) for name, file in row.files.items()}
-        return Pair(
-            number,
-            images["down"],
-            images["up"],
-            rig=rig,
-            stroke_m=row.stroke_m,
-            card=from_json(SensorCard, row.card),
-            down_off=images.get("down_off"),
-            up_off=images.get("up_off"),
-            box_down=_private_box(row.box_down),
-            box_up=_private_box(row.box_up),
-            beam=None if row.beam is None else from_json(Beam, row.beam),
-        )
+        return pair_of_files(self._files, number)
 
     def with_truths(self, truths: Sequence[PairTruth]) -> SealedPairs:
         """The same set with the truths of all its pairs, by number."""
@@ -148,11 +102,12 @@ class SealedPairs:
         DatasetError
             If it is sealed: nobody who has only this folder has the truth.
         """
-        self._row(number)
+        self._files.row(number)
         if self._truths is not None:
             return self._truths[number]
         raise DatasetError(
-            f"{self._folder} is sealed, the truth of pair {number} is not in it; send a submission to who sealed it"
+            f"{self._files.folder} is sealed, the truth of pair {number} is not in it; "
+            "send a submission to who sealed it"
         )
 
     def document(self) -> dict[str, Any]:
@@ -167,44 +122,7 @@ class SealedPairs:
         DatasetError
             If a file is missing, changed, or not of the set.
         """
-        for name in self._listed:
-            self._read(name)
-        found = (path.relative_to(self._folder).as_posix() for path in (self._folder / FRAMES).rglob("*"))
-        if strays := sorted(set(found) - set(self._listed)):
-            raise DatasetError(f"{self._folder / strays[0]} is not of the sealed set; remove it")
-
-    def _row(self, number: int) -> PublicPair:
-        if not 0 <= number < len(self._rows):
-            raise DatasetError(f"pair {number}: there are {len(self._rows)}, numbered from 0; ask for one of them")
-        return self._rows[number]
-
-    def _read(self, name: str) -> bytes:
-        """Bytes of a file of the set."""
-        if name not in self._listed:
-            raise DatasetError(f"{self._folder / name} is not listed in {CHECKSUMS}; download the set again")
-        data = InputFile(self._folder / name, "download the set again").read()
-        if hashlib.sha256(data).hexdigest() != self._listed[name]:
-            raise DatasetError(
-                f"{self._folder / name} was changed, its SHA-256 is not the listed one; download it again"
-            )
-        return data
-
-    def _image(self, name: str, camera: Camera) -> Image:
-        """Image of a file, of the camera's size, read-only: 16 bits with one channel, or 8 bits R, G, B."""
-        file = InputFile(self._folder / name, "download the set again")
-        picture = file.picture(data=self._read(name))
-        if picture.size != (camera.width_px, camera.height_px):
-            raise file.fault(f"has {picture.width} x {picture.height} pixels, not those of the pair's camera")
-        if picture.mode not in _MODES:
-            raise file.fault(f"is a picture of mode {picture.mode}: allowed are {', '.join(_MODES)}")
-        image = np.array(picture)
-        result = image.astype(np.uint16) if image.ndim == 2 else image
-        result.flags.writeable = False
-        return result
-
-
-def _private_box(box: PublicBox | None) -> Box | None:
-    return None if box is None else Box(box.u0_px, box.v0_px, box.width_px, box.height_px)
+        self._files.check()
 
 
 # -- submissions ---------------------------------------------------------------------------------------------------

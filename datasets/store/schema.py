@@ -337,6 +337,7 @@ class TruthFolder(StrEnum):
     DATASET = "dataset.json"
     FILMS = "film.json"
     EXPORT = "export.json"
+    FRAMES_SET = "frames_set.json"
     BAKED_ROOMS = "rooms.json"
     IMPORTED = "imported.json"
     UNFINISHED = ".phibench-working"

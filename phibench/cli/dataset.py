@@ -327,7 +327,7 @@ def export(
     out: Path,
     preset: Preset = DEFAULT_PRESET,
     draws: Whole = 1,
-    laser_off: bool = False,
+    laser_off: bool | None = None,
     exposure: str | None = None,
     region: Whole | None = None,
     camera_seed: Whole | None = None,
@@ -346,7 +346,7 @@ def export(
     directory
         Folder of a data set.
     to
-        "parquet" (read by `datasets`), "webdataset" (tar files) or "frames" (image files).
+        "parquet" (read by `datasets`), "webdataset" (tar files) or "frames" (image files; `score` takes them, too).
     out
         Folder to write.
     preset
@@ -354,9 +354,9 @@ def export(
     draws
         Draws of the noise of every pair.
     laser_off
-        Also every image without the spot.
+        Also every image without the spot; by default for "frames" whose recipe has them.
     exposure
-        As in `phibench dataset frames`.
+        As in `phibench dataset frames`. Files with an exposure, a region or a camera of their own are not for `score`.
     region
         Side in pixels of a square around the spot, instead of the whole image.
     camera_seed
@@ -373,10 +373,14 @@ def export(
         Number of processes; one for each core by default.
     """
     from phibench.benchmark.export.export_make import export as export_pairs
+    from phibench.benchmark.export.export_make import scored_with_laser_off
     from phibench.benchmark.export.pair_rows import ExportRequest
 
     options = _options(preset, exposure, region, camera_seed, {})
-    request = ExportRequest(to, options, draws, laser_off, split_by, validation, test, pairs_per_shard)
+    scored = to == "frames" and not options.given
+    shares = (split_by, validation, test, pairs_per_shard)
+    off = scored_with_laser_off(directory) if laser_off is None and scored else bool(laser_off)
+    request = ExportRequest(to, options, draws, off, *shares, scored=scored)
     done = export_pairs(directory, request, out, workers=workers)
     for note in done.notes:
         print(f"note: {note}")

@@ -29,8 +29,7 @@ from phibench.cli.dataset import dataset, export, fetch, release
 from phibench.cli.film import film, loop
 from phibench.cli.methods import method
 from phibench.cli.options import DATA, INSTALLATION, METHODS, SENSOR, answer_to_old_spelling
-from phibench.cli.room import room
-from phibench.cli.scene import scene
+from phibench.cli.room import room, scene
 from phibench.cli.score import bench, compare, report, results, score
 from phibench.cli.seal import seal, submission
 from phibench.cli.studies import paper, stroke, study

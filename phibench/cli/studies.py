@@ -85,7 +85,7 @@ def _refuse(why: str, *values: object) -> None:
 
 
 def _tables(directory: Path, calibration: Path | None, wide: bool, out: Path | None) -> int:
-    from phibench.benchmark.scores.dataset_pairs import of_calibration
+    from phibench.benchmark.pair_sets.dataset_pairs import of_calibration
     from phibench.benchmark.scores.score_tables import show_grid, table_console
     from phibench.calibration.rig.file import read_calibration
     from phibench.datasets.read import open_finished

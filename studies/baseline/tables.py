@@ -16,7 +16,7 @@ import numpy as np
 import polars as pl
 from scipy.stats import bootstrap
 
-from phibench.benchmark.scores.dataset_pairs import DatasetPairs
+from phibench.benchmark.pair_sets.dataset_pairs import DatasetPairs
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.exposures.pair_draws import PairDraw, pair_draws
 from phibench.datasets.parallel import parallel_map

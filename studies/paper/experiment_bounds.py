@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
+from phibench.benchmark.pair_sets.dataset_pairs import spot_bounds as bounds_of_spot
 from phibench.benchmark.scores.answer_errors import Rules
-from phibench.benchmark.scores.dataset_pairs import spot_bounds as bounds_of_spot
 from phibench.benchmark.scores.intervals import Clusters, Estimate, estimates, rate, rms_of, rms_ratio_of
 from phibench.benchmark.scores.score_tables import TextTable, cell_parts
 from phibench.datasets.errors import DatasetError

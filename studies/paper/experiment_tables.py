@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from phibench.benchmark.scores.dataset_pairs import DatasetPairs
+from phibench.benchmark.pair_sets.dataset_pairs import DatasetPairs
 from phibench.calibration.outline.outline_result import mean_outline
 from phibench.calibration.rig.bundle import Bundle, calibrate
 from phibench.calibration.rig.from_dataset import frame_outline, frame_spots

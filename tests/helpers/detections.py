@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 from helpers.further_spots import with_further_spots
 
+from phibench.benchmark.pair_sets.dataset_pairs import dataset_pairs
 from phibench.benchmark.scores.answer_errors import MATCH_PX, Rules
-from phibench.benchmark.scores.dataset_pairs import dataset_pairs
 from phibench.benchmark.scores.intervals import Clusters, Estimate, rate
 from phibench.benchmark.scores.strata import CLEAR_SIGMAS
 from phibench.datasets.read import Dataset, open_dataset

@@ -23,6 +23,7 @@ from helpers.bench_cases import cases, outcomes, truth_itself
 from PIL import Image
 
 from phibench.benchmark.isolation.resolve import Reference
+from phibench.benchmark.pair_sets.truth_file import read_truth_file, truth_text
 from phibench.benchmark.scores.answer_errors import Rules
 from phibench.benchmark.scores.document import MethodCard, read_records, read_score, write_score
 from phibench.benchmark.scores.score import score_outcomes
@@ -34,7 +35,6 @@ from phibench.benchmark.sealed.sealed_set import (
     seal_id,
 )
 from phibench.benchmark.sealed.submission import SealedPairs, outcomes_of, read_submission, submission
-from phibench.benchmark.sealed.truth_file import read_truth_file, truth_text
 from phibench.calibration.captures.picture_files import read_picture
 from phibench.calibration.rig.bundle import Bundle
 from phibench.calibration.rig.file import read_calibration, write_calibration

@@ -10,8 +10,8 @@ import pytest
 
 from phibench.benchmark.isolation import example_method
 from phibench.benchmark.isolation.example_method import extract
+from phibench.benchmark.pair_sets.dataset_pairs import dataset_pairs
 from phibench.benchmark.scores.answer_errors import MATCH_PX
-from phibench.benchmark.scores.dataset_pairs import dataset_pairs
 from phibench.datasets.read import open_finished
 from phibench.estimator.interface import Answer, Pair
 

@@ -18,8 +18,8 @@ from helpers.processes import quiet
 
 from phibench.benchmark.isolation.easy_pairs import EasyPairs
 from phibench.benchmark.isolation.pairs_ahead import PairsAhead
+from phibench.benchmark.pair_sets.dataset_pairs import dataset_pairs
 from phibench.benchmark.scores import score as scoring
-from phibench.benchmark.scores.dataset_pairs import dataset_pairs
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.read import open_finished
 from phibench.estimator.interface import Pair

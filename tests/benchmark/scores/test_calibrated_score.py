@@ -12,9 +12,9 @@ import pytest
 from helpers.bench_cases import RIG, Cases, cases
 from scipy import stats
 
+from phibench.benchmark.pair_sets.dataset_pairs import CalibratedPairs, of_calibration
 from phibench.benchmark.scores import score as scoring
 from phibench.benchmark.scores.answer_errors import Rules
-from phibench.benchmark.scores.dataset_pairs import CalibratedPairs, of_calibration
 from phibench.benchmark.scores.metrics import measure, prepared
 from phibench.benchmark.scores.records import records
 from phibench.calibration.rig.bundle import Bundle

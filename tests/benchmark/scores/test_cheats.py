@@ -29,8 +29,8 @@ from helpers.sandbox_pairs import GOOD, SmallPairs, method_file
 from scipy.stats import norm
 
 from phibench.benchmark.isolation.runner import Harness
+from phibench.benchmark.pair_sets.dataset_pairs import dataset_pairs
 from phibench.benchmark.scores.answer_errors import Rules
-from phibench.benchmark.scores.dataset_pairs import dataset_pairs
 from phibench.benchmark.scores.metrics import measure, prepared
 from phibench.benchmark.scores.records import records
 from phibench.datasets.read import open_finished

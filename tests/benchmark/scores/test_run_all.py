@@ -17,8 +17,8 @@ from phibench.benchmark.isolation import resolve as resolving
 from phibench.benchmark.isolation.process import MethodProcess
 from phibench.benchmark.isolation.resolve import GROUP, MethodError, RunLimits, resolve
 from phibench.benchmark.isolation.runner import Harness
+from phibench.benchmark.pair_sets.dataset_pairs import dataset_pairs
 from phibench.benchmark.scores import score as scoring
-from phibench.benchmark.scores.dataset_pairs import dataset_pairs
 from phibench.benchmark.scores.document import read_score
 from phibench.benchmark.scores.score import bench, score
 from phibench.cli import main as cli

@@ -14,7 +14,7 @@ import polars as pl
 import pytest
 from helpers.processes import quiet
 
-from phibench.benchmark.scores.dataset_pairs import dataset_pairs
+from phibench.benchmark.pair_sets.dataset_pairs import dataset_pairs
 from phibench.benchmark.scores.document import read_records, read_score, write_score
 from phibench.benchmark.scores.records import COLUMN_TYPES
 from phibench.benchmark.scores.score import Scored, score

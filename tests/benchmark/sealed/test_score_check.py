@@ -12,8 +12,8 @@ import polars as pl
 import pytest
 from helpers.processes import quiet
 
+from phibench.benchmark.pair_sets.dataset_pairs import dataset_pairs
 from phibench.benchmark.scores.answer_errors import Rules
-from phibench.benchmark.scores.dataset_pairs import dataset_pairs
 from phibench.benchmark.scores.document import MethodCard, ScoreDocument, read_records, read_score, write_score
 from phibench.benchmark.scores.score import isolated, saved, score, score_outcomes
 from phibench.benchmark.sealed.score_check import check_score, schema_text

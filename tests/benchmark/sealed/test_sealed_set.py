@@ -17,7 +17,8 @@ from helpers.processes import quiet
 from helpers.sealed_sets import refusal, tampered
 from PIL import Image
 
-from phibench.benchmark.scores.dataset_pairs import dataset_pairs
+from phibench.benchmark.pair_sets.dataset_pairs import dataset_pairs
+from phibench.benchmark.pair_sets.truth_file import TruthRow, truth_document, truth_of
 from phibench.benchmark.scores.document import read_score
 from phibench.benchmark.scores.score import show
 from phibench.benchmark.sealed.sealed_set import (
@@ -30,7 +31,6 @@ from phibench.benchmark.sealed.sealed_set import (
     single_pairs,
 )
 from phibench.benchmark.sealed.submission import SealedPairs, submit
-from phibench.benchmark.sealed.truth_file import TruthRow, truth_document, truth_of
 from phibench.cli import main as cli
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.read import open_dataset
@@ -297,7 +297,7 @@ def test_a_frame_changed_with_its_hash_is_refused(sealed: Sealed, submitted: Pat
         (lambda c: (c / "seal.json").write_text("{"), "seal.json is damaged"),
         (lambda c: flip(c / "pairs.jsonl"), "pairs.jsonl was changed"),
         (lambda c: next((c / "frames").iterdir()).unlink(), "is missing"),
-        (lambda c: (c / "frames" / "note.png").write_bytes(b"x"), "is not of the sealed set"),
+        (lambda c: (c / "frames" / "note.png").write_bytes(b"x"), "is not of the set"),
     ],
 )
 def test_a_spoiled_set_is_refused(sealed: Sealed, submitted: Path, copy: Path, spoil: Any, words: str) -> None:

@@ -11,7 +11,7 @@ import pytest
 from helpers.sealed_sets import METHOD, refusal, tampered
 
 from phibench.benchmark.isolation.runner import run_method
-from phibench.benchmark.scores.dataset_pairs import TASK_VERSION
+from phibench.benchmark.pair_sets.dataset_pairs import TASK_VERSION
 from phibench.benchmark.sealed.sealed_set import Sealed
 from phibench.benchmark.sealed.submission import SealedPairs, outcomes_of, read_submission, unseal
 

@@ -15,7 +15,7 @@ import pytest
 from helpers.bench_samples import hidden, with_tables
 from PIL import Image
 
-from phibench.benchmark.scores.dataset_pairs import DatasetPairs, dataset_pairs, spot_bounds
+from phibench.benchmark.pair_sets.dataset_pairs import DatasetPairs, dataset_pairs, spot_bounds
 from phibench.benchmark.scores.worst_images import worst
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.exposures.expected import expected_of_light, expected_region

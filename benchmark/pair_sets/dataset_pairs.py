@@ -26,6 +26,7 @@ from phibench.datasets.frames.source import FrameSource, PositionLight
 from phibench.datasets.read import Dataset, Sample, open_dataset
 from phibench.datasets.store import schema
 from phibench.datasets.store.files import sha256
+from phibench.datasets.store.pair_files import LEAST_BOX_PX
 from phibench.datasets.store.provenance import provenance
 from phibench.datasets.store.short_form import ShortForm
 from phibench.estimator.draw_pairs import DrawnPairs
@@ -35,15 +36,7 @@ from phibench.estimator.limits.off_frame_bound import FrameCounts, on_off_limit,
 from phibench.estimator.limits.position_bound import SpotLimit, spot_limit
 from phibench.estimator.limits.processed_bound import chain_limit
 from phibench.estimator.limits.spot_snr import processed_snr, raw_snr
-from phibench.estimator.pair_set import (
-    LEAST_BOX_PX,
-    Distraction,
-    ImageTruth,
-    PairSet,
-    PairTruth,
-    tell_answered,
-    truth_folders,
-)
+from phibench.estimator.pair_set import Distraction, ImageTruth, PairSet, PairTruth, tell_answered, truth_folders
 from phibench.estimator.spots.gaussian_spot import SpotBlur
 from phibench.estimator.spots.image_planes import PROCESSED
 from phibench.estimator.spots.spot_prediction import spot_blur

@@ -15,106 +15,25 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import Field
 
 from phibench.datasets.errors import DatasetError
-from phibench.datasets.input_files import InputFile, Name
+from phibench.datasets.input_files import InputFile
 from phibench.datasets.store.documents import from_json, to_json
-from phibench.datasets.store.schema import Document, Number
-from phibench.estimator.pair_set import LEAST_BOX_PX, Distraction, ImageTruth, PairTruth
+from phibench.datasets.store.pair_files import MOST_PAIRS, SpotTruthRow, TruthRow
+from phibench.datasets.store.schema import Document
+from phibench.estimator.pair_set import Distraction, ImageTruth, PairTruth
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import Rig
 
-MOST_PAIRS = 1_000_000
 Digest = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
 
 _MATRICES = ("bound_px2", "raw_bound_px2")
 _RIGS = ("true_rig", "nominal_rig")
-# keys of "phibench truth 1"
-_RENAMED = {"believed_rig": "nominal_rig", "believed_stroke_m": "nominal_stroke_m"}
 _NOT_SEALED = (
     "calibration_covariance",
     "depth_sigma_m",
 )  # of a score's calibration, and of real pairs: never of a seal
-_LARGEST = 1e100  # of a number of a truth: its square is a double, too
-
-
-def _sensible(value: float) -> float:
-    if abs(value) > _LARGEST:
-        raise ValueError(f"{value} is beyond +-{_LARGEST}")
-    return value
-
-
-_Real = Annotated[float, AfterValidator(_sensible)]
-_RealOrNan = Annotated[Number, AfterValidator(_sensible)]
-_Place = Annotated[tuple[_RealOrNan, _RealOrNan], Field(strict=False)]
-_Matrix = Annotated[tuple[_Place, _Place], Field(strict=False)]
-
-
-class DistractionRow(Document):
-    """A `Distraction` in the truth's file."""
-
-    kind: Name
-    uv_px: _Place
-    electrons: _RealOrNan
-
-
-class AnglesRow(Document):
-    """The three phi of a spot."""
-
-    ray: _RealOrNan
-    normal: _RealOrNan
-    incidence: _RealOrNan
-
-
-class SpotTruthRow(Document):
-    """A `ImageTruth` in the truth's file."""
-
-    uv_px: _Place
-    phi_rad: AnglesRow
-    azimuth_rad: _RealOrNan
-    visible: bool
-    cause: Name
-    electrons: _RealOrNan
-    peak_e: _RealOrNan
-    snr: _RealOrNan
-    saturated: bool
-    bound_px2: _Matrix | None
-    raw_bound_px2: _Matrix | None
-    distractions: Annotated[tuple[DistractionRow, ...], Field(strict=False, max_length=1000)]
-    axis_px: _Place = (math.nan, math.nan)
-
-
-class TruthRow(Document):
-    """A `PairTruth` in the truth's file, of version 1 or 2."""
-
-    number: Annotated[int, Field(ge=0, lt=MOST_PAIRS)]
-    sample_id: Name
-    draw: Annotated[int, Field(ge=0, lt=MOST_PAIRS)]
-    preset: Name
-    jpeg_quality: Annotated[int, Field(ge=1, le=100)] | None
-    hinted: bool
-    depth_m: _Real
-    stroke_m: _Real
-    true_rig: dict[str, Any]
-    nominal_rig: dict[str, Any]
-    down: SpotTruthRow
-    up: SpotTruthRow
-    nominal_stroke_m: _Real | None
-    exposure_s: _Real | None = None
-    analogue_gain: _Real | None = None
-    laser_level: _Real | None = None
-    lamp_level: _Real | None = None
-    axis_depth_m: _RealOrNan = math.nan
-    box_px2: _Real = float(LEAST_BOX_PX**2)
-
-    @model_validator(mode="before")
-    @classmethod
-    def _names_of_version_1(cls, document: Any) -> Any:
-        if not isinstance(document, dict):
-            return document
-        renamed = {old: new for old, new in _RENAMED.items() if new not in document}
-        return {renamed.get(name, name): value for name, value in document.items()}
 
 
 class SealedTruth(Document):

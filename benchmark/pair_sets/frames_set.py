@@ -1,0 +1,285 @@
+"""Frames set: camera frames with their truth, which scores take like a data set with layers.
+
+frames_set.json   where the frames come from: data set, preset, draws, task version
+pairs.jsonl       per pair: files, what a user knows, and the truth with its bounds
+frames/           images: PNG of 8 or 16 bits, or the camera's JPEG
+SHA256SUMS        of everything above
+
+Its pairs are those of `Dataset.pairs` in one preset, with the same numbers and bytes. Nothing is drawn anew: no other
+exposure, boxes or sensor. `phibench export --to frames` writes one.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field
+
+from phibench.benchmark.pair_sets.dataset_pairs import TASK_VERSION, DatasetPairs
+from phibench.benchmark.pair_sets.truth_file import truth_document, truth_of
+from phibench.datasets.errors import DatasetError
+from phibench.datasets.frames.sensor_card import SensorCard
+from phibench.datasets.input_files import SETTINGS_BYTES, InputFile, Name
+from phibench.datasets.store.documents import from_json
+from phibench.datasets.store.files import sha256, write_text
+from phibench.datasets.store.pair_files import (
+    FRAMES_SET,
+    MOST_PAIRS,
+    PAIRS,
+    FramesRow,
+    PairFiles,
+    PublicBox,
+    TruthRow,
+    public_fields,
+)
+from phibench.datasets.store.provenance import provenance
+from phibench.datasets.store.schema import CHECKSUMS, Document
+from phibench.datasets.store.short_form import ShortForm
+from phibench.estimator.interface import Box, Pair
+from phibench.estimator.pair_set import PairTruth
+from phibench.scenes.laser import Beam
+from phibench.scenes.rig import Rig
+
+FORMAT: Literal["phibench frames set 1"] = "phibench frames set 1"
+_Count = Annotated[int, Field(ge=1, le=MOST_PAIRS)]
+
+
+class FramesInfo(Document):
+    """`frames_set.json`."""
+
+    format: Literal["phibench frames set 1"] = FORMAT
+    name: Name
+    task_version: Annotated[int, Field(ge=1, le=1000)]
+    preset: Name
+    draws: _Count
+    pairs: _Count
+    samples: _Count
+    seed: Annotated[int, Field(ge=0)]
+    recipe_sha256: Name
+    dataset_sha256: Name | None
+
+
+class FramesSet(ShortForm):
+    """Pairs of a frames set by number, with their truth.
+
+    Parameters
+    ----------
+    folder : Path
+    numbers : sequence of int, optional
+        Of the pairs in the files; all by default. They are numbered from 0 here.
+    hints : bool
+        Show the boxes of pairs that have some.
+
+    Raises
+    ------
+    DatasetError
+        If it is no frames set, of another task version, incomplete, or changed; in one sentence.
+    """
+
+    def __init__(self, folder: str | Path, numbers: Sequence[int] | None = None, hints: bool = True) -> None:
+        self.folder = Path(folder)
+        self.info = _read_info(self.folder)
+        self._files = PairFiles(self.folder, FramesRow, self.info.pairs, (FRAMES_SET,))
+        self._numbers = tuple(range(self.info.pairs) if numbers is None else numbers)
+        self._hints = hints
+
+    def _shown(self) -> dict[str, Any]:
+        return {"folder": self.folder, "data set": self.info.name, "pairs": len(self), "preset": self.preset}
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle without rows: another process opens the set itself."""
+        return FramesSet, (self.folder, self._numbers, self._hints)
+
+    @property
+    def preset(self) -> str:
+        """Sensor preset of the frames."""
+        return self.info.preset
+
+    @property
+    def folders(self) -> tuple[Path, ...]:
+        """Folder of the set, with the truth."""
+        return (self.folder,)
+
+    def __len__(self) -> int:
+        return len(self._numbers)
+
+    def __iter__(self) -> Iterator[tuple[Pair, PairTruth]]:
+        """Pairs with their truths, by number."""
+        return ((self.pair(number), self.truth(number)) for number in range(len(self)))
+
+    def pair(self, number: int) -> Pair:
+        """Images of a pair, with what a user knows of the rig."""
+        found = replace(pair_of_files(self._files, self._place(number)), number=number)
+        return found if self._hints else replace(found, box_down=None, box_up=None)
+
+    def truth(self, number: int) -> PairTruth:
+        """Exact answer for a pair, with its bounds.
+
+        Raises
+        ------
+        DatasetError
+            If the line of the pair holds no rig.
+        """
+        place = self._place(number)
+        try:
+            found = truth_of(self._files.row(place).truth)
+        except DatasetError as error:
+            raise DatasetError(f"{self.folder / PAIRS} line {place + 1}: {error}; download the set again") from error
+        return replace(found, number=number, hinted=found.hinted and self._hints)
+
+    def number_of(self, sample_id: str, draw: int = 0, preset: str | None = None) -> int:
+        """Number of the pair of a sample in a draw of the noise, as scores name it.
+
+        Raises
+        ------
+        DatasetError
+            If there is none.
+        """
+        wanted = (sample_id, draw, preset or self.preset)
+        rows = (self._files.row(place).truth for place in self._numbers)
+        found = [k for k, row in enumerate(rows) if (row.sample_id, row.draw, row.preset) == wanted]
+        if not found:
+            raise DatasetError(f"sample '{sample_id}', draw {draw}, preset {wanted[2]}: there is no such pair")
+        return found[0]
+
+    def pairs(
+        self, preset: str | None = None, draws: int | None = None, *, pairs: int | None = None, hints: bool = True
+    ) -> FramesSet:
+        """A part of the set: the first draws of each sample, the first pairs, or pairs without their boxes.
+
+        Raises
+        ------
+        DatasetError
+            If the set has another preset, or fewer draws.
+        """
+        if preset not in (None, self.preset):
+            raise DatasetError(
+                f"{self.folder} holds frames of '{self.preset}', none of '{preset}': leave the preset out, or take "
+                "the set of that preset"
+            )
+        if draws is not None and not 1 <= draws <= self.info.draws:
+            raise DatasetError(f"draws = {draws}: {self.folder} holds 1 to {self.info.draws} of each sample")
+        if pairs is not None and pairs < 1:
+            raise DatasetError(f"pairs = {pairs}: must be 1 or above")
+        most = self.info.draws if draws is None else draws
+        numbers = [place for place in self._numbers if self._files.row(place).truth.draw < most]
+        return FramesSet(self.folder, numbers[:pairs], hints)
+
+    def check(self) -> None:
+        """Read every file once.
+
+        Raises
+        ------
+        DatasetError
+            If a file is missing, changed, or not of the set.
+        """
+        self._files.check()
+
+    def document(self) -> dict[str, Any]:
+        """Provenance of the set."""
+        rows = [self._files.row(place).truth for place in self._numbers]
+        return {
+            "name": self.info.name,
+            "task_version": self.info.task_version,
+            "sealed": False,
+            "pairs": len(self),
+            "samples": len({row.sample_id for row in rows}),
+            "presets": [self.preset],
+            "hinted": sum(row.hinted for row in rows) if self._hints else 0,
+            "boxes_px": None,
+            "seed": self.info.seed,
+            "recipe_sha256": self.info.recipe_sha256,
+            "dataset_sha256": self.info.dataset_sha256,
+            "frames_set_sha256": sha256(self.folder / CHECKSUMS),
+            "provenance": provenance(),
+        }
+
+    def _place(self, number: int) -> int:
+        if not 0 <= number < len(self):
+            raise DatasetError(f"pair {number}: there are {len(self)}, numbered from 0; ask for one of them")
+        return self._numbers[number]
+
+
+def _read_info(folder: Path) -> FramesInfo:
+    path = folder / FRAMES_SET
+    if not path.is_file():
+        raise DatasetError(
+            f"{folder} is no frames set: it has no {FRAMES_SET}; `phibench export --to frames` writes one"
+        )
+    if not (folder / CHECKSUMS).is_file():
+        raise DatasetError(f"{folder / CHECKSUMS} is missing: the set was not finished, or download it again")
+    info = InputFile(path, "download the set again", limit_bytes=SETTINGS_BYTES).document(FramesInfo)
+    if info.task_version != TASK_VERSION:
+        raise DatasetError(
+            f"{folder} is of task version {info.task_version}, this phibench scores version {TASK_VERSION}; fetch or "
+            "export the set again"
+        )
+    return info
+
+
+def frames_row(pair: Pair, truth: PairTruth, files: dict[str, str]) -> dict[str, Any]:
+    """Line of a pair whose images lie in files, as JSON."""
+    row = FramesRow(**public_fields(pair, files), truth=TruthRow.model_validate(truth_document(truth)))
+    document: dict[str, Any] = row.model_dump(mode="json")
+    return document
+
+
+def write_frames_set(
+    out: Path, pairs: DatasetPairs, preset: str, draws: int, rows: Sequence[dict[str, Any]]
+) -> tuple[str, ...]:
+    """Write `pairs.jsonl` and `frames_set.json` beside the images; return their names."""
+    known = pairs.document()
+    info = FramesInfo(
+        name=known["name"],
+        task_version=TASK_VERSION,
+        preset=preset,
+        draws=draws,
+        pairs=len(rows),
+        samples=known["samples"],
+        seed=known["seed"],
+        recipe_sha256=known["recipe_sha256"],
+        dataset_sha256=known["dataset_sha256"],
+    )
+    ordered = sorted(rows, key=lambda row: int(row["number"]))
+    write_text(out / PAIRS, "".join(json.dumps(row, allow_nan=False) + "\n" for row in ordered))
+    write_text(out / FRAMES_SET, json.dumps(info.model_dump(mode="json"), indent=1) + "\n")
+    return PAIRS, FRAMES_SET
+
+
+def pair_of_files(files: PairFiles[Any], number: int) -> Pair:
+    """Images of a pair in files, with what a user knows of the rig.
+
+    Raises
+    ------
+    DatasetError
+        If a file or the line of the pair will not do; in one sentence.
+    """
+    row = files.row(number)
+    try:
+        rig = from_json(Rig, row.rig)
+        images = {name: files.image(file, rig.camera) for name, file in row.files.items()}
+        return Pair(
+            number,
+            images["down"],
+            images["up"],
+            rig=rig,
+            stroke_m=row.stroke_m,
+            card=from_json(SensorCard, row.card),
+            down_off=images.get("down_off"),
+            up_off=images.get("up_off"),
+            box_down=_box(row.box_down),
+            box_up=_box(row.box_up),
+            beam=None if row.beam is None else from_json(Beam, row.beam),
+        )
+    except DatasetError as error:
+        if str(error).startswith(str(files.folder)):
+            raise
+        raise DatasetError(f"{files.folder / PAIRS} line {number + 1}: {error}; download the set again") from error
+
+
+def _box(box: PublicBox | None) -> Box | None:
+    return None if box is None else Box(box.u0_px, box.v0_px, box.width_px, box.height_px)
