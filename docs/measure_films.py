@@ -19,7 +19,7 @@ from scipy.stats import chi2
 
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.film.film_read import Film, open_films
-from phibench.estimator.geometry.depth_interval import depth_pull
+from phibench.estimator.geometry.status import depth_pull
 from phibench.robot.film.film_estimates import bundle_depth, filtered, seen_film
 from phibench.robot.film.film_frames import film_frames
 

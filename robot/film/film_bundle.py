@@ -18,9 +18,9 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from phibench.datasets.errors import DatasetError
-from phibench.estimator.geometry.depth_interval import depth_interval
 from phibench.estimator.geometry.mirror_image import image_of
 from phibench.estimator.geometry.rig_parameters import PARAMETERS, STROKE_PARAMETERS
+from phibench.estimator.geometry.status import depth_interval
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.robot.film.film_positions import FilmPositions
 from phibench.scenes.frames import Array, BoolArray

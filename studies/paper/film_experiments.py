@@ -31,7 +31,7 @@ from phibench.datasets.film.film_read import Film, Films
 from phibench.datasets.film.film_store import FilmInfo
 from phibench.datasets.frames.sensor_card import card_of
 from phibench.datasets.read import Dataset
-from phibench.estimator.geometry.depth_interval import depth_pull
+from phibench.estimator.geometry.status import depth_pull
 from phibench.estimator.interface import Image, Pair
 from phibench.robot.film.film_bundle import FilmDepth, film_depth
 from phibench.robot.film.film_estimates import EqualLight, bundle_depth, equal_light, seen_film

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from phibench.estimator.geometry.depth_interval import LINEAR, depth_interval, depth_pull
+from phibench.estimator.geometry.status import LINEAR, depth_interval, depth_pull
 
 
 def test_pulls_of_a_gaussian_disparity_are_normal_on_both_sides() -> None:
