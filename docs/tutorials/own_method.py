@@ -184,6 +184,6 @@ plt.show()
 # ## What next
 #
 # * Put `extract` into a file and score it as `my_phi.py:extract`: it then runs alone, with limits of time and memory.
-# * Score on the paper's 25 pairs of full size (`make dataset`), then on [the benchmark](../benchmark.md).
+# * Score on the paper's 25 pairs of full size (`make dataset`), then on [the benchmark](../release.md).
 # * What a method gets and may answer: [a method of your own](../method.md). What the numbers mean:
 #   [scoring](../scoring.md).
