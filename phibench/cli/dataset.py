@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from cyclopts import App, Parameter
 
 from phibench.cli.completions import parts, pictures, recipes, released
-from phibench.cli.options import DATA, DEFAULT_PRESET, OwnOrPreset, Preset, Whole
+from phibench.cli.options import DEFAULT_PRESET, START, OwnOrPreset, Preset, Whole
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from phibench.datasets.frames.request import FrameOptions
     from phibench.datasets.read import Sample
 
-dataset = App(name="dataset", group=DATA, help="Make, check and show data sets; draw frames and panoramas.")
+dataset = App(name="dataset", group=START, help="Make, check and show data sets; draw frames and panoramas.")
 
 
 @dataset.command

@@ -28,10 +28,11 @@ from phibench.cli.captures import import_, measure, sensor
 from phibench.cli.dataset import dataset, export, fetch, release
 from phibench.cli.film import film, loop
 from phibench.cli.methods import method
-from phibench.cli.options import DATA, INSTALLATION, METHODS, SENSOR, answer_to_old_spelling
+from phibench.cli.options import DATA, INSTALLATION, KEEPERS, METHODS, SENSOR, START, answer_to_old_spelling
 from phibench.cli.room import room, scene
 from phibench.cli.score import bench, compare, report, results, score
 from phibench.cli.seal import seal, submission
+from phibench.cli.start import recipe, start
 from phibench.cli.studies import paper, stroke, study
 from phibench.datasets.parallel import ONE_THREAD
 
@@ -50,25 +51,26 @@ app = App(
     suppress_keyboard_interrupt=False,
     result_action="return_value",
 )
-for _group in (dataset, film, room, scene, method, seal, submission, sensor, loop, study):
+for _group in (recipe, dataset, film, room, scene, method, seal, submission, sensor, loop, study):
     app.command(_group)
+app.command(start, group=START)
 app.command(export, group=DATA)
-app.command(release, group=DATA)
+app.command(release, group=KEEPERS)
 app.command(fetch, group=DATA)
-app.command(score, group=METHODS)
+app.command(score, group=START)
 app.command(bench, group=METHODS)
 app.command(compare, group=METHODS)
-app.command(report, group=METHODS)
-app.command(results, group=METHODS)
+app.command(report, group=START)
+app.command(results, group=KEEPERS)
 app.command(calibrate, group=SENSOR)
 app.command(align, group=SENSOR)
-app.command(measure, group=SENSOR)
+app.command(measure, group=START)
 app.command(import_, name="import", group=SENSOR)
 app.command(paper, group=SENSOR)
 app.command(stroke, group=SENSOR)
 
 
-cache = App(name="cache", group=INSTALLATION, help="Show, clear and limit the cache of baked rooms.")
+cache = App(name="cache", group=KEEPERS, help="Show, clear and limit the cache of baked rooms.")
 app.command(cache)
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import App, Parameter
 
 from phibench.cli.completions import methods
-from phibench.cli.options import DEFAULT_PRESET, LIMITS, METHODS, Limits, Preset, wide_console
+from phibench.cli.options import DEFAULT_PRESET, LIMITS, START, Limits, Preset, wide_console
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -21,7 +21,7 @@ _EXAMPLE = Path(__file__).parents[1] / "benchmark" / "isolation" / "example_meth
 
 method = App(
     name="method",
-    group=METHODS,
+    group=START,
     help="Write, check and list methods, which find the spot in images.",
 )
 

@@ -19,8 +19,9 @@ if TYPE_CHECKING:
 
     from phibench.benchmark.isolation.resolve import RunLimits
 
-DATA, METHODS, SENSOR, INSTALLATION = (
-    Group.create_ordered(name) for name in ("Data sets", "Methods", "Sensor and paper", "Installation")
+START, DATA, METHODS, SENSOR, KEEPERS, INSTALLATION = (
+    Group.create_ordered(name)
+    for name in ("Start with", "Data sets", "Methods", "Sensor and paper", "Publish and study", "Installation")
 )
 DEFAULT_PRESET = "mjpeg"  # what the C310 delivers; a data set's own presets go before it
 SECONDS = 30.0  # of one pair; the same numbers as in `sandbox.resolve.RunLimits`, whose module is slow to import

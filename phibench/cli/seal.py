@@ -8,11 +8,11 @@ from typing import Annotated
 
 from cyclopts import App, Parameter
 
-from phibench.cli.options import LIMITS, METHODS, Limits, OwnOrPreset, Whole
+from phibench.cli.options import KEEPERS, LIMITS, Limits, OwnOrPreset, Whole
 
 seal = App(
     name="seal",
-    group=METHODS,
+    group=KEEPERS,
     help="Seal a data set, answer a sealed one, and score the answers.",
 )
 
@@ -118,7 +118,7 @@ def open_(public: Path, *, truth: Path, submission: Path, out: Path | None = Non
 
 submission = App(
     name="submission",
-    group=METHODS,
+    group=KEEPERS,
     help="Check a score that is to be added to the results.",
 )
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import App, Parameter
 
-from phibench.cli.options import DEFAULT_PRESET, SENSOR, OwnOrPreset, Preset, Whole, number
+from phibench.cli.options import DEFAULT_PRESET, KEEPERS, OwnOrPreset, Preset, Whole, number
 
 if TYPE_CHECKING:
     from phibench.estimator.limits.best_stroke import BestStroke
@@ -250,7 +250,7 @@ STUDIES = {
 }
 """Every study in one sentence; the names are those of `studies.run`."""
 
-study = App(name="study", group=SENSOR, help="Run a study: its data sets, tables in Parquet, drawings, and findings.")
+study = App(name="study", group=KEEPERS, help="Run a study: its data sets, tables in Parquet, drawings, and findings.")
 
 
 def _command(name: str, sentence: str) -> None:

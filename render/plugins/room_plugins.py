@@ -17,7 +17,6 @@ import numpy as np
 
 from phibench.render.plugins.plugin_tree import BitmapPlugin, Plugin, Rgb, Triangles, Value
 from phibench.render.room.camera_plugin import MM_PER_M
-from phibench.render.room.scene import to_scene_mm
 from phibench.scenes.faces import face_table
 from phibench.scenes.frames import Array, Pose
 from phibench.scenes.rig import View
@@ -155,3 +154,11 @@ def _bitmap(texture: Bitmap, label: str, index: int) -> Plugin:
     picture = BitmapPlugin(shape_key(index), texture.values[..., :3])
     values: dict[str, Value] = {"filename": picture, "raw": True, "filter_type": "bilinear", "wrap_mode": "repeat"}
     return Plugin("texture", "bitmap", values, label=label)
+
+
+def to_scene_mm(view: View, points_world_m: Array) -> Array:
+    """World points, metres, in Mitsuba's scene: millimetres from the sphere centre.
+
+    In metres with the origin on the floor Mitsuba's ray offset moves the spot by 0.01 px.
+    """
+    return MM_PER_M * (points_world_m - view.sphere_centre_m)

@@ -21,7 +21,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phibench.render.room.camera_plugin import MM_PER_M
-from phibench.render.room.scene import load_scene
 from phibench.render.room.texel_grid import TexelGrid
 from phibench.scenes.faces import FaceTable, IntArray
 from phibench.scenes.frames import Array
@@ -320,3 +319,11 @@ def _inside_reflectance(mi: ModuleType, coats: Array) -> Array:
         coat: mi.fresnel_diffuse_reflectance(1.0 / coat) if coat > 0.0 else 0.0 for coat in set(map(float, coats))
     }
     return np.array([float(np.array(values[float(coat)]).ravel()[0]) if coat > 0.0 else 0.0 for coat in coats])
+
+
+def load_scene(mi: ModuleType, scene: dict[str, Any]) -> Any:
+    """Load a scene dictionary so that lamps keep their order, and runs their bits.
+
+    Mitsuba's scene optimisation merges meshes and materials in an order that differs between loads.
+    """
+    return mi.load_dict(scene, parallel=False, optimize=False)

@@ -17,10 +17,10 @@ from helpers.path_spots import compare
 
 from phibench.render.optics.spot_layer import spot_layer
 from phibench.render.optics.truth import spot_truth, truth_layer
+from phibench.render.plugins.room_plugins import to_scene_mm
 from phibench.render.room.ambient import render_ambient
 from phibench.render.room.camera_plugin import sensor_dict
 from phibench.render.room.light_map import BakeSettings, bake
-from phibench.render.room.scene import to_scene_mm
 from phibench.render.setup.variant import activate
 from phibench.scenes.camera import Camera, Detector
 from phibench.scenes.catalog import c310_camera, default_rig, lab

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from phibench.render.plugins.plugin_tree import mitsuba_dict
 from phibench.render.plugins.standard_scene import standard_scene
 from phibench.render.room.camera_plugin import sensor_dict
-from phibench.render.room.scene import load_scene
+from phibench.render.room.surfaces import load_scene
 from phibench.render.setup.variant import activate
 from phibench.scenes.rig import View
 from phibench.scenes.room import Room
