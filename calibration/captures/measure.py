@@ -26,6 +26,7 @@ from phibench.calibration.captures.pair_photos import (
     PairPhotos,
     PositionPhotos,
     contradiction,
+    exchanged_colours,
     frames_note,
     moved_between,
     moved_note,
@@ -238,6 +239,8 @@ def _measured(test: ChainTest, stroke_m: float, setting: KnownNumbers) -> Measur
     )
     if int(depth.status) != Status.OK:
         raise contradiction(found.pair, photos, describe(int(depth.status)))
+    if test.doubt and (fault := exchanged_colours(found.pair, photos)):
+        raise fault
     tests = _doubt(depth), _torn(down, "down"), _torn(up, "up"), *_moved(found.pair, photos), _foreign(test)
     notes = (chosen.note, test.note, *found.notes, frames_note(photos), *tests)
     told = tuple(text for text in notes if text)

@@ -155,6 +155,18 @@ def known_fault(pair: Pair, photos: PairPhotos) -> DatasetError | None:
             f"the light changed between laser on and off: {getattr(photos, name).off[0].path} has {ratio:.2f} times "
             "the codes of the picture with the laser on; fix exposure and white balance, and leave the lamps alone"
         )
+    if fault := exchanged_colours(pair, photos):
+        return fault
+    for position in POSITIONS:
+        if f"{position}_off" not in pair.images:
+            continue
+        on, off = pair.images[position], pair.images[f"{position}_off"]
+        if _both(detect(replace(pair, **{position: off, f"{position}_off": on}))):
+            group: PositionPhotos = getattr(photos, position)
+            return DatasetError(
+                f"laser on and off are exchanged at the position {position}: the spot is in {group.off[0].path}; give "
+                f"it to --{position}, and {group.on[0].path} to --{position}-off"
+            )
     if pair.down_off is not None and pair.up_off is not None:
         other = replace(pair, down=pair.down_off, up=pair.up_off, down_off=pair.down, up_off=pair.up)
         if _both(detect(other)):
@@ -163,6 +175,24 @@ def known_fault(pair: Pair, photos: PairPhotos) -> DatasetError | None:
                 f"{photos.up.off[0].path}; give these to --down and --up, the others to --down-off and --up-off"
             )
     return next(_strokes_faults(pair), None)
+
+
+def exchanged_colours(pair: Pair, photos: PairPhotos) -> DatasetError | None:
+    """Error of pictures whose spots are blue: programs that count B, G, R wrote them as R, G, B."""
+    if any(image.ndim != 3 or image.shape[2] != 3 for image in pair.images.values()):
+        return None
+    other = detect(replace(pair, **{name: image[..., ::-1] for name, image in pair.images.items()}))
+    if not _both(other) or _evidence(other) < _MORE_EVIDENCE * _evidence(detect(pair)):
+        return None
+    return DatasetError(
+        f"red and blue are exchanged: the spots in {photos.down.on[0].path} and {photos.up.on[0].path} are blue; "
+        "OpenCV counts B, G, R: turn the colours around before the pictures are saved"
+    )
+
+
+def _evidence(found: PairDetection) -> float:
+    """Significance of both spots together."""
+    return math.hypot(*(one.significance for one in (found.down, found.up) if one is not None), 0.0)
 
 
 def moved_note(photos: PairPhotos, position: str, shift_px: float) -> str:
@@ -201,6 +231,9 @@ def _strokes_faults(pair: Pair) -> Iterator[DatasetError]:
             f"{FARTHEST_M:g} m away, is seen at both spots; a stroke of {NEAREST_M / per_m:.2g} to "
             f"{FARTHEST_M / per_m:.2g} m is possible; give --stroke-m in metres"
         )
+
+
+_MORE_EVIDENCE = 1.5  # of blue spots over red ones, from which on the colours are exchanged
 
 
 def _both(found: PairDetection) -> bool:

@@ -148,6 +148,26 @@ def test_laser_on_and_off_exchanged_is_told(case: Case, capsys) -> None:
 
 
 @pytest.mark.usefixtures("unaligned")
+def test_laser_on_and_off_exchanged_at_one_position_is_told(case: Case, capsys) -> None:
+    one = {**case.raw, "up": case.raw["up_off"], "up_off": case.raw["up"]}
+    said = refused(capsys, case.arguments(one))
+    assert "exchanged at the position up: the spot is in" in said
+    assert "down" not in said.partition("exchanged at")[2]
+
+
+@pytest.mark.usefixtures("unaligned")
+def test_red_and_blue_exchanged_are_told(case: Case, tmp_path: Path, capsys) -> None:
+    """Frames that OpenCV counts as B, G, R, stored as if they were R, G, B: D was 6 sigma off, with the wrong doubt."""
+    swapped = {}
+    for name in NAMES:
+        with Image.open(case.jpg[name][0]) as picture:
+            colours = Image.fromarray(np.ascontiguousarray(np.array(picture)[..., ::-1]))
+            swapped[name] = [tmp_path / f"{name}.jpg"]
+            colours.save(swapped[name][0], qtables=picture.quantization, subsampling="4:2:2")
+    assert "red and blue are exchanged" in refused(capsys, case.arguments(swapped))
+
+
+@pytest.mark.usefixtures("unaligned")
 @pytest.mark.parametrize("kind", ["raw", "jpg"])
 def test_a_camera_that_moved_between_on_and_off_is_told(case: Case, tmp_path: Path, kind: str, capsys) -> None:
     """Three pixels: the edges that remain are no spot, and their remedy is not an exchange. A found D is doubtful."""
