@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy import fft
@@ -160,8 +161,8 @@ def known_fault(pair: Pair, photos: PairPhotos) -> DatasetError | None:
     for position in POSITIONS:
         if f"{position}_off" not in pair.images:
             continue
-        on, off = pair.images[position], pair.images[f"{position}_off"]
-        if _both(detect(replace(pair, **{position: off, f"{position}_off": on}))):
+        turned: dict[str, Any] = {position: pair.images[f"{position}_off"], f"{position}_off": pair.images[position]}
+        if _both(detect(replace(pair, **turned))):
             group: PositionPhotos = getattr(photos, position)
             return DatasetError(
                 f"laser on and off are exchanged at the position {position}: the spot is in {group.off[0].path}; give "
@@ -181,7 +182,8 @@ def exchanged_colours(pair: Pair, photos: PairPhotos) -> DatasetError | None:
     """Error of pictures whose spots are blue: programs that count B, G, R wrote them as R, G, B."""
     if any(image.ndim != 3 or image.shape[2] != 3 for image in pair.images.values()):
         return None
-    other = detect(replace(pair, **{name: image[..., ::-1] for name, image in pair.images.items()}))
+    turned: dict[str, Any] = {name: image[..., ::-1] for name, image in pair.images.items()}
+    other = detect(replace(pair, **turned))
     if not _both(other) or _evidence(other) < _MORE_EVIDENCE * _evidence(detect(pair)):
         return None
     return DatasetError(
