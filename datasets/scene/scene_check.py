@@ -1,12 +1,13 @@
-"""Samples against Mitsuba's own path tracer: windows of their exported scenes beside the stored layers.
+"""Samples against Mitsuba's own path tracer: their exported scenes beside the stored layers.
 
 Nothing of phibench's optics, light maps or Dr.Jit kernels takes part: the XML holds standard plugins alone. Compared
 are
 
-* **ambient light**: means over windows in the mirror, and beside it. The image of Mitsuba gets our lens's blur. A
-  window shows no lamp, nothing of the robot, and nothing nearer than `NEAREST_M`: what light maps leave out there
-  (docs/model.md) is known. The noise is that of the mean, from the scatter of the windows: it holds the noise of both
-  renderers.
+* **ambient light**: means over squares that tile the image, in the mirror, and beside it. The image of Mitsuba gets our
+  lens's blur. A square shows no lamp, and counted are pixels that show nothing of the robot, and nothing nearer than
+  `NEAREST_M`: what light maps leave out there (docs/model.md) is known. The noise is that of the mean, from the scatter
+  of the squares: it holds the noise of both renderers. A light map's is the larger one, and the same within a
+  decimetre: many squares with few paths each see more than few with many.
 * **outline**: the mirror's share of windows around places of it, as a distance across the outline.
 * **spot**: flux and centroid of its light on a film sixteen times as fine.
 """
@@ -30,7 +31,7 @@ from phibench.render.plugins.sensor_plugin import carried, etendue, film_axes
 from phibench.render.plugins.standard_scene import Light
 from phibench.render.setup.variant import activate
 from phibench.scenes.frames import Array
-from phibench.scenes.random_streams import generator, seed_32
+from phibench.scenes.random_streams import seed_32
 from phibench.scenes.rig import POSITIONS
 from phibench.scenes.validation import SceneError
 
@@ -39,9 +40,9 @@ LIGHT_TOLERANCE = 0.005
 CENTROID_TOLERANCE_PX, OUTLINE_TOLERANCE_PX = 0.02, 0.02
 SIGMAS = 3.0
 NEAREST_M = 0.5
-_WINDOWS = {"in the mirror": 8, "beside it": 8}
-_SIDE_PX, _SAMPLES = 16, 144  # of a window, and of each of its pixels
-_EVEN = 4.0  # brightest pixel of a window over its median: no lamp
+_SIDES = {"in the mirror": 11.0, "beside it": 5.5}  # height of the image over the side of a square, independent ones
+_PATHS = 1 << 22  # of the ambient image
+_EVEN = 4.0  # brightest pixel of a square over its median: no lamp
 _AROUND, _OUTLINE_SIDE_PX, _FINEST = 8, 8, 16
 _FINER, _SPOT_RUNS, _SPOT_SAMPLES = 16, 8, 1 << 20
 Crop = tuple[int, int, int, int]
@@ -67,13 +68,13 @@ class RendererDifference:
 
 
 @dataclass(frozen=True)
-class ViewComparison:
+class Checked:
     """One view of a sample.
 
     Attributes
     ----------
     sample_id, position : str
-    differences : dict of str to Difference
+    differences : dict of str to RendererDifference
     left_out : tuple of str
         What was not compared, and why.
     """
@@ -103,13 +104,13 @@ def chosen_samples(dataset: Dataset, count: int) -> list[Sample]:
     return [dataset[int(place)] for place in places]
 
 
-def check_sample(sample: Sample) -> Iterator[ViewComparison]:
+def check_sample(sample: Sample) -> Iterator[Checked]:
     """Compare both views of a sample."""
     for position in POSITIONS:
         yield check_view(sample, position)
 
 
-def check_view(sample: Sample, position: str) -> ViewComparison:
+def check_view(sample: Sample, position: str) -> Checked:
     """Compare one view of a sample."""
     found: dict[str, RendererDifference] = {}
     left_out: list[str] = []
@@ -119,7 +120,7 @@ def check_view(sample: Sample, position: str) -> ViewComparison:
             if view.tube is not None:
                 left_out.append("not compared: our layers leave out reflections in the tube's glass")
             else:
-                scene = _Loaded(sample, position, Path(folder))
+                scene = LoadedScene(sample, position, Path(folder))
                 found["outline"] = _outline(scene)
                 if room.sun is not None:
                     left_out.append("ambient light not compared: standard plugins have no sun behind panes")
@@ -128,10 +129,10 @@ def check_view(sample: Sample, position: str) -> ViewComparison:
                 found |= _spot(scene)
     except SceneError as error:
         left_out.append(f"not compared: {error}")
-    return ViewComparison(sample.row.sample_id, position, found, tuple(left_out))
+    return Checked(sample.row.sample_id, position, found, tuple(left_out))
 
 
-class _Loaded:
+class LoadedScene:
     """Scenes of a view as Mitsuba loads them from XML."""
 
     def __init__(self, sample: Sample, position: str, folder: Path) -> None:
@@ -169,21 +170,43 @@ class _Loaded:
 # Ambient light.
 
 
-def _ambient(scene: _Loaded) -> dict[str, RendererDifference]:
-    ours = np.moveaxis(expected_radiance(scene.sample, scene.position, "ambient"), 0, -1)
+def _ambient(scene: LoadedScene) -> dict[str, RendererDifference]:
+    ours = light_layer(scene.sample, scene.position)
     if not ours.any():
         return {}
+    height, width = ours.shape[:2]
+    samples = max(1, int(np.sqrt(_PATHS / (height * width)))) ** 2
+    seed, sigma = seed_32("mitsuba", scene.sample.row.sample_id, scene.position), scene.camera.blur_sigma_px
+    theirs = ndimage.gaussian_filter(
+        scene.rendered("ambient", (0, 0, width, height), samples, seed), (sigma, sigma, 0.0)
+    )
     found = {}
     for name, free in _free(scene, ours).items():
-        windows = list(_windows(scene, name, free, ours))
-        if len(windows) > 1:
-            ratios = np.array([_window_ratio(scene, ours, crop) for crop in windows]) - 1.0
-            error = ratios.mean(axis=1).std(ddof=1) / np.sqrt(len(ratios))
+        wide = ndimage.minimum_filter(free, 2 * int(np.ceil(4.0 * sigma)) + 1, mode="constant", cval=False)
+        ratios = np.array(list(_ratios(theirs, ours, wide, round(height / _SIDES[name])))) - 1.0
+        if len(ratios) > 1:
+            error = ratios.std(ddof=1) / np.sqrt(len(ratios))
             found[f"light {name}"] = RendererDifference(float(ratios.mean()), float(error), LIGHT_TOLERANCE, "1")
     return found
 
 
-def _free(scene: _Loaded, ours: Array) -> dict[str, NDArray[np.bool_]]:
+def light_layer(sample: Sample, position: str) -> Array:
+    """Our ambient light in the pixels of the exported scene, shape (H, W, 3), W/(m^2 sr)."""
+    return np.moveaxis(expected_radiance(sample, position, "ambient"), 0, -1)
+
+
+def _ratios(theirs: Array, ours: Array, free: NDArray[np.bool_], side: int) -> Iterator[float]:
+    """Mitsuba's mean over ours, of all bands, in each evenly lit square of which half is free."""
+    for v in range(0, ours.shape[0] - side + 1, side):
+        for u in range(0, ours.shape[1] - side + 1, side):
+            square = slice(v, v + side), slice(u, u + side)
+            part = ours[square][free[square]]
+            level = part.mean(axis=-1)
+            if 2 * len(part) >= side**2 and 0.0 < level.max() <= _EVEN * np.median(level):
+                yield float((theirs[square][free[square]].mean(axis=0) / part.mean(axis=0)).mean())
+
+
+def _free(scene: LoadedScene, ours: Array) -> dict[str, NDArray[np.bool_]]:
     """Pixels that may be compared, in the mirror and beside it, shape (H, W)."""
     sample, view = scene.sample, scene.sample.view(scene.position)
     truth = sample.truth(scene.position)
@@ -193,44 +216,11 @@ def _free(scene: _Loaded, ours: Array) -> dict[str, NDArray[np.bool_]]:
         shown = (ids >= 0) & (ids < own) & (depth_m > NEAREST_M)
     outline = scene.camera.project(sample.rig.camera.rays(sample.rig.outline_px()))
     middle = outline.mean(axis=0)
-    reach = float(np.linalg.norm(outline - middle, axis=1).max()) + _SIDE_PX
+    reach = float(np.linalg.norm(outline - middle, axis=1).max())
     v, u = np.mgrid[: ours.shape[0], : ours.shape[1]]
     beside = np.hypot(u - middle[0], v - middle[1]) > reach
     seen = np.isfinite(ours).all(axis=-1)
     return {"in the mirror": shown & seen, "beside it": beside & seen & (not view.holder_shapes)}
-
-
-def _windows(scene: _Loaded, name: str, free: NDArray[np.bool_], ours: Array) -> Iterator[Crop]:
-    """Windows drawn among those that are free, with a margin for the blur, and evenly lit."""
-    side, margin = _SIDE_PX, _margin(scene)
-    wide = ndimage.minimum_filter(free, side + 2 * margin, mode="constant", cval=False)
-    places = np.argwhere(wide)
-    rng = generator("mitsuba", scene.sample.row.sample_id, scene.position, name)
-    left = _WINDOWS[name]
-    for v, u in rng.permutation(places):
-        crop = (int(u) - side // 2, int(v) - side // 2, side, side)
-        part = ours[crop[1] : crop[1] + side, crop[0] : crop[0] + side].mean(axis=-1)
-        if not 0.0 < part.max() <= _EVEN * np.median(part):
-            continue
-        yield crop
-        left -= 1
-        if not left:
-            return
-
-
-def _margin(scene: _Loaded) -> int:
-    return int(np.ceil(4.0 * scene.camera.blur_sigma_px))
-
-
-def _window_ratio(scene: _Loaded, ours: Array, crop: Crop) -> Array:
-    """Mitsuba's mean over ours, by band."""
-    u, v, width, height = crop
-    m = _margin(scene)
-    seed = seed_32("mitsuba", scene.sample.row.sample_id, scene.position, u, v)
-    wide = scene.rendered("ambient", (u - m, v - m, width + 2 * m, height + 2 * m), _SAMPLES, seed)
-    sigma = scene.camera.blur_sigma_px
-    theirs = ndimage.gaussian_filter(wide, (sigma, sigma, 0.0))[m : m + height, m : m + width]
-    return theirs.mean(axis=(0, 1)) / ours[v : v + height, u : u + width].mean(axis=(0, 1))
 
 
 # Outline.
@@ -238,7 +228,7 @@ def _window_ratio(scene: _Loaded, ours: Array, crop: Crop) -> Array:
 _DENSE = 14400  # places of the outline, 0.15 px apart for the default rig
 
 
-def _outline(scene: _Loaded) -> RendererDifference:
+def _outline(scene: LoadedScene) -> RendererDifference:
     """Mean distance of Mitsuba's outline beyond ours, over places around it."""
     rig = scene.sample.rig
     outline = scene.camera.project(rig.camera.rays(rig.outline_px(_DENSE)))
@@ -258,7 +248,7 @@ def _outline(scene: _Loaded) -> RendererDifference:
     )
 
 
-def _shape_index(scene: _Loaded, crop: Crop, finer: int = 1) -> Array:
+def _shape_index(scene: LoadedScene, crop: Crop, finer: int = 1) -> Array:
     """Number of the shape that one ray of each pixel meets, shape (h, w)."""
     integrator = scene.mi.load_dict({"type": "aov", "aovs": "shape:shape_index"})
     return scene.rendered("ambient", crop, 1, 0, finer, integrator)[..., -1]
@@ -286,7 +276,7 @@ def _offset_px(outline: Array, inner: Array, crop: Crop, share: float) -> float:
 # The spot.
 
 
-def _spot(scene: _Loaded) -> dict[str, RendererDifference]:
+def _spot(scene: LoadedScene) -> dict[str, RendererDifference]:
     """Flux and centroid of the spot's light, where all of it falls on the image."""
     sample, camera = scene.sample, scene.camera
     row = sample.truth_row(scene.position)
@@ -321,7 +311,7 @@ def _spot(scene: _Loaded) -> dict[str, RendererDifference]:
     }
 
 
-def _half_px(scene: _Loaded) -> float:
+def _half_px(scene: LoadedScene) -> float:
     """Half of a window that holds the spot's light without blur: by the spread of the layer's, less the blur's."""
     layer = scene.sample.spot(scene.position).electrons_per_s[0]
     rows, columns = layer.sum(axis=1), layer.sum(axis=0)

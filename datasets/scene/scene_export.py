@@ -209,16 +209,17 @@ _README = """# Sample {sample} of the data set {name} as Mitsuba scenes
 |---|---|---|---|
 {rows}
 
-Mitsuba 3 opens them as they are; phibench is not needed:
+Mitsuba 3 opens them as they are (`pip install mitsuba`); phibench is not needed:
 
-    mitsuba -m llvm_ad_rgb {ambient}           # or -m scalar_rgb, or -m cuda_ad_rgb
-    mitsuba -m llvm_ad_rgb -Dspp=1024 {ambient}    # less noise
+    mitsuba -m llvm_ad_rgb {ambient}             # or -m scalar_rgb, or -m cuda_ad_rgb; writes {rendered}
+    mitsuba -m llvm_ad_rgb -Dspp=16 {ambient}    # a quick look; -Dspp=1024 has less noise
 
 * Lengths are millimetres. The middle of the mirror is the origin, z points up.
 * The three channels are the bands of the camera's filters, not colours of a screen: take an rgb variant.
 * Pixels are mean radiances, W/(m^2 sr). The spot's radiance is scaled to give the laser's electrons behind each filter.
 * The spot's distance D is {depth!r} m.
 * `spp`, `max_depth`, `width`, `height` and the `crop_` settings may be changed with -D.
+* Leave `-t` away. With `-t 1` or `-t 2`, Mitsuba 3.9.1 waits for ever where it writes OpenEXR.
 
 `{position}.glb` is the same view as glTF, with mirror, camera and spot, for Blender. Its lengths are metres.
 
@@ -227,12 +228,13 @@ Mitsuba 3 opens them as they are; phibench is not needed:
 phibench's images hold the same radiance, without noise. Their lens blurs, so that edges differ and means do not:
 
     python - <<'END'
+    import drjit as dr
     import mitsuba as mi
-    import numpy as np
     mi.set_variant("scalar_rgb")
-    theirs, ours = (np.array(mi.Bitmap(name))[..., :3] for name in ("{rendered}", "{ours}"))
-    ratio = theirs.reshape(-1, 3).mean(axis=0) / ours.reshape(-1, 3).mean(axis=0)
-    print("mean of theirs over ours, by band:", ratio)
+    theirs, ours = (mi.TensorXf(mi.Bitmap(name))[..., :3] for name in ("{rendered}", "{ours}"))
+    known = dr.isfinite(ours)  # beyond phibench's image there is no number
+    theirs, ours = (dr.sum(dr.select(known, image, 0.0), axis=(0, 1)) for image in (theirs, ours))
+    print("mean of theirs over ours, by band:", theirs / ours)
     END
 
 Photo-electrons per second of a pixel are its radiance times E cos^4. E is {electrons} for the three bands.

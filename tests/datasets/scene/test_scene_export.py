@@ -139,7 +139,7 @@ mi.util.write_bitmap("down-ambient.exr", image)
         for part in (script, code)
     ]
     (exported / "down-ambient.exr").unlink()
-    ratios = [float(x) for x in run[1].stdout.split("[")[1].rstrip("]\n").split()]
+    ratios = json.loads(run[1].stdout[run[1].stdout.index("[") :])
     assert len(ratios) == 3
     assert ratios == pytest.approx([1.0, 1.0, 1.0], abs=0.2)
 
