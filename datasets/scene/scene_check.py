@@ -68,7 +68,7 @@ class RendererDifference:
 
 
 @dataclass(frozen=True)
-class Checked:
+class ViewComparison:
     """One view of a sample.
 
     Attributes
@@ -104,13 +104,13 @@ def chosen_samples(dataset: Dataset, count: int) -> list[Sample]:
     return [dataset[int(place)] for place in places]
 
 
-def check_sample(sample: Sample) -> Iterator[Checked]:
+def check_sample(sample: Sample) -> Iterator[ViewComparison]:
     """Compare both views of a sample."""
     for position in POSITIONS:
         yield check_view(sample, position)
 
 
-def check_view(sample: Sample, position: str) -> Checked:
+def check_view(sample: Sample, position: str) -> ViewComparison:
     """Compare one view of a sample."""
     found: dict[str, RendererDifference] = {}
     left_out: list[str] = []
@@ -129,7 +129,7 @@ def check_view(sample: Sample, position: str) -> Checked:
                 found |= _spot(scene)
     except SceneError as error:
         left_out.append(f"not compared: {error}")
-    return Checked(sample.row.sample_id, position, found, tuple(left_out))
+    return ViewComparison(sample.row.sample_id, position, found, tuple(left_out))
 
 
 class LoadedScene:
