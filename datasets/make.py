@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
 import time
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -17,8 +15,15 @@ from phibench.datasets.build.finished_work import (
     OR_REPLACE,
     LostWorkError,
     finished_without,
+    forget_others,
+    incomplete_text,
     kept_samples,
+    left_out_line,
+    left_out_text,
     lost_work,
+    possible,
+    refused_samples,
+    settled_samples,
 )
 from phibench.datasets.build.forecast import (
     Forecast,
@@ -28,17 +33,9 @@ from phibench.datasets.build.forecast import (
     rim_lines,
     slowdown,
 )
-from phibench.datasets.build.journal import FolderHead, Journal
+from phibench.datasets.build.journal import Journal
 from phibench.datasets.build.kept_draws import draws_bytes, read_draws, seen_causes, write_draws
-from phibench.datasets.build.refusals import (
-    forget_others,
-    incomplete_text,
-    left_out_line,
-    left_out_text,
-    possible,
-    refused_samples,
-    settled_samples,
-)
+from phibench.datasets.build.parts import unfinished
 from phibench.datasets.build.room_export import (
     damaged_exports,
     export_lines,
@@ -48,24 +45,18 @@ from phibench.datasets.build.room_export import (
     stale_exports,
 )
 from phibench.datasets.build.run_tasks import (
-    assemble,
+    Build,
     claimed,
     copy_room_files,
-    differing,
+    finish,
     missing_room_files,
     refuse_other,
     remove_files,
-    run_tasks,
-    stale_files,
-    unfinished,
     visibility_line,
-    write_documents,
 )
 from phibench.datasets.build.task_list import plan_tasks
-from phibench.datasets.build.tasks import BuildTask
-from phibench.datasets.build.workers import Environment, NoRendererError, WorkerPool, versions
+from phibench.datasets.build.workers import Environment, NoRendererError, WorkerPool
 from phibench.datasets.errors import DatasetError, IncompleteError
-from phibench.datasets.input_files import InputFile
 from phibench.datasets.plan.kept_samples import Causes
 from phibench.datasets.plan.plan import Plan, make_plan
 from phibench.datasets.plan.room_draws import unexported
@@ -75,10 +66,9 @@ from phibench.datasets.recipe.load import find_recipe, parse_recipe, recipe_file
 from phibench.datasets.recipe.tables import Recipe
 from phibench.datasets.rooms.room_files import RoomFiles
 from phibench.datasets.store import schema
-from phibench.datasets.store.documents import dataset_info, info_text, parse_info, read_manifest, same_content
-from phibench.datasets.store.files import WriteError, write_text
+from phibench.datasets.store.documents import dataset_info, parse_info, read_manifest
+from phibench.datasets.store.files import write_text
 from phibench.datasets.store.provenance import code_sha256, provenance
-from phibench.datasets.store.schema import DatasetInfo
 from phibench.render.optics.truth import VISIBLE
 from phibench.scenes.rig import POSITIONS
 
@@ -129,10 +119,10 @@ def make(
         If nothing but samples by themselves cannot be made; the others are finished first, and `SHA256SUMS` is
         missing. With `leave_out_refused`, if not one sample can be made.
     """
-    console, out, exports = console or progress_console(), Path(out), Exports()
+    console, out, exported = console or progress_console(), Path(out), list[str]()
 
     def export(asked: Recipe, files: RoomFiles) -> RoomFiles:
-        return _export(asked, files, out, workers, console, scheduler, replace, exports)
+        return _export(asked, files, out, workers, console, scheduler, replace, exported)
 
     plan, text, note = _planned(recipe, out, shard, samples, seed, replace, room_files, export)
     causes = seen_causes(plan)
@@ -142,7 +132,7 @@ def make(
     try:
         make_from_plan(plan, text, out, workers, console, scheduler, replace, leave_out_refused, draws)
     except LostWorkError:
-        remove_files(out, exports.made)  # the folder is as it was
+        remove_files(out, exported)  # the folder is as it was
         raise
     remove_files(out, stale_exports(out, plan.files))
     if note:
@@ -174,17 +164,14 @@ def dry_run(
     pairs, journal = list(pair_forecasts(plan)), Journal(out)
     tasks, todo, told = plan_tasks(plan, {}), [], [note] if note else []
     if journal.entries:
-        environment, _ = _environment(WorkerPool(out, count), journal)
-        tasks = plan_tasks(plan, versions(environment))
-        forget_others(journal, tasks)
-        info = dataset_info(plan, environment)
-        lost = None if replace else _lost(out, _keys(tasks), journal, info, leave_out_refused)
+        build = Build(plan, "", out, journal, _environment(WorkerPool(out, count), journal)[0])
+        forget_others(journal, build.tasks)
+        lost = None if replace else _lost(build, leave_out_refused)
         told += [f"will be refused: {lost}"] if lost else []
         if leave_out_refused:
-            plan = plan.without(settled_samples(plan, tasks, journal))
-            tasks, pairs = plan_tasks(plan, versions(environment)), list(pair_forecasts(plan))
-        todo = unfinished(tasks, journal, out)
-        todo = possible(todo, tasks, journal) if leave_out_refused else todo
+            build = build.without(settled_samples(plan, build.tasks, journal))
+            plan, pairs = build.plan, list(pair_forecasts(build.plan))
+        tasks, todo = build.tasks, _todo(build, leave_out_refused)
     chosen = [tasks[name] for name in (todo if journal.entries else tasks)]
     cost = forecast(plan, chosen).text(count, slowdown(count)) if chosen else "to make: nothing"
     seen = f"{sum(pair.visible for pair in pairs)} of {len(pairs)} pairs will be visible in both images"
@@ -255,13 +242,6 @@ def _planned(
     return make_plan(parsed, files, shard, read_draws(out, parsed, files)), text, note
 
 
-@dataclass
-class Exports:
-    """Files of rooms that this call has made, relative to the folder."""
-
-    made: list[str] = field(default_factory=list)
-
-
 def _export(
     recipe: Recipe,
     files: RoomFiles,
@@ -270,27 +250,23 @@ def _export(
     console: Console,
     scheduler: str | None,
     replace: bool,
-    exports: Exports,
+    made: list[str],
 ) -> RoomFiles:
-    """Make the files of rooms that are missing in a folder, beside copies of the recipe's own.
+    """Make the files of rooms that are missing in a folder, beside copies of the recipe's own; `made` gets their names.
 
     Samples are drawn from what the files hold, so that this comes before the plan.
     """
     with claimed(out, None if replace else recipe.dataset.name):
         remove_files(out, damaged_exports(out))
         own = own_files(recipe, files)
-        exports.made += [schema.room_file(name) for name in missing_room_files(own, out)]
+        made += [schema.room_file(name) for name in missing_room_files(own, out)]
         copy_room_files(own, out)
         held = RoomFiles(out / schema.ROOM_FILES, own.digests)
         if todo := unexported(recipe, held):
             with WorkerPool(out, _count(workers), scheduler) as pool:
                 pool.environment()  # tells where nothing can be rendered, and connects to a scheduler
-                export_rooms(todo, recipe.ambient, pool, console, exports.made)
+                export_rooms(todo, recipe.ambient, pool, console, made)
     return held
-
-
-def _keys(tasks: Mapping[str, BuildTask]) -> dict[str, str]:
-    return {name: task.key for name, task in tasks.items()}
 
 
 def make_from_plan(
@@ -308,97 +284,72 @@ def make_from_plan(
 
     With `leave_out` the data set is finished without the samples that are refused. `draws` are kept for the next start.
     """
-    count = _count(workers)
-    try:
-        with (
-            claimed(out, None if replace else plan.recipe.dataset.name),
-            WorkerPool(out, count, scheduler) as pool,
-            Journal(out) as journal,
-        ):
-            if draws:
-                write_draws(out, draws)
-            return _make(plan, recipe, out, pool, journal, console, replace, leave_out)
-    except OSError as error:
-        text = str(error) if isinstance(error, WriteError) else f"could not write to {out}: {error}"
-        raise DatasetError(f"{text}; then run the same command again") from error
+    with (
+        claimed(out, None if replace else plan.recipe.dataset.name),
+        WorkerPool(out, _count(workers), scheduler) as pool,
+        Journal(out) as journal,
+    ):
+        if draws:
+            write_draws(out, draws)
+        return _make(plan, recipe, out, pool, journal, console, replace, leave_out)
 
 
 def _make(
-    whole: Plan,
-    recipe: str,
-    out: Path,
-    pool: WorkerPool,
-    journal: Journal,
-    console: Console,
-    replace: bool,
-    leave_out: bool,
+    plan: Plan, recipe: str, out: Path, pool: WorkerPool, journal: Journal, console: Console, replace: bool, leave: bool
 ) -> list[str]:
     started, began = time.monotonic(), datetime.now(UTC)
     environment, no_renderer = _environment(pool, journal)
-    every = plan_tasks(whole, versions(environment))
-    forget_others(journal, every)
-    if not replace and (lost := _lost(out, _keys(every), journal, dataset_info(whole, environment), leave_out)):
+    whole = Build(plan, recipe, out, journal, environment)
+    forget_others(journal, whole.tasks)
+    if not replace and (lost := _lost(whole, leave)):
         raise LostWorkError(lost)
-    settled = settled_samples(whole, every, journal) if leave_out else {}
-    plan, tasks, head = _part(whole, settled, every, environment, recipe, journal, out)
-    todo = unfinished(tasks, journal, out)
-    todo = possible(todo, tasks, journal) if leave_out else todo
+    settled = settled_samples(plan, whole.tasks, journal) if leave else {}
+    build = whole.without(settled)
+    todo = _todo(build, leave)
     if todo and no_renderer is not None:
-        what = f"{len(todo)} of {len(tasks)} tasks are to be done, such as '{todo[0]}'"
+        what = f"{len(todo)} of {len(build.tasks)} tasks are to be done, such as '{todo[0]}'"
         raise DatasetError(f"{what}, and {no_renderer}") from no_renderer
-    copies = missing_room_files(plan.files, out)
-    if todo or (plan.refused and not leave_out):
+    copies = missing_room_files(build.plan.files, out)
+    if todo or (build.plan.refused and not leave):
         (out / schema.CHECKSUMS).unlink(missing_ok=True)
-        run_tasks(plan, tasks, todo, journal, head, out, pool, console)
-    refused = settled | refused_samples(plan, tasks, journal)
-    if refused and not (leave_out and len(refused) < len(whole.sample_ids)):
+        build.run(todo, pool, console)
+    refused = settled | refused_samples(build.plan, build.tasks, journal)
+    if refused and not (leave and len(refused) < len(plan.sample_ids)):
         (out / schema.CHECKSUMS).unlink(missing_ok=True)
-        raise IncompleteError(incomplete_text(whole, refused))
+        raise IncompleteError(incomplete_text(plan, refused))
     if refused != settled:
-        plan, tasks, head = _part(whole, refused, every, environment, recipe, journal, out)
-    journal.keep_refusals(every)
-    faults = _loose_ends(plan, head, journal, tasks, out)
-    if not todo and not faults and not copies:
-        said = f"; {left_out_line(plan.left_out, len(plan.pairs))}" if plan.left_out else ""
-        if journal.is_written(head, tasks):
-            console.print(f"{out} is complete, nothing to do{said}", highlight=False, soft_wrap=True)
-            return []
-        journal.begin(head, tasks)
-        console.print(f"{out} is complete, its journal is written anew{said}", highlight=False, soft_wrap=True)
-        return [schema.JOURNAL]
-    journal.begin(head, tasks)
-    copy_room_files(plan.files, out)
-    wanted = assemble(plan, head, journal.entries)
-    remove_files(out, [name for name in faults if name not in wanted])
-    write_documents(out, wanted, [name for name in faults if name in wanted])
+        build = whole.without(refused)
+    journal.keep_refusals(whole.tasks)
+    left_out, pairs, was_written = (
+        build.plan.left_out,
+        len(build.plan.pairs),
+        journal.is_written(build.head, build.tasks),
+    )
+    changed = finish(build.plan, build.head, journal, build.tasks, out)
+    if not todo and not changed and not copies:
+        told = "nothing to do" if was_written else "its journal is written anew"
+        said = f"; {left_out_line(left_out, pairs)}" if left_out else ""
+        console.print(f"{out} is complete, {told}{said}", highlight=False, soft_wrap=True)
+        return [] if was_written else [schema.JOURNAL]
     _write_run(out, pool.width, began, time.monotonic() - started)
     console.print(f"{out}: {visibility_line(read_manifest(out))}", highlight=False, soft_wrap=True)
-    if plan.left_out:
-        text = left_out_text(plan.left_out, len(plan.pairs))
-        console.print(f"{out}: {text}", highlight=False, soft_wrap=True, markup=False)
-    return [*(name for name in todo if name in tasks), *(schema.room_file(name) for name in copies), *faults]
+    if left_out:
+        console.print(f"{out}: {left_out_text(left_out, pairs)}", highlight=False, soft_wrap=True, markup=False)
+    return [*(name for name in todo if name in build.tasks), *(schema.room_file(name) for name in copies), *changed]
 
 
-def _lost(out: Path, keys: Mapping[str, str], journal: Journal, info: DatasetInfo, leave_out: bool) -> str | None:
+def _lost(build: Build, leave_out: bool) -> str | None:
     """Sentence on what a run would lose: finished work, or the end of a data set that leaves samples out."""
-    if lost := lost_work(out, keys, journal, info):
+    keys = {name: task.key for name, task in build.tasks.items()}
+    if lost := lost_work(build.out, keys, build.journal, dataset_info(build.plan, build.environment)):
         return f"{lost}; {OR_REPLACE}"
-    return None if leave_out else finished_without(out, journal)
+    return None if leave_out else finished_without(build.out, build.journal)
 
 
-def _part(
-    whole: Plan,
-    left_out: Mapping[str, str],
-    every: dict[str, BuildTask],
-    environment: Environment,
-    recipe: str,
-    journal: Journal,
-    out: Path,
-) -> tuple[Plan, dict[str, BuildTask], FolderHead]:
-    """Plan without some samples, its tasks, and the head of its folder."""
-    plan = whole.without(left_out)
-    tasks = plan_tasks(plan, versions(environment)) if left_out else every
-    return plan, tasks, FolderHead(_info_text(dataset_info(plan, environment), journal, out), recipe)
+def _todo(build: Build, leave_out: bool) -> list[str]:
+    """Names of the tasks that are to be done: all that are not whole, without those that cannot be done."""
+    todo = unfinished(build.tasks, build.journal, build.out)
+    return possible(todo, build.tasks, build.journal) if leave_out else todo
 
 
 def _environment(pool: WorkerPool, journal: Journal) -> tuple[Environment, NoRendererError | None]:
@@ -416,25 +367,6 @@ def _environment(pool: WorkerPool, journal: Journal) -> tuple[Environment, NoRen
         except ValueError:  # of another version
             raise error from None
         return {**held, "commit": provenance()["commit"], "code_sha256": code_sha256()}, error
-
-
-def _loose_ends(plan: Plan, head: FolderHead, journal: Journal, tasks: Iterable[str], out: Path) -> list[str]:
-    """Documents to be written, and files to be removed, when every task is done."""
-    entries = {name: journal.entries[name] for name in tasks}
-    files = [name for entry in entries.values() for name in entry.files]
-    return [*differing(out, assemble(plan, head, entries)), *stale_files(out, files)]
-
-
-def _info_text(info: DatasetInfo, journal: Journal, out: Path) -> str:
-    """Text of `dataset.json`: the journal's, or the one that is there, if it means the same."""
-    held = [] if journal.head is None else [journal.head.info]
-    with contextlib.suppress(DatasetError):
-        held.append(InputFile(out / schema.INFO, "run `phibench dataset repair`").text())
-    for text in held:
-        with contextlib.suppress(ValueError):  # of another version, or damaged
-            if same_content(parse_info(text), info):
-                return text
-    return info_text(info)
 
 
 def _write_run(out: Path, count: int, began: datetime, seconds: float) -> None:

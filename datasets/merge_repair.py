@@ -16,17 +16,8 @@ from typing import Any
 from rich.console import Console
 
 from phibench.datasets.build.finished_work import lost_work
-from phibench.datasets.build.journal import Entry, FolderHead, Journal, Refusal
-from phibench.datasets.build.run_tasks import (
-    assemble,
-    claimed,
-    copy_room_files,
-    held_head,
-    is_intact,
-    remove_files,
-    stale_files,
-    write_documents,
-)
+from phibench.datasets.build.journal import Entry, FolderHead, Journal, Refusal, is_intact
+from phibench.datasets.build.run_tasks import claimed, copy_room_files, finish, held_head
 from phibench.datasets.build.task_list import task_names
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.make import make_from_plan
@@ -44,7 +35,7 @@ from phibench.datasets.store.documents import (
     recipe_sha256,
     same_content,
 )
-from phibench.datasets.store.files import WriteError, only_run, sha256, write_atomic
+from phibench.datasets.store.files import only_run, sha256, write_atomic
 from phibench.datasets.store.layers import read_exr
 from phibench.datasets.store.provenance import provenance
 from phibench.datasets.store.schema import CHECKSUMS, DatasetInfo
@@ -79,10 +70,7 @@ def merge(out: str | Path, shards: Sequence[str | Path], console: Console | None
         _copy(out, [entries[name] for name in names], console)
         journal.entries, journal.refusals = {name: entries[name][0] for name in names}, refusals
         journal.keep_refusals(task_names(whole))
-        journal.begin(head, names)
-        wanted = assemble(plan, head, journal.entries)
-        remove_files(out, stale_files(out, [file for entry in journal.entries.values() for file in entry.files]))
-        write_documents(out, wanted, wanted)
+        finish(plan, head, journal, names, out)
     return out
 
 
@@ -162,10 +150,7 @@ def _copy_file(source: Path, target: Path, digest: str) -> None:
 
     if not source.is_file():
         raise DatasetError(f"{source} is missing; run `phibench dataset repair` on its shard")
-    try:
-        write_atomic(target, write)
-    except WriteError as error:
-        raise DatasetError(str(error)) from error
+    write_atomic(target, write)
 
 
 def repair(

@@ -17,9 +17,9 @@ from pathlib import Path
 
 import numpy as np
 from draw_rooms import STROKE_M, VIEWS, coarse_rig
+from image_statistics import ImageStatistics, image_statistics
 from scipy.stats import ks_2samp, wasserstein_distance
 
-from phibench.datasets.rooms.image_statistics import ImageStatistics, image_statistics
 from phibench.datasets.rooms.panorama_files import read_panorama
 from phibench.estimator.geometry.panorama import PanoramaGrid, pixels_by_model, unrolled
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from importlib.metadata import version
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from phibench.benchmark.export.containers import FOLDER, hugging_face_features
@@ -28,7 +27,6 @@ from phibench.datasets.store.croissant import (
     manifest_texts,
     record_set,
 )
-from phibench.datasets.store.files import sha256
 from phibench.datasets.store.schema import columns
 
 if TYPE_CHECKING:
@@ -43,10 +41,12 @@ _MEDIA = {
 _PIXELS = "Pixels are (column, row), integers at pixel centres."
 
 
-def croissant(dataset: Dataset, request: ExportRequest, table: DataFrame, out: Path, hashes: Mapping[str, str]) -> str:
-    """JSON-LD text of an export whose index `table` lies in `out`."""
+def croissant(
+    dataset: Dataset, request: ExportRequest, table: DataFrame, index_sha256: str, hashes: Mapping[str, str]
+) -> str:
+    """JSON-LD text of an export whose index `table` has that SHA-256."""
     name = f"{dataset.info.name}-{request.frames.preset}"
-    distribution = [file_object(INDEX, PARQUET, sha256(out / INDEX)), *_distribution(request, hashes)]
+    distribution = [file_object(INDEX, PARQUET, index_sha256), *_distribution(request, hashes)]
     about = "One row for each pair of images and draw of the noise, with the exact truth."
     types = {column: str(dtype) for column, dtype in table.schema.items()}
     pairs = record_set("pairs", about, types, column_texts(request), {"fileObject": {"@id": INDEX}}, key="key")

@@ -1,7 +1,6 @@
 """Export of a data set's pairs in the formats of other tools, with index, card, licence and hashes.
 
-A shard is known by the hash of all that it depends on. `export.jsonl` has a line for each that is finished, so that a
-run that ended early goes on where it was.
+Each shard is a part of the folder (`datasets.build.parts`), so that a run that ended early goes on where it was.
 """
 
 from __future__ import annotations
@@ -9,8 +8,8 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -29,49 +28,37 @@ from phibench.benchmark.export.pair_rows import (
     splits,
 )
 from phibench.benchmark.pair_sets.dataset_pairs import DatasetPairs, dataset_pairs
-from phibench.benchmark.pair_sets.frames_set import frames_row, write_frames_set
+from phibench.benchmark.pair_sets.frames_set import frames_row, frames_set_documents
+from phibench.datasets.build.parts import Brought, bring_all
+from phibench.datasets.build.tasks import BuildTask, Made
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.exposures.draw import require_outside, sample_key
 from phibench.datasets.frames.request import whole_number
 from phibench.datasets.frames.source import FrameSource, has_place
 from phibench.datasets.input_files import InputFile
-from phibench.datasets.parallel import parallel_map
-from phibench.datasets.progress import Steps, progress_console
+from phibench.datasets.progress import progress_console
 from phibench.datasets.read import Dataset, open_dataset, open_finished
 from phibench.datasets.recipe.tables import FramesTable
 from phibench.datasets.store import schema
-from phibench.datasets.store.checksums import checksums_text, differing_files, read_checksums
+from phibench.datasets.store.checksums import differing_files, read_checksums
 from phibench.datasets.store.croissant import LICENSE_TEXT
 from phibench.datasets.store.documents import parquet_bytes
-from phibench.datasets.store.files import (
-    WriteError,
-    only_run,
-    read_rows,
-    remove_temporary,
-    sha256,
-    working,
-    write_bytes,
-    write_text,
-)
-from phibench.datasets.store.leftovers import folder_for_work
+from phibench.datasets.store.files import sha256, write_text
+from phibench.datasets.store.filling import filling, signed, write_documents
 from phibench.datasets.store.provenance import code_behind
-from phibench.datasets.store.schema import Document, described
 from phibench.scenes.rig import POSITIONS
 
 INFO = schema.TruthFolder.EXPORT.value
-SHARDS = schema.TruthFile.SHARDS.value
 _COPIED = (schema.RIGS, schema.ROOMS, schema.RECIPE)
 _AGAIN = "run the same `phibench export` again"
 
 
-class ShardRow(Document):
-    """One line of `export.jsonl`: a finished shard."""
+@dataclass(frozen=True)
+class ShardResult:
+    """Sample id of each pair and what its draw adds, in order; and the lines of the pairs of a frames set."""
 
-    name: str = described("-", "shard")
-    key: str = described("-", "hash of all that it depends on")
-    files: dict[str, str] = described("-", "SHA-256 by file")
-    drawn: list[tuple[str, dict[str, Any]]] = described("-", "sample id, and what its draw adds, in order")
-    scored: list[dict[str, Any]] = described("-", "lines of the pairs of a frames set", default_factory=list)
+    drawn: list[tuple[str, dict[str, Any]]]
+    scored: list[dict[str, Any]]
 
 
 @dataclass(frozen=True)
@@ -79,12 +66,10 @@ class Shard:
     """One shard to be made: its pairs, as (sample id, draw), in order."""
 
     dataset: Path
-    out: Path
     request: ExportRequest
     split: str
     name: str
     pairs: tuple[tuple[str, int], ...]
-    known: Mapping[str, ShardRow] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -117,50 +102,24 @@ def export(
     count = whole_number("workers", os.cpu_count() or 1 if workers is None else workers, 1)
     _check_folder(out, Path(folder))
     _versions(request)  # a missing package is said before anything is written
-    try:
-        with folder_for_work(out), only_run(out):
-            remove_temporary(out)
-            return _export(dataset, request, out, count, console)
-    except OSError as error:
-        text = str(error) if isinstance(error, WriteError) else f"could not write to {out}: {error}"
-        raise DatasetError(f"{text}; then run the same command again") from error
-
-
-def _export(dataset: Dataset, request: ExportRequest, out: Path, workers: int, console: Console) -> ExportOutcome:
-    _claim(out, dataset, request)
-    shards, notes = _shards(dataset, request, out)
-    known = {row.name: row for row in read_rows(out / SHARDS, ShardRow)} if (out / SHARDS).is_file() else {}
-    rows: dict[str, ShardRow] = {}
-    made = 0
-    (out / schema.CHECKSUMS).unlink(missing_ok=True)  # until all is there the export is not finished
-    with Steps(console, "shards", len(shards)) as steps:
-        jobs = [Shard(**{**shard.__dict__, "known": _one(known, shard.name)}) for shard in shards]
-        for row, new in parallel_map(perform, jobs, workers, in_order=False):
-            rows[row.name], made = row, made + new
-            if new:
-                _write_rows(out, {**known, **rows}.values())
-            steps.advance()
-    _write_rows(out, rows.values())
-    _finish(dataset, request, out, shards, rows)
+    with filling(out):
+        _claim(out, dataset, request)
+        shards, notes = _shards(dataset, request)
+        tasks = _tasks(dataset, request, shards)
+        (out / schema.CHECKSUMS).unlink(missing_ok=True)  # until all is there the export is not finished
+        brought = bring_all(tasks, out, count, console, "shards")
+        _finish(dataset, request, out, shards, brought)
     counts = {name: sum(len(shard.pairs) for shard in shards if shard.split == name) for name in SPLITS}
-    return ExportOutcome(out, counts, made, len(shards) - made, tuple(notes))
+    return ExportOutcome(out, counts, len(brought.made), len(shards) - len(brought.made), tuple(notes))
 
 
-def perform(shard: Shard) -> tuple[ShardRow, bool]:
-    """Make one shard, or keep the one that is there; True if it was written."""
+def make_shard(out: Path, shard: Shard) -> Made:
+    """Task: make one shard; the result is a `ShardResult`."""
     dataset = open_dataset(shard.dataset)
-    key = _key(dataset, shard)
-    if (held := shard.known.get(shard.name)) and held.key == key and not differing_files(shard.out, held.files):
-        return held, False
-    if shard.request.scored:
-        pairs, scored = _scored_pairs(dataset, shard)
-    else:
-        pairs, scored = _drawn_pairs(dataset, shard), []
+    pairs, scored = _scored_pairs(dataset, shard) if shard.request.scored else (_drawn_pairs(dataset, shard), [])
     drawn = [(pair.sample_id, {"key": pair.key, "split": shard.split, **pair.added}) for pair in pairs]
-    with working(shard.out):
-        files = write_shard(shard.out, shard.name, shard.request, pairs, pair_table(dataset.rows, drawn))
-    hashes = {name: sha256(shard.out / name) for name in files}
-    return ShardRow(name=shard.name, key=key, files=hashes, drawn=drawn, scored=scored), True
+    files = write_shard(out, shard.name, shard.request, pairs, pair_table(dataset.rows, drawn))
+    return Made(tuple(files), {"drawn": drawn, "scored": scored})
 
 
 def _drawn_pairs(dataset: Dataset, shard: Shard) -> list[DrawnPair]:
@@ -216,11 +175,12 @@ def verify_export(folder: str | Path) -> list[str]:
     listed = read_checksums(folder)
     found = (path for path in folder.rglob("*") if path.is_symlink() or not path.is_dir())  # pipes and sockets, too
     there = {path.relative_to(folder).as_posix() for path in found}
-    strange = sorted(there - set(listed) - {schema.CHECKSUMS, SHARDS, schema.LOCK})
+    state = {schema.CHECKSUMS, schema.JOURNAL, schema.LOCK, schema.TruthFile.SHARDS.value}
+    strange = sorted(there - set(listed) - state)
     return differing_files(folder, listed) + [f"{name} is not of the export" for name in strange]
 
 
-def _shards(dataset: Dataset, request: ExportRequest, out: Path) -> tuple[list[Shard], list[str]]:
+def _shards(dataset: Dataset, request: ExportRequest) -> tuple[list[Shard], list[str]]:
     split_of, notes, shards = splits(dataset, request), [], []
     for split in SPLITS:
         pairs = []
@@ -235,15 +195,23 @@ def _shards(dataset: Dataset, request: ExportRequest, out: Path) -> tuple[list[S
         parts = [pairs[k : k + request.pairs_per_shard] for k in range(0, len(pairs), request.pairs_per_shard)]
         for number, part in enumerate(parts):
             name = shard_name(request.form, split, number, len(parts))
-            shards.append(Shard(dataset.folder, out, request, split, name, tuple(part)))
+            shards.append(Shard(dataset.folder, request, split, name, tuple(part)))
     return shards, notes
 
 
-def _key(dataset: Dataset, shard: Shard) -> str:
-    samples = dict.fromkeys(sample_id for sample_id, _ in shard.pairs)
-    keys = [sample_key(dataset[sample_id], shard.request.frames) for sample_id in samples]
-    modules = ["export.pair_rows", "export.containers", *(["pair_sets.frames_set"] if shard.request.scored else [])]
+def _tasks(dataset: Dataset, request: ExportRequest, shards: Sequence[Shard]) -> dict[str, BuildTask]:
+    listed = read_checksums(dataset.folder)
+    modules = ["export.pair_rows", "export.containers", *(["pair_sets.frames_set"] if request.scored else [])]
     code = [code_behind(f"phibench.benchmark.{name}") for name in modules]
+    tasks = [
+        BuildTask(f"shard {shard.name}", _key(dataset, listed, code, shard), make_shard, (shard,)) for shard in shards
+    ]
+    return {task.name: task for task in tasks}
+
+
+def _key(dataset: Dataset, listed: Mapping[str, str], code: Sequence[str], shard: Shard) -> str:
+    samples = dict.fromkeys(sample_id for sample_id, _ in shard.pairs)
+    keys = [sample_key(dataset[sample_id], shard.request.frames, listed) for sample_id in samples]
     parts = [shard.name, shard.split, shard.pairs, shard.request.document(), keys, code, _versions(shard.request)]
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
 
@@ -264,15 +232,6 @@ def _versions(request: ExportRequest) -> list[str]:
         return [f"pyarrow {version('pyarrow')}"]
     except PackageNotFoundError as error:
         raise DatasetError(NEEDS_PYARROW) from error
-
-
-def _one(known: Mapping[str, ShardRow], name: str) -> Mapping[str, ShardRow]:
-    return {name: known[name]} if name in known else {}
-
-
-def _write_rows(out: Path, rows: Iterable[ShardRow]) -> None:
-    ordered = sorted(rows, key=lambda row: row.name)
-    write_text(out / SHARDS, "".join(json.dumps(row.model_dump(mode="json")) + "\n" for row in ordered))
 
 
 def _check_folder(out: Path, dataset: Path) -> None:
@@ -300,29 +259,26 @@ def _claim(out: Path, dataset: Dataset, request: ExportRequest) -> None:
     write_text(path, json.dumps(meant, indent=1, allow_nan=False) + "\n")
 
 
-def _finish(
-    dataset: Dataset, request: ExportRequest, out: Path, shards: Sequence[Shard], rows: Mapping[str, ShardRow]
-) -> None:
-    """Write index, card, Croissant and hashes; files of an older run that belong to no shard go."""
-    ordered = [entry for shard in shards for entry in rows[shard.name].drawn]
-    table = pair_table(dataset.rows, ordered)
+def _finish(dataset: Dataset, request: ExportRequest, out: Path, shards: Sequence[Shard], brought: Brought) -> None:
+    """Write index, card, Croissant and hashes."""
+    results = brought.results(ShardResult)
+    table = pair_table(dataset.rows, [pair for result in results for pair in result.drawn])
     for column, _, _ in request.images:
         table = table.with_columns(_names(request, shards, column))
-    write_bytes(out / INDEX, parquet_bytes(table))
-    for name in _COPIED:
-        write_bytes(out / name, InputFile(dataset.folder / name, "run `phibench dataset repair`").read())
-    write_text(out / "LICENSE", LICENSE_TEXT)
-    of_frames_set: tuple[str, ...] = ()
+    hashes, index, again = brought.hashes, parquet_bytes(table), "run `phibench dataset repair`"
+    documents = {
+        INFO: (out / INFO).read_bytes(),
+        INDEX: index,
+        schema.CROISSANT: croissant(dataset, request, table, hashlib.sha256(index).hexdigest(), hashes).encode(),
+        "README.md": card(dataset, request, table).encode(),
+        "LICENSE": LICENSE_TEXT.encode(),
+        **{name: InputFile(dataset.folder / name, again).read() for name in _COPIED},
+    }
     if request.scored:
-        lines = [line for shard in shards for line in rows[shard.name].scored]
+        lines = [line for result in results for line in result.scored]
         taken = scored_pairs(dataset, request)
-        of_frames_set = write_frames_set(out, taken, request.frames.preset, request.draws, lines)
-    hashes = {name: digest for shard in shards for name, digest in rows[shard.name].files.items()}
-    write_text(out / schema.CROISSANT, croissant(dataset, request, table, out, hashes))
-    write_text(out / "README.md", card(dataset, request, table))
-    for name in (INFO, INDEX, schema.CROISSANT, "README.md", "LICENSE", *_COPIED, *of_frames_set):
-        hashes[name] = sha256(out / name)
-    write_text(out / schema.CHECKSUMS, checksums_text(hashes))
+        documents |= frames_set_documents(taken, request.frames.preset, request.draws, lines)
+    write_documents(out, signed(documents, hashes))
 
 
 def _names(request: ExportRequest, shards: Sequence[Shard], column: str) -> Any:

@@ -25,7 +25,7 @@ from phibench.datasets.errors import DatasetError
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.datasets.input_files import SETTINGS_BYTES, InputFile, Name
 from phibench.datasets.store.documents import from_json
-from phibench.datasets.store.files import sha256, write_text
+from phibench.datasets.store.files import sha256
 from phibench.datasets.store.pair_files import (
     FRAMES_SET,
     MOST_PAIRS,
@@ -228,10 +228,10 @@ def frames_row(pair: Pair, truth: PairTruth, files: dict[str, str]) -> dict[str,
     return document
 
 
-def write_frames_set(
-    out: Path, pairs: DatasetPairs, preset: str, draws: int, rows: Sequence[dict[str, Any]]
-) -> tuple[str, ...]:
-    """Write `pairs.jsonl` and `frames_set.json` beside the images; return their names."""
+def frames_set_documents(
+    pairs: DatasetPairs, preset: str, draws: int, rows: Sequence[dict[str, Any]]
+) -> dict[str, bytes]:
+    """Files `pairs.jsonl` and `frames_set.json`, which stand beside the images."""
     known = pairs.document()
     info = FramesInfo(
         name=known["name"],
@@ -245,9 +245,9 @@ def write_frames_set(
         dataset_sha256=known["dataset_sha256"],
     )
     ordered = sorted(rows, key=lambda row: int(row["number"]))
-    write_text(out / PAIRS, "".join(json.dumps(row, allow_nan=False) + "\n" for row in ordered))
-    write_text(out / FRAMES_SET, json.dumps(info.model_dump(mode="json"), indent=1) + "\n")
-    return PAIRS, FRAMES_SET
+    lines = "".join(json.dumps(row, allow_nan=False) + "\n" for row in ordered)
+    about = json.dumps(info.model_dump(mode="json"), indent=1) + "\n"
+    return {PAIRS: lines.encode(), FRAMES_SET: about.encode()}
 
 
 def pair_of_files(files: PairFiles[Any], number: int) -> Pair:

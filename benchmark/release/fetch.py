@@ -30,7 +30,8 @@ from phibench.datasets.input_files import FILE_NAME, SETTINGS_BYTES, InputFile
 from phibench.datasets.progress import Steps, progress_console
 from phibench.datasets.store import schema
 from phibench.datasets.store.checksums import damaged, differing_files, read_checksums
-from phibench.datasets.store.files import WriteError, only_run, sha256, write_text
+from phibench.datasets.store.files import only_run, sha256, write_text
+from phibench.datasets.store.filling import writing_to
 from phibench.datasets.store.leftovers import (
     TEMPORARY_PREFIX,
     OwnedFolder,
@@ -93,15 +94,12 @@ def fetch(
             return Fetched(out, title, 0, len(part.archives))
         raise DatasetError(_what_it_is(out, title, part))
     stage = out.with_name(f"{out.name}.part")
-    try:
+    with writing_to(stage):
         _claim(stage, title, part)
         with only_run(stage):
             fetched = _archives(place, stage, title, part, console)
             _check(stage, title, part, place, fetched == len(part.archives))
             (stage / _SET).rename(out)
-    except OSError as error:
-        text = str(error) if isinstance(error, WriteError) else f"could not write to {stage}: {error}"
-        raise DatasetError(f"{text}; then run the same command again") from error
     _remove_own(stage)
     return Fetched(out, title, fetched, len(part.archives))
 

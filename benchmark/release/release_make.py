@@ -27,7 +27,6 @@ from phibench.benchmark.release.benchmark import (
     MANIFEST,
     VERSION,
     Archive,
-    Digest,
     Manifest,
     ReleasedPart,
     ReleasePart,
@@ -37,6 +36,8 @@ from phibench.benchmark.release.benchmark import (
 )
 from phibench.benchmark.release.secret_seed import secret_seed
 from phibench.datasets.build.forecast import megabytes
+from phibench.datasets.build.parts import bring_all
+from phibench.datasets.build.tasks import BuildTask, Made
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.film.film_forecast import films_forecast
 from phibench.datasets.film.film_make import make_films
@@ -44,40 +45,23 @@ from phibench.datasets.film.film_plan import film_plans
 from phibench.datasets.film.film_store import INFO as FILM_INFO
 from phibench.datasets.input_files import InputFile
 from phibench.datasets.make import cost, make
-from phibench.datasets.progress import Steps, progress_console
+from phibench.datasets.progress import progress_console
 from phibench.datasets.recipe.load import parse_recipe, recipe_files, with_numbers
 from phibench.datasets.store import schema
-from phibench.datasets.store.checksums import checksums_text, read_checksums
+from phibench.datasets.store.checksums import read_checksums
 from phibench.datasets.store.croissant import LICENSE_TEXT, LICENSE_URL, croissant_text, file_object
 from phibench.datasets.store.documents import read_info
-from phibench.datasets.store.files import (
-    WriteError,
-    only_run,
-    read_rows,
-    remove_temporary,
-    sha256,
-    write_atomic,
-    write_text,
-)
+from phibench.datasets.store.files import sha256, write_atomic, write_text
+from phibench.datasets.store.filling import filling, signed, write_documents
 from phibench.datasets.store.leftovers import folder_for_work
-from phibench.datasets.store.schema import Document
 
 Seal = Callable[[Path, Path], object]
 """Sealing of a data set: (folder, public folder); `benchmark.sealed.sealed_set.seal`."""
 ARCHIVE_BYTES = 500_000_000
-DIARY, README = "archives.jsonl", "README.md"
+README = "README.md"
 _TIME_S = 315532800  # 1980-01-01, as all files of a sealed set have
 _SEAL = "seal.json"
 _IMAGE_BYTES, _IMAGES = 730_000, 4  # of a sealed pair at 1280 x 720; the mean of 40 pairs in three presets
-
-
-class ArchiveRow(Document):
-    """One line of `archives.jsonl`, the diary: an archive that is finished, and what it was packed from."""
-
-    name: str
-    key: Digest
-    size: int
-    sha256: Digest
 
 
 @dataclass(frozen=True)
@@ -137,20 +121,15 @@ def release(request: ReleaseRequest, seal: Seal) -> Released:
     _check_folders(request)
     used = _assigned(request)
     out = request.out
-    try:
-        with folder_for_work(out), folder_for_work(request.work), only_run(out):
-            request.work.chmod(stat.S_IRWXU)  # it holds a secret
-            remove_temporary(out)
-            manifest = _claimed(out)
-            made = kept = 0
-            for part in request.parts:
-                folder = _dataset(request, part, used, seal)
-                manifest, new, old = _packed(request, part, folder, manifest)
-                made, kept = made + new, kept + old
-            _finish(out, manifest)
-    except OSError as error:
-        text = str(error) if isinstance(error, WriteError) else f"could not write to {out}: {error}"
-        raise DatasetError(f"{text}; then run the same command again") from error
+    with filling(out), folder_for_work(request.work):
+        request.work.chmod(stat.S_IRWXU)  # it holds a secret
+        manifest = _claimed(out)
+        made = kept = 0
+        for part in request.parts:
+            folder = _dataset(request, part, used, seal)
+            manifest, new, old = _packed(request, part, folder, manifest)
+            made, kept = made + new, kept + old
+        _finish(out, manifest)
     return Released(out, manifest, made, kept)
 
 
@@ -301,28 +280,25 @@ def _packed(request: ReleaseRequest, part: ReleasePart, folder: Path, manifest: 
     """Archives of one part, and the manifest with it; numbers of archives written and kept."""
     out = request.out
     members, title = _members(part, folder), part.title
-    shares = list(_shares(folder, members, request.archive_bytes))
-    diary = request.work / DIARY
-    rows = {row.name: row for row in read_rows(diary, ArchiveRow)} if diary.is_file() else {}
+    shares = {
+        f"{title}-{number:03d}.tar": {name: members[name] for name in names}
+        for number, names in enumerate(_shares(folder, members, request.archive_bytes))
+    }
     parts = dict(manifest.parts)
     if parts.pop(title, None) is not None:
         write_text(out / MANIFEST, manifest.model_copy(update={"parts": parts}).text())
     (out / schema.CHECKSUMS).unlink(missing_ok=True)  # until all is there the release is not finished
-    archives, made = [], 0
-    with Steps(request.console, title, len(shares)) as steps:
-        for number, names in enumerate(shares):
-            name = f"{title}-{number:03d}.tar"
-            key = hashlib.sha256(json.dumps([title, [(one, members[one]) for one in names]]).encode()).hexdigest()
-            if not _is_there(out / name, rows.get(name), key):
-                write_atomic(out / name, lambda path, names=names: _write_tar(path, title, folder, names, members))  # type: ignore[misc]
-                rows[name] = ArchiveRow(name=name, key=key, size=(out / name).stat().st_size, sha256=sha256(out / name))
-                write_text(diary, "".join(rows[one].model_dump_json() + "\n" for one in sorted(rows)))
-                made += 1
-            row = rows[name]
-            archives.append(Archive(name=name, size=row.size, sha256=row.sha256))
-            steps.advance()
+    tasks = [
+        BuildTask(f"archive {name}", _digest([title, list(share.items())]), write_archive, (name, title, folder, share))
+        for name, share in shares.items()
+    ]
+    state = request.work / f"{title}-archives"
+    brought = bring_all({task.name: task for task in tasks}, out, 1, request.console, title, state=state)
+    archives = [
+        Archive(name=name, size=(out / name).stat().st_size, sha256=digest) for name, digest in brought.hashes.items()
+    ]
     for path in out.glob(f"{title}-[0-9][0-9][0-9].tar"):
-        if path.name not in {archive.name for archive in archives}:
+        if path.name not in shares:
             path.unlink()  # of an earlier release with more files
     count = _sample_count(part, folder)
     parts[title] = ReleasedPart(
@@ -337,7 +313,11 @@ def _packed(request: ReleaseRequest, part: ReleasePart, folder: Path, manifest: 
     )
     manifest = manifest.model_copy(update={"parts": parts})
     write_text(out / MANIFEST, manifest.text())
-    return manifest, made, len(shares) - made
+    return manifest, len(brought.made), len(shares) - len(brought.made)
+
+
+def _digest(document: object) -> str:
+    return hashlib.sha256(json.dumps(document).encode()).hexdigest()
 
 
 def _members(part: ReleasePart, folder: Path) -> dict[str, str]:
@@ -366,16 +346,22 @@ def _shares(folder: Path, members: Mapping[str, str], most: int) -> Iterator[lis
         yield share
 
 
-def _is_there(path: Path, row: ArchiveRow | None, key: str) -> bool:
-    """True if an archive of these members lies there, undamaged."""
-    known = row is not None and row.key == key and path.is_file() and path.stat().st_size == row.size
-    return known and row is not None and sha256(path) == row.sha256
+def write_archive(out: Path, archive: str, title: str, folder: Path, members: Mapping[str, str]) -> Made:
+    """Task: write an archive of a folder's files, each with its SHA-256.
+
+    Raises
+    ------
+    DatasetError
+        If one has another hash.
+    """
+    write_atomic(out / archive, lambda path: _write_tar(path, title, folder, members))
+    return Made((archive,))
 
 
-def _write_tar(path: Path, title: str, folder: Path, names: Sequence[str], members: Mapping[str, str]) -> None:
+def _write_tar(path: Path, title: str, folder: Path, members: Mapping[str, str]) -> None:
     """Tar whose bytes depend on names and contents alone; every file is checked on its way."""
     with path.open("wb") as file, tarfile.open(fileobj=file, mode="w", format=tarfile.USTAR_FORMAT) as tar:
-        for name in names:
+        for name in members:
             with (folder / name).open("rb") as source:
                 entry = tarfile.TarInfo(f"{title}/{name}")
                 entry.size, entry.mtime, entry.mode = os.fstat(source.fileno()).st_size, _TIME_S, 0o644
@@ -422,12 +408,13 @@ def _finish(out: Path, manifest: Manifest) -> None:
     )
     objects = [file_object(name, "application/x-tar", hashes[name]) for name in sorted(hashes)]
     objects.append(file_object(MANIFEST, "application/json", sha256(out / MANIFEST)))
-    write_text(out / schema.CROISSANT, croissant_text(title, about, f"{VERSION}.0", objects))
-    write_text(out / "LICENSE", LICENSE_TEXT)
-    write_text(out / README, _card(title, manifest))
-    for name in (MANIFEST, schema.CROISSANT, "LICENSE", README):
-        hashes[name] = sha256(out / name)
-    write_text(out / schema.CHECKSUMS, checksums_text(hashes))
+    documents = {
+        MANIFEST: (out / MANIFEST).read_bytes(),
+        schema.CROISSANT: croissant_text(title, about, f"{VERSION}.0", objects).encode(),
+        "LICENSE": LICENSE_TEXT.encode(),
+        README: _card(title, manifest).encode(),
+    }
+    write_documents(out, signed(documents, hashes))
 
 
 def _card(title: str, manifest: Manifest) -> str:

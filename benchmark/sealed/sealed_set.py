@@ -34,7 +34,8 @@ from phibench.datasets.read import open_finished
 from phibench.datasets.recipe.load import RECIPES, load_recipe
 from phibench.datasets.recipe.tables import Recipe
 from phibench.datasets.store.checksums import checksums_text, read_checksums
-from phibench.datasets.store.files import WriteError, sha256, write_bytes, write_secret, write_text
+from phibench.datasets.store.files import sha256, write_bytes, write_secret, write_text
+from phibench.datasets.store.filling import writing_to
 from phibench.datasets.store.leftovers import OwnedFolder, folder_for_work
 from phibench.datasets.store.pair_files import (
     FRAMES,
@@ -141,12 +142,8 @@ def seal(folder: str | Path, public: str | Path, preset: str | None = None, cons
     check_seed(Path(folder), dataset.recipe.dataset.seed)
     pairs = single_pairs(dataset_pairs(dataset, preset))
     _check_folder(public, Path(folder))
-    try:
-        with folder_for_work(public.parent), OwnedFolder("seal", public.parent) as work:
-            return _seal(pairs, Path(folder), work, public, console)
-    except OSError as error:
-        text = str(error) if isinstance(error, WriteError) else f"could not write to {public}: {error}"
-        raise DatasetError(f"{text}; then run the same command again") from error
+    with writing_to(public), folder_for_work(public.parent), OwnedFolder("seal", public.parent) as work:
+        return _seal(pairs, Path(folder), work, public, console)
 
 
 def single_pairs(pairs: DatasetPairs) -> DatasetPairs:

@@ -35,7 +35,8 @@ from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.datasets.input_files import SETTINGS_BYTES, FileName, InputFile, Name, below
 from phibench.datasets.store.checksums import checksums_text, read_checksums
 from phibench.datasets.store.documents import from_json, to_json
-from phibench.datasets.store.files import WriteError, read_rows, sha256, write_bytes, write_text
+from phibench.datasets.store.files import read_rows, sha256, write_bytes, write_text
+from phibench.datasets.store.filling import writing_to
 from phibench.datasets.store.leftovers import OwnedFolder, folder_for_work
 from phibench.datasets.store.provenance import provenance
 from phibench.datasets.store.schema import CHECKSUMS, Document, TruthFolder
@@ -113,12 +114,8 @@ def import_pairs(folder: Path, out: Path, rig: Path | None = None, sensor: Path 
         below(folder, name)  # what a link leads to elsewhere would be given away with the set
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise DatasetError(f"{out} exists and is not an empty folder; give a new one, --out")
-    try:
-        with folder_for_work(out.parent), OwnedFolder("import", out.parent) as work:
-            return _import(folder, listed, setting, work, out)
-    except OSError as error:
-        text = str(error) if isinstance(error, WriteError) else f"could not write to {out}: {error}"
-        raise DatasetError(f"{text}; then run the same command again") from error
+    with writing_to(out), folder_for_work(out.parent), OwnedFolder("import", out.parent) as work:
+        return _import(folder, listed, setting, work, out)
 
 
 def _there(path: Path) -> Path | None:

@@ -1,27 +1,33 @@
-"""Finished work of a folder that a run with other values would lose: it is counted, and the run is refused.
+"""Work that earlier runs have left in a folder: finished, which no run loses unasked, or refused.
 
 Work is finished when the journal has its line and its files have the bytes that the line tells. Where lines of the
 journal are lost, SHA256SUMS of a finished data set vouches for files. Camera frames are no such work: they are drawn
 from the layers in seconds, in folders of their own.
 
 A finished data set of more samples than a run asks for is kept whole: its first samples are those that are asked for.
+
+A sample is refused that cannot be drawn, or one of whose tasks cannot be done: its certificates, its noise, its room.
+Both follow from recipe, code and versions. The journal keeps the refusals of tasks with their keys. A data set may be
+finished without its refused samples. They are settled then: `dataset.json` lists them. All tasks of a sample that is
+not settled are run as far as their needs go, also after a kill. So the same refusals, causes and bytes come out in
+whatever order tasks end.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from phibench.datasets.build.journal import Entry, FolderHead, Journal
-from phibench.datasets.build.refusals import OPTION, left_out_line
-from phibench.datasets.build.run_tasks import held_head, is_intact
-from phibench.datasets.build.task_list import plan_tasks
+from phibench.datasets.build.journal import Entry, FolderHead, Journal, is_intact
+from phibench.datasets.build.parts import intact
+from phibench.datasets.build.run_tasks import held_head, listed
+from phibench.datasets.build.task_list import plan_tasks, sample_task_name
+from phibench.datasets.build.tasks import BuildTask
 from phibench.datasets.build.workers import versions
 from phibench.datasets.errors import DatasetError
-from phibench.datasets.plan.plan import make_plan
+from phibench.datasets.plan.plan import Plan, make_plan
 from phibench.datasets.recipe.load import parse_recipe
 from phibench.datasets.recipe.tables import Recipe
 from phibench.datasets.store import schema
@@ -30,6 +36,7 @@ from phibench.datasets.store.documents import parse_info
 from phibench.datasets.store.provenance import code_sha256
 from phibench.datasets.store.schema import DatasetInfo
 
+OPTION = "--leave-out-refused"
 OR_REPLACE = "give another folder, or add `--replace` to delete them"
 _NOT_IN_KEYS = ("dataset", "frames", "distractors")
 """Tables of a recipe: the first is told by itself, on the others no task depends."""
@@ -75,9 +82,7 @@ def finished_without(out: Path, journal: Journal) -> str | None:
 def _lost_tasks(out: Path, keys: Mapping[str, str], journal: Journal) -> list[str]:
     """Tasks whose files are good, and which the run does not have or makes from other values."""
     other = [name for name, entry in journal.entries.items() if entry.files and keys.get(name) != entry.key]
-    with ThreadPoolExecutor(2) as pool:  # hashing lets go of the interpreter
-        good = list(pool.map(lambda name: is_intact(journal.entries[name], out), other))
-    return [name for name, intact in zip(other, good, strict=True) if intact]
+    return [name for name, good in zip(other, intact([journal.entries[n] for n in other], out), strict=True) if good]
 
 
 def _lost_files(out: Path, keys: Mapping[str, str], journal: Journal, wanted: DatasetInfo) -> list[str]:
@@ -159,3 +164,76 @@ def kept_samples(out: Path, recipe: Recipe) -> int | None:
     if held.random is None or held.dataset != recipe.dataset or held.random.samples <= recipe.random.samples:
         return None
     return held.random.samples
+
+
+# Samples that are refused.
+
+
+def forget_others(journal: Journal, tasks: Mapping[str, BuildTask]) -> None:
+    """Forget refusals of tasks that are not among these, or are made from other values now."""
+    journal.keep_refusals(
+        name for name, task in tasks.items() if name in journal.refusals and journal.refusals[name].key == task.key
+    )
+
+
+def refused_samples(plan: Plan, tasks: Mapping[str, BuildTask], journal: Journal) -> dict[str, str]:
+    """Cause by id of all samples that cannot be drawn or made, in the order of the recipe.
+
+    Of several refused tasks of a sample the first one counts, by the order of `needs` from its last task on.
+    """
+    found = dict(plan.refused)
+    if journal.refusals:
+        for pair in plan.pairs:
+            if (culprit := _culprit(sample_task_name(pair), tasks, journal)) is not None:
+                found[pair.sample_id] = journal.refusals[culprit].refused
+    return {name: found[name] for name in plan.sample_ids if name in found}
+
+
+def settled_samples(plan: Plan, tasks: Mapping[str, BuildTask], journal: Journal) -> dict[str, str]:
+    """Cause by id of those refused samples without which the folder was finished."""
+    try:
+        held = {} if journal.head is None else parse_info(journal.head.info).causes
+    except ValueError:  # of another version
+        return {}
+    return {name: cause for name, cause in refused_samples(plan, tasks, journal).items() if name in held}
+
+
+def possible(names: Sequence[str], tasks: Mapping[str, BuildTask], journal: Journal) -> list[str]:
+    """Names of those tasks that are not refused, nor is what they need."""
+    return [name for name in names if _culprit(name, tasks, journal) is None] if journal.refusals else list(names)
+
+
+def _culprit(name: str, tasks: Mapping[str, BuildTask], journal: Journal) -> str | None:
+    """First refused task among a task and what it needs."""
+    for need in tasks[name].needs:
+        if (found := _culprit(need, tasks, journal)) is not None:
+            return found
+    return name if name in journal.refusals else None
+
+
+def incomplete_text(plan: Plan, refused: Mapping[str, str]) -> str:
+    """One sentence for each refused sample of an unfinished data set: which, why, and what to do."""
+    order, count = list(refused), len(plan.sample_ids)
+    remedy = "change its target, its stroke or its rig"
+    if plan.recipe.random is not None:
+        number = int(order[0].rsplit("-", 1)[1])  # the samples of a shard are numbered as in the whole
+        fewer = f", or `--samples {number}` for those before {order[0]} alone" if number and plan.shard is None else ""
+        remedy = f"give another seed{fewer}"
+    lines = [f"{name} is refused: {refused[name]}; {remedy}" for name in order]
+    first = f"{len(refused)} of {count} samples are refused, all others are kept; the data set is not finished"
+    finish = f" (`phibench dataset make ... {OPTION}` finishes it without them)" if len(refused) < count else ""
+    return listed(f"{first}{finish}:", lines)
+
+
+def left_out_line(left_out: Mapping[str, str], others: int) -> str:
+    """Sentence on the samples that a finished data set leaves out, beside so many others."""
+    names = list(left_out)
+    which = ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
+    verb = "is" if len(names) == 1 else "are"
+    return f"{len(names)} of {len(names) + others} samples {verb} refused and left out: {which}"
+
+
+def left_out_text(left_out: Mapping[str, str], others: int) -> str:
+    """The same with a line for each sample and its cause."""
+    first = f"{left_out_line(left_out, others)}; {schema.INFO} lists them:"
+    return listed(first, [f"{name}: {cause}" for name, cause in left_out.items()])

@@ -21,8 +21,7 @@ import numpy as np
 
 from phibench.datasets.build.bake_task import bake_settings
 from phibench.datasets.build.light_map_cache import is_cached
-from phibench.datasets.build.scheduler import Executor, Outcome
-from phibench.datasets.build.tasks import BuildTask, Done
+from phibench.datasets.build.tasks import BuildTask, Done, Executor, Outcome
 from phibench.datasets.plan.plan import PairPlan, Plan
 from phibench.render.optics.room_tracer import room_geometry
 from phibench.render.optics.truth import EDGE, NO_REFLECTION, SpotTruth, depth_m, spot_truth

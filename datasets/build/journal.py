@@ -2,10 +2,11 @@
 
 It alone decides what is finished; names and times of files do not.
 
-Each line is one entry: a CRC-32 and a JSON object. The first is the folder's head, with the texts of `dataset.json` and
-`recipe.toml`, so that these can be repaired. One entry per finished task follows, and one per task that was refused;
-the last one of a name counts. A line that was half-written or damaged fails its CRC and is ignored: its task is done
-again. So is one whose files are not those of its task: nobody follows a name that leads elsewhere.
+Each line is one entry: a CRC-32 and a JSON object. The first is the folder's head. Of a data set it has the texts of
+`dataset.json` and `recipe.toml`, so that these can be repaired; of other folders it is empty. One entry per finished
+task follows, and one per task that was refused; the last one of a name counts. A line that was half-written or damaged
+fails its CRC and is ignored: its task is done again. So is one whose files are not those of its task: nobody follows a
+name that leads elsewhere.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from pydantic import TypeAdapter, ValidationError
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.input_files import FileName, InputFile
 from phibench.datasets.store import schema
-from phibench.datasets.store.files import write_bytes
+from phibench.datasets.store.files import sha256, write_bytes
 
 
 @dataclass(frozen=True)
@@ -52,11 +53,21 @@ class FolderHead:
     recipe: str
 
 
+NO_HEAD = FolderHead("", "")
+"""First line of the journal of a folder whose documents are not repaired from it."""
+
+
+def is_intact(entry: Entry, out: Path) -> bool:
+    """Return True if all files of a part are there with their bytes."""
+    return all((out / name).is_file() and sha256(out / name) == digest for name, digest in entry.files.items())
+
+
 class Journal:
     """The journal of one folder, as a context manager: read when made, appended to inside.
 
     Attributes
     ----------
+    folder : Path
     head : FolderHead or None
     entries : dict of Entry by task
     refusals : dict of Refusal by task
@@ -65,7 +76,7 @@ class Journal:
     """
 
     def __init__(self, folder: Path) -> None:
-        self._path = folder / schema.JOURNAL
+        self.folder, self._path = folder, folder / schema.JOURNAL
         self._file: IO[bytes] | None = None
         self._size = 0
         self.head: FolderHead | None = None
@@ -76,7 +87,7 @@ class Journal:
             if document is None:
                 self.damaged.append(number)
             elif isinstance(document, FolderHead):
-                self.head = document
+                self.head = None if document == NO_HEAD else document
             elif _is_of_its_task(document):
                 self._note(document)
             else:
@@ -125,7 +136,7 @@ class Journal:
         except FileNotFoundError:
             same = False
         if not same:
-            text = f"{self._path.parent} was removed or moved while this run wrote to it"
+            text = f"{self.folder} was removed or moved while this run wrote to it"
             raise DatasetError(f"{text}; delete what is left of it and run the same command again")
 
     def is_written(self, head: FolderHead, tasks: Iterable[str]) -> bool:
@@ -150,8 +161,7 @@ class Journal:
 
 def _is_of_its_task(document: Entry | Refusal) -> bool:
     """Tell whether a line names a task, and no files but those that the task may write."""
-    files = schema.task_files(document.task)
-    return set(document.files) <= files if isinstance(document, Entry) else bool(files)
+    return schema.may_write(document.task, document.files if isinstance(document, Entry) else ())
 
 
 def _line(document: dict[str, Any]) -> bytes:

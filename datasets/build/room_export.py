@@ -18,8 +18,8 @@ from rich.console import Console
 
 from phibench.datasets.build.bake_task import bake_settings
 from phibench.datasets.build.light_map_cache import light_map
+from phibench.datasets.build.parts import schedule
 from phibench.datasets.build.run_tasks import missing_room_files
-from phibench.datasets.build.scheduler import schedule
 from phibench.datasets.build.tasks import BuildTask, Failed, Made
 from phibench.datasets.build.workers import WorkerPool
 from phibench.datasets.errors import DatasetError

@@ -1,7 +1,7 @@
-"""Runs the unfinished tasks of a folder, with a journal entry and a log line for each, and assembles its small files.
+"""Parts and documents of a data set: which folder will do, its tasks run by the engine, its small files assembled.
 
-The first part guards the output folder: it must be writable, hold no other data set, and have room on its disk. The
-last part gives the small files as bytes, from plan and journal, so that each can be checked and written anew.
+The first part guards the output folder: it must hold no other data set, and have room on its disk. The last part gives
+the small files as bytes, from plan and journal, so that each can be checked and written anew.
 """
 
 from __future__ import annotations
@@ -11,20 +11,19 @@ import hashlib
 import json
 import shutil
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from datetime import UTC, datetime
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 from rich.console import Console
 
 from phibench.datasets.build.forecast import Pace, TaskProgress, forecast, megabytes, slowdown
-from phibench.datasets.build.journal import Entry, FolderHead, Journal, Refusal
-from phibench.datasets.build.refusals import listed
-from phibench.datasets.build.scheduler import schedule
-from phibench.datasets.build.task_list import bake_task_name, sample_task_name, spot_task_name
-from phibench.datasets.build.tasks import BuildTask, Done, Failed, log_entry
-from phibench.datasets.build.workers import WorkerPool
+from phibench.datasets.build.journal import Entry, FolderHead, Journal
+from phibench.datasets.build.parts import bring, note
+from phibench.datasets.build.task_list import bake_task_name, plan_tasks, sample_task_name, spot_task_name
+from phibench.datasets.build.tasks import BuildTask, Done, Failed
+from phibench.datasets.build.workers import Environment, WorkerPool, versions
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.input_files import InputFile
 from phibench.datasets.plan.plan import PairPlan, Plan
@@ -32,52 +31,28 @@ from phibench.datasets.progress import Steps
 from phibench.datasets.rooms.room_files import RoomFiles, checked_data
 from phibench.datasets.rooms.room_sources import ONLY_ROOM
 from phibench.datasets.store import schema
-from phibench.datasets.store.checksums import checksums_text
 from phibench.datasets.store.croissant import dataset_croissant
-from phibench.datasets.store.documents import manifest_documents, parse_info, read_info, rigs_text, to_table
-from phibench.datasets.store.files import only_run, remove_temporary, sha256, write_bytes
-from phibench.datasets.store.leftovers import TEMPORARY_PREFIX, folder_for_work
-from phibench.datasets.store.schema import ManifestRow, RoomInfo
+from phibench.datasets.store.documents import (
+    dataset_info,
+    info_text,
+    manifest_documents,
+    parse_info,
+    read_info,
+    rigs_text,
+    same_content,
+    to_table,
+)
+from phibench.datasets.store.files import sha256, write_bytes
+from phibench.datasets.store.filling import differing, filling, signed, write_documents
+from phibench.datasets.store.schema import DatasetInfo, ManifestRow, RoomInfo
 from phibench.scenes.rig import POSITIONS
 
 _OWN = ".phibench-"  # locks, and temporary files that a killed run left
 
 
-@contextlib.contextmanager
-def claimed(out: Path, name: str | None) -> Iterator[None]:
-    """Make the folder, refuse one that holds something else, and hold it: of two that start together one is refused.
-
-    Parameters
-    ----------
-    out : folder
-    name : that of the data set that the folder may hold; None for any
-
-    Raises
-    ------
-    DatasetError
-        With one sentence that says what to do.
-    """
-    refuse_other(out, name)
-    with contextlib.ExitStack() as stack:
-        try:
-            stack.enter_context(folder_for_work(out, (schema.DRAWS,)))
-        except OSError as error:
-            raise _not_writable(out, error) from error
-        stack.enter_context(only_run(out))
-        refuse_other(out, name)  # again: now nobody else can write
-        try:
-            write_bytes(out / f"{TEMPORARY_PREFIX}probe", b"").unlink()
-        except OSError as error:
-            raise _not_writable(out, error) from error
-        remove_temporary(out)
-        try:
-            yield
-        finally:
-            remove_temporary(out)
-
-
-def _not_writable(out: Path, error: OSError) -> DatasetError:
-    return DatasetError(f"cannot write to {out}: {error.strerror or error}; give another folder")
+def claimed(out: Path, name: str | None) -> contextlib.AbstractContextManager[None]:
+    """Hold a folder to be filled; one of another data set than `name` (None for any), or of others, is refused."""
+    return filling(out, lambda: refuse_other(out, name), (schema.DRAWS,))
 
 
 def check_disk(out: Path, needed: int, replaced: Collection[str]) -> None:
@@ -157,75 +132,89 @@ def held_head(out: Path) -> FolderHead | None:
     return FolderHead(info.text(), recipe.text() if recipe.path.is_file() else "")
 
 
-def unfinished(tasks: Mapping[str, BuildTask], journal: Journal, out: Path) -> list[str]:
-    """Names of the tasks whose entry is missing, of another key, or belies the files."""
-    known = [name for name, task in tasks.items() if (e := journal.entries.get(name)) is not None and e.key == task.key]
-    with ThreadPoolExecutor(2) as pool:  # hashing lets go of the interpreter
-        good = dict(zip(known, pool.map(lambda name: is_intact(journal.entries[name], out), known), strict=True))
-    return [name for name in tasks if not good.get(name)]
+@dataclass(frozen=True)
+class Build:
+    """A data set that is being made.
 
-
-def is_intact(entry: Entry, out: Path) -> bool:
-    """Return True if all files of an entry are there with their bytes."""
-    return all((out / name).is_file() and sha256(out / name) == digest for name, digest in entry.files.items())
-
-
-def run_tasks(
-    plan: Plan,
-    tasks: Mapping[str, BuildTask],
-    todo: list[str],
-    journal: Journal,
-    head: FolderHead,
-    out: Path,
-    pool: WorkerPool,
-    console: Console,
-) -> None:
-    """Run the tasks of `todo`; say beforehand what that takes, and what will not be seen.
-
-    Raises
-    ------
-    DatasetError
-        If the disk has no room, or, when all others are done, with the tasks that failed and why. The journal has
-        those that were refused; if nothing else has failed they are no error here.
+    Attributes
+    ----------
+    plan : what the folder is to hold
+    recipe : text
+    out, journal : folder, held by `claimed`
+    environment : what tasks run on
     """
-    chosen = [tasks[name] for name in todo]
-    cost, before = forecast(plan, chosen), {name: journal.entries[name] for name in todo if name in journal.entries}
-    check_disk(out, cost.size, [name for entry in before.values() for name in entry.files])
-    factor = slowdown(pool.width)
-    kept = f", {len(tasks) - len(todo)} of {len(tasks)} tasks are done" if len(todo) < len(tasks) else ""
-    if chosen:
-        console.print(cost.text(pool.width, factor) + kept, highlight=False, soft_wrap=True)
-    left = set(todo)
-    journal.begin(head, [name for name in tasks if name not in left])
-    copy_room_files(plan.files, out)  # tasks see this folder alone
-    failures = _run(chosen, Pace(cost.seconds, factor, pool.width), journal, out, pool, console) if chosen else {}
-    for name, entry in before.items():
-        if name in journal.entries and journal.entries[name] != entry and journal.entries[name].key == entry.key:
-            console.print(f"warning: {name} came out with other bytes than the first time", highlight=False)
-    if any(not failed.refused for failed in failures.values()):
-        raise DatasetError(_report(failures, len(todo)))
+
+    plan: Plan
+    recipe: str
+    out: Path
+    journal: Journal
+    environment: Environment
+
+    @cached_property
+    def tasks(self) -> dict[str, BuildTask]:
+        """All tasks by name."""
+        return plan_tasks(self.plan, versions(self.environment))
+
+    @cached_property
+    def head(self) -> FolderHead:
+        """Description of the folder."""
+        info = dataset_info(self.plan, self.environment)
+        return FolderHead(_info_text(info, self.journal, self.out), self.recipe)
+
+    def without(self, left_out: Mapping[str, str]) -> Build:
+        """The same without some samples, whose causes are given."""
+        return replace(self, plan=self.plan.without(left_out)) if left_out else self
+
+    def run(self, todo: list[str], pool: WorkerPool, console: Console) -> None:
+        """Run the tasks of `todo`; say beforehand what that takes.
+
+        Raises
+        ------
+        DatasetError
+            If the disk has no room, or, when all others are done, with the tasks that failed and why. The journal has
+            those that were refused; if nothing else has failed they are no error here.
+        """
+        tasks, journal, out = self.tasks, self.journal, self.out
+        chosen = [tasks[name] for name in todo]
+        cost = forecast(self.plan, chosen)
+        before = {name: journal.entries[name] for name in todo if name in journal.entries}
+        check_disk(out, cost.size, [name for entry in before.values() for name in entry.files])
+        factor = slowdown(pool.width)
+        kept = f", {len(tasks) - len(todo)} of {len(tasks)} tasks are done" if len(todo) < len(tasks) else ""
+        if chosen:
+            console.print(cost.text(pool.width, factor) + kept, highlight=False, soft_wrap=True)
+        left = set(todo)
+        journal.begin(self.head, [name for name in tasks if name not in left])
+        copy_room_files(self.plan.files, out)  # tasks see this folder alone
+        failures = _run(chosen, Pace(cost.seconds, factor, pool.width), journal, pool, console) if chosen else {}
+        for name, entry in before.items():
+            if name in journal.entries and journal.entries[name] != entry and journal.entries[name].key == entry.key:
+                console.print(f"warning: {name} came out with other bytes than the first time", highlight=False)
+        if any(not failed.refused for failed in failures.values()):
+            raise DatasetError(_report(failures, len(todo)))
 
 
-def _run(
-    tasks: list[BuildTask], pace: Pace, journal: Journal, out: Path, pool: WorkerPool, console: Console
-) -> dict[str, Failed]:
-    failures: dict[str, Failed] = {}
+def _run(tasks: list[BuildTask], pace: Pace, journal: Journal, pool: WorkerPool, console: Console) -> dict[str, Failed]:
     progress = TaskProgress(tasks, pace)
+
+    def settle(task: BuildTask, outcome: Done | Failed) -> None:
+        note(journal.folder, task, outcome)
+        progress.settle(task)
+
     steps = Steps(console, "tasks", len(tasks), progress.left_s, progress.running_text)
-    with steps, (out / schema.LOG).open("a", encoding="utf-8") as log:
-        for task, outcome in schedule(tasks, progress.watch(pool.executor(len(tasks)))):
-            journal.require()  # what tasks write to a folder that is gone is lost, whatever they return
-            if isinstance(outcome, Done):
-                journal.add(Entry(task.name, task.key, outcome.files, outcome.result))
-            else:
-                if outcome.refused and not any(need in failures for need in task.needs):
-                    journal.add(Refusal(task.name, task.key, outcome.cause))
-                failures[task.name] = outcome
-            log.write(json.dumps({"time": datetime.now(UTC).isoformat(), **log_entry(task, outcome)}) + "\n")
-            log.flush()
-            progress.settle(task)
-            steps.advance()
-    return failures
+    return bring(tasks, journal, progress.watch(pool.executor(len(tasks))), steps, settle)
+
+
+def _info_text(info: DatasetInfo, journal: Journal, out: Path) -> str:
+    """Text of `dataset.json`: the journal's, or the one that is there, if it means the same."""
+    held = [] if journal.head is None else [journal.head.info]
+    with contextlib.suppress(DatasetError):
+        held.append(InputFile(out / schema.INFO, "run `phibench dataset repair`").text())
+    for text in held:
+        with contextlib.suppress(ValueError):  # of another version, or damaged
+            if same_content(parse_info(text), info):
+                return text
+    return info_text(info)
 
 
 def _report(failures: dict[str, Failed], count: int) -> str:
@@ -239,6 +228,24 @@ def _report(failures: dict[str, Failed], count: int) -> str:
 # The small files, when all tasks are done.
 
 
+def finish(plan: Plan, head: FolderHead, journal: Journal, tasks: Collection[str], out: Path) -> list[str]:
+    """Write journal and documents where they differ; return the names of documents written and of files removed.
+
+    Parameters
+    ----------
+    tasks : names of all tasks, each of which has an entry
+    """
+    if not journal.is_written(head, tasks):
+        journal.begin(head, tasks)
+    copy_room_files(plan.files, out)
+    wanted = assemble(plan, head, journal.entries)
+    changed = differing(out, wanted)
+    stale = stale_files(out, [file for entry in journal.entries.values() for file in entry.files])
+    remove_files(out, stale)
+    write_documents(out, wanted, changed)
+    return [*changed, *stale]
+
+
 def assemble(plan: Plan, head: FolderHead, entries: Mapping[str, Entry]) -> dict[str, bytes]:
     """All small files of a finished data set by name, SHA256SUMS last."""
     rows = [_row(pair, entries) for pair in plan.pairs]
@@ -250,12 +257,10 @@ def assemble(plan: Plan, head: FolderHead, entries: Mapping[str, Entry]) -> dict
         **manifest_documents(rows),
     }
     hashes = {name: digest for entry in entries.values() for name, digest in entry.files.items()}
-    hashes |= {name: hashlib.sha256(data).hexdigest() for name, data in small.items()}
     types = {name: str(dtype) for name, dtype in to_table(rows).schema.items()}
-    small[schema.CROISSANT] = dataset_croissant(parse_info(head.info), types, hashes).encode()
-    hashes[schema.CROISSANT] = hashlib.sha256(small[schema.CROISSANT]).hexdigest()
-    hashes |= {schema.room_file(name): digest for name, digest in plan.files.digests.items()}
-    return {**small, schema.CHECKSUMS: checksums_text(hashes).encode()}
+    listed = hashes | {name: hashlib.sha256(data).hexdigest() for name, data in small.items()}
+    small[schema.CROISSANT] = dataset_croissant(parse_info(head.info), types, listed).encode()
+    return signed(small, hashes | {schema.room_file(name): digest for name, digest in plan.files.digests.items()})
 
 
 def _room_line(room_id: str, entries: Mapping[str, Entry]) -> str:
@@ -279,43 +284,6 @@ def _row(pair: PairPlan, entries: Mapping[str, Entry]) -> ManifestRow:
         raise DatasetError(f"{text}; remove the file and run `phibench dataset make` again") from error
 
 
-def differing(out: Path, wanted: Mapping[str, bytes]) -> list[str]:
-    """Names of files that are missing or have other bytes."""
-    return [name for name, data in wanted.items() if not (out / name).is_file() or (out / name).read_bytes() != data]
-
-
-def write_documents(out: Path, wanted: Mapping[str, bytes], names: Iterable[str]) -> None:
-    """Write some of the small files, in their order. Without SHA256SUMS the folder does not pass for finished.
-
-    Raises
-    ------
-    DatasetError
-        If a file that SHA256SUMS names is not there: it is then not written, or removed.
-    """
-    names = set(names)
-    if names:
-        (out / schema.CHECKSUMS).unlink(missing_ok=True)
-        names.add(schema.CHECKSUMS)
-    for name, data in wanted.items():
-        if name in names:
-            if name == schema.CHECKSUMS:
-                _require_all(out, data)
-            write_bytes(out / name, data)
-    try:
-        _require_all(out, wanted[schema.CHECKSUMS])  # again: a folder may go while its last file is written
-    except DatasetError:
-        (out / schema.CHECKSUMS).unlink(missing_ok=True)
-        raise
-
-
-def _require_all(out: Path, checksums: bytes) -> None:
-    """Look for every file that the text of SHA256SUMS names."""
-    listed = [line.split("  ", 1)[1] for line in checksums.decode().splitlines()]
-    if missing := [name for name in listed if not (out / name).is_file()]:
-        what = f"{len(missing)} of {len(listed)} files are gone from {out}, such as {missing[0]}"
-        raise DatasetError(f"{what}: something else removed them during the run; run the same command again")
-
-
 def visibility_line(rows: Sequence[ManifestRow]) -> str:
     """Say how many pairs are visible in both images, and the causes for the others with their numbers."""
     hidden = [row for row in rows if not (row.down.visible and row.up.visible)]
@@ -325,3 +293,12 @@ def visibility_line(rows: Sequence[ManifestRow]) -> str:
     spots = ((position, row.position(position)) for row in hidden for position in POSITIONS)
     causes = Counter(f"{position} {spot.cause}" for position, spot in spots if not spot.visible)
     return f"{text}; not visible: " + ", ".join(f"{cause} ({count})" for cause, count in causes.items())
+
+
+_TOLD = 20  # samples or failures that are told in full
+
+
+def listed(first: str, lines: Sequence[str]) -> str:
+    """A sentence, and some lines below it; of many the first ones."""
+    more = [f"  and {len(lines) - _TOLD} more, see {schema.LOG}"] if len(lines) > _TOLD else []
+    return "\n".join([first, *(f"  {line}" for line in lines[:_TOLD]), *more])

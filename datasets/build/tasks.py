@@ -16,7 +16,7 @@ import traceback
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.rooms.room_files import RoomError
@@ -72,6 +72,7 @@ class Done:
     seconds: float
     peak_mb: float
     worker: str
+    cpu_s: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -93,6 +94,22 @@ class Failed:
     refused: bool = field(default=False, kw_only=True)
 
 
+Outcome = tuple[BuildTask, Done | Failed]
+
+
+class Executor(Protocol):
+    """Anything that runs tasks."""
+
+    def width(self) -> int:
+        """Return the number of tasks that run at a time."""
+
+    def submit(self, task: BuildTask) -> None:
+        """Begin a task, or queue it."""
+
+    def next(self) -> Outcome:
+        """Wait for any submitted task; `Failed.lethal` means that its worker died."""
+
+
 def task_key(inputs: Any, code: str, versions: Mapping[str, Any], needs: tuple[str, ...] = ()) -> str:
     """Key of a task: `inputs` as JSON, hash of the code, versions of what it runs on, keys of what it needs."""
     document = {"inputs": inputs, "code": code, "versions": versions, "needs": needs}
@@ -106,14 +123,15 @@ def perform(task: BuildTask, out: Path, code: str | None = None) -> Done | Faile
     """
     if code is not None and code != code_sha256():
         return Failed(f"worker {worker_name()} runs other code than the sender: install the same version on both")
-    began = time.perf_counter()
+    began, began_cpu = time.perf_counter(), time.process_time()
     try:
         with working(out):
             made = task.function(out, *task.arguments)
             files = {name: sha256(out / name) for name in made.files}
     except Exception as error:
         return Failed(fault_text(error), refused=_is_refusal(error))
-    return Done(files, made.result, round(time.perf_counter() - began, 3), _peak_mb(), worker_name())
+    seconds, cpu_s = time.perf_counter() - began, time.process_time() - began_cpu
+    return Done(files, made.result, round(seconds, 3), _peak_mb(), worker_name(), round(cpu_s, 3))
 
 
 def worker_name() -> str:

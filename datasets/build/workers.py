@@ -24,8 +24,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from phibench.datasets.build.scheduler import Executor, Outcome
-from phibench.datasets.build.tasks import BuildTask, Done, Failed, fault_text, perform, worker_name
+from phibench.datasets.build.tasks import BuildTask, Done, Executor, Failed, Outcome, fault_text, perform, worker_name
 from phibench.datasets.build.view_task import start_renderer
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.frames.request import whole_number

@@ -39,8 +39,8 @@ from phibench.datasets.progress import Steps, progress_console
 from phibench.datasets.read import Dataset, Sample, open_dataset, open_finished
 from phibench.datasets.store import schema
 from phibench.datasets.store.checksums import read_checksums
-from phibench.datasets.store.files import WriteError, only_run, remove_temporary, sha256, working
-from phibench.datasets.store.leftovers import folder_for_work
+from phibench.datasets.store.files import sha256, working
+from phibench.datasets.store.filling import filling, require_files
 from phibench.datasets.store.provenance import code_behind
 from phibench.datasets.store.schema import ManifestRow, row_line
 from phibench.scenes.rig import POSITIONS
@@ -126,20 +126,15 @@ def draw_frames(
     count = whole_number("workers", os.cpu_count() or 1 if workers is None else workers, 1)
     _check_folder(target, Path(folder))
     jobs, notes = _jobs(dataset, target, options, _items(options, draws, laser_off), samples)
-    try:
-        with folder_for_work(target), only_run(target):
-            remove_temporary(target)
-            made, kept = _draw(jobs, dataset, target, options, count, console)
-    except OSError as error:
-        text = str(error) if isinstance(error, WriteError) else f"could not write to {target}: {error}"
-        raise DatasetError(f"{text}; then run the same command again") from error
+    with filling(target):
+        made, kept = _draw(jobs, dataset, target, options, count, console)
     return Drawn(target, made, kept, tuple(notes))
 
 
 def perform(job: SampleJob) -> tuple[list[FrameRow], int]:
     """Do a job: rows of all its files, and how many were written."""
     sample = _opened(job.dataset, sha256(job.dataset / schema.CHECKSUMS))[job.sample_id]
-    base, source = sample_key(sample, job.options), None
+    base, source = sample_key(sample, job.options, read_checksums(job.dataset)), None
     rows, made = [], 0
     with working(job.out):
         for item in job.items:
@@ -178,9 +173,7 @@ def _draw(
     finally:  # what an interrupted run has drawn is found by the next one
         write_index(out, rows.values())
     names = [job.file(item) for job in jobs for item in job.items]
-    if missing := [name for name in names if not (out / name).is_file()]:
-        what = f"{len(missing)} of {len(names)} files are gone from {out}, such as {missing[0]}"
-        raise DatasetError(f"{what}: something else removed them during the run; run the same command again")
+    require_files(out, names)
     return made, total - made
 
 
@@ -294,9 +287,12 @@ def _document(request: FrameRequest) -> dict[str, object]:
     return document
 
 
-def sample_key(sample: Sample, options: FrameOptions) -> str:
-    """Hash of all that the frames of a sample depend on: names, numbers, layers, code, libraries."""
-    listed, request = read_checksums(sample.dataset.folder), sample.frame_request(options)
+def sample_key(sample: Sample, options: FrameOptions, listed: Mapping[str, str]) -> str:
+    """Hash of all that the frames of a sample depend on: names, numbers, layers, code, libraries.
+
+    `listed` is SHA256SUMS of its data set.
+    """
+    request = sample.frame_request(options)
     layers = [listed.get(schema.RIGS), listed.get(schema.ROOMS)]
     for position in POSITIONS:
         row = sample.truth_row(position)

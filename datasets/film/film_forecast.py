@@ -16,7 +16,7 @@ import numpy as np
 from phibench.datasets.build.bake_task import bake_settings
 from phibench.datasets.build.forecast import START_S, duration, light_map_s, megabytes, slowdown
 from phibench.datasets.build.light_map_cache import is_cached
-from phibench.datasets.film.film_make import unfinished
+from phibench.datasets.film.film_make import unfinished_films
 from phibench.datasets.film.film_plan import FilmPlan, check_drives, film_plans
 from phibench.datasets.film.film_room import light_views
 from phibench.datasets.plan.plan import Plan
@@ -95,7 +95,7 @@ def dry_run(recipe: str | Path, out: Path, workers: int | None = None) -> Iterat
     """
     plan, films = film_plans(load_recipe(recipe), recipe_files(recipe))
     check_drives(plan, films)
-    todo = unfinished(plan, films, out)
+    todo = unfinished_films(plan, films, out)
     for film in todo:
         times, (height, width) = film.scene.times, film.region.shape
         yield (

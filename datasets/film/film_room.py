@@ -11,16 +11,19 @@ import hashlib
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from phibench.datasets.build.journal import Entry, Journal, is_intact
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.film.film_plan import FilmPlan
-from phibench.datasets.film.film_store import FilmFolder, ViewHashes, read_view, write_view
+from phibench.datasets.film.film_store import FilmFolder, read_view, view_name, write_view
 from phibench.datasets.plan.plan import Plan
 from phibench.datasets.recipe.tables import AmbientTable
+from phibench.datasets.store.files import sha256
 from phibench.render.film.key_views import ALLOWED, PoseParts, ViewError, blended, compare, key_offsets_m, key_weights
 from phibench.render.film.moving_rows import RowsImage, chief_uv_px, spot_time_s
 from phibench.scenes.frames import Array
@@ -95,7 +98,7 @@ def light_views(rig: Rig, film: FilmPlan) -> Iterator[tuple[Array, list[View]]]:
 
 
 def key_views(
-    film: FilmPlan, folder: FilmFolder, key: str, render: Render, images: Sequence[RowsImage], hashes: ViewHashes
+    film: FilmPlan, folder: FilmFolder, key: str, render: Render, images: Sequence[RowsImage], journal: Journal
 ) -> tuple[list[Array], ViewError]:
     """Render key views until views that were left out agree; return their places, part by part, and the worst error.
 
@@ -112,7 +115,7 @@ def key_views(
             if part in errors and not errors[part].largest > ALLOWED:
                 continue
             views = np.stack(
-                [_key_view(film, folder, key, render, parts, (part, float(place)), hashes) for place in at]
+                [_key_view(film, folder, key, render, parts, (part, float(place)), journal) for place in at]
             )
             errors[part] = held_out_error(film, render, parts, part, at, views, images)
         # a part that no frame falls into has nothing to prove
@@ -136,19 +139,25 @@ def _key_view(
     render: Render,
     parts: PoseParts,
     pose: tuple[int, float],
-    hashes: ViewHashes,
+    journal: Journal,
 ) -> NDArray[np.float32]:
     """Key view from its file, or rendered and written: files of a killed run, or of fewer keys, have key and hash.
 
     The places of few keys are among those of twice as many, but for rounding.
     """
-    path, (part, place) = folder.view(*pose), pose
+    path, (part, place), name = folder.view(*pose), pose, key_view_name(*pose)
     wanted = hashlib.sha256(f"{key} {path.name}".encode()).hexdigest()
-    if not hashes.holds(path, wanted):
+    held = journal.entries.get(name)
+    if held is None or held.key != wanted or not is_intact(held, folder.path):
         planes = render(parts.view(part, place), pose, seed_32(*film.names, "key", path.name))
         write_view(path, planes, film.region, {"film": film.film_id, "place": place, "part": part, "key": wanted})
-        hashes.add(path)
+        journal.add(Entry(name, wanted, {view_name(*pose): sha256(path)}))
     return read_view(path, film.region)
+
+
+def key_view_name(part: int, place: float) -> str:
+    """Name of a key view in its film's journal."""
+    return f"key {Path(view_name(part, place)).stem}"
 
 
 def held_out_error(

@@ -7,20 +7,19 @@ films/<film>/film.parquet  truth, a row per frame
 films/<film>/spots.npz     the spot in each frame, electrons per second over the exposure
 films/<film>/lights.parquet  truth of other lights, a row per light and frame; light00.npz, ... their images
 films/<film>/views/k0_0.150000.exr  key views of the room: part of the poses, and place there
-films/<film>/done.json     what the film was made from; a film that has it is complete
+films/<film>/done.json     what the film was made from, region, proof, hashes
+films/<film>/journal.txt   key views that are whole, while the film is made and after; no part of the data
 SHA256SUMS
-log.jsonl                  diary of the runs: when each film was made, and what it took; no part of the data
+journal.txt, log.jsonl     films that are whole, and the diary of the runs; no part of the data
 """
 
 from __future__ import annotations
 
-import contextlib
 import io
 import json
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -31,10 +30,10 @@ from pydantic import ValidationError
 
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.input_files import FileName, InputFile, first_fault
-from phibench.datasets.store.checksums import checksums_text, differing_files, read_checksums
-from phibench.datasets.store.files import sha256, write_bytes, write_text
+from phibench.datasets.store.checksums import differing_files, read_checksums
+from phibench.datasets.store.files import write_bytes, write_text
 from phibench.datasets.store.layers import read_exr, write_exr
-from phibench.datasets.store.schema import CROISSANT, LOG, Document, TruthFile, TruthFolder, described
+from phibench.datasets.store.schema import CROISSANT, Document, TruthFile, TruthFolder, described
 from phibench.render.film.film_truth import RATES, InstantTruth
 from phibench.render.film.moving_rows import RowsImage
 from phibench.render.optics.spot_layer import SpotLight
@@ -125,11 +124,6 @@ class FilmFolder:
         """File that says that the film is complete."""
         return self.path / "done.json"
 
-    @property
-    def begun(self) -> Path:
-        """File of a film that is being made: the hashes of its key views."""
-        return self.path / "views.json"
-
     def info(self) -> FilmInfo:
         """Content of `done.json`.
 
@@ -141,26 +135,6 @@ class FilmFolder:
         if not self.done.is_file():
             raise DatasetError(f"{self.path} is not finished; {_AGAIN}")
         return read_document(self.done, FilmInfo)
-
-    def is_whole(self, info: FilmInfo) -> bool:
-        """True if all files are there with the right bytes."""
-        files = ((self.path / name, digest) for name, digest in info.sha256.items())
-        return all(path.is_file() and sha256(path) == digest for path, digest in files)
-
-
-@dataclass(frozen=True)
-class FilmCost:
-    """Processor time that a film took."""
-
-    film: str
-    cpu_s: float
-
-
-def log_film(out: Path, cost: FilmCost) -> None:
-    """Add a line to the diary of a data set's runs."""
-    line = json.dumps({"time": datetime.now(UTC).isoformat(), **asdict(cost)})
-    with (out / LOG).open("a", encoding="utf-8") as log:
-        log.write(line + "\n")
 
 
 def read_document(path: Path, model: type[_Model]) -> _Model:
@@ -174,7 +148,12 @@ def read_document(path: Path, model: type[_Model]) -> _Model:
 
 def write_document(path: Path, document: Document) -> None:
     """Write a JSON document."""
-    write_text(path, json.dumps(document.model_dump(mode="json"), indent=1, allow_nan=False) + "\n")
+    write_text(path, document_text(document))
+
+
+def document_text(document: Document) -> str:
+    """JSON of a document."""
+    return json.dumps(document.model_dump(mode="json"), indent=1, allow_nan=False) + "\n"
 
 
 # Key views.
@@ -205,53 +184,6 @@ def read_view(path: Path, region: Region) -> NDArray[np.float32]:
     if file.origin_px != (region.u0_px, region.v0_px) or planes.shape[1:] != region.shape:
         raise DatasetError(f"{path} holds other pixels than its film; {_AGAIN}")
     return planes
-
-
-class ViewHashes:
-    """SHA-256 of the key views of a film that is being made, in a file that goes when the film is complete.
-
-    A view is kept only if it has the hash that was written down when it was rendered: its header alone would let
-    changed pixels be hashed anew. A film that is made again begins with the hashes of its `done.json`.
-    """
-
-    def __init__(self, folder: FilmFolder) -> None:
-        self._folder, self._file = folder, folder.begun
-        self._known: dict[str, str] = {}
-        with contextlib.suppress(DatasetError):  # without it, or damaged: all views are rendered again
-            if self._file.is_file():
-                self._known = read_document(self._file, _Views).sha256
-            elif folder.done.is_file():
-                self._known = {name: one for name, one in folder.info().sha256.items() if name.startswith("views/")}
-        self._write()
-
-    def holds(self, path: Path, key: str) -> bool:
-        """True if a view is there, is of this key, and has the bytes that were written."""
-        try:
-            known = self._known.get(self._name(path))
-            return known is not None and sha256(path) == known and read_exr(path).header.get("key") == key
-        except (DatasetError, OSError):
-            return False
-
-    def add(self, path: Path) -> None:
-        """Write down the hash of a view that was rendered now."""
-        self._known[self._name(path)] = sha256(path)
-        self._write()
-
-    def remove(self) -> None:
-        """Remove the file: `done.json` has the hashes."""
-        self._file.unlink(missing_ok=True)
-
-    def _name(self, path: Path) -> str:
-        return path.relative_to(self._folder.path).as_posix()
-
-    def _write(self) -> None:
-        write_document(self._file, _Views(sha256=dict(sorted(self._known.items()))))
-
-
-class _Views(Document):
-    """`views.json` of a film that is being made."""
-
-    sha256: dict[FileName, str]
 
 
 # Spots.
@@ -391,11 +323,6 @@ def data_files(out: Path, films: Sequence[str]) -> list[str]:
         folder = FilmFolder.of(out, film)
         names += [f"films/{film}/{name}" for name in (*folder.info().sha256, "done.json")]
     return sorted(names)
-
-
-def write_checksums(out: Path, films: Sequence[str]) -> None:
-    """Write SHA256SUMS."""
-    write_text(out / CHECKSUMS, checksums_text({name: sha256(out / name) for name in data_files(out, films)}))
 
 
 def verify(out: Path) -> list[str]:

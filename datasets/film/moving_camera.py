@@ -8,8 +8,8 @@ frames, or windows of them, through the sensor's chain (`render.sensor`): room (
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,15 +17,17 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
+from phibench.datasets.build.parts import bring_all
+from phibench.datasets.build.tasks import BuildTask, Made, task_key
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.frames.request import in_one_sentence
 from phibench.datasets.input_files import FileName, InputFile
-from phibench.datasets.parallel import parallel_map
-from phibench.datasets.progress import Steps, progress_console
+from phibench.datasets.progress import progress_console
 from phibench.datasets.rooms.room_sources import GeneratedRoom
 from phibench.datasets.store.documents import from_json, to_json
-from phibench.datasets.store.files import only_run, write_bytes, write_text
-from phibench.datasets.store.leftovers import folder_for_work
+from phibench.datasets.store.files import write_bytes, write_text
+from phibench.datasets.store.filling import filling
+from phibench.datasets.store.provenance import code_behind, provenance
 from phibench.datasets.store.schema import Document, TruthFolder, described
 from phibench.render.film.room_image import LitRoom, Placement, quick_spot, room_image
 from phibench.render.optics.room_tracer import blocked_by, own_geometry
@@ -113,19 +115,22 @@ def bake_rooms(
         If the folder cannot be written, or Mitsuba is not installed.
     """
     console, settings = console or progress_console(), settings or BakeSettings()
-    try:
-        with folder_for_work(out), only_run(out), Steps(console, "rooms", count) as steps:
-            infos = []
-            for info in parallel_map(partial(_bake, out, settings, stream), range(count), workers):
-                infos.append(info)
-                steps.advance()
-            write_text(out / INFO, BakedSetInfo(rooms=tuple(infos)).model_dump_json(indent=1) + "\n")
-    except OSError as error:
-        raise DatasetError(f"could not write to {out}: {error}; then run the same command again") from error
+    code = code_behind(__name__)
+    tasks = [_bake_task(number, stream, settings, code) for number in range(count)]
+    with filling(out):
+        brought = bring_all({task.name: task for task in tasks}, out, workers, console, "rooms", sign=INFO)
+        infos = brought.results(BakedRoomInfo)
+        write_text(out / INFO, BakedSetInfo(rooms=tuple(infos)).model_dump_json(indent=1) + "\n")
     return count
 
 
-def _bake(out: Path, settings: BakeSettings, stream: tuple[Name, ...], number: int) -> BakedRoomInfo:
+def _bake_task(number: int, stream: tuple[Name, ...], settings: BakeSettings, code: str) -> BuildTask:
+    key = task_key([number, stream, asdict(settings)], code, {"packages": provenance()["packages"]})
+    return BuildTask(f"room room{number:03d}", key, bake_drawn_room, (settings, stream, number))
+
+
+def bake_drawn_room(out: Path, settings: BakeSettings, stream: tuple[Name, ...], number: int) -> Made:
+    """Task: write the light map of a drawn room below `out`; the result is its `BakedRoomInfo`."""
     from phibench.datasets.build.light_map_cache import light_map
     from phibench.datasets.build.view_task import start_renderer
 
@@ -137,7 +142,8 @@ def _bake(out: Path, settings: BakeSettings, stream: tuple[Name, ...], number: i
     light = light_map(Rig().at(0.0), room, settings)
     name = f"room{number:03d}"
     write_bytes(out / f"{name}.npz", encoded(light))
-    return BakedRoomInfo(name=name, source=to_json(source), digest=room.digest, texel_m=settings.texel_m)
+    info = BakedRoomInfo(name=name, source=to_json(source), digest=room.digest, texel_m=settings.texel_m)
+    return Made((f"{name}.npz",), info.model_dump(mode="json"))
 
 
 def _drawn_room(*stream: Name) -> tuple[GeneratedRoom, Room]:

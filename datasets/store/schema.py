@@ -18,7 +18,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer, field_validator, model_validator
 
-from phibench.datasets.input_files import FileName, Name, NoFileName, Text
+from phibench.datasets.input_files import FILE_NAME, FileName, Name, NoFileName, Text
 from phibench.datasets.rooms.room_sources import ONLY_ROOM
 
 SCHEMA_VERSION = 7
@@ -356,7 +356,7 @@ class TruthFile(StrEnum):
     FRAMES = "frames.jsonl"
     FRAMES_TABLE = "frames.parquet"
     PAIRS_TABLE = "pairs.parquet"
-    SHARDS = "export.jsonl"
+    SHARDS = "export.jsonl"  # of exports before journals
     FILM = "film.parquet"
     SPOTS = "spots.npz"
     LIGHTS = "lights.parquet"
@@ -387,11 +387,22 @@ SENSITIVITIES = TruthFile.SENSITIVITIES.value
 NOT_DATA = (CHECKSUMS, RUN, LOG, JOURNAL, LOCK, WORKING, DRAWS, CONTACT_SHEET, SENSITIVITIES)
 """Files that SHA256SUMS does not list: itself, the diaries of the run, locks, and what is computed from it all."""
 
-_TASK = re.compile(rf"(bake|view|spot|sample) ({_ID})")
-_TASK_FILE = re.compile(
-    rf"lightmaps/{_ID}\.npz|lightmap\.npz|views/{_ID}/(ambient|truth)\.exr|views/{_ID}/preview\.png|"
-    rf"spots/{_ID}-(down|up)\.exr|previews/{_ID}\.png"
-)
+_WRITES = {
+    "bake": r"lightmaps/{}\.npz|lightmap\.npz",
+    "view": r"views/{}/(ambient|truth)\.exr|views/{}/preview\.png",
+    "spot": r"spots/{}-(down|up)\.exr",
+    "sample": r"previews/{}\.png",
+}
+"""Files of each kind of task of a data set, as patterns with a place for its id."""
+_TASK_FILE = re.compile("|".join(pattern.replace("{}", _ID) for pattern in _WRITES.values()))
+_WRITES_ALONE = {
+    "film": r"films/{}/.+",
+    "key": r"views/{}\.exr",
+    "room": r"{}\.npz",
+    "shard": r"{}(/[^/]+)?",
+    "archive": r"{}",
+}
+"""The same of films, of the key views in a film's folder, of baked rooms, of exports and of releases."""
 
 
 def room_file(name: str) -> str:
@@ -419,19 +430,15 @@ def preview_file(sample_id: str) -> str:
     return f"previews/{sample_id}.png"
 
 
-def task_files(task: str) -> frozenset[str]:
-    """Files that a task may write, by its name; none for what is no task."""
-    found = _TASK.fullmatch(task)
-    if found is None:
-        return frozenset()
-    kind, name = found.groups()
-    files = {
-        "bake": (light_map_file(name),),
-        "view": tuple(view_file(name, which) for which in ("ambient", "truth", "preview")),
-        "spot": tuple(spot_file(name, position) for position in ("down", "up")),
-        "sample": (preview_file(name),),
-    }
-    return frozenset(files[kind])
+def may_write(task: str, files: Iterable[str]) -> bool:
+    """True if a name is that of a task, and if all of these files are such as the task may write."""
+    kind, _, name = task.partition(" ")
+    pattern = (_WRITES | _WRITES_ALONE).get(kind)
+    if pattern is None or not re.fullmatch(_ID if kind in _WRITES else FILE_NAME, name):
+        return False
+    if kind == "bake":
+        return set(files) <= {light_map_file(name)}
+    return all(re.fullmatch(pattern.replace("{}", re.escape(name)), file) for file in files)
 
 
 def is_task_file(name: str) -> bool:

@@ -29,7 +29,7 @@ from phibench.datasets.plan.plan import make_plan
 from phibench.datasets.progress import Steps
 from phibench.datasets.recipe.load import load_recipe
 from phibench.datasets.rooms.room_sources import room_of
-from phibench.datasets.store import schema
+from phibench.datasets.store import filling, schema
 from phibench.datasets.store.checksums import damaged, data_files, read_checksums
 from phibench.datasets.store.documents import read_manifest
 from phibench.datasets.store.layers import read_exr
@@ -150,7 +150,7 @@ def test_a_folder_that_cannot_be_written_is_refused(tmp_path: Path, monkeypatch:
     def denied(*_: object) -> None:
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
 
-    monkeypatch.setattr(run_tasks, "write_bytes", denied)
+    monkeypatch.setattr(filling, "write_bytes", denied)
     text = refusal(tmp_path / "out")
     assert "Permission denied" in text
     assert "\n" not in text
@@ -202,7 +202,7 @@ def test_a_full_disk_in_the_middle_loses_nothing(tmp_path: Path, monkeypatch: py
     def full(*_: object) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr(make, "write_documents", full)
+    monkeypatch.setattr(run_tasks, "write_documents", full)
     assert "No space left on device" in refusal(tmp_path / "out")
     assert complete_but_unfinished(tmp_path / "out") == 3 + 6
 

@@ -33,8 +33,7 @@ from phibench.benchmark.sealed import rebuilt_score, score_check
 from phibench.calibration.captures import imported_set
 from phibench.calibration.sensor_fit import fit
 from phibench.calibration.sensor_fit.capture_folder import read_header
-from phibench.datasets import make
-from phibench.datasets.build import kept_draws
+from phibench.datasets.build import kept_draws, run_tasks
 from phibench.datasets.build.journal import Journal
 from phibench.datasets.build.run_tasks import held_head
 from phibench.datasets.errors import DatasetError
@@ -61,7 +60,7 @@ def _held(text: str, path: Path) -> object:
     info = parse_info(text)
     folder = path.parent
     (folder / schema.RECIPE).write_text(recipe_text("bench-dev"))
-    make._info_text(info, Journal(folder), folder)
+    run_tasks._info_text(info, Journal(folder), folder)
     held_head(folder)
     part = PARTS[0]
     release_make._misfit(_request(folder), part, folder)

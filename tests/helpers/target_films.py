@@ -19,10 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 
-from phibench.datasets.film.film_make import coloured, frame_spots
 from phibench.datasets.film.film_plan import FilmPlan, film_plans
 from phibench.datasets.film.film_read import film_light
 from phibench.datasets.film.film_room import renderer
+from phibench.datasets.film.film_task import coloured, frame_spots
 from phibench.datasets.frames.sensor_card import card_of
 from phibench.datasets.plan.plan import Plan
 from phibench.datasets.recipe.load import parse_recipe

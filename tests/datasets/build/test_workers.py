@@ -20,7 +20,7 @@ from helpers.listeners import listeners
 from helpers.processes import SMALLEST, left_of, living, quiet, said, wait_for
 
 from phibench.datasets.build import workers
-from phibench.datasets.build.scheduler import schedule
+from phibench.datasets.build.parts import schedule
 from phibench.datasets.build.tasks import BuildTask, Done, Failed, Made
 from phibench.datasets.build.workers import _checked, describe, local_environment, local_workers
 from phibench.datasets.errors import DatasetError
@@ -59,7 +59,7 @@ def told(out: Path) -> Made:
 LASTING = """
 import sys, time
 from pathlib import Path
-from phibench.datasets.build.tasks import Made, Task
+from phibench.datasets.build.tasks import Made, BuildTask
 from phibench.datasets.build.workers import local_workers
 
 def last(out, number):
@@ -70,7 +70,7 @@ def last(out, number):
 if __name__ == "__main__":
     with local_workers(2, Path(sys.argv[1])) as pool:
         for number in range(2):
-            pool.submit(Task(f"last {number}", "", last, (number,)))
+            pool.submit(BuildTask(f"last {number}", "", last, (number,)))
         pool.next()
 """
 """A program with two workers, both in tasks that do not end."""
@@ -145,14 +145,14 @@ if "spawn_main" in " ".join(sys.orig_argv):
 START = """
 import sys
 from pathlib import Path
-from phibench.datasets.build.tasks import Made, Task
+from phibench.datasets.build.tasks import Made, BuildTask
 from phibench.datasets.build.workers import local_workers
 from phibench.cli import main as cli
 
 def start() -> None:
     with local_workers(2, Path(sys.argv[1])) as pool:
         for number in range(2):
-            pool.submit(Task(f"nothing {number}", "", Made))
+            pool.submit(BuildTask(f"nothing {number}", "", Made))
         print(pool.next(), "the workers are there")
 
 cli.app.command(start)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from phibench.datasets.rooms.image_statistics import image_statistics, spectrum_slope
+from docs.image_statistics import image_statistics, spectrum_slope
 
 
 def noise_rows(exponent: float, rows: int = 40, columns: int = 256) -> np.ndarray:
