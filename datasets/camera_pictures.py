@@ -32,6 +32,7 @@ Kind = Literal["jpeg", "rgb", "yuyv", "raw"]
 Subsampling = Literal["4:4:4", "4:2:2", "4:2:0"]
 
 _ORIENTATION, _MAKE, _MODEL, _DNG = 0x0112, 0x010F, 0x0110, 0xC612  # EXIF and TIFF tags
+_LIT_CODE, _LIT_SHARE = 32, 0.01  # below, JPEG rounds all chroma away
 _WHITE_IS_0 = 0  # TIFF's photometric interpretation
 _PHOTOMETRIC = 0x0106
 _SAMPLING: dict[tuple[int, int], Subsampling] = {(1, 1): "4:4:4", (2, 1): "4:2:2", (2, 2): "4:2:0"}
@@ -109,9 +110,9 @@ def _of_decoded(file: InputFile, picture: Image.Image) -> CameraPicture:
 
 
 def _is_grey(pixels: NDArray[Any]) -> bool:
-    """Tell whether a picture's three colours are equal everywhere; of a black one they say nothing."""
+    """Tell whether a picture's three colours are equal everywhere; one of a dark room says nothing of them."""
     red = pixels[..., :1]
-    return bool(np.ptp(red) > 0 and (pixels == red).all())
+    return bool((pixels == red).all() and (red > _LIT_CODE).mean() > _LIT_SHARE)
 
 
 def _with_tables(file: InputFile, picture: Image.Image, found: CameraPicture) -> CameraPicture:
