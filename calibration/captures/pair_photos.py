@@ -158,15 +158,15 @@ def known_fault(pair: Pair, photos: PairPhotos) -> DatasetError | None:
         )
     if fault := exchanged_colours(pair, photos):
         return fault
-    for position in POSITIONS:
-        if f"{position}_off" not in pair.images:
+    for place in POSITIONS:
+        if f"{place}_off" not in pair.images:
             continue
-        turned: dict[str, Any] = {position: pair.images[f"{position}_off"], f"{position}_off": pair.images[position]}
+        turned: dict[str, Any] = {place: pair.images[f"{place}_off"], f"{place}_off": pair.images[place]}
         if _both(detect(replace(pair, **turned))):
-            group: PositionPhotos = getattr(photos, position)
+            group: PositionPhotos = getattr(photos, place)
             return DatasetError(
-                f"laser on and off are exchanged at the position {position}: the spot is in {group.off[0].path}; give "
-                f"it to --{position}, and {group.on[0].path} to --{position}-off"
+                f"laser on and off are exchanged at the position {place}: the spot is in {group.off[0].path}; give "
+                f"it to --{place}, and {group.on[0].path} to --{place}-off"
             )
     if pair.down_off is not None and pair.up_off is not None:
         other = replace(pair, down=pair.down_off, up=pair.up_off, down_off=pair.down, up_off=pair.up)
