@@ -44,7 +44,7 @@ from phibench.render.room.light_map import (
 )
 from phibench.render.room.surfaces import Surfaces, aligned
 from phibench.render.room.texel_grid import TexelGrid
-from phibench.render.room.texel_points import Texels, filled
+from phibench.render.room.texel_points import Texels, nearest_free
 from phibench.render.setup.variant import activate
 from phibench.scenes.faces import FaceTable, IntArray, face_table
 from phibench.scenes.frames import Array, BoolArray
@@ -129,7 +129,8 @@ def lamps_alone(mi: ModuleType, surfaces: Surfaces, grid: TexelGrid, settings: B
     texels, covered = _spread_texels(mi, surfaces, grid, settings.texel_m)
     surfaces.set_light(grid, np.zeros((grid.count, 3)))
     direct = direct_light(mi, surfaces, texels, None, settings.lamp_rays, _SEED)
-    halves = (filled(half, covered, grid) for half in direct)
+    free = nearest_free(covered, grid)
+    halves = (half[free] for half in direct)
     return np.maximum(smoothed(grid, *halves, _KEPT_OF_LAMPS)[0], 0.0)
 
 

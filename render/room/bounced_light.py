@@ -19,7 +19,7 @@ import numpy as np
 from phibench.render.room.subpixel_grid import points, shifts
 from phibench.render.room.surfaces import LookUp, Surfaces
 from phibench.render.room.texel_grid import TexelGrid
-from phibench.render.room.texel_points import Texels, covered_texels, filled, transmitted
+from phibench.render.room.texel_points import Texels, covered_texels, nearest_free, transmitted
 from phibench.scenes.frames import Array
 
 BOUNCE_TEXEL_M = 0.1
@@ -39,13 +39,13 @@ def bounced_light(
     """Bounced irradiance of the fine texels, shape (texels, 3), from passes over a coarse grid."""
     coarse = TexelGrid.of(surfaces.table, max(BOUNCE_TEXEL_M, texel_m))
     texels = Texels.of(mi, surfaces, coarse)
-    covered = covered_texels(mi, surfaces, texels, texel_m)
+    free = nearest_free(covered_texels(mi, surfaces, texels, texel_m), coarse)
     direct, bounced = coarser(fine, coarse, lit), np.zeros((coarse.count, 3))
     surfaces.set_light(coarse, direct)
     found = list(_found(mi, surfaces, texels, rays, seed))
     for _ in range(bounces):
         surfaces.set_light(coarse, direct + bounced)
-        bounced = filled(np.concatenate([_light(surfaces, part) for part in found]), covered, coarse)
+        bounced = np.concatenate([_light(surfaces, part) for part in found])[free]
     return finer(coarse, fine, bounced)
 
 
@@ -141,10 +141,15 @@ def finer(coarse: TexelGrid, fine: TexelGrid, values: Array) -> Array:
 
 def _resampled(old: TexelGrid, new: TexelGrid, values: Array, matrix: Callable[[int, int], Array]) -> Array:
     out = np.zeros((new.count, 3))
+    alike: dict[tuple[int, ...], list[tuple[int, int]]] = {}
     for (part, *size), (to, *wanted) in zip(old.grids(), new.grids(), strict=True):
-        down, across = (matrix(n, m) for n, m in zip(size, wanted, strict=True))
-        image = np.matmul(down, values[part].reshape(size[0], -1)).reshape(wanted[0], size[1], 3)
-        out[to] = np.matmul(across, image).reshape(-1, 3)  # einsum takes 20 times as long
+        alike.setdefault((*size, *wanted), []).append((part.start, to.start))
+    for (rows, columns, *wanted), starts in alike.items():
+        first, to = np.array(starts).T[..., None]
+        images = values[first + np.arange(rows * columns)].reshape(-1, rows, columns * 3)
+        down, across = matrix(rows, wanted[0]), matrix(columns, wanted[1])
+        images = np.matmul(down, images).reshape(-1, wanted[0], columns, 3)  # einsum takes 20 times as long
+        out[to + np.arange(wanted[0] * wanted[1])] = np.matmul(across, images).reshape(len(starts), -1, 3)
     return out
 
 

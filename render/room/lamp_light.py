@@ -101,11 +101,10 @@ def _around(texels: Texels, marked: BoolArray) -> BoolArray:
     """Texels that are marked, and those within two of them on their grid."""
     if len(texels) != texels.grid.count:  # those of the carriage: few
         return np.ones_like(marked)
-    wide = marked.copy()
-    for part, rows, columns in texels.grid.grids():
-        if marked[part].any():
-            grid = marked[part].reshape(rows, columns)
-            wide[part] = ndimage.maximum_filter(grid, size=2 * _PENUMBRA_TEXELS + 1).ravel()
+    wide, side = marked.copy(), 2 * _PENUMBRA_TEXELS + 1
+    for grids in texels.grid.alike:
+        some = grids[marked[grids].any(axis=(1, 2))]
+        wide[some] = ndimage.maximum_filter(marked[some], size=(1, side, side))
     return wide
 
 

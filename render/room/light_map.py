@@ -34,9 +34,9 @@ from phibench.render.room.lamp_light import direct_light
 from phibench.render.room.mirror_light import mirror_body, mirror_light
 from phibench.render.room.surfaces import Surfaces
 from phibench.render.room.texel_grid import TexelGrid
-from phibench.render.room.texel_points import Texels, covered_texels, filled, spread_out
+from phibench.render.room.texel_points import Texels, covered_texels, nearest_free, spread_out
 from phibench.render.setup.variant import activate
-from phibench.scenes.faces import face_table
+from phibench.scenes.faces import IntArray, face_table
 from phibench.scenes.frames import Array, BoolArray
 from phibench.scenes.rig import RobotPose, View
 from phibench.scenes.room import Room, Sun, chassis
@@ -103,13 +103,14 @@ def bake(view: View, room: Room, settings: BakeSettings) -> LightMap:
     fine, covered = _spread_texels(mi, surfaces, grid, settings.texel_m)
     surfaces.set_light(fine.grid, np.zeros((len(fine), 3)))
     direct = direct_light(mi, surfaces, fine, room.sun, settings.lamp_rays, _SEED)
-    one, other = (filled(half, covered, fine.grid) for half in direct)
+    free = nearest_free(covered, fine.grid)
+    one, other = (half[free] for half in direct)
     lamps, noise = smoothed(fine.grid, one, other, _KEPT_OF_LAMPS)
     lit = lamps + bounced_light(
         mi, surfaces, fine.grid, lamps, settings.texel_m, settings.bounces, settings.bounce_rays, _SEED + 10
     )
     surfaces.set_light(fine.grid, lit)
-    mean, sigma = _indirect(mi, surfaces, fine, covered, settings)
+    mean, sigma = _indirect(mi, surfaces, fine, free, settings)
     dr.flush_malloc_cache()  # arrays that Dr.Jit keeps for the next time, of other sizes than a view's
     total = np.maximum(mean, 0.0) + np.maximum(lamps, 0.0)  # a straight line through noise may end below 0
     return LightMap(total.astype(np.float32), np.hypot(noise, sigma).astype(np.float32), covered)
@@ -124,17 +125,16 @@ def _spread_texels(mi: ModuleType, surfaces: Surfaces, grid: TexelGrid, near_m: 
 
 
 def _indirect(
-    mi: ModuleType, surfaces: Surfaces, fine: Texels, covered: BoolArray, settings: BakeSettings
+    mi: ModuleType, surfaces: Surfaces, fine: Texels, free: IntArray, settings: BakeSettings
 ) -> tuple[Array, Array]:
     """Irradiance by all surfaces, from the present map, and its standard error, shape (texels, 3) each."""
-    texels, hidden = fine, covered
+    texels = fine
     if settings.indirect_texel_m > settings.texel_m:
         grid = TexelGrid.of(surfaces.table, settings.indirect_texel_m)
         texels, hidden = _spread_texels(mi, surfaces, grid, settings.texel_m)
+        free = nearest_free(hidden, grid)
     # two independent halves: half their difference is the standard error of their mean
-    halves = [
-        filled(gathered(mi, surfaces, texels, settings.final_rays, 2 + 2 * i), hidden, texels.grid) for i in (0, 1)
-    ]
+    halves = [gathered(mi, surfaces, texels, settings.final_rays, 2 + 2 * i)[free] for i in (0, 1)]
     mean, sigma = smoothed(texels.grid, halves[0], halves[1], _KEPT_OF_SURFACES)
     if texels is fine:
         return mean, sigma
@@ -214,16 +214,14 @@ def smoothed(grid: TexelGrid, a: Array, b: Array, kept: int) -> tuple[Array, Arr
         Means of smoothed texels over squares of so many along a side are kept. Small ones leave more of the noise.
     """
     mean, variance = 0.5 * (a + b), (0.5 * (a - b)) ** 2
-    for part, rows, columns in grid.grids():
-        if rows * columns >= _FEWEST:
-            one, other = (half[part].reshape(rows, columns, 3) for half in (a, b))
-            best = _best(one, other, kept)
-            mean[part], variance[part] = (plane.reshape(-1, 3) for plane in best)
+    for texels in grid.alike:
+        if texels[0].size >= _FEWEST:
+            mean[texels], variance[texels] = _best(a[texels], b[texels], kept)
     return mean, np.sqrt(variance)
 
 
 def _best(a: Array, b: Array, kept: int) -> tuple[Array, Array]:
-    """Mean and variance of a grid, each texel with the reach that serves it best."""
+    """Mean and variance of grids, each texel with the reach that serves it best; shape (grids, rows, columns, 3)."""
     # the reach 0, in which a itself is compared with b
     best, least = [a, b], _around(2.0 * (a - b) ** 2).sum(axis=-1)
     changed = np.zeros((*least.shape, 1), dtype=bool)
@@ -242,13 +240,13 @@ def _best(a: Array, b: Array, kept: int) -> tuple[Array, Array]:
 
 
 def _around(image: Array, side: int = _AROUND) -> Array:
-    return np.asarray(ndimage.uniform_filter(image, size=(side, side, 1), mode="nearest"))
+    return np.asarray(ndimage.uniform_filter(image, size=(1, side, side, 1), mode="nearest"))
 
 
 def _fit(image: Array, reach: int) -> Array:
     """Straight-line fits along both axes."""
-    rows, columns = (line_fit(length, reach) for length in image.shape[:2])
-    down = np.matmul(rows, image.reshape(len(image), -1)).reshape(image.shape)  # einsum takes 20 times as long
+    rows, columns = (line_fit(length, reach) for length in image.shape[1:3])
+    down = np.matmul(rows, image.reshape(*image.shape[:2], -1)).reshape(image.shape)  # einsum takes 20 times as long
     return np.matmul(columns, down)
 
 

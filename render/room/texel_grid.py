@@ -65,6 +65,20 @@ class TexelGrid:
                 if columns and first >= 0:
                     yield slice(first, first + rows * columns), rows, columns
 
+    @cached_property
+    def alike(self) -> list[IntArray]:
+        """Texels of all grids, those of as many rows and columns together, shape (grids, rows, columns) each.
+
+        A room has a thousand grids of few shapes: what is done to all of one shape at once costs a tenth of the time.
+        """
+        found: dict[tuple[int, int], list[int]] = {}
+        for part, *size in self.grids():
+            found.setdefault((size[0], size[1]), []).append(part.start)
+        return [
+            np.array(starts)[:, None, None] + np.arange(rows * columns).reshape(rows, columns)
+            for (rows, columns), starts in found.items()
+        ]
+
     def patch(self) -> tuple[IntArray, IntArray]:
         """Patch and number within its grid of every texel, shape (N,) each."""
         each = self.columns * self.rows

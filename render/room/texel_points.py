@@ -12,6 +12,7 @@ from scipy import ndimage
 from phibench.render.room.camera_plugin import MM_PER_M
 from phibench.render.room.surfaces import Surfaces, aligned
 from phibench.render.room.texel_grid import TexelGrid
+from phibench.scenes.faces import IntArray
 from phibench.scenes.frames import Array, BoolArray
 
 _LIFT_MM = 0.05  # rays start this far in front of their surface
@@ -131,15 +132,19 @@ def _vector(mi: ModuleType, values: Array) -> Any:
     return mi.Vector3f(*(mi.Float(aligned(values[:, i])) for i in range(3)))
 
 
-def filled(values: Array, covered: BoolArray, grid: TexelGrid) -> Array:
-    """Give covered texels the value of the nearest uncovered one of their grid, so that none leaks."""
-    full = values.copy()
-    for part, rows, columns in grid.grids():
-        hidden = covered[part].reshape(rows, columns)
-        if hidden.any() and not hidden.all():
-            row, column = ndimage.distance_transform_edt(hidden, return_distances=False, return_indices=True)
-            full[part] = values[part].reshape(rows, columns, 3)[row, column].reshape(-1, 3)
-    return full
+def nearest_free(covered: BoolArray, grid: TexelGrid) -> IntArray:
+    """For every texel the nearest uncovered one of its grid, shape (texels,): none leaks that takes its value.
+
+    Itself, where it is free or where all of its grid are covered.
+    """
+    nearest = np.arange(grid.count)
+    for texels in grid.alike:
+        hidden = covered[texels]
+        partly = hidden.any(axis=(1, 2)) & ~hidden.all(axis=(1, 2))
+        for own, mask in zip(texels[partly], hidden[partly], strict=True):
+            row, column = ndimage.distance_transform_edt(mask, return_distances=False, return_indices=True)
+            nearest[own] = own[row, column]
+    return nearest
 
 
 def chosen(mi: ModuleType, texels: Texels, lanes: Any) -> tuple[Any, Any, Any]:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from phibench.render.room.bounced_light import _between, _overlap
+from phibench.render.room.bounced_light import _between, _overlap, coarser, finer
 from phibench.render.room.light_map import line_fit, smoothed
 from phibench.render.room.texel_grid import TexelGrid
+from phibench.render.room.texel_points import nearest_free
 from phibench.scenes.faces import face_table
-from phibench.scenes.shapes import rectangle
+from phibench.scenes.shapes import Rectangle, rectangle
 
 GRID = TexelGrid.of(face_table([rectangle("wall", (0, 0, 0), (0, 0, 1), (6.0, 4.0))]), 0.1)
 X, Y = np.meshgrid((np.arange(60) + 0.5) / 60, (np.arange(40) + 0.5) / 40)
@@ -69,3 +70,37 @@ def test_coarser_grids_keep_the_light_and_finer_ones_lines() -> None:
     coarse, fine = (np.arange(8) + 0.5) / 8, (np.arange(21) + 0.5) / 21
     inner = (fine > coarse[0]) & (fine < coarse[-1])
     np.testing.assert_allclose((_between(8, 21) @ (3.0 * coarse))[inner], 3.0 * fine[inner], atol=1e-12)
+
+
+def test_grids_of_one_shape_are_treated_as_if_each_were_alone() -> None:
+    """Three walls of two shapes, in the order that parts those alike: smoothing, resampling and nearest free texels."""
+    walls = [rectangle(f"wall_{k}", (k, 0, 0), (0, 0, 1), size) for k, size in enumerate(((1.0, 0.6), (0.7, 2.0)) * 2)]
+    rng = np.random.default_rng(4)
+
+    def of(shapes: list[Rectangle], a: np.ndarray, b: np.ndarray, covered: np.ndarray) -> list[np.ndarray]:
+        grid, coarse = (TexelGrid.of(face_table(shapes), size) for size in (0.1, 0.2))
+        free, means = nearest_free(covered, grid), coarser(grid, coarse, a)
+        return [*smoothed(grid, a, b, 5), a[free], finer(coarse, grid, means)]
+
+    grid = TexelGrid.of(face_table(walls), 0.1)
+    a, b = (1.0 + 0.1 * rng.normal(size=(grid.count, 3)) for _ in range(2))
+    covered = rng.random(grid.count) < 0.3
+    together = of(walls, a, b, covered)
+    for wall, (part, _, _) in zip(walls, grid.grids(), strict=True):
+        for all_of, alone in zip(together, of([wall], a[part], b[part], covered[part]), strict=True):
+            np.testing.assert_allclose(all_of[part], alone, rtol=1e-12, atol=1e-12)
+
+
+def test_covered_texels_take_the_value_of_the_nearest_free_one() -> None:
+    """Against all distances; a grid without a free texel keeps its own."""
+    walls = [rectangle(f"wall_{k}", (k, 0, 0), (0, 0, 1), (1.0, 0.6)) for k in range(2)]
+    grid = TexelGrid.of(face_table(walls), 0.1)
+    covered = np.random.default_rng(6).random(grid.count) < 0.7
+    covered[60:] = True
+    found = nearest_free(covered, grid)
+    np.testing.assert_array_equal(found[60:], np.arange(60, 120))
+    place = np.stack(np.divmod(np.arange(60), 10), axis=1)
+    away = np.linalg.norm(place[:, None] - place[~covered[:60]], axis=2).min(axis=1)
+    assert covered[:60].any()
+    assert not covered[found[:60]].any()
+    np.testing.assert_allclose(np.linalg.norm(place - place[found[:60]], axis=1), away)
