@@ -108,7 +108,7 @@ def exact(mi: ModuleType, room: Room, surfaces: Surfaces, points: Shown) -> tupl
     surfaces.set_light(texels.grid, np.zeros((texels.grid.count, 3)))
     lamps = direct_light(mi, surfaces, texels, None, _LAMP_RAYS, 77)
     surfaces.set_light(TexelGrid.of(table, FINE.texel_m), bake(RIG.at(0.0), room, FINE).irradiance_w_m2)
-    others = [gathered(mi, surfaces, texels, _RAYS, 5000 + k) for k in (0, 7)]
+    others = [gathered(mi, surfaces, texels, np.full(len(start), _RAYS), 5000 + k) for k in (0, 7)]
     return 0.5 * (lamps[0] + lamps[1]), 0.5 * (others[0] + others[1])
 
 

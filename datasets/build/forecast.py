@@ -25,7 +25,7 @@ from phibench.datasets.build.tasks import BuildTask, Done, Executor, Outcome
 from phibench.datasets.plan.plan import PairPlan, Plan
 from phibench.render.optics.room_tracer import room_geometry
 from phibench.render.optics.truth import EDGE, NO_REFLECTION, SpotTruth, depth_m, spot_truth
-from phibench.render.room.bounced_light import BOUNCE_TEXEL_M
+from phibench.render.room.bounced_light import BOUNCE_TEXEL_M, rays_by_area
 from phibench.render.room.lamp_light import FIRST_RAYS
 from phibench.render.room.light_map import fixed_shapes, texel_count
 from phibench.render.room.texel_grid import TexelGrid
@@ -162,17 +162,15 @@ def light_map_s(plan: Plan, room: Room) -> float:
     ambient = plan.recipe.ambient
     table = face_table(fixed_shapes(room))
     doubled = math.log2(max(len(table.patch), 64))
-    fine, indirect, coarse = (
-        TexelGrid.of(table, size).count
-        for size in (
-            ambient.texel_m,
-            max(ambient.indirect_texel_m, ambient.texel_m),
-            max(BOUNCE_TEXEL_M, ambient.texel_m),
-        )
+    fine = TexelGrid.of(table, ambient.texel_m).count
+    sizes = (max(ambient.indirect_texel_m, ambient.texel_m), max(BOUNCE_TEXEL_M, ambient.texel_m))
+    indirect, coarse = (
+        rays_by_area(TexelGrid.of(table, size), rays, size).sum()
+        for size, rays in zip(sizes, (ambient.final_rays, ambient.bounce_rays), strict=True)
     )
     # every other texel faces a lamp
     lamps = 0.5 * fine * table.emits.sum() * (FIRST_RAYS + 2.0 * _PENUMBRA * doubled * ambient.lamp_rays)
-    rays = lamps + 2 * ambient.final_rays * indirect + ambient.bounce_rays * coarse
+    rays = lamps + 2.0 * indirect + coarse
     return float(rays * (_TRIANGLES[0] * doubled + _TRIANGLES[1]) + fine * BAKE_S_PER_MEGATEXEL) / 1e6
 
 

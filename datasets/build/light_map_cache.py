@@ -36,7 +36,7 @@ from phibench.scenes.textures import Bitmap
 
 LIMIT_MB = 1000.0
 """Limit of a cache that was given none; a room of the default settings has 2 MB."""
-_FORM = b"phibench light map 2"
+_FORM = b"phibench light map 3"
 _SUFFIX = ".lightmap"
 _LOCK, _LIMIT = ".lock", "limit.txt"
 _PATIENCE_S = 10.0

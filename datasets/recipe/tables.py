@@ -243,7 +243,9 @@ class AmbientTable(Table):
     )
     bounces: int = Field(default=12, ge=0, le=100, description="passes of bounced light before the last one")
     bounce_rays: int = Field(default=64, ge=1, le=65536, description="rays in such a pass, per texel of 0.2 m")
-    final_rays: int = Field(default=384, ge=1, le=65536, description="rays per texel in the last pass, twice")
+    final_rays: int = Field(
+        default=384, ge=1, le=65536, description="rays per texel in the last pass, twice; fewer on smaller faces"
+    )
 
 
 class TargetTable(Table):

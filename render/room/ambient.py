@@ -23,7 +23,7 @@ from phibench.render.room.refinement import render_refined
 from phibench.render.room.shading import LampOutlines, Look
 from phibench.render.room.subpixel_grid import CellSampler, Crop, FilmGrid, Stack
 from phibench.render.room.surfaces import Surfaces
-from phibench.render.room.texel_grid import TexelGrid
+from phibench.render.room.texel_grid import TexelGrid, texel_sizes_m
 from phibench.render.setup.variant import activate
 from phibench.scenes.camera import Camera
 from phibench.scenes.frames import Array
@@ -129,8 +129,9 @@ def view_film(
 
 
 def _texel_sizes_m(surfaces: Surfaces, fixed: int, texel_m: float) -> Array:
-    """Texels of each patch: a third of the mirror's width where a holder is lit, whose light the mirror changes."""
-    sizes = np.full(len(surfaces.table.shape), texel_m)
+    """Texels of each patch: those of the map; on a holder a third of the mirror's width, which changes its light."""
+    sizes = texel_sizes_m(surfaces.table, texel_m)
+    sizes[fixed:] = texel_m
     rig = surfaces.view.rig
     if rig.holder is not None:
         sizes[fixed:] = min(texel_m, rig.extent.wide_m / 3.0)

@@ -1,9 +1,12 @@
 """Light of lamps and of the sun on a room's texels: what arrives without a bounce.
 
-Where a lamp is seen whole, its irradiance is Lambert's closed form for a polygon. Where a part of it is hidden, rays
-over the lamp give the part that is seen, and the closed form the rest. A few rays tell which texels those are; their
-neighbours count as well, so that a texel's own luck decides nothing.
+Where nothing hides a lamp, its irradiance is Lambert's closed form for a polygon, cut by the horizon. Where a part of
+it is hidden, rays over the lamp give the part that is seen, and the closed form the rest. A few rays tell which texels
+those are; their neighbours count as well, so that a texel's own luck decides nothing.
 The sun: rays over its disc that leave by a window.
+
+Coats mirror lamps. From a texel chance rarely finds a small lamp in a coat, which is a hundred times as bright as the
+rest. So photons go the other way, from lamps to coats, and on to texels (`lamps_in_coats`).
 """
 
 from __future__ import annotations
@@ -19,7 +22,7 @@ from phibench.render.room.camera_plugin import MM_PER_M
 from phibench.render.room.mirror_light import MirrorBody
 from phibench.render.room.subpixel_grid import points, shifts
 from phibench.render.room.surfaces import Surfaces, aligned
-from phibench.render.room.texel_points import Texels, chosen, transmitted
+from phibench.render.room.texel_points import Texels, chosen, transmitted, vector
 from phibench.scenes.frames import Array, BoolArray
 from phibench.scenes.room import Sun
 
@@ -28,6 +31,8 @@ FIRST_RAYS = 8
 """Towards a lamp, from every texel that faces it."""
 _PENUMBRA_TEXELS = 2  # around those that see a part of a lamp
 _SUN_RAYS = 16
+_PHOTONS = 1 << 17  # of all lamps: one changes a texel of 10 cm by 0.001 of the room's light
+_COATS = 3
 
 
 def direct_light(
@@ -56,19 +61,21 @@ def direct_light(
         if len(seen) == 0:
             continue
         whole = whole_lamp(way[seen], texels.normals_world[seen], lamp)
-        whole[above[seen] < reach[seen]] = np.nan
-        key = seed + 100 * number
-        value, share = _lamp_rays(mi, surfaces, texels, seen, lamp, whole, min(FIRST_RAYS, rays), key, mirror)
+        key, first = seed + 100 * number, min(FIRST_RAYS, rays)
+        sums = _lamp_rays(mi, surfaces, texels, seen, lamp, (0, first), key, mirror)
+        share = sums[4] / first
         partly = np.zeros(len(texels), dtype=bool)
         partly[seen] = (share > 0.0) & (share < 1.0)
         # a screen's picture needs all rays
-        again = _around(texels, partly)[seen] | np.isnan(whole) | surfaces.table.is_radiance[int(lamp[13])]
+        again = _around(texels, partly)[seen] | surfaces.table.is_radiance[int(lamp[13])]
         for half, total in enumerate(halves):
-            if again.any():
-                value[again], _ = _lamp_rays(
-                    mi, surfaces, texels, seen[again], lamp, whole[again], rays, key + 50 + half, mirror
-                )
-            total[seen] += value
+            own = sums.copy()
+            more = (first, rays) if half == 0 else (0, rays)  # the first rays are of the first half
+            if again.any() and more[0] < more[1]:
+                found = _lamp_rays(mi, surfaces, texels, seen[again], lamp, more, key + 50 * half, mirror)
+                own[:, again] = found + (own[:, again] if half == 0 else 0.0)
+            weight = own[3]
+            total[seen] += (own[:3] * np.divide(whole, weight, out=np.zeros_like(whole), where=weight > 0.0)).T
     return halves[0], halves[1]
 
 
@@ -82,19 +89,29 @@ def _lamps(surfaces: Surfaces) -> Array:
 
 
 def whole_lamp(way: Array, normals: Array, lamp: Array) -> Array:
-    """Irradiance per radiance by a rectangle that is above the horizon, shape (n,): Lambert's formula for polygons.
+    """Irradiance per radiance by the part of a rectangle above the horizon, shape (n,): Lambert's formula for polygons.
 
     Half the sum over the edges of the angle that an edge subtends, times its plane's normal, times the texel's normal.
-    `way` leads to the lamp's centre, mm.
+    Where the horizon cuts the rectangle, it is an edge. `way` leads to the lamp's centre, mm.
     """
     corners = [way + a * lamp[3:6] + b * lamp[6:9] for a, b in ((-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5))]
-    total = np.zeros(len(way))
-    for here, there in zip(corners, corners[1:] + corners[:1], strict=True):
-        across = np.cross(here, there)
-        length = np.linalg.norm(across, axis=1)
-        angle = np.arctan2(length, np.einsum("ni,ni->n", here, there))
-        total += angle * np.einsum("ni,ni->n", across, normals) / np.maximum(length, 1e-30)
-    return np.asarray(0.5 * np.abs(total))
+    heights = [np.einsum("ni,ni->n", corner, normals) for corner in corners]
+    total, setting, rising = np.zeros(len(way)), np.zeros_like(way), np.zeros_like(way)
+    for k in range(4):
+        (here, there), (low, high) = ((values[k], values[(k + 1) % 4]) for values in (corners, heights))
+        share = np.divide(low, low - high, out=np.zeros_like(low), where=low != high)[:, None]
+        cut, up, goes_up = here + share * (there - here), (low > 0.0)[:, None], (high > 0.0)[:, None]
+        setting, rising = np.where(up & ~goes_up, cut, setting), np.where(~up & goes_up, cut, rising)
+        total += _edge(np.where(up, here, cut), np.where(goes_up, there, cut), normals) * (up | goes_up)[:, 0]
+    return np.asarray(0.5 * np.abs(total + _edge(setting, rising, normals)))
+
+
+def _edge(here: Array, there: Array, normals: Array) -> Array:
+    """Angle that edges subtend, times the normal of the plane through them, times the texel's normal."""
+    across = np.cross(here, there)
+    length = np.linalg.norm(across, axis=1)
+    angle = np.arctan2(length, np.einsum("ni,ni->n", here, there))
+    return np.asarray(angle * np.einsum("ni,ni->n", across, normals) / np.maximum(length, 1e-30))
 
 
 def _around(texels: Texels, marked: BoolArray) -> BoolArray:
@@ -114,14 +131,13 @@ def _lamp_rays(
     texels: Texels,
     some: NDArray[np.intp],
     lamp: Array,
-    whole: Array,
-    rays: int,
+    rays: tuple[int, int],
     seed: int,
     mirror: MirrorBody | None,
-) -> tuple[Array, Array]:
-    """Irradiance of some texels by a lamp, shape (n, 3), and the part of the rays that reach it, shape (n,).
+) -> Array:
+    """Sums over rays from some texels to a lamp, shape (5, n); `rays` are the first number and the end of them.
 
-    The rays give the part of the light that arrives; `whole`, where it is no NaN, the light itself.
+    What arrives in the bands R, G, B, its weights if nothing hid the lamp, and the number of rays that reach it.
     """
     import drjit as dr
 
@@ -129,7 +145,7 @@ def _lamp_rays(
     point, normal, coat = chosen(mi, texels, lanes)
     numbers = [dr.opaque(mi.Float, float(value)) for value in lamp]
     is_screen = bool(surfaces.table.is_radiance[int(lamp[13])])
-    count, key, patch = (dr.opaque(mi.UInt32, value) for value in (rays, seed, int(lamp[13])))
+    start_at, count, key, patch = (dr.opaque(mi.UInt32, value) for value in (*rays, seed, int(lamp[13])))
     spread = texels.spread
     shift = shifts(mi, lanes, 2 if spread is None else 3, key)
     dr.eval(shift)
@@ -157,16 +173,66 @@ def _lamp_rays(
         return i + 1, total + light, weights + weight, seen + dr.select(free | ~faces, 1.0, 0.0)
 
     n = len(some)
-    zero = (mi.UInt32(0), dr.zeros(mi.Color3f, n), dr.zeros(mi.Float, n), dr.zeros(mi.Float, n))
+    zero = (mi.UInt32(start_at), dr.zeros(mi.Color3f, n), dr.zeros(mi.Float, n), dr.zeros(mi.Float, n))
     _, total, weights, seen = dr.while_loop(zero, lambda i, *_: i < count, body)
     dr.eval(total, weights, seen)  # together: each would run the loop anew
-    value = np.stack([np.array(total[k], dtype=float) for k in range(3)], axis=-1)
+    sums = np.stack([np.array(one, dtype=float) for one in (*total, weights, seen)])
     if not is_screen:
-        value *= surfaces.table.radiance_w_m2_sr[int(lamp[13])]
-    weight = np.array(weights, dtype=float)
-    scale = np.divide(whole, weight, out=np.zeros_like(whole), where=weight > 0.0)
-    scale = np.where(np.isnan(whole), lamp[12] / rays, scale)
-    return value * scale[:, None], np.array(seen, dtype=float) / rays
+        sums[:3] *= surfaces.table.radiance_w_m2_sr[int(lamp[13])][:, None]
+    return sums
+
+
+def lamps_in_coats(mi: ModuleType, surfaces: Surfaces, texels: Texels, seed: int) -> Array:
+    """Irradiance from lamps by way of coats, three of them at most, shape (texels, 3): photons, counted by texel.
+
+    The light of the surfaces must be that of the same grid.
+    """
+    import drjit as dr
+
+    total, areas = np.zeros((texels.grid.count, 3)), texels.grid.areas_m2()
+    lamps = _lamps(surfaces)
+    if not surfaces.has_coats or not len(lamps):
+        return total
+    ray, flux = _photons(mi, surfaces, lamps, seed)
+    t, patch, valid = surfaces.hit(ray, coherent=False)
+    for _ in range(_COATS):
+        onward, coated, reflectance = surfaces.mirrored(patch, ray(t), ray.d, valid)
+        flux *= reflectance
+        dr.eval(onward, coated, flux)
+        some = dr.compress(coated)
+        if not dr.width(some):
+            break
+        ray = mi.Ray3f(dr.gather(mi.Point3f, onward.o, some), dr.gather(mi.Vector3f, onward.d, some))
+        flux = dr.gather(mi.Color3f, flux, some)
+        t, patch, valid = surfaces.hit(ray, coherent=False)
+        found, arriving = surfaces.ground(patch, ray(t), ray.d, valid, False), flux * surfaces.entering(patch, ray.d)
+        texel = dr.select(found.active, found.nearest(), texels.grid.count)
+        dr.eval(ray, t, patch, valid, texel, arriving)
+        number = np.array(texel)
+        for k in range(3):
+            total[:, k] += np.bincount(number, np.array(arriving[k]), len(total) + 4)[: len(total)]
+    free = 1.0 if texels.spread is None else np.maximum(texels.spread.free_share(), 1.0 / 16.0)
+    return total / (areas * free)[:, None]
+
+
+def _photons(mi: ModuleType, surfaces: Surfaces, lamps: Array, seed: int) -> tuple[Any, Any]:
+    """Rays that leave lamps, cosine-weighted, and the flux of each, W: as many of a lamp as its part of the power."""
+    import drjit as dr
+
+    bands = np.where(
+        surfaces.table.is_radiance[:, None], surfaces.mean_albedo()[:, None], surfaces.table.radiance_w_m2_sr
+    )
+    power = bands[lamps[:, 13].astype(int)].sum(axis=1) * lamps[:, 12]
+    counts = np.maximum(np.round(_PHOTONS * power / max(power.sum(), 1e-30)), 1).astype(np.int64)
+    owner = mi.UInt32(aligned(np.repeat(np.arange(len(lamps)), counts), np.uint32))
+    centre, across, up, normal = (dr.gather(mi.Vector3f, vector(mi, lamps[:, k : k + 3]), owner) for k in (0, 3, 6, 9))
+    each = dr.gather(mi.Float, mi.Float(aligned(np.pi * lamps[:, 12] / MM_PER_M**2 / counts)), owner)
+    patch = dr.gather(mi.UInt32, mi.UInt32(aligned(lamps[:, 13], np.uint32)), owner)
+    lane = dr.arange(mi.UInt32, int(counts.sum()))
+    x = points(mi, shifts(mi, lane // 256, 4, dr.opaque(mi.UInt32, seed)), lane % 256)
+    place = mi.Point3f(centre + (x[0] - 0.5) * across + (x[1] - 0.5) * up)
+    way = mi.Frame3f(normal).to_world(mi.warp.square_to_cosine_hemisphere(mi.Point2f(x[2], x[3])))
+    return mi.Ray3f(place + _LAMP_GAP_MM * normal, way), each * surfaces.emission(patch, place)
 
 
 def _sunlight(

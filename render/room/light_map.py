@@ -29,8 +29,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from phibench.render.room.bounced_light import bounced_light, finer, gathered
-from phibench.render.room.lamp_light import direct_light
+from phibench.render.room.bounced_light import BrightTexels, bounced_light, finer, gathered, rays_by_area
+from phibench.render.room.lamp_light import direct_light, lamps_in_coats
 from phibench.render.room.mirror_light import mirror_body, mirror_light
 from phibench.render.room.surfaces import Surfaces
 from phibench.render.room.texel_grid import TexelGrid
@@ -104,13 +104,13 @@ def bake(view: View, room: Room, settings: BakeSettings) -> LightMap:
     surfaces.set_light(fine.grid, np.zeros((len(fine), 3)))
     direct = direct_light(mi, surfaces, fine, room.sun, settings.lamp_rays, _SEED)
     free = nearest_free(covered, fine.grid)
-    one, other = (half[free] for half in direct)
+    one, other = ((half + lamps_in_coats(mi, surfaces, fine, _SEED + 20 + k))[free] for k, half in enumerate(direct))
     lamps, noise = smoothed(fine.grid, one, other, _KEPT_OF_LAMPS)
     lit = lamps + bounced_light(
         mi, surfaces, fine.grid, lamps, settings.texel_m, settings.bounces, settings.bounce_rays, _SEED + 10
     )
     surfaces.set_light(fine.grid, lit)
-    mean, sigma = _indirect(mi, surfaces, fine, free, settings)
+    mean, sigma = _indirect(mi, surfaces, fine, free, settings, BrightTexels.of(mi, surfaces, fine.grid, lit))
     dr.flush_malloc_cache()  # arrays that Dr.Jit keeps for the next time, of other sizes than a view's
     total = np.maximum(mean, 0.0) + np.maximum(lamps, 0.0)  # a straight line through noise may end below 0
     return LightMap(total.astype(np.float32), np.hypot(noise, sigma).astype(np.float32), covered)
@@ -125,16 +125,22 @@ def _spread_texels(mi: ModuleType, surfaces: Surfaces, grid: TexelGrid, near_m: 
 
 
 def _indirect(
-    mi: ModuleType, surfaces: Surfaces, fine: Texels, free: IntArray, settings: BakeSettings
+    mi: ModuleType,
+    surfaces: Surfaces,
+    fine: Texels,
+    free: IntArray,
+    settings: BakeSettings,
+    bright: BrightTexels | None,
 ) -> tuple[Array, Array]:
     """Irradiance by all surfaces, from the present map, and its standard error, shape (texels, 3) each."""
-    texels = fine
+    texels, largest_m = fine, max(settings.indirect_texel_m, settings.texel_m)
     if settings.indirect_texel_m > settings.texel_m:
         grid = TexelGrid.of(surfaces.table, settings.indirect_texel_m)
         texels, hidden = _spread_texels(mi, surfaces, grid, settings.texel_m)
         free = nearest_free(hidden, grid)
     # two independent halves: half their difference is the standard error of their mean
-    halves = [gathered(mi, surfaces, texels, settings.final_rays, 2 + 2 * i)[free] for i in (0, 1)]
+    rays = rays_by_area(texels.grid, settings.final_rays, largest_m)
+    halves = [gathered(mi, surfaces, texels, rays, 2 + 3 * i, bright, lamps=False)[free] for i in (0, 1)]
     mean, sigma = smoothed(texels.grid, halves[0], halves[1], _KEPT_OF_SURFACES)
     if texels is fine:
         return mean, sigma
@@ -163,7 +169,7 @@ def light_carriage(
         body = mirror_body(mi, surfaces.view)
         rays = _CARRIAGE_RAYS if body is None else _HOLDER_RAYS
         direct = direct_light(mi, surfaces, texels, sun, settings.lamp_rays, _SEED, body)
-        light = 0.5 * (direct[0] + direct[1]) + gathered(mi, surfaces, texels, rays, _SEED + 2)
+        light = 0.5 * (direct[0] + direct[1]) + gathered(mi, surfaces, texels, np.full(len(texels), rays), _SEED + 2)
         if body is not None:
             light = np.maximum(light + mirror_light(mi, surfaces, texels, body, rays, _SEED + 3), 0.0)
         full[first:] = light

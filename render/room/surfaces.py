@@ -71,6 +71,12 @@ class LookUp:
     emitted: Any
     active: Any
 
+    def nearest(self) -> Any:
+        """Texel around the point."""
+        import drjit as dr
+
+        return self.first + dr.select(self.tx < 0.5, 0, 1) + dr.select(self.ty < 0.5, 0, self.across)
+
 
 class Surfaces:
     """A Mitsuba scene of faces, with tables that answer look-ups.
@@ -168,6 +174,26 @@ class Surfaces:
         coated = active & (plane.w > 0.0) & (cos > 0.0)
         onward = mi.Ray3f(point + _LIFT_MM * normal, direction + 2.0 * cos * normal)
         return onward, coated, self.reflectance(cos, plane.w)
+
+    def cosine(self, patch: Any, direction: Any) -> Any:
+        """Size of the cosine between directions and the normals of patches."""
+        import drjit as dr
+
+        plane = dr.gather(self._mi.Vector4f, self._rows, patch * _ROW)
+        return dr.abs(dr.dot(self._mi.Vector3f(plane.x, plane.y, plane.z), direction))
+
+    def entering(self, patch: Any, direction: Any) -> Any:
+        """Part of light of a direction that the coats of patches let in; 1 where there is none."""
+        import drjit as dr
+
+        plane = dr.gather(self._mi.Vector4f, self._rows, patch * _ROW)
+        cos = dr.abs(dr.dot(self._mi.Vector3f(plane.x, plane.y, plane.z), direction))
+        return dr.select(plane.w > 0.0, 1.0 - self.reflectance(cos, dr.maximum(plane.w, 1.0)), 1.0)
+
+    def mean_albedo(self) -> Array:
+        """Albedo of each patch, mean of its texture and of the bands, shape (P,)."""
+        means = [image[..., :3].mean() for image, _ in map(_image, self.table.textures)]
+        return np.array([*means, 0.0])[np.where(self.table.emits, len(means), self.table.texture)]
 
     def emission(self, patch: Any, point: Any) -> Any:
         """Radiance of lamps and screens at points on them (scene, mm)."""

@@ -16,6 +16,18 @@ import numpy as np
 from phibench.scenes.faces import FaceTable, IntArray
 from phibench.scenes.frames import Array
 
+_ACROSS, _FINEST_M = 8.0, 0.05  # texels across a small face, and their least size
+
+
+def texel_sizes_m(table: FaceTable, texel_m: float) -> Array:
+    """Sizes of the texels of patches, shape (P,): `texel_m` on large faces.
+
+    Smaller ones, where shadows of near things count for more, get eight texels across, down to half the size, or 5 cm
+    if that is more. Strips narrower than a texel would gain nothing.
+    """
+    short, finest = table.size_m.min(axis=1, initial=np.inf), min(texel_m, max(0.5 * texel_m, _FINEST_M))
+    return np.where(short < texel_m, texel_m, np.clip(short / _ACROSS, finest, texel_m))
+
 
 @dataclass(frozen=True, eq=False)
 class TexelGrid:
@@ -37,7 +49,9 @@ class TexelGrid:
 
     @classmethod
     def of(cls, table: FaceTable, texel_m: float | Array) -> TexelGrid:
-        """Grid with texels of at most `texel_m`, a number or one for each patch, shape (P,)."""
+        """Grid with texels of at most `texel_m`: sizes of patches, shape (P,), or one for `texel_sizes_m`."""
+        if np.ndim(texel_m) == 0:
+            texel_m = texel_sizes_m(table, float(texel_m))
         sides = np.maximum(np.ceil(table.size_m / np.reshape(texel_m, (-1, 1)) - 1e-9), 2).astype(np.int64)
         columns, rows = np.where(table.emits | table.is_radiance, 0, sides.T)
         counts = columns * rows * np.where(table.two_sided, 2, 1)
@@ -86,6 +100,11 @@ class TexelGrid:
         grid = np.repeat(np.arange(len(counts)), counts)
         first = np.cumsum(counts) - counts
         return grid // 2, np.arange(len(grid)) - first[grid]
+
+    def areas_m2(self) -> Array:
+        """Area of every texel, shape (N,)."""
+        each = self.table.size_m.prod(axis=1) / np.maximum(self.columns * self.rows, 1)
+        return np.asarray(each[self.patch()[0]])
 
     def points(self) -> tuple[Array, Array]:
         """World points of the texels' middles and the normals of their side, shape (N, 3) each.

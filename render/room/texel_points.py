@@ -45,6 +45,10 @@ class Spread:
     free: Any
     hidden: BoolArray
 
+    def free_share(self) -> Array:
+        """Part of each texel that is free, shape (texels,)."""
+        return np.array(self.free, dtype=float) / _PLACES
+
     def start(self, mi: ModuleType, middle: Any, texel: Any, x: Any) -> Any:
         """Starts of rays of texels with these middles, by uniform deviates; the middles where no place is free."""
         import drjit as dr
@@ -106,7 +110,7 @@ def spread_out(mi: ModuleType, surfaces: Surfaces, texels: Texels) -> Texels:
 
     grid, table, (patch, _) = texels.grid, surfaces.table, texels.grid.patch()
     sides = MM_PER_M * table.size_m[patch] / np.stack([grid.columns, grid.rows], axis=1)[patch]
-    across, up = (_vector(mi, sides[:, [k]] * axis[patch]) for k, axis in enumerate((table.x_axis, table.y_axis)))
+    across, up = (vector(mi, sides[:, [k]] * axis[patch]) for k, axis in enumerate((table.x_axis, table.y_axis)))
     lane = dr.arange(mi.UInt32, len(texels) * _PLACES)
     texel = lane // _PLACES
     way, over, aside = (dr.gather(mi.Vector3f, one, texel) for one in (texels.normals, across, up))
@@ -117,7 +121,7 @@ def spread_out(mi: ModuleType, surfaces: Surfaces, texels: Texels) -> Texels:
     own = dr.gather(mi.UInt32, mi.UInt32(aligned(patch, np.uint32)), texel)
     t, above, met = surfaces.hit(mi.Ray3f(start, way))
     # the back of a face that has one side alone is seen from inside a solid
-    outward = dr.dot(dr.gather(mi.Vector3f, _vector(mi, table.normal), above, met), way) > 0.0
+    outward = dr.dot(dr.gather(mi.Vector3f, vector(mi, table.normal), above, met), way) > 0.0
     inside = outward & (dr.gather(mi.Float, mi.Float(aligned(table.two_sided)), above, met) == 0.0)
     clear = t > dr.gather(mi.Float, mi.Float(aligned(_CLEAR * sides.min(axis=1))), texel)
     found = on_face & (below == own) & met & ~inside & clear
@@ -128,7 +132,8 @@ def spread_out(mi: ModuleType, surfaces: Surfaces, texels: Texels) -> Texels:
     return replace(texels, spread=Spread(across, up, places, mi.Float(aligned(count)), count == 0))
 
 
-def _vector(mi: ModuleType, values: Array) -> Any:
+def vector(mi: ModuleType, values: Array) -> Any:
+    """Vectors of an array, shape (N, 3)."""
     return mi.Vector3f(*(mi.Float(aligned(values[:, i])) for i in range(3)))
 
 

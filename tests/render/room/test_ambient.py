@@ -130,10 +130,10 @@ def test_irradiance_under_one_lamp() -> None:
     big_a, big_b = math.hypot(c, a), math.hypot(c, b)
     expected = 4.0 * 0.5 * (a / big_a * math.atan(b / big_a) + b / big_b * math.atan(a / big_b))
     black = Uniform((0.0, 0.0, 0.0))
-    floor = rectangle("floor", (0, 0, 0), (0, 0, 1), (0.3, 0.3), texture=black)
+    floor = rectangle("floor", (0, 0, 0), (0, 0, 1), (0.12, 0.12), texture=black)
     lamp = rectangle("lamp", (0, 0, c), (0, 0, -1), (2 * a, 2 * b), texture=black, radiance_w_m2_sr=(1.0, 2.0, 3.0))
     room = Room("one lamp", (floor, lamp), (), robot=False)
-    result = bake(RIG.at(0.0), room, BakeSettings(texel_m=0.1, lamp_rays=512, bounces=1, bounce_rays=1, final_rays=1))
+    result = bake(RIG.at(0.0), room, BakeSettings(texel_m=0.04, lamp_rays=512, bounces=1, bounce_rays=1, final_rays=1))
     centre = result.irradiance_w_m2[4]  # 3 x 3 texels
     assert centre == pytest.approx(expected * np.array([1.0, 2.0, 3.0]), rel=1e-3)
 

@@ -78,11 +78,11 @@ def test_grids_of_one_shape_are_treated_as_if_each_were_alone() -> None:
     rng = np.random.default_rng(4)
 
     def of(shapes: list[Rectangle], a: np.ndarray, b: np.ndarray, covered: np.ndarray) -> list[np.ndarray]:
-        grid, coarse = (TexelGrid.of(face_table(shapes), size) for size in (0.1, 0.2))
+        grid, coarse = (TexelGrid.of(face_table(shapes), np.full(len(shapes), size)) for size in (0.1, 0.2))
         free, means = nearest_free(covered, grid), coarser(grid, coarse, a)
         return [*smoothed(grid, a, b, 5), a[free], finer(coarse, grid, means)]
 
-    grid = TexelGrid.of(face_table(walls), 0.1)
+    grid = TexelGrid.of(face_table(walls), np.full(len(walls), 0.1))
     a, b = (1.0 + 0.1 * rng.normal(size=(grid.count, 3)) for _ in range(2))
     covered = rng.random(grid.count) < 0.3
     together = of(walls, a, b, covered)
@@ -94,7 +94,7 @@ def test_grids_of_one_shape_are_treated_as_if_each_were_alone() -> None:
 def test_covered_texels_take_the_value_of_the_nearest_free_one() -> None:
     """Against all distances; a grid without a free texel keeps its own."""
     walls = [rectangle(f"wall_{k}", (k, 0, 0), (0, 0, 1), (1.0, 0.6)) for k in range(2)]
-    grid = TexelGrid.of(face_table(walls), 0.1)
+    grid = TexelGrid.of(face_table(walls), np.full(len(walls), 0.1))
     covered = np.random.default_rng(6).random(grid.count) < 0.7
     covered[60:] = True
     found = nearest_free(covered, grid)
