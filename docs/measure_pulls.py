@@ -5,7 +5,8 @@ Run from the repository root. FOLDER holds what `phibench bench` wrote: `<preset
 3 px with a claimed covariance, their samples, the rms pull about the centre of the light and about the beam's axis with
 95 % intervals (bootstrap over samples), rms at the bound over rms, and the share of all claims that are off by more
 than 5 claimed sigma, answers beyond 3 px included. Strata: shift between light and axis, saturation, signal to noise,
-distance from the detection, and saturation within each of the others. A stratum of fewer than 30 answers is not shown.
+claimed sigma, distance from the detection, and saturation within each of the others. A stratum of fewer than 30 answers
+is not shown.
 Above each table: of images in which `detect` is within 1 px, how many the method answers, and how many beyond 3 px.
 """
 
@@ -31,6 +32,7 @@ METHODS = ("raw_maximum_likelihood", "chain_fit", "joint_fit")
 EDGES = {
     "shift": ("shift_px", (0.0, 0.001, 0.01, 0.04, math.inf), "px"),
     "snr": ("snr", (0.0, 5.0, 10.0, 30.0, 100.0, math.inf), ""),
+    "claimed": ("claimed_px", (0.0, 0.02, 0.05, 0.1, 0.2, math.inf), "px"),
     "from detect": ("from_detect_px", (0.0, 0.3, 1.0, 3.0, math.inf), "px"),
 }
 
@@ -44,6 +46,7 @@ def claims_of(folder: Path, preset: str, method: str) -> pl.DataFrame:
     pulls = whitened(error, np.stack([np.stack([uu, uv], -1), np.stack([uv, vv], -1)], -2))
     table = table.with_columns(
         shift_px=light_shift(),
+        claimed_px=(0.5 * (pl.col("claimed_uu_px2") + pl.col("claimed_vv_px2"))).sqrt(),
         light2=0.5 * pl.col("mahalanobis2"),
         axis2=pl.Series(0.5 * np.sum(pulls**2, axis=-1)),
         saturation=pl.when(pl.col("saturated")).then(pl.lit("saturated")).otherwise(pl.lit("not saturated")),

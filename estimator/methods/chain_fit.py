@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -12,7 +13,7 @@ from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.estimator.geometry.status import Status, describe
 from phibench.estimator.interface import Answer, Box, Pair, Spot
 from phibench.estimator.methods.fit_place import at_detection
-from phibench.estimator.methods.likelihood_maps import SpotLikelihood, of_pixels, of_window
+from phibench.estimator.methods.likelihood_maps import SpotLikelihood, claimed_px2, of_pixels, of_window
 from phibench.estimator.methods.locate import around as box_at
 from phibench.estimator.methods.locate import (
     box_around,
@@ -54,7 +55,7 @@ def chain_fit(pair: Pair) -> Answer:
 
     The blur is what the rig predicts (`spot_blur`), with the beam's size once the distance is known. The room behind
     comes from the laser-off frames where they are there, otherwise from what surrounds the spot. A misfit above 1 per
-    degree of freedom widens the covariance by as much.
+    degree of freedom widens the covariance by as much. That of a faint spot is its posterior's, about the fit's place.
     """
     if pair.card.output not in PROCESSED:
         missing = Spot.missing(f"chain_fit needs srgb8, yuyv or mjpeg images, not {pair.card.output}")
@@ -95,15 +96,19 @@ def _spot(pair: Pair, position: str, box: Box | None, depth_m: float | None, nea
     lens, model = SpotBlur(pair.rig.camera.blur_sigma_px), SpotModel(_response(pair))
     start = first_fit(on, origin, pair.card, lens, model.response, background, near)[0, :2] + origin[0]
     blur = pair_blur(pair, start, depth_m)
+
+    def answer(fit: SpotFit) -> Spot:
+        return _answer(fit, lambda place: spot_likelihood(pair, position, place, depth_m))
+
     if pair.card.output == "srgb8":
-        return _answer(_srgb(pair, position, start, blur, model, near))
+        return answer(_srgb(pair, position, start, blur, model, near))
     if background is None:
         known = around(start[None], origin, (region.height_px, region.width_px))
         background = _background(on, known, origin, pair.card)
     if pair.card.output == "yuyv":
-        return _answer(fit_yuyv(on, origin, pair.card, blur, model, background, near_px=near))
+        return answer(fit_yuyv(on, origin, pair.card, blur, model, background, near_px=near))
     size = (shape[1], shape[0])
-    return _answer(fit_jpeg(on, origin, pair.card, blur, model, background, size_px=size, near_px=near))
+    return answer(fit_jpeg(on, origin, pair.card, blur, model, background, size_px=size, near_px=near))
 
 
 def _region(box: Box, card: SensorCard, shape: tuple[int, ...]) -> Box:
@@ -173,14 +178,15 @@ def _response(pair: Pair) -> tuple[float, float, float]:
     return r, g, b
 
 
-def _answer(fit: SpotFit) -> Spot:
+def _answer(fit: SpotFit, likelihood: Callable[[Spot], SpotLikelihood | None]) -> Spot:
     if fit.status[0] != Status.OK:
         return Spot.missing(describe(int(fit.status[0])))
     if fit.chi2[0] > _MOST_CHI2:
         return Spot.missing(f"what is there is no spot: misfit {fit.chi2[0]:.1f}")
-    c = fit.covariance_px2[0] * max(1.0, float(fit.chi2[0]))
     u, v = (float(x) for x in fit.uv_px[0])
-    return Spot((u, v), ((float(c[0, 0]), float(c[0, 1])), (float(c[1, 0]), float(c[1, 1]))))
+    worse = fit.covariance_px2[0] * max(1.0, float(fit.chi2[0]))
+    c = claimed_px2(fit.uv_px[0], worse, lambda: likelihood(Spot((u, v))))
+    return Spot((u, v), None if c is None else ((float(c[0, 0]), float(c[0, 1])), (float(c[1, 0]), float(c[1, 1]))))
 
 
 def spot_likelihood(pair: Pair, position: str, spot: Spot, depth_m: float | None) -> SpotLikelihood | None:

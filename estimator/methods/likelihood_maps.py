@@ -14,13 +14,18 @@ from functools import partial
 import numpy as np
 from scipy.interpolate import RegularGridInterpolator
 
-from phibench.estimator.geometry.joint_posterior import MISFIT_RANGE, LikelihoodMap
+from phibench.estimator.geometry.joint_posterior import MISFIT_RANGE, LikelihoodMap, single_posterior
 from phibench.estimator.processed.interval_fit import interval_posterior
 from phibench.estimator.processed.quasi_score import CoefficientWindow, fit_window
 from phibench.estimator.spots.fisher import covariance_bound, limited, scoring_step
 from phibench.estimator.spots.fit_raw import SpotData
 from phibench.scenes.frames import Array
 
+FAINT_PX = 0.05
+"""Claimed sigma from which the posterior is asked: the curvature at the best place says too little then.
+
+Of a spot of 5 to 10 sigma, and where the mosaic or JPEG makes valleys, errors are 1.2 to 2 times such a claim.
+"""
 _AT_ONCE = 48  # hypotheses, whose arrays take some 50 MB
 _WIDE_PX = (1.25, 2.25, 3.25)  # half sides of the first map, the next one where a posterior reaches its sides
 _WIDE_STEP_PX = 0.25
@@ -119,6 +124,21 @@ def place_covariance(one: SpotLikelihood) -> Array:
     """Covariance of the place, shape (2, 2), pixels squared, by the curvature at the best hypothesis."""
     _, _, fisher = one.scores(one.theta[None], 0)
     return covariance_bound(fisher[0]) * one.excess
+
+
+def claimed_px2(uv_px: Array, covariance_px2: Array, likelihood: Callable[[], SpotLikelihood | None]) -> Array | None:
+    """Covariance that a fit may claim, shape (2, 2): that at its place, or the posterior's of a faint spot.
+
+    The mean square of the posterior about the fit's place holds other minima as well. None where the posterior has no
+    end near the place: nothing can be claimed then.
+    """
+    if np.trace(covariance_px2) < 2.0 * FAINT_PX**2 or (one := likelihood()) is None:
+        return covariance_px2
+    found = None if (places := likelihood_map(one)) is None else single_posterior(places)
+    if found is None:
+        return None
+    mean, covariance = found
+    return covariance + np.outer(mean - uv_px, mean - uv_px)
 
 
 def likelihood_map(one: SpotLikelihood) -> LikelihoodMap | None:

@@ -31,7 +31,14 @@ from phibench.estimator.geometry.status import Status, describe
 from phibench.estimator.interface import Answer, Image, Matrix2, Pair, Spot
 from phibench.estimator.methods.chain_fit import chain_fit, spot_likelihood
 from phibench.estimator.methods.fit_place import at_detection, kept
-from phibench.estimator.methods.likelihood_maps import SpotLikelihood, likelihood_map, of_pixels, place_covariance
+from phibench.estimator.methods.likelihood_maps import (
+    FAINT_PX,
+    SpotLikelihood,
+    claimed_px2,
+    likelihood_map,
+    of_pixels,
+    place_covariance,
+)
 from phibench.estimator.methods.locate import (
     SearchRegion,
     SharedPair,
@@ -65,6 +72,7 @@ _MISFIT_SIGMAS = 3.0  # by which the fit's chi2 must exceed 1 before its covaria
 def raw_maximum_likelihood(region: SearchRegion) -> Spot:
     """Position and covariance by maximum likelihood on 15 x 15 raw pixels about the place of the spot.
 
+    The covariance of a faint spot is that of its posterior about the fit's place: the mosaic has other places for it.
     Of a spot that was seen but gives no fit there, it is the place of the matched filter, without covariance; of one
     with too few pixels that are not full it is nothing.
     """
@@ -77,17 +85,20 @@ def raw_maximum_likelihood(region: SearchRegion) -> Spot:
     if near is None or place is None:
         return Spot.missing("no spot")
     x, start = raw_electrons(near.pixels, region.pair.card)[None], np.add(place, region.origin_px)
-    flat = _fit(near, x, noise, None, start)
+    flat, data = _fit(near, x, noise, None, start)
     fit, good = flat, flat.status[0] == Status.OK
     if near.off_pixels is not None or not good or flat.chi2[0] >= 1.0 + _FLAT_SIGMAS * math.sqrt(2.0 / x.size):
-        structured = _fit(near, x, noise, _background(near, x, noise, flat), start)
-        fit = structured if structured.status[0] == Status.OK else flat
-    spot = _fitted_spot(fit, x.size)
+        structured, over_room = _fit(near, x, noise, _background(near, x, noise, flat), start)
+        if structured.status[0] == Status.OK:
+            fit, data = structured, over_room
+    spot = _fitted_spot(fit, data)
     return spot if fit.status[0] == Status.SATURATED else at_detection(region.found, spot)
 
 
-def _fit(near: SearchRegion, x: Array, noise: PixelNoise, background: Background | None, start: Array) -> SpotFit:
-    """Fit from a place (u, v) of the image, with a known background or with a level per filter."""
+def _fit(
+    near: SearchRegion, x: Array, noise: PixelNoise, background: Background | None, start: Array
+) -> tuple[SpotFit, SpotData]:
+    """Fit from a place (u, v) of the image, with a known background or with a level per filter; and its pixels."""
     card, rig = near.pair.card, near.pair.rig
     u0, v0 = near.origin_px
     blur = pair_blur(near.pair, (u0 + near.box.width_px // 2, v0 + near.box.height_px // 2), near.depth_m)
@@ -100,7 +111,7 @@ def _fit(near: SearchRegion, x: Array, noise: PixelNoise, background: Background
         else GaussLaw(noise, background.variance_e2, frames, pattern.prnu, background.mean_e)
     )
     regions = spot_regions(x, near.origin_px, x < _full_from_e(card, frames))
-    return fit_law(regions, law, blur, model, start)
+    return fit_law(regions, law, blur, model, start), spot_data(regions, law, blur, model)
 
 
 def _full_from_e(card: SensorCard, frames: int) -> float:
@@ -126,12 +137,16 @@ def _background(near: SearchRegion, x: Array, noise: PixelNoise, flat: SpotFit) 
     return background_of(x, noise.variance_e2(x) / frames[0], around(uv, origin, (x.shape[1], x.shape[2])), pattern)
 
 
-def _fitted_spot(fit: SpotFit, count: int) -> Spot:
+def _fitted_spot(fit: SpotFit, data: SpotData) -> Spot:
     status = Status(int(fit.status[0]))
     if status is not Status.OK:
         return Spot.missing(describe(status))
     chi2, covariance = float(fit.chi2[0]), fit.covariance_px2[0]
-    if chi2 > 1.0 + _MISFIT_SIGMAS * math.sqrt(2.0 / count):
+    if not data.pixels.free_width:
+        covariance = claimed_px2(fit.uv_px[0], covariance, lambda: of_pixels(data, fit.uv_px[0]))
+    if covariance is None:
+        return Spot((float(fit.uv_px[0, 0]), float(fit.uv_px[0, 1])))
+    if chi2 > 1.0 + _MISFIT_SIGMAS * math.sqrt(2.0 / data.regions.x_e.size):
         # a room that the model does not follow misfits everywhere: the claim is widened by chi2, as for any fit of
         # least squares; a light of another shape, such as a spot on an edge, misfits on the few pixels that place it
         covariance = max(chi2 * covariance, fit.misfit_px2[0], key=np.trace)
@@ -168,13 +183,6 @@ def joint_of(pair: Pair, separate: Answer) -> Answer:
     return (_raw if pair.card.output == "raw" else _processed)(pair, separate)
 
 
-_FAINT_PX = 0.05
-"""Claimed sigma from which the posterior's mean and covariance are taken: those at the best place say too little then.
-
-Of a spot of 5 to 10 sigma, and where the mosaic or JPEG makes valleys, errors are 1.5 to 2 times such a claim.
-"""
-
-
 def with_posteriors(pair: Pair, separate: Answer) -> Answer:
     """Answer with mean and covariance of each image's own posterior for its faint spots; the rig enters nowhere."""
     depth_m = seen_depth_m(pair, separate)
@@ -183,7 +191,7 @@ def with_posteriors(pair: Pair, separate: Answer) -> Answer:
 
 
 def _with_posterior(pair: Pair, position: str, spot: Spot, depth_m: float | None) -> Spot:
-    if spot.covariance_px2 is None or np.trace(spot.covariance_px2) < 2.0 * _FAINT_PX**2:
+    if spot.covariance_px2 is None or np.trace(spot.covariance_px2) < 2.0 * FAINT_PX**2:
         return spot
     one = _likelihood(pair, position, spot, depth_m)
     places = None if one is None else likelihood_map(one)
@@ -242,7 +250,7 @@ def _of_other_shape(spot: Spot, one: SpotLikelihood) -> bool:
     Not of faint spots: their likelihood has valleys, and the posterior says what they claim.
     """
     own = float(np.trace(place_covariance(one)))
-    return own < 2.0 * _FAINT_PX**2 and bool(np.trace(np.array(spot.covariance_px2)) > _OTHER_SHAPE * own)
+    return own < 2.0 * FAINT_PX**2 and bool(np.trace(np.array(spot.covariance_px2)) > _OTHER_SHAPE * own)
 
 
 def _combined(pair: Pair, separate: Answer) -> Answer:
