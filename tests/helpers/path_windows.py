@@ -130,8 +130,8 @@ def independent_bake(room: Room, settings: BakeSettings, number: int) -> LightMa
     """
     gathered = light_map.gathered
 
-    def others(*arguments: Any) -> Any:
-        return gathered(*arguments[:-1], arguments[-1] + 1000 * number)
+    def others(mi: Any, surfaces: Any, texels: Any, rays: Any, seed: int, *rest: Any, **named: Any) -> Any:
+        return gathered(mi, surfaces, texels, rays, seed + 1000 * number, *rest, **named)
 
     with patch.object(light_map, "gathered", others), patch.object(light_map, "_SEED", 1000 * number):
         return bake(RIG.at(0.0), room, settings)
