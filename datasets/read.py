@@ -127,10 +127,10 @@ class Dataset(ShortForm):
     @property
     def beam(self) -> Beam:
         """Diameter of the laser's spots by the recipe; single targets may differ."""
-        laser = self.info.recipe["laser"]
-        if laser["diameter_m"] is not None:
-            return Beam(laser["diameter_m"], 0.0)
-        return Beam(laser["diameter_base_m"], laser["diameter_growth_m_per_m"])
+        laser = self.recipe.laser
+        if laser.diameter_m is not None:
+            return Beam(laser.diameter_m, 0.0)
+        return Beam(laser.diameter_base_m, laser.diameter_growth_m_per_m)
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -199,7 +199,7 @@ class Dataset(ShortForm):
         if len(infos) != 1:
             return f"{len(infos)} rooms"
         kind = infos[0].source.get("kind", "named")
-        name = self.info.recipe["room"]["name"] if kind == "named" else kind
+        name = self.recipe.room.name if kind == "named" else kind
         return f"{name}, {_count(len(infos[0].object_names), 'object')}"
 
     def _image_size(self) -> str:
@@ -288,14 +288,16 @@ class Sample(ShortForm):
     @property
     def laser_spot(self) -> LaserSpot:
         """The laser spot as a scene description."""
-        laser = self.dataset.info.recipe["laser"]
+        laser = self.dataset.recipe.laser
         return LaserSpot(
             position_world_m=self.row.spot_world_m,
             normal_world=self.row.spot_normal_world,
             diameter_m=self.row.spot_diameter_m,
-            albedo=spot_albedo(laser["albedo"], self.row.spot_beam_world),
+            albedo=spot_albedo(laser.albedo, self.row.spot_beam_world),
             beam_direction_world=self.row.spot_beam_world,
-            **{key: laser[key] for key in ("power_w", "wavelength_nm", "profile")},
+            power_w=laser.power_w,
+            wavelength_nm=laser.wavelength_nm,
+            profile=laser.profile,
         )
 
     def ambient(self, position: str) -> NDArray[np.float32]:
@@ -383,8 +385,7 @@ class Sample(ShortForm):
     @property
     def stream_names(self) -> tuple[str, int, str]:
         """Names of this sample's noise streams: data set, its seed, sample id."""
-        info = self.dataset.info
-        return info.name, info.recipe["dataset"]["seed"], self.row.sample_id
+        return self.dataset.info.name, self.dataset.recipe.dataset.seed, self.row.sample_id
 
     def _view(self, position: str) -> dict[str, str]:
         """Fields that the headers of the view's layers must have."""

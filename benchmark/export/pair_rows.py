@@ -172,7 +172,7 @@ def splits(dataset: Dataset, request: ExportRequest) -> dict[str, str]:
     validation split, each as far as its share goes; what is left is for training.
     """
     groups = sorted(_groups(dataset.rows, request.split_by), key=min)
-    seed = dataset.info.recipe["dataset"]["seed"]
+    seed = dataset.recipe.dataset.seed
     order = generator(dataset.info.name, seed, "export", request.split_by).permutation(len(groups))
     total = len(dataset.rows)
     found: dict[str, str] = {}

@@ -25,7 +25,7 @@ from phibench.datasets.store.leftovers import remove_tree
 
 HUNG_UP = 97
 """Exit code of a supervisor whose runner hung up before the worker ended."""
-KILL_SECONDS = 3.0
+KILL_SECONDS = 10.0
 """For processes that start others while they are killed."""
 _PROC = Path("/proc")
 _PR_SET_PDEATHSIG, _PR_SET_CHILD_SUBREAPER = 1, 36  # linux/prctl.h
@@ -101,25 +101,40 @@ def _ended() -> Iterator[tuple[int, int]]:
 
 
 def end_descendants(worker: int, seconds: float = KILL_SECONDS) -> None:
-    """Kill all descendants of this process, whatever their sessions, and the worker's group; until none is left."""
+    """Kill all descendants of this process, whatever their sessions, and the worker's group; until none is left.
+
+    Orphans become children of this process: whoever kills its children again and again reaches all. A look at them is
+    faster than a process can start others, a look at all processes of a busy machine is not.
+    """
     own, end = os.getpid(), time.monotonic() + seconds
     groups = {worker}
     while time.monotonic() < end:
-        tree = _descendants(own)
-        groups |= set(tree.values()) - {os.getpgrp()}
-        for group in groups:  # as a whole: a process that is being forked does not get away
+        known = len(groups)
+        for pid, group in (_children(own) or _descendants(own)).items():
+            groups.add(group)
+            _send(pid, signal.SIGKILL)
+        for group in groups - {os.getpgrp()}:  # as a whole: a process that is being forked does not get away
             with contextlib.suppress(OSError):
                 os.killpg(group, signal.SIGKILL)
-        for pid in tree:
-            _send(pid, signal.SIGKILL)
         list(_ended())
         if sys.platform != "linux":  # without a subreaper there is no more to be known
             return
         try:
             os.waitid(os.P_ALL, 0, os.WEXITED | os.WNOHANG | os.WNOWAIT)
-        except ChildProcessError:  # orphans become children of this process: without a child there is no descendant
+        except ChildProcessError:  # without a child there is no descendant
             return
-        time.sleep(0.002)
+        if len(groups) == known:
+            time.sleep(0.001)
+
+
+def _children(parent: int) -> dict[int, int]:
+    """Process groups of children, by process, of those that have ended as well; none where the system does not tell."""
+    found = {}
+    with contextlib.suppress(OSError, ValueError):
+        for pid in map(int, (_PROC / f"{parent}/task/{parent}/children").read_text().split()):
+            with contextlib.suppress(OSError):
+                found[pid] = os.getpgid(pid)
+    return found
 
 
 def _descendants(ancestor: int) -> dict[int, int]:

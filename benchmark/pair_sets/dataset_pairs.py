@@ -163,7 +163,7 @@ class DatasetPairs(DrawnPairs, ShortForm):
             "presets": sorted({draw.preset for draw in self.pair_draws}),
             "hinted": sum(draw.boxes is not None for draw in self.pair_draws),
             "boxes_px": self._boxes_px,
-            "seed": info.recipe["dataset"]["seed"],
+            "seed": self.dataset.recipe.dataset.seed,
             "recipe_sha256": info.recipe_sha256,
             "dataset_sha256": sha256(listed) if listed.is_file() else None,
             "provenance": provenance(),

@@ -89,11 +89,12 @@ def fetch(
     """
     out, console, place = Path(out), console or progress_console(), Source.of(source, tries, patience)
     title, part = _listed(name, place, out, manifest_sha256)
+    stage = out.with_name(f"{out.name}.part")
     if out.exists() or out.is_symlink():
         if _is_the_set(out, part):
+            _remove_rest(stage)
             return Fetched(out, title, 0, len(part.archives))
         raise DatasetError(_what_it_is(out, title, part))
-    stage = out.with_name(f"{out.name}.part")
     with writing_to(stage):
         _claim(stage, title, part)
         with only_run(stage):
@@ -189,9 +190,18 @@ def _remove_own(stage: Path) -> None:
     _remove_strays(stage / _ARCHIVES, [])
     remove_leftovers(stage)
     (stage / _STATE).unlink(missing_ok=True)
-    with contextlib.suppress(OSError):
-        (stage / _ARCHIVES).rmdir()
-        stage.rmdir()
+    for folder in (stage / _ARCHIVES, stage):
+        with contextlib.suppress(OSError):
+            folder.rmdir()
+
+
+def _remove_rest(stage: Path) -> None:
+    """Remove what a fetch has left that was killed after it had given the set its name."""
+    if stage.is_dir() and not (stage / _SET).exists() and not _foreign(stage):
+        with contextlib.suppress(OSError, DatasetError):
+            with only_run(stage):
+                pass
+            _remove_own(stage)
 
 
 def _write_state(stage: Path, state: dict[str, Any]) -> None:
@@ -205,7 +215,8 @@ def _size(folder: Path) -> int:
 def _archives(place: Source, stage: Path, title: str, part: ReleasedPart, console: Console) -> int:
     """Fetch and unpack the archives that are missing; return how many."""
     state = InputFile(stage / _STATE, f"remove {stage}", limit_bytes=SETTINGS_BYTES).json()
-    done = [text for text in state.get("unpacked", []) if isinstance(text, str)]
+    unpacked = state.get("unpacked")
+    done = [text for text in unpacked if isinstance(text, str)] if isinstance(unpacked, list) else []
     todo = [archive for archive in part.archives if archive.sha256 not in done]
     (stage / _SET).mkdir(exist_ok=True)
     _remove_strays(stage / _ARCHIVES, todo)

@@ -12,6 +12,7 @@ import hashlib
 import io
 import json
 import os
+import re
 import stat
 import tarfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -263,7 +264,10 @@ def _dataset(request: ReleaseRequest, part: ReleasePart, used: Mapping[str, Path
         return folder
     public = request.work / f"{part.title}-public"
     if (public / _SEAL).is_file():
-        number = InputFile(public / _SEAL, "remove the folder").json().get("id")
+        file = InputFile(public / _SEAL, "remove the folder")
+        number = file.json().get("id")
+        if not isinstance(number, str) or not re.fullmatch("[0-9a-f]{16}", number):
+            raise file.fault("has no id of a seal")
         if (folder / f"seal_{number}.truth.json").is_file():
             return public
         raise DatasetError(

@@ -151,7 +151,7 @@ def single_pairs(pairs: DatasetPairs) -> DatasetPairs:
     dataset, draws = pairs.dataset, pairs.pair_draws
     presets = sorted({draw.preset for draw in draws})
     samples = sorted({draw.sample_id for draw in draws})
-    order = generator(dataset.info.name, dataset.info.recipe["dataset"]["seed"], "seal", "presets")
+    order = generator(dataset.info.name, dataset.recipe.dataset.seed, "seal", "presets")
     dealt = {samples[k]: presets[place % len(presets)] for place, k in enumerate(order.permutation(len(samples)))}
     chosen = [draw for draw in draws if draw.draw == 0 and draw.preset == dealt[draw.sample_id]]
     return DatasetPairs(dataset, tuple(replace(draw, number=number) for number, draw in enumerate(chosen)))

@@ -97,7 +97,7 @@ def _groups(file: InputFile, lines: list[_Line]) -> Iterator[tuple[FrameGroup, b
     first = heads[0] if heads else len(lines)
     if stray := [one for one in lines[:first] if one.key == "i"]:
         raise file.fault(f"line {stray[0].number}: a picture stands before the first level")
-    for k, end in zip(heads, [*heads[1:], len(lines)], strict=True):
+    for k, end in zip(heads, [*heads, len(lines)][1:], strict=True):
         head = lines[k]
         pictures = tuple(_picture(file, one) for one in lines[k + 1 : end] if one.key == "i")
         if len(pictures) < 2:

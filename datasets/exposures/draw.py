@@ -278,7 +278,7 @@ def _check_folder(out: Path, dataset: Path) -> None:
 
 
 def _names(dataset: Dataset) -> tuple[str, int]:
-    return dataset.info.name, dataset.info.recipe["dataset"]["seed"]
+    return dataset.info.name, dataset.recipe.dataset.seed
 
 
 def _document(request: FrameRequest) -> dict[str, object]:

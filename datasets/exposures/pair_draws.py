@@ -102,7 +102,7 @@ def pair_draws(
     presets = frames.presets if preset is None else (preset,)
     count = frames.draws if draws is None else whole_number("draws", draws, 1)
     found = [pair_draw for sample in dataset for pair_draw in _of_sample(sample, frames, presets, count, sensor)]
-    name, seed = dataset.info.name, dataset.info.recipe["dataset"]["seed"]
+    name, seed = dataset.info.name, dataset.recipe.dataset.seed
     order = generator(name, seed, _ORDER_STREAM, "order", *presets, count).permutation(len(found))
     return tuple(replace(found[k], number=number) for number, k in enumerate(order))
 

@@ -193,7 +193,8 @@ def claim(folder: Path, dataset: tuple[str, int], wanted: dict[str, Any]) -> Non
     held = InputFile(path, "give another folder, `--out FOLDER`").json()
     meant = json.loads(json.dumps(meant))
     if other := [name for name in {**meant, **held} if held.get(name) != meant.get(name)]:
-        texts = ", ".join(f"{name} {_shown(held.get(name))}, not {_shown(meant.get(name))}" for name in other)
+        shown = ((printable_line(name, 60), _shown(held.get(name)), _shown(meant.get(name))) for name in other[:20])
+        texts = ", ".join(f"{name} {there}, not {right}" for name, there, right in shown)
         raise DatasetError(f"{folder} holds frames with {texts}: give another folder, `--out FOLDER`")
 
 

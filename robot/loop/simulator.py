@@ -23,7 +23,7 @@ from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.motion.vehicle import Obstacle, PlanarPose, Stance, Vehicle, rig_placement, stance
 from phibench.scenes.random_streams import Name, generator
 from phibench.scenes.rig import Rig
-from phibench.scenes.validation import SceneError, within
+from phibench.scenes.validation import SceneError, printable_line, within
 
 CODES = ("0", "1", "111100010011010")
 """Laser codes, a bit per step: off, on, and a maximal sequence that no light imitates by chance."""
@@ -464,10 +464,14 @@ def _cause_of(place: tuple[float, float] | str, spots: Sequence[SpotReading], re
     return SEEN if near or not read else FAINT
 
 
+_LARGEST = 1e6  # of any number of an action: a whole one may have hundreds of digits
+
+
 def _check(action: Action) -> None:
     for name, value in zip(Action._fields, action, strict=True):
-        if not math.isfinite(value):
-            raise SceneError(f"action {name} = {value}: must be finite; the episode is lost")
+        if not abs(value) <= _LARGEST:
+            shown = printable_line(repr(value), 40)
+            raise SceneError(f"action {name} = {shown}: must be finite, at most {_LARGEST:g}; the episode is lost")
     if not 0 <= action.exposure < len(EXPOSURES_S):
         raise SceneError(f"action exposure = {action.exposure}: must be 0 to {len(EXPOSURES_S) - 1}, see EXPOSURES_S")
     if not 0 <= action.code < len(CODES):

@@ -18,7 +18,7 @@ from helpers.processes import processes_under
 from phibench.benchmark.isolation.resolve import MethodError, RunLimits, resolve
 from phibench.robot.loop.episodes import LOST, Episode, run_foreign
 from phibench.robot.loop.foreign_policies import PolicyFile, _action
-from phibench.robot.loop.simulator import Action, Setup, Task
+from phibench.robot.loop.simulator import Action, Setup, Simulator, Task
 from phibench.scenes.validation import SceneError
 
 ROOT, SOURCES = Path(__file__).resolve().parents[2], DISTRICTS
@@ -38,6 +38,19 @@ def test_a_forged_answer_is_seven_numbers_or_refused() -> None:
         with pytest.raises(SceneError, match="the policy answered"):
             _action(answer)
     assert len(wrong) > 40
+
+
+@pytest.mark.parametrize("value", [10**400, -(10**4000), 1e308, math.inf, math.nan, 2**63], ids=range(6))
+def test_a_number_beyond_all_bounds_is_a_sentence(value: float) -> None:
+    """Whole numbers of any length come as JSON; one is no float, and fills a terminal."""
+    simulator = Simulator(SHORT)
+    simulator.start("a")
+    for place in range(7):
+        if place not in (4, 5) or isinstance(value, int):
+            action = Action(*(value if k == place else Action()[k] for k in range(7)))
+            with pytest.raises(SceneError) as caught:
+                simulator.act(action)
+            assert len(str(caught.value)) < 200
 
 
 DEEP = [

@@ -374,3 +374,21 @@ def test_a_file_that_is_a_folder_too_is_no_reason_to_try_again(names: tuple[str,
     message = told(release, tmp_path / "set")
     assert f"holds {min(names, key=len)} as a file and as a folder; ask who made the release" in message
     assert "again" not in message
+
+
+def test_a_fetch_that_was_killed_after_its_end_leaves_nothing(tmp_path: Path) -> None:
+    """The set has its name, and its folder of work is there; what is foreign in such a folder stays."""
+    release = tiny_release(tmp_path / "release")
+    fetch("tiny", tmp_path / "set", str(release))
+    rest = tmp_path / "set.part"
+    for name in ("fetch.json", "archives/", ".phibench-lock"):
+        (rest / name).mkdir(parents=True) if name.endswith("/") else None
+        rest.mkdir(exist_ok=True)
+        if not name.endswith("/"):
+            (rest / name).write_text("{}")
+        assert fetch("tiny", tmp_path / "set", str(release)).fetched == 0
+        assert not rest.exists()
+    rest.mkdir()
+    (rest / "mine.txt").touch()
+    fetch("tiny", tmp_path / "set", str(release))
+    assert (rest / "mine.txt").exists()

@@ -82,7 +82,7 @@ def _sealed_of_release(path: Path) -> object:
     public = work / f"{part.title}-public"
     public.mkdir(parents=True, exist_ok=True)
     shutil.copyfile(path, public / path.name)
-    shutil.copyfile(path, path.parent / "seal_7.truth.json")
+    shutil.copyfile(path, path.parent / f"seal_{TEXT[:16]}.truth.json")
     request = replace(_request(path.parent), work=work)
     folder = release_make._dataset(request, part, {part.title: path.parent}, lambda *_: None)
     return release_make._sample_count(part, folder)
@@ -215,7 +215,7 @@ def folder_kinds(folder: Path, dataset: Path) -> dict[str, Kind]:
     every = [
         Kind(schema.INFO, info_text.encode(), partial(_held, info_text), compact),
         Kind(schema.RECIPE, recipe_text("bench-dev").encode(), _recipe_of_release),
-        Kind("seal.json", compact({"id": 7, "pairs": 2}), _sealed_of_release, compact),
+        Kind("seal.json", compact({"id": TEXT[:16], "pairs": 2}), _sealed_of_release, compact),
         Kind(schema.DRAWS, draws, read_draws, forge=forged),
         Kind(
             export_make.INFO,

@@ -254,6 +254,11 @@ PROCESS: dict[str, Hostile] = {
         "        if os.fork(): os._exit(0)\n    os._exit(0)",
         ("",),
     ),
+    "a hundred chains of children, each of its own session": Hostile(
+        "for _ in range(100):\n    if os.fork() == 0:\n        os.setsid()\n        end = time.monotonic() + 20\n"
+        "        while time.monotonic() < end:\n            if os.fork(): os._exit(0)\n        os._exit(0)",
+        ("", "timeout"),
+    ),
     "a daemon without environment": Hostile(
         "subprocess.Popen(['/bin/sh', '-c', 'setsid sleep 60 & exit'], env={}, cwd='/')\ntime.sleep(0.2)", ("",)
     ),
@@ -351,7 +356,7 @@ FOLDER: dict[str, Hostile] = {
     ),
     "five thousand files": Hostile("for i in range(5000): os.close(os.open(f'f{i}', os.O_CREAT))", ("",)),
     "a folder that nobody may write": Hostile(
-        "os.mkdir('a')\nopen('a/b', 'w').close()\nos.chmod('a', 0)\nos.chmod('.', 0)", ("",)
+        "os.mkdir('a')\nopen('a/b', 'w').close()\nos.chmod('a', 0)\nos.chmod('.', 0)", ("", "error")
     ),
 }
 

@@ -5,6 +5,7 @@ Not a test file. The files are small: a camera of 64 x 48 pixels, two pairs, fou
 
 from __future__ import annotations
 
+import copy
 import hashlib
 import io
 import json
@@ -342,7 +343,7 @@ def changed(document: Any, rng: random.Random) -> Any:
         elif act == 2:
             inner[key] = nested(rng.choice((50, 70, 300)))
         else:
-            inner[key] = rng.choice(NASTY)
+            inner[key] = copy.deepcopy(rng.choice(NASTY))  # the next fault may lie in it
     return document
 
 
