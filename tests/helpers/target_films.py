@@ -16,6 +16,7 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
+from helpers.simple_targets import ColourIdentity, NearestBlob, red_blobs
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 
@@ -39,7 +40,6 @@ from phibench.render.sensor.light import Light, Region
 from phibench.render.sensor.noise_tiles import NoiseStream
 from phibench.render.sensor.settings import sensor
 from phibench.robot.film.blink_identity import TargetCode, TargetTracker
-from phibench.robot.film.simple_targets import ColourIdentity, NearestBlob, red_blobs
 from phibench.scenes.frames import Array
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.motion.carriage import Carriage

@@ -5,15 +5,15 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
-from helpers.oracles import true_pixel
-
-from phibench.calibration.rig.central_model import (
+from helpers.central_model import (
     CentralModel,
     depth_central,
     error_by_distance,
     fit_central,
     unified,
 )
+from helpers.oracles import true_pixel
+
 from phibench.scenes.frames import Pose
 from phibench.scenes.revolved_mirror import Profile, RevolvedMirror, hyperboloid, paraboloid
 from phibench.scenes.rig import Rig

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import ROOT
+from helpers.simple_targets import ColourIdentity, NearestBlob
 from helpers.target_films import CODE, Outcome, RenderedRoom, StagedFilm, rendered_rooms, staged, swept
 from matplotlib.figure import Figure
 from scipy import stats
@@ -32,7 +33,6 @@ from phibench.robot.film.blink_identity import (
     track_targets,
 )
 from phibench.robot.film.film_estimates import found_rows, track_film, tracked_positions
-from phibench.robot.film.simple_targets import ColourIdentity, NearestBlob
 from phibench.robot.film.spot_tracks import FrameSearch, FrameSpots, SpotTrack, _assigned, _motion
 from phibench.robot.loop.smoothing import film_beliefs
 from phibench.scenes.frames import Array
