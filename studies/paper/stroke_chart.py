@@ -43,7 +43,7 @@ _REMEDIES = {
     IMAGE_EDGE: _ELSEWHERE,
     TOO_BRIGHT: "give a longer --depth-m or less --power-mw",
     TOO_FAINT: "give a shorter --depth-m or more --power-mw",
-    NO_BOUND: "give another --depth-m or a calibration",
+    NO_BOUND: f"{_ELSEWHERE}, or a --calibration",
 }
 
 
@@ -80,7 +80,8 @@ def require_measured(best: BestStroke) -> None:
     none = f"D = {best.depth_m:g} m: no stroke from {first:g} to {last:g} m measures it"
     if math.isnan(best.stroke_m):
         what = dict.fromkeys(_REMEDIES.get(cause, _ELSEWHERE) for cause in best.limits)
-        raise DatasetError(f"{none} ({', '.join(best.limits)}); {', or '.join(what)}")
+        said = [one for one in what if not any(other != one and other.startswith(one) for other in what)]
+        raise DatasetError(f"{none} ({', '.join(best.limits)}); {', or '.join(said)}")
     if best.sigma_m > WORST * best.depth_m:
         raise DatasetError(
             f"{none}: the best leaves a sigma of {best.sigma_m:.2g} m, more than a third of D; "

@@ -13,7 +13,7 @@ from PIL import Image
 from phibench.cli import main as cli
 from phibench.datasets.errors import DatasetError
 from phibench.estimator.limits.best_stroke import LARGEST, BestStroke
-from phibench.estimator.limits.stroke_curve import CEILING, FREE, TOO_FAINT, StrokeCurve, stroke_grid
+from phibench.estimator.limits.stroke_curve import CEILING, FREE, NO_BOUND, TOO_FAINT, StrokeCurve, stroke_grid
 from phibench.studies.paper.stroke_chart import (
     USUAL_M,
     best_lines,
@@ -94,6 +94,11 @@ def test_a_distance_that_no_stroke_measures_is_one_sentence(best: BestStroke, wo
         assert all(word in str(caught.value) for word in words)
         assert "\n" not in str(caught.value)
     require_measured(replace(found(), sigma_m=0.6))  # below a third
+
+
+def test_what_to_give_instead_is_said_once() -> None:
+    with pytest.raises(DatasetError, match=r"; give another --height-m or --depth-m, or a --calibration$"):
+        require_measured(replace(found(), stroke_m=math.nan, limits=(NO_BOUND, "occluded by camera_housing")))
 
 
 def test_the_picture_is_the_same_for_the_same_curve(tmp_path: Path) -> None:
