@@ -10,20 +10,22 @@ import dataclasses
 import math
 from collections.abc import Callable
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import pytest
 from helpers.oracles import TARGETS
 
 from phibench.render.room.ambient import _texel_sizes_m, view_film, view_surfaces
-from phibench.render.room.bounced_light import _LANES
+from phibench.render.room.bounced_light import _LANES, BrightTexels
 from phibench.render.room.equirectangular import equirectangular
 from phibench.render.room.light_map import _HOLDER_RAYS, BakeSettings, LightMap, bake, fixed_shapes
 from phibench.render.room.texel_grid import TexelGrid
 from phibench.render.setup.variant import activate
 from phibench.scenes.catalog import default_rig, lab
 from phibench.scenes.holder import fitted
-from phibench.scenes.shapes import Rectangle
+from phibench.scenes.room import Room
+from phibench.scenes.shapes import Rectangle, rectangle
 
 ROOM, RIG = lab(TARGETS), default_rig()
 SETTINGS = BakeSettings(texel_m=0.5, indirect_texel_m=1.0, lamp_rays=16, bounces=2, bounce_rays=8, final_rays=16)
@@ -67,6 +69,22 @@ def test_a_bake_looks_up_its_light_once(baked: tuple[LightMap, list[dict[str, An
     _, found = baked
     prepared, looked_up = 2 * A_LAMP * LAMPS, SETTINGS.bounces + GATHERS - 1
     assert tracing(found) + prepared + looked_up <= len(found) <= tracing(found) + prepared + looked_up + 1
+
+
+def test_a_bake_with_coats_and_a_bright_ceiling_traces_every_ray_once() -> None:
+    """Photons of both halves meet a coat three times. A gather follows what a coat mirrors, and aims at the ceiling.
+
+    Nothing hides the lamp: it gets its first rays alone.
+    """
+    floor = rectangle("floor", (0, 0, 0), (0, 0, 1), (4, 4), coat=1.5)
+    ceiling = rectangle("ceiling", (0, 0, 2.5), (0, 0, -1), (4, 4), coat=1.5)
+    lamp = rectangle("lamp", (0, 0, 2.4), (0, 0, 1), (0.2, 0.2), radiance_w_m2_sr=(9.0, 9.0, 9.0))
+    room = Room("uplight", (floor, ceiling, lamp), (), robot=False)
+    with patch.object(BrightTexels, "weight", autospec=True, side_effect=BrightTexels.weight) as weight:
+        light, found = kernels(lambda: bake(RIG.at(0.0), room, SETTINGS))
+    assert light.irradiance_w_m2.min() > 0.0
+    assert weight.call_count == GATHERS
+    assert tracing(found) == GRIDS + 1 + 2 * (1 + 3) + 2 * GATHERS
 
 
 def test_a_view_lights_its_holder_once(baked: tuple[LightMap, list[dict[str, Any]]]) -> None:
