@@ -1,4 +1,4 @@
-"""Attack: over a hundred kills at random moments; the same command again ends in the bytes of an undisturbed run."""
+"""Attack: a hundred kills at random moments; the same command again ends in the bytes of an undisturbed run."""
 
 import json
 import os
@@ -19,7 +19,6 @@ from helpers.processes import SMALLEST
 
 from phibench.datasets.store import schema
 
-FILMS = SMALLEST.with_name("films.toml")
 ROUND = 5
 """Kills before a run may end."""
 
@@ -48,17 +47,6 @@ JOBS = {
         25,
         lambda given, out: ["dataset", "frames", str(given), "--out", str(out / "frames"), "--draws", "2"],
         "frames",
-    ),
-    "export": Job(
-        10,
-        lambda given, out: [
-            *("export", str(given), "--to", "frames", "--out", str(out / "export")),
-            *("--pairs-per-shard", "1", "--workers", "2"),
-        ],
-        "export",
-    ),
-    "films": Job(
-        5, lambda _, out: ["film", "make", str(FILMS), "--out", str(out / "films"), "--workers", "1"], "films"
     ),
     "seal": Job(25, lambda given, out: ["seal", "make", str(given), "--out", str(out / "public")], "public"),
     "score": Job(

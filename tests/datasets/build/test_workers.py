@@ -149,14 +149,14 @@ from phibench.datasets.build.tasks import Made, BuildTask
 from phibench.datasets.build.workers import local_workers
 from phibench.cli import main as cli
 
-def start() -> None:
+def try_workers() -> None:
     with local_workers(2, Path(sys.argv[1])) as pool:
         for number in range(2):
             pool.submit(BuildTask(f"nothing {number}", "", Made))
         print(pool.next(), "the workers are there")
 
-cli.app.command(start)
-sys.exit(cli.main(["start"]))
+cli.app.command(try_workers)
+sys.exit(cli.main(["try-workers"]))
 """
 
 
