@@ -64,6 +64,7 @@ benchmark/scores
 benchmark/scored_dataset
 benchmark/sealed
 benchmark/export
+benchmark/demo
 robot/film
 robot/loop
 studies/paper

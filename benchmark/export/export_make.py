@@ -98,7 +98,7 @@ def export(
     DatasetError
         If the data set, the request or the folder will not do, or the disk is full; in one sentence.
     """
-    dataset, console, out = open_finished(folder), console or progress_console(), Path(out)
+    dataset, console, out = request.part_of(open_finished(folder)), console or progress_console(), Path(out)
     count = whole_number("workers", os.cpu_count() or 1 if workers is None else workers, 1)
     _check_folder(out, Path(folder))
     _versions(request)  # a missing package is said before anything is written
@@ -115,7 +115,7 @@ def export(
 
 def make_shard(out: Path, shard: Shard) -> Made:
     """Task: make one shard; the result is a `ShardResult`."""
-    dataset = open_dataset(shard.dataset)
+    dataset = shard.request.part_of(open_dataset(shard.dataset))
     pairs, scored = _scored_pairs(dataset, shard) if shard.request.scored else (_drawn_pairs(dataset, shard), [])
     drawn = [(pair.sample_id, {"key": pair.key, "split": shard.split, **pair.added}) for pair in pairs]
     files = write_shard(out, shard.name, shard.request, pairs, pair_table(dataset.rows, drawn))

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from phibench.datasets.errors import DatasetError
@@ -47,6 +47,8 @@ class ExportRequest:
         Draws 0 to draws - 1 of every pair.
     laser_off : bool
         Also every image without the spot.
+    samples : tuple of str
+        Ids or numbers of the samples; all of them where it is empty.
     scored : bool
         Pairs as they are scored, with their truth: a frames set. Of plain files with the recipe's own frames.
     split_by : "both", "rig" or "room"
@@ -65,6 +67,7 @@ class ExportRequest:
     validation: float = 0.1
     test: float = 0.1
     pairs_per_shard: int = 64
+    samples: tuple[str, ...] = ()
     scored: bool = False
 
     def __post_init__(self) -> None:
@@ -96,9 +99,16 @@ class ExportRequest:
         """End of an image file's name."""
         return suffix(self.frames.sensor(), self.frames.region is None)
 
+    def part_of(self, dataset: Dataset) -> Dataset:
+        """The data set's samples that are asked for."""
+        if not self.samples:
+            return dataset
+        return replace(dataset, rows=tuple(sample.row for sample in dataset.chosen(self.samples)))
+
     def document(self) -> dict[str, Any]:
         """The request as JSON."""
         plain = {name: getattr(self, name) for name in self.__dataclass_fields__ if name != "frames"}
+        plain["samples"] = list(self.samples)
         return {**plain, "frames": json.loads(json.dumps(self.frames.document()))}
 
 

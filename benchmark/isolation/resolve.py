@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from phibench.benchmark.isolation.loaded_packages import package_sha256
 from phibench.datasets.input_files import MIB, InputFile
-from phibench.datasets.store.files import sha256
+from phibench.datasets.store.files import sha256, write_text
 from phibench.datasets.store.provenance import code_behind
 from phibench.scenes.validation import close_names, printable_line
 
@@ -281,3 +281,21 @@ class RunLimits:
         """A failure for want of memory in one sentence, with the limit."""
         limit = f"the limit of {self.memory_mb:g} MB of address space on top of the imports (--memory-mb)"
         return f"more memory than {limit}: {detail}"
+
+
+_EXAMPLE = Path(__file__).with_name("example_method.py")
+
+
+def write_example(path: Path) -> Path:
+    """Write the example method to a file that is not there yet.
+
+    Raises
+    ------
+    MethodError
+        If the name does not end in .py, or there is something of that name.
+    """
+    if path.suffix != ".py":
+        raise MethodError(f"{path}: the file of a method must end in .py, such as my_phi.py")
+    if path.exists():
+        raise MethodError(f"{path} is there already and is not overwritten: give another name or remove it")
+    return write_text(path, _EXAMPLE.read_text(encoding="utf-8").replace("my_phi.py", path.name))

@@ -327,6 +327,7 @@ def export(
     out: Path,
     preset: Preset = DEFAULT_PRESET,
     draws: Whole = 1,
+    sample: Annotated[tuple[str, ...], Parameter(consume_multiple=True, negative="")] = (),
     laser_off: bool | None = None,
     exposure: str | None = None,
     region: Whole | None = None,
@@ -353,6 +354,8 @@ def export(
         Where the camera's chain ends: "mono-raw", "bayer-raw", "srgb8", "yuyv" or "mjpeg" (the camera's own JPEG).
     draws
         Draws of the noise of every pair.
+    sample
+        Samples: numbers, counted from 0, or ids; all by default.
     laser_off
         Also every image without the spot; by default for "frames" whose recipe has them.
     exposure
@@ -380,7 +383,7 @@ def export(
     scored = to == "frames" and not options.given
     shares = (split_by, validation, test, pairs_per_shard)
     off = scored_with_laser_off(directory) if laser_off is None and scored else bool(laser_off)
-    request = ExportRequest(to, options, draws, off, *shares, scored=scored)
+    request = ExportRequest(to, options, draws, off, *shares, samples=sample, scored=scored)
     done = export_pairs(directory, request, out, workers=workers)
     for note in done.notes:
         print(f"note: {note}")

@@ -32,7 +32,7 @@ from phibench.cli.options import DATA, INSTALLATION, KEEPERS, METHODS, SENSOR, S
 from phibench.cli.room import room, scene
 from phibench.cli.score import bench, compare, report, results, score
 from phibench.cli.seal import seal, submission
-from phibench.cli.start import recipe, start
+from phibench.cli.start import demo, recipe, start
 from phibench.cli.studies import paper, stroke, study
 from phibench.datasets.parallel import ONE_THREAD
 
@@ -54,6 +54,7 @@ app = App(
 for _group in (recipe, dataset, film, room, scene, method, seal, submission, sensor, loop, study):
     app.command(_group)
 app.command(start, group=START)
+app.command(demo, group=START)
 app.command(export, group=DATA)
 app.command(release, group=KEEPERS)
 app.command(fetch, group=DATA)

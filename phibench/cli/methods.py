@@ -16,7 +16,6 @@ if TYPE_CHECKING:
 
 
 _TABLE_WIDTH = 120
-_EXAMPLE = Path(__file__).parents[1] / "benchmark" / "isolation" / "example_method.py"
 
 
 method = App(
@@ -85,7 +84,9 @@ def new(path: Path) -> int:
     path
         Python file to write; one that is there is not touched.
     """
-    written = _write_example(path)
+    from phibench.benchmark.isolation.resolve import write_example
+
+    written = write_example(path)
     print(f"{written}: try it with `phibench method check {written}:extract`")
     return 0
 
@@ -115,21 +116,3 @@ def _kinds(accepts: tuple[str, ...]) -> str:
     from phibench.estimator.spots.image_planes import KINDS
 
     return "every image" if accepts == KINDS else ", ".join(accepts)
-
-
-def _write_example(path: Path) -> Path:
-    """Write the example to a file that is not there yet.
-
-    Raises
-    ------
-    MethodError
-        If the name does not end in .py, or there is something of that name.
-    """
-    from phibench.benchmark.isolation.resolve import MethodError
-    from phibench.datasets.store.files import write_text
-
-    if path.suffix != ".py":
-        raise MethodError(f"{path}: the file of a method must end in .py, such as my_phi.py")
-    if path.exists():
-        raise MethodError(f"{path} is there already and is not overwritten: give another name or remove it")
-    return write_text(path, _EXAMPLE.read_text(encoding="utf-8").replace("my_phi.py", path.name))

@@ -1,7 +1,8 @@
-"""Commands `phibench start` and `phibench recipe`: what a newcomer asks for first."""
+"""Commands `phibench start`, `phibench demo` and `phibench recipe`: what a newcomer asks for first."""
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated
 
 from cyclopts import App, Parameter
@@ -10,9 +11,9 @@ from phibench.cli.completions import recipes
 from phibench.cli.options import START
 
 _FIRST = (
+    ("phibench demo", "five pairs, three methods, one page: what a score is"),
     ("phibench recipe list", "the recipes that are shipped; `recipe show NAME` prints one"),
     ("phibench dataset make smoke --out out/smoke", "render a small data set: a minute, needs Mitsuba"),
-    ("phibench dataset show out/smoke", "its table, and a contact sheet"),
     ("phibench method new my_phi.py", "a commented method that works: put your idea in"),
     ("phibench method check my_phi.py:extract", "ten easy pairs; says in plain words what is wrong"),
     ("phibench score out/smoke --method my_phi.py:extract --preset mjpeg --out mine.json", "an honest score"),
@@ -25,6 +26,26 @@ def start() -> int:
     """Print the eight commands that a newcomer uses, in their order."""
     for command, meaning in _FIRST:
         print(f"{command}\n    {meaning}")
+    return 0
+
+
+def demo(*, out: Path = Path("phibench-demo")) -> int:
+    """Score two built-in methods and an example on five pairs that are shipped; write one page. It needs no Mitsuba.
+
+    Parameters
+    ----------
+    out
+        Folder to write: pairs, example, scores, and report.html. An example that you have changed is scored again.
+    """
+    from phibench.benchmark.demo import demo as run_demo
+    from phibench.benchmark.scores.score import show
+    from phibench.benchmark.scores.score_tables import score_table, text_of
+
+    done = run_demo(out)
+    for one in done.scores:
+        print(text_of(score_table(one.document)))
+    print(f"{done.page}: {'opened' if show(done.page) else 'open it in a browser'}")
+    print(f"change {done.example} and give the same command again; the pairs and their truth are {done.pairs}")
     return 0
 
 

@@ -1,0 +1,52 @@
+"""The demo as a newcomer runs it: five pairs of five kinds, three methods, one page, and the example changed."""
+
+from pathlib import Path
+
+import pytest
+
+from phibench.benchmark.demo import EXAMPLE, FRAMES, METHODS, REPORT, SHIPPED
+from phibench.benchmark.pair_sets.frames_set import FramesSet
+from phibench.cli.main import main
+
+
+def test_the_pairs_are_of_five_kinds() -> None:
+    """Found, faint, hidden in one image, beside a lamp, saturated; each in a room of its own; 4 MB at most."""
+    shipped = FramesSet(SHIPPED)
+    shipped.check()
+    truths = [shipped.truth(number) for number in range(len(shipped))]
+    assert len(truths) == 5
+    both = [truth for truth in truths if truth.down.visible and truth.up.visible]
+    assert len(both) == 4
+    faintest = [min(truth.down.snr, truth.up.snr) for truth in both]
+    assert sum(snr < 15.0 for snr in faintest) == 1
+    assert sum(truth.down.saturated or truth.up.saturated for truth in both) >= 1
+    assert {truth.preset for truth in truths} == {"mjpeg"}
+    assert sum(path.stat().st_size for path in SHIPPED.rglob("*") if path.is_file()) < 4e6
+
+
+@pytest.mark.slow  # three methods on five whole frames: 10 CPU-s
+def test_the_demo_writes_one_page_and_scores_a_changed_example(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    out = tmp_path / "demo"
+    assert main(["demo", "--out", str(out)]) == 0
+    shown = capsys.readouterr().out
+    assert all(name in shown for name in (*METHODS, "extract", f"{out / REPORT}"))
+    page = (out / REPORT).read_text(encoding="utf-8")
+    assert "chain_fit" in page
+    assert len(FramesSet(out / FRAMES)) == 5
+    example = out / EXAMPLE
+    example.write_text(example.read_text(encoding="utf-8") + "\n# mine\n", encoding="utf-8")
+    assert main(["demo", "--out", str(out)]) == 0
+    assert example.read_text(encoding="utf-8").endswith("# mine\n")
+
+
+def test_a_folder_of_other_files_or_without_access_is_one_sentence(
+    tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    (tmp_path / "thesis.tex").write_text("mine")
+    assert main(["demo", "--out", str(tmp_path)]) == 2
+    assert "holds other files, such as thesis.tex" in capsys.readouterr().err
+    (tmp_path / "file").write_text("no folder")
+    assert main(["demo", "--out", str(tmp_path / "file" / "demo")]) == 2
+    told = capsys.readouterr().err
+    assert "cannot be written" in told
+    assert "Traceback" not in told
