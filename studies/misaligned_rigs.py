@@ -20,12 +20,11 @@ import numpy as np
 from phibench.calibration.outline.limb_image import PoseMeasurement
 from phibench.calibration.rig.bundle import Bundle, KnownSpot, apparent_outline, calibrate
 from phibench.datasets.errors import DatasetError
-from phibench.estimator.geometry.estimators import ESTIMATORS
 from phibench.estimator.geometry.mirror_image import image_of
 from phibench.estimator.geometry.rig_parameters import PRIOR_SIGMA, prior_sigmas
 from phibench.estimator.geometry.sensitivities import PARAMETERS as ANALYTIC
 from phibench.estimator.geometry.sensitivities import sensitivity
-from phibench.estimator.geometry.triangulate import depth_exact, exact_gradient
+from phibench.estimator.geometry.triangulate import ESTIMATORS, depth_exact, exact_gradient
 from phibench.render.optics.reflection_point import reflection_points
 from phibench.render.optics.spot_layer import spot_layer
 from phibench.scenes.frames import Array

@@ -150,8 +150,8 @@ def known_fault(pair: Pair, photos: PairPhotos) -> DatasetError | None:
             f"down and up are swapped: the spot moves the wrong way from {down} to {up}, but the right one if they "
             "change places; give them to --down and --up the other way round"
         )
-    if (position := next(relit_between(pair), None)) is not None:
-        name, ratio = position
+    if (relit := next(relit_between(pair), None)) is not None:
+        name, ratio = relit
         return DatasetError(
             f"the light changed between laser on and off: {getattr(photos, name).off[0].path} has {ratio:.2f} times "
             "the codes of the picture with the laser on; fix exposure and white balance, and leave the lamps alone"

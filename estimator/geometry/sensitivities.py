@@ -14,12 +14,11 @@ from functools import partial
 
 import numpy as np
 
-from phibench.estimator.geometry.estimators import ESTIMATORS
 from phibench.estimator.geometry.mirror_image import image_of
 from phibench.estimator.geometry.paper_depth import paper_gradient, revolved_gradient
 from phibench.estimator.geometry.phi import CONVENTIONS, GRADIENTS
 from phibench.estimator.geometry.reflection import ray_basis, ray_slope, reflect
-from phibench.estimator.geometry.triangulate import exact_gradient
+from phibench.estimator.geometry.triangulate import ESTIMATORS, exact_gradient
 from phibench.scenes.camera import Camera
 from phibench.scenes.frames import Array
 from phibench.scenes.mirror import HARMONICS, Form, Level, gradients_by_parameter

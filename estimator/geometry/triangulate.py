@@ -8,14 +8,17 @@ all arguments broadcast together. `least_squares_depth` takes the same rays and 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from phibench.datasets.store.short_form import ShortForm, short
-from phibench.estimator.geometry.paper_depth import PARALLEL_SINE
+from phibench.estimator.geometry.paper_depth import PARALLEL_SINE, depth_approx, depth_paper, depth_revolved
+from phibench.estimator.geometry.phi import CONVENTIONS
 from phibench.estimator.geometry.reflection import room_rays, room_rays_jacobian
 from phibench.estimator.geometry.status import (
     DepthEstimate,
@@ -28,6 +31,7 @@ from phibench.estimator.geometry.status import (
     stroke_status,
 )
 from phibench.scenes.frames import Array
+from phibench.scenes.revolved_mirror import RevolvedMirror
 from phibench.scenes.rig import Rig
 from phibench.scenes.validation import SceneError
 
@@ -322,3 +326,34 @@ def _require_aligned(rig: Rig) -> None:
             f"depth_in_plane: sphere centre {offset:.2e} m beside the vertical through the camera, stroke axis tilted "
             f"by {tilt:.2e} rad; both must be below {_ALIGNED_M:g}. Use depth_exact for such a rig"
         )
+
+
+# Estimators by name.
+
+Estimator = Callable[[Rig, float, Array, Array], DepthEstimate]
+
+
+def paper_estimator(convention: str, rig: Rig, stroke_m: float, uv_down_px: Array, uv_up_px: Array) -> DepthEstimate:
+    """Eq. (4) with phi in one convention; on a mirror of revolution, with its profile."""
+    phi1, phi2 = _phis(convention, rig, stroke_m, uv_down_px, uv_up_px)
+    if isinstance(rig.mirror, RevolvedMirror):
+        return depth_revolved(phi1, phi2, stroke_m, rig.mirror.profile)
+    return depth_paper(phi1, phi2, stroke_m, rig.mirror.radius_m)
+
+
+def approx_estimator(convention: str, rig: Rig, stroke_m: float, uv_down_px: Array, uv_up_px: Array) -> DepthEstimate:
+    """Eq. (5) with phi in one convention."""
+    phi1, phi2 = _phis(convention, rig, stroke_m, uv_down_px, uv_up_px)
+    return depth_approx(phi1, phi2, stroke_m)
+
+
+ESTIMATORS: dict[str, Estimator] = {
+    **{f"paper_{name}": partial(paper_estimator, name) for name in CONVENTIONS},
+    "approx_ray": partial(approx_estimator, "ray"),
+    "exact": depth_exact,
+}
+
+
+def _phis(convention: str, rig: Rig, stroke_m: float, down_px: Array, up_px: Array) -> tuple[Array, Array]:
+    phi = CONVENTIONS[convention]
+    return phi(rig.at(0.0), down_px), phi(rig.at(stroke_m), up_px)

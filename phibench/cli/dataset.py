@@ -548,7 +548,7 @@ def sensitivities(directory: Path, *, out: Path | None = None) -> int:
     """
     from phibench.datasets.read import open_finished
     from phibench.datasets.store import schema
-    from phibench.estimator.geometry.estimators import ESTIMATORS
+    from phibench.estimator.geometry.triangulate import ESTIMATORS
     from phibench.studies.paper.sensitivity_table import columns, write_sensitivities
 
     dataset = open_finished(directory)

@@ -15,11 +15,11 @@ import numpy as np
 
 from phibench.benchmark.scores.score_tables import TextTable
 from phibench.calibration.rig.file import Calibration
-from phibench.estimator.geometry.estimators import ESTIMATORS
 from phibench.estimator.geometry.least_squares_depth import GeneralDepth, depth_general
 from phibench.estimator.geometry.paper_depth import find_published
 from phibench.estimator.geometry.rig_parameters import stroke_of
 from phibench.estimator.geometry.status import DepthEstimate, Status, describe
+from phibench.estimator.geometry.triangulate import ESTIMATORS
 from phibench.estimator.spots.simple_spots import find_spot
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import POSITIONS, Rig

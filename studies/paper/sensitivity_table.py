@@ -19,8 +19,8 @@ from phibench.datasets.read import Dataset, Sample, open_finished
 from phibench.datasets.store import schema
 from phibench.datasets.store.documents import sensitivity_bytes, sensitivity_fault
 from phibench.datasets.store.files import write_bytes
-from phibench.estimator.geometry.estimators import ESTIMATORS
 from phibench.estimator.geometry.sensitivities import PARAMETERS, sensitivity
+from phibench.estimator.geometry.triangulate import ESTIMATORS
 from phibench.scenes.rig import POSITIONS
 
 Row = dict[str, str | float | None]

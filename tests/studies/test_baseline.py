@@ -12,8 +12,8 @@ from rich.console import Console
 
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.read import open_dataset
-from phibench.estimator.geometry.estimators import ESTIMATORS
 from phibench.estimator.geometry.paper_depth import load_published
+from phibench.estimator.geometry.triangulate import ESTIMATORS
 from phibench.scenes.frames import Array
 from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.random_streams import generator

@@ -9,10 +9,10 @@ import polars as pl
 import pytest
 from scipy.stats import multivariate_normal
 
-from phibench.estimator.geometry.estimators import ESTIMATORS
 from phibench.estimator.geometry.mirror_image import image_of
 from phibench.estimator.geometry.paper_depth import depth_approx
 from phibench.estimator.geometry.phi import outline_circle, phi_outline
+from phibench.estimator.geometry.triangulate import ESTIMATORS
 from phibench.scenes.frames import Array, Pose
 from phibench.scenes.misalignment import PARAMETERS as MISALIGNMENT
 from phibench.scenes.misalignment import Misalignment

@@ -9,7 +9,6 @@ import pytest
 from helpers.revolved_rigs import PROFILES, revolved
 
 from phibench.estimator.geometry.combine import combine
-from phibench.estimator.geometry.estimators import ESTIMATORS
 from phibench.estimator.geometry.least_squares_depth import depth_general
 from phibench.estimator.geometry.mirror_image import image_of
 from phibench.estimator.geometry.paper_depth import depth_paper, depth_revolved, paper_gradient, revolved_gradient
@@ -18,7 +17,7 @@ from phibench.estimator.geometry.reflection import reflect, reflect_jacobian
 from phibench.estimator.geometry.rig_parameters import RIG_PARAMETERS, has_effect, moves_rays, rig_gradient
 from phibench.estimator.geometry.sensitivities import PARAMETERS, pixel_gradient, sensitivity
 from phibench.estimator.geometry.status import Status
-from phibench.estimator.geometry.triangulate import depth_exact
+from phibench.estimator.geometry.triangulate import ESTIMATORS, depth_exact
 from phibench.render.optics.ray_tracer import trace_pixels
 from phibench.render.optics.reflection_point import mirror_points
 from phibench.scenes.catalog import default_rig

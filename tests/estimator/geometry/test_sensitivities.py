@@ -15,7 +15,6 @@ from helpers.misaligned_cases import Case, draw_case
 
 from phibench.cli.main import main
 from phibench.datasets.read import open_finished
-from phibench.estimator.geometry.estimators import ESTIMATORS
 from phibench.estimator.geometry.mirror_image import image_of
 from phibench.estimator.geometry.paper_depth import paper_gradient
 from phibench.estimator.geometry.reflection import ray_basis
@@ -27,7 +26,7 @@ from phibench.estimator.geometry.sensitivities import (
     sensitivity,
     truth_gradient,
 )
-from phibench.estimator.geometry.triangulate import depth_exact, exact_gradient
+from phibench.estimator.geometry.triangulate import ESTIMATORS, depth_exact, exact_gradient
 from phibench.render.optics.certificate import pixel_centroid
 from phibench.render.optics.spot_layer import spot_layer
 from phibench.render.optics.truth import depth_m, spot_truth

@@ -15,8 +15,8 @@ from rich.console import Console
 from scipy.special import ndtr
 
 from phibench.benchmark.scores.score_tables import show_grid
-from phibench.estimator.geometry.estimators import ESTIMATORS
 from phibench.estimator.geometry.paper_depth import find_published, load_published
+from phibench.estimator.geometry.triangulate import ESTIMATORS
 from phibench.scenes.rig import Rig
 from phibench.studies.paper.paper_tables import GENERAL, SOURCES, as_records, bias_table, score, summarise, table
 
