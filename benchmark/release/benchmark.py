@@ -72,11 +72,11 @@ class ReleasePart:
 
 
 PARTS = (
-    ReleasePart("dev", "bench-dev", "pairs", "c7d7e7de3551cd4d0e55fbac91ca9936a6debe57958051dc6046242d4a1c4fa0"),
-    ReleasePart("test", "bench-test", "sealed", "46144d56bc9db2639ef887f4cd169a6b808ad06e67ad0c5a54cd6404de1f3540"),
+    ReleasePart("dev", "bench-dev", "pairs", "a274640eda114303c9fa7a51185574048483b7e529d3f9916bdac10f89f7ac6b"),
+    ReleasePart("test", "bench-test", "sealed", "32818cd99112fcf5f0125898b2ab538ab9d53cf02fd90089ec9d14457af67aaa"),
     ReleasePart("paper", "paper", "pairs", "025ece80c9cfc9cce31e558089867a760568627e53154381c59bf926be27563d"),
     ReleasePart(
-        "mirrors", "bench-mirrors", "pairs", "2b63e735f53c26545511c37c369ee0525a2e1423719e6e663c3d0f27f52b6b9e"
+        "mirrors", "bench-mirrors", "pairs", "45f352f98d2c12a779a89b805240481f519a09e92401dff9ae76ad529bce68fb"
     ),
     ReleasePart("films", "bench-films", "films", "d7e243e791f85a1e0c0e761c5f1ca5377cc839d1a7e1221b5d0a87424c91b9c9"),
     ReleasePart("drives", "bench-drives", "films", "825473dc49345b0f331de47ab49b735d453fcdfafa669aa45dbbb39c4a3926f3"),

@@ -8,6 +8,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import io
+import json
 import random
 import shutil
 from collections.abc import Callable
@@ -23,8 +24,10 @@ from helpers.valid_files import TEXT, Kind, changed, compact, digest, png, publi
 from PIL import Image
 from rich.console import Console
 
+from phibench.benchmark.demo import SHIPPED
 from phibench.benchmark.export import export_make
 from phibench.benchmark.export.pair_rows import ExportRequest
+from phibench.benchmark.pair_sets.frames_set import FramesSet
 from phibench.benchmark.release import release_make
 from phibench.benchmark.release.benchmark import PARTS
 from phibench.benchmark.release.release_make import ReleaseRequest
@@ -46,6 +49,8 @@ from phibench.datasets.rooms.room_files import RoomFiles
 from phibench.datasets.store import schema
 from phibench.datasets.store.checksums import checksums_text
 from phibench.datasets.store.documents import parse_info, to_json
+from phibench.datasets.store.pair_files import FRAMES_SET
+from phibench.datasets.store.pair_files import PAIRS as LINES
 from phibench.render.room.light_map import LightMap, encoded
 from phibench.studies import run
 
@@ -200,6 +205,26 @@ def of_other_bytes() -> bytes:
     return buffer.getvalue()
 
 
+def _frames_set(name: str, path: Path) -> object:
+    """A frames set whose file of this name was damaged, with hashes that fit; its lines are read."""
+    data = path.read_bytes()
+    folder = path.parent / "frames-set"
+    folder.mkdir(exist_ok=True)
+    info = json.loads((SHIPPED / FRAMES_SET).read_text()) | {"pairs": 1, "samples": 1}
+    files = {FRAMES_SET: compact(info), LINES: _one_line(), name: data}
+    for file, content in files.items():
+        (folder / file).write_bytes(content)
+    hashes = {file: hashlib.sha256(content).hexdigest() for file, content in files.items()}
+    (folder / schema.CHECKSUMS).write_text(checksums_text(hashes))
+    opened = FramesSet(folder)
+    return [opened.truth(number) for number in range(len(opened))], opened.document()
+
+
+def _one_line() -> bytes:
+    first = (SHIPPED / LINES).read_bytes().splitlines(keepends=True)[0]
+    return compact(json.loads(first) | {"number": 0}) + b"\n"
+
+
 def folder_kinds(folder: Path, dataset: Path) -> dict[str, Kind]:
     """Targets by the name of their file."""
     opened = open_finished(dataset)
@@ -208,6 +233,7 @@ def folder_kinds(folder: Path, dataset: Path) -> dict[str, Kind]:
     export_make._claim(folder, opened, exported)
     rooms, light = _baked(folder)
     info, rows = _imported_files()
+    of_frames = compact(json.loads((SHIPPED / FRAMES_SET).read_text()) | {"pairs": 1})
     draws, read_draws, forged = _draws()
     manifest = {"parts": {"a": {"sums_sha256": TEXT}, "b": {"sums_sha256": TEXT}}}
     score = cast(ScoreDocument, SimpleNamespace(pair_set={"dataset_sha256": TEXT}))
@@ -226,6 +252,13 @@ def folder_kinds(folder: Path, dataset: Path) -> dict[str, Kind]:
         Kind(frame_files.REQUEST, compact(held), _frames, compact),
         Kind(moving_camera.INFO, rooms, partial(_rooms, "room000.npz", light), compact),
         Kind("room000.npz", light, partial(_rooms, moving_camera.INFO, rooms)),
+        Kind(
+            FRAMES_SET,
+            of_frames,
+            partial(_frames_set, FRAMES_SET),
+            compact,
+        ),
+        Kind("lines-of-frames.jsonl", _one_line(), partial(_frames_set, LINES), compact),
         Kind(imported_set.INFO, info, partial(_imported, info, rows, png()), compact),
         Kind(imported_set.ROWS, rows, partial(_imported, info, rows, png()), compact),
         Kind("imported.png", png(), partial(_imported, info, rows, png())),
