@@ -99,6 +99,8 @@ def export(
         If the data set, the request or the folder will not do, or the disk is full; in one sentence.
     """
     dataset, console, out = request.part_of(open_finished(folder)), console or progress_console(), Path(out)
+    if request.samples:  # ids, however they were named
+        request = replace(request, samples=tuple(row.sample_id for row in dataset.rows))
     count = whole_number("workers", os.cpu_count() or 1 if workers is None else workers, 1)
     _check_folder(out, Path(folder))
     _versions(request)  # a missing package is said before anything is written

@@ -34,6 +34,10 @@ COMMANDS: dict[str, Callable[[str, str, str], list[str]]] = {
             f"{out}.png",
         ),
     ],
+    "export": lambda folder, name, out: [
+        *("export", folder, "--to", "frames", "--sample", name, "--preset", "mono-raw", "--region", "32"),
+        *("--workers", "1", "--out", out),
+    ],
     "calibrate": lambda folder, name, out: [
         *("calibrate", folder, "--sample", name, "--preset", "layers", "--out", f"{out}.json"),
     ],

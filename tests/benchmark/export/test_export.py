@@ -159,8 +159,8 @@ class Row:
 
 def splits_of(pairs: Sequence[tuple[int, int]], **options: Any) -> dict[str, str]:
     rows = [Row(f"s{k}", f"rig{rig}", f"room{room}") for k, (rig, room) in enumerate(pairs)]
-    info = SimpleNamespace(name="any", recipe={"dataset": {"seed": 1}})
-    return splits(SimpleNamespace(rows=rows, info=info), request_of("frames", **options))  # type: ignore[arg-type]
+    info, recipe = SimpleNamespace(name="any"), SimpleNamespace(dataset=SimpleNamespace(seed=1))
+    return splits(SimpleNamespace(rows=rows, info=info, recipe=recipe), request_of("frames", **options))  # type: ignore[arg-type]
 
 
 @given(

@@ -615,7 +615,7 @@ OPEN = {
     "log.jsonl": "time and causes of tasks",
     "request.json": "how frames were drawn",
     "seal.json": "public half of a sealed set",
-    "pairs.jsonl": "public pairs of a sealed set; an imported set is hidden whole",
+    "pairs.jsonl": "public pairs of a sealed set; an imported set and a frames set are hidden whole",
     "done.json": "key and hashes of a film",
     "light{:02d}.npz": "light of a film, which is hidden whole",
     "fetch.json": "state of a download",
@@ -623,6 +623,7 @@ OPEN = {
     "direct_url.json": "an installer's",
     "published.csv": "table of the paper, shipped with this package",
     "{preset}-{name}.json": "a score: told by its content",
+    "my_phi.json": "a score of the demo: told by its content",
 }
 """Names that a method may read, and why."""
 

@@ -13,6 +13,7 @@ from helpers import inline_workers, refusing_workers
 from helpers.folders import contents
 from helpers.inline_workers import make_inline
 from helpers.processes import SMALLEST, quiet
+from helpers.sealed_sets import with_secret_seed
 
 from phibench.benchmark.export.export_make import export
 from phibench.benchmark.export.pair_rows import ExportRequest
@@ -381,8 +382,7 @@ def test_pairs_are_exported_and_scored(finished: Path, tmp_path: Path) -> None:
 
 
 def test_a_seal_tells_nobody_what_was_left_out(finished: Path, tmp_path: Path) -> None:
-    out, public = tmp_path / "set", tmp_path / "public"
-    shutil.copytree(finished, out)
+    out, public = with_secret_seed(finished, tmp_path / "set"), tmp_path / "public"
     seal(out, public, "mjpeg", quiet())
     assert json.loads((public / "seal.json").read_text())["pairs"] == 3
     texts = [path.read_text() for path in public.iterdir() if path.is_file()]

@@ -16,7 +16,7 @@ from pathlib import Path
 from phibench.datasets.build.bake_task import bake_room
 from phibench.datasets.plan.plan import make_plan
 from phibench.datasets.recipe.load import load_recipe
-from phibench.datasets.build.tasks import Done, Task, perform
+from phibench.datasets.build.tasks import Done, BuildTask, perform
 from phibench.datasets.build.view_task import render_view
 
 def resident_mb():
@@ -26,10 +26,10 @@ plan, out, count = make_plan(load_recipe(sys.argv[1])), Path(sys.argv[2]), int(s
 camera = replace(plan.rig.camera, width_px=64, height_px=36, fx_px=71.5, fy_px=71.5, cx_px=31.5, cy_px=17.5,
                  pixel_pitch_um=56.0, f_number=2.4)  # full pixels ask for no refinement
 rig, room = replace(plan.rig, camera=camera), plan.rooms["room"]
-assert isinstance(perform(Task("bake room", "", bake_room, (rig, "room", room, plan.recipe.ambient)), out), Done)
+assert isinstance(perform(BuildTask("bake room", "", bake_room, (rig, "room", room, plan.recipe.ambient)), out), Done)
 for number in range(1, count + 1):
     pose = replace(plan.poses[0], pose_id="h0.000", offset_m=number / count, seed=number)
-    outcome = perform(Task("view", "", render_view, ("x", rig, room, pose, plan.recipe.ambient)), out)
+    outcome = perform(BuildTask("view", "", render_view, ("x", rig, room, pose, plan.recipe.ambient)), out)
     assert isinstance(outcome, Done), outcome
     if number in (50, count):
         print(resident_mb(), outcome.peak_mb)
