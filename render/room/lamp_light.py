@@ -66,8 +66,9 @@ def direct_light(
         share = sums[4] / first
         partly = np.zeros(len(texels), dtype=bool)
         partly[seen] = (share > 0.0) & (share < 1.0)
-        # a screen's picture needs all rays
+        # a screen's picture needs all rays, and so does a lamp of which no ray has met the part above the horizon
         again = _around(texels, partly)[seen] | surfaces.table.is_radiance[int(lamp[13])]
+        again |= (sums[3] == 0.0) & (whole > 0.0)
         for half, total in enumerate(halves):
             own = sums.copy()
             more = (first, rays) if half == 0 else (0, rays)  # the first rays are of the first half

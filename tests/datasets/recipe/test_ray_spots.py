@@ -16,7 +16,7 @@ from phibench.datasets.plan.plan import make_plan
 from phibench.datasets.read import Dataset, Sample
 from phibench.datasets.recipe.load import check_recipe
 from phibench.datasets.recipe.spot_placement import by_ray
-from phibench.datasets.recipe.tables import LaserTable
+from phibench.datasets.recipe.tables import LaserTable, Recipe
 from phibench.datasets.rooms.room_sources import room_of
 from phibench.datasets.store.schema import ManifestRow, SpotRow
 from phibench.scenes.catalog import default_rig
@@ -118,11 +118,11 @@ def test_a_recipe_of_beams_is_drawn_and_read_back() -> None:
         spot = plan.spots[pair.spot]
         assert spot.albedo is None
         assert spot.beam_direction_world is not None
-        assert read_back(plan.recipe.model_dump(), row_of(spot, pair)) == spot
+        assert read_back(plan.recipe, row_of(spot, pair)) == spot
     flat = make_plan(check_recipe(drawing(samples=2, spot=RAY)))
     row = row_of(flat.spots[flat.pairs[0].spot], flat.pairs[0])
     assert row.spot_beam_world is None
-    assert read_back(flat.recipe.model_dump(), row) == flat.spots[flat.pairs[0].spot]
+    assert read_back(flat.recipe, row) == flat.spots[flat.pairs[0].spot]
 
 
 def row_of(spot: LaserSpot, pair: Any) -> ManifestRow:
@@ -130,8 +130,8 @@ def row_of(spot: LaserSpot, pair: Any) -> ManifestRow:
     return manifest_row(default_rig(), spot, pair, side, side)
 
 
-def read_back(recipe: dict[str, Any], row: ManifestRow) -> LaserSpot:
-    dataset = cast(Dataset, SimpleNamespace(info=SimpleNamespace(recipe=recipe)))
+def read_back(recipe: Recipe, row: ManifestRow) -> LaserSpot:
+    dataset = cast(Dataset, SimpleNamespace(recipe=recipe))
     return Sample(dataset, row).laser_spot
 
 
