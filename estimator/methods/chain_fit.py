@@ -24,6 +24,7 @@ from phibench.estimator.methods.locate import (
     seen_depth_m,
     trusted_hints,
 )
+from phibench.estimator.processed.chroma_loss import regained
 from phibench.estimator.processed.fit_chain import (
     code_data,
     first_fit,
@@ -165,7 +166,8 @@ def _background(
 
     For the law of a single frame's `own` codes, which counts the pattern of all its light itself.
     """
-    x, rounding = undone_mean(frames, origin, card)
+    seen, rounding = undone_mean(frames, origin, card)
+    x = regained(seen, origin, card)
     variance = unrounded(card, not own).variance_e2(x) + 1.0 / (12.0 * card.dn_per_e**2)
     everywhere = np.ones(x.shape) if known is None else known
     pattern = None if own else PatternNoise.of(card)

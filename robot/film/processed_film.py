@@ -19,6 +19,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from phibench.estimator.processed.chroma_loss import regained
 from phibench.estimator.processed.fit_chain import spot_window, undone, unrounded
 from phibench.estimator.processed.interval_fit import interval_posterior
 from phibench.estimator.processed.quasi_score import CoefficientWindow, fit_window
@@ -102,7 +103,7 @@ def _room(frames: FilmFrames, weights: Array, corner: NDArray[np.int64], part: t
     used = np.flatnonzero(np.abs(weights) > _LEAST_WEIGHT)
     images, w = frames.off_e[used][:, *part], weights[used] / weights[used].sum()
     x, rounding = undone(images, np.tile(corner, (len(used), 1)), frames.card)
-    mean = np.tensordot(w, x, 1)
+    mean = regained(np.tensordot(w, x, 1)[None], corner[None], frames.card)[0]
     noise = unrounded(frames.card, True).variance_e2(mean)
     variance = w @ w * noise + np.tensordot(w**2, rounding, 1)
     found = background_of(mean[None], variance[None], np.ones((1, *mean.shape)), PatternNoise.of(frames.card))
