@@ -16,8 +16,8 @@ from phibench.benchmark.isolation.resolve import write_example
 from phibench.benchmark.pair_sets.frames_set import FramesSet
 from phibench.benchmark.scores.report import write_report
 from phibench.benchmark.scores.score import Scored, run_and_score, saved_each
-from phibench.datasets.errors import DatasetError
-from phibench.datasets.progress import progress_console
+from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.common.progress import progress_console
 from phibench.datasets.store.files import require_writable
 
 SHIPPED = Path(__file__).parent / "pair_sets" / "demo"

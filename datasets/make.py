@@ -56,11 +56,11 @@ from phibench.datasets.build.run_tasks import (
 )
 from phibench.datasets.build.task_list import plan_tasks
 from phibench.datasets.build.workers import Environment, NoRendererError, WorkerPool
-from phibench.datasets.errors import DatasetError, IncompleteError
+from phibench.datasets.common.errors import DatasetError, IncompleteError
+from phibench.datasets.common.progress import progress_console
 from phibench.datasets.plan.kept_samples import Causes
 from phibench.datasets.plan.plan import Plan, make_plan
 from phibench.datasets.plan.room_draws import unexported
-from phibench.datasets.progress import progress_console
 from phibench.datasets.recipe.checks import warnings
 from phibench.datasets.recipe.load import find_recipe, parse_recipe, recipe_files, recipe_text, with_numbers
 from phibench.datasets.recipe.tables import Recipe

@@ -19,10 +19,10 @@ from phibench.datasets.build.finished_work import lost_work
 from phibench.datasets.build.journal import Entry, FolderHead, Journal, Refusal, is_intact
 from phibench.datasets.build.run_tasks import claimed, copy_room_files, finish, held_head
 from phibench.datasets.build.task_list import task_names
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.common.progress import Steps, progress_console
 from phibench.datasets.make import make_from_plan
 from phibench.datasets.plan.plan import Plan, make_plan, parse_shard
-from phibench.datasets.progress import Steps, progress_console
 from phibench.datasets.recipe.load import parse_recipe, recipe_text
 from phibench.datasets.recipe.tables import Recipe
 from phibench.datasets.store import schema

@@ -20,12 +20,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.common.input_files import first_fault
 from phibench.datasets.frames.distractors import Distractor, distractors
 from phibench.datasets.frames.request import FrameOptions, FrameRequest
 from phibench.datasets.frames.sample_request import sample_request
 from phibench.datasets.frames.source import Frames, FrameSource
-from phibench.datasets.input_files import first_fault
 from phibench.datasets.recipe.build import spot_albedo
 from phibench.datasets.recipe.tables import Recipe
 from phibench.datasets.store.checksums import check_documents

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.frames.source import Frame
 from phibench.datasets.read import Dataset, Sample
 from phibench.datasets.store.files import write_text

@@ -12,8 +12,8 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from phibench.datasets.errors import DatasetError
-from phibench.datasets.progress import Steps, progress_console
+from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.common.progress import Steps, progress_console
 from phibench.datasets.read import Dataset, Sample, open_finished
 from phibench.datasets.store import schema
 from phibench.datasets.store.pictures import (

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.frames.request import FrameOptions, FrameRequest, in_one_sentence, whole_number
 from phibench.datasets.frames.sample_request import sample_request
 from phibench.datasets.frames.sensor_card import SensorCard, card_of

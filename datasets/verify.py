@@ -23,10 +23,10 @@ from phibench.datasets.build.journal import Journal
 from phibench.datasets.build.sample_task import noise_row, spot_noise
 from phibench.datasets.build.spot_task import OUT_OF_TOLERANCE, SpotAnswer, answer_spot, certificate_fault
 from phibench.datasets.build.task_list import sample_task_name
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.common.progress import Steps, progress_console
 from phibench.datasets.plan.plan import PairPlan, Plan, make_plan
 from phibench.datasets.plan.sampling import UNDRAWN
-from phibench.datasets.progress import Steps, progress_console
 from phibench.datasets.read import Dataset, Sample, open_dataset
 from phibench.datasets.recipe.load import parse_recipe
 from phibench.datasets.store import schema

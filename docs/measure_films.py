@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import chi2
 
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.film.film_read import Film, open_films
 from phibench.estimator.geometry.status import depth_pull
 from phibench.robot.film.film_estimates import bundle_depth, filtered, seen_film

@@ -20,8 +20,8 @@ from phibench.datasets.exposures.pair_draws import CachedSample, PairDraw, searc
 from phibench.datasets.frames.request import FrameRequest
 from phibench.datasets.frames.source import FrameSource
 from phibench.datasets.read import Dataset, Sample, open_dataset
-from phibench.estimator.draw_pairs import DrawnPairs
 from phibench.estimator.interface import Answer, Box, Pair
+from phibench.estimator.methods.draw_pairs import DrawnPairs
 from phibench.estimator.methods.locate import SharedPair, detected
 from phibench.estimator.methods.registry import METHODS
 from phibench.scenes.rig import POSITIONS

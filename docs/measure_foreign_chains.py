@@ -26,7 +26,7 @@ from PIL import Image
 from phibench.calibration.captures.measure import Measurement, measure, read_setting
 from phibench.calibration.captures.pair_photos import PairPhotos, PositionPhotos
 from phibench.calibration.captures.picture_files import read_photo
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.read import Sample, open_dataset
 
 SAMPLES = (

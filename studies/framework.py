@@ -21,8 +21,8 @@ from rich.console import Console
 
 from phibench.benchmark.scores import figures
 from phibench.benchmark.scores.figures import EmbeddedFigure
-from phibench.datasets.errors import DatasetError
-from phibench.datasets.input_files import SETTINGS_BYTES, InputFile
+from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.common.input_files import SETTINGS_BYTES, InputFile
 from phibench.datasets.read import Dataset, open_finished
 from phibench.datasets.recipe.load import find_recipe
 from phibench.scenes.validation import structural_faults

@@ -20,9 +20,9 @@ from pydantic import Field
 from rich.console import Console
 
 from phibench.benchmark.scores.report import Section
-from phibench.datasets.errors import DatasetError
-from phibench.datasets.input_files import FileName, InputFile
-from phibench.datasets.progress import progress_console
+from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.common.input_files import FileName, InputFile
+from phibench.datasets.common.progress import progress_console
 from phibench.datasets.store.files import require_writable, sha256, write_bytes, write_text
 from phibench.datasets.store.provenance import provenance
 from phibench.datasets.store.schema import Document

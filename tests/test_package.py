@@ -18,7 +18,7 @@ import yaml
 import phibench
 from phibench.benchmark.isolation.resolve import MethodError
 from phibench.benchmark.isolation.runner import asked_here
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.estimator import interface
 from phibench.scenes.rig import Rig
 from phibench.scenes.validation import SceneError

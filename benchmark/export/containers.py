@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from phibench.benchmark.export.pair_rows import DrawnPair, ExportRequest, Form
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.store.files import write_bytes
 
 if TYPE_CHECKING:

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any
 
 from phibench.benchmark.export.containers import FOLDER, hugging_face_features
 from phibench.benchmark.export.pair_rows import INDEX, POSITION_FIELDS, SPLITS, ExportRequest
+from phibench.datasets.common.shown_text import markdown_text
 from phibench.datasets.frames.frame_files import VALUES, FrameRow
 from phibench.datasets.read import Dataset
-from phibench.datasets.shown_text import markdown_text
 from phibench.datasets.store.croissant import (
     LICENSE_URL,
     PARQUET,

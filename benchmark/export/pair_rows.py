@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.frames.frame_files import png_bytes, suffix
 from phibench.datasets.frames.request import FrameOptions, whole_number
 from phibench.datasets.frames.source import Frames, FrameSource

@@ -29,8 +29,8 @@ from phibench.benchmark.isolation.transport import (
     pack,
     unpack,
 )
-from phibench.datasets.errors import DatasetError
-from phibench.datasets.parallel import ONE_THREAD
+from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.common.parallel import ONE_THREAD
 from phibench.estimator.interface import Pair
 from phibench.estimator.pair_set import PairSet, PairTruth, truth_folders
 

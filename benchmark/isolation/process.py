@@ -43,7 +43,7 @@ from phibench.benchmark.isolation.transport import (
     pack,
 )
 from phibench.benchmark.isolation.worker import lacks_memory
-from phibench.datasets.parallel import ONE_THREAD
+from phibench.datasets.common.parallel import ONE_THREAD
 from phibench.datasets.store.leftovers import OwnedFolder
 from phibench.estimator.interface import FAILURES, Outcome, Pair
 from phibench.scenes.validation import printable_line

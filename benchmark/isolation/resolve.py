@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from phibench.benchmark.isolation.loaded_packages import package_sha256
-from phibench.datasets.input_files import MIB, InputFile
+from phibench.datasets.common.input_files import MIB, InputFile
 from phibench.datasets.store.files import sha256, write_text
 from phibench.datasets.store.provenance import code_behind
 from phibench.scenes.validation import close_names, printable_line

@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 
 from phibench.calibration.rig.file import Calibration, CalibrationError
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.exposures.expected import ExpectedRegion, expected_of_light
-from phibench.datasets.exposures.pair_draws import CachedSample, PairDraw, pair_draws, search_boxes
+from phibench.datasets.exposures.pair_draws import CachedSample, FrameCounts, PairDraw, pair_draws, search_boxes
 from phibench.datasets.frames.sensor_card import SensorCard, card_of
 from phibench.datasets.frames.sensor_file import SensorFile
 from phibench.datasets.frames.source import FrameSource, PositionLight
@@ -29,13 +29,13 @@ from phibench.datasets.store.files import sha256
 from phibench.datasets.store.pair_files import LEAST_BOX_PX
 from phibench.datasets.store.provenance import provenance
 from phibench.datasets.store.short_form import ShortForm
-from phibench.estimator.draw_pairs import DrawnPairs
 from phibench.estimator.geometry.rig_parameters import stroke_of
 from phibench.estimator.interface import Pair
-from phibench.estimator.limits.off_frame_bound import FrameCounts, on_off_limit, processed_on_off_limit
+from phibench.estimator.limits.off_frame_bound import on_off_limit, processed_on_off_limit
 from phibench.estimator.limits.position_bound import SpotLimit, spot_limit
 from phibench.estimator.limits.processed_bound import chain_limit
 from phibench.estimator.limits.spot_snr import processed_snr, raw_snr
+from phibench.estimator.methods.draw_pairs import DrawnPairs
 from phibench.estimator.pair_set import Distraction, ImageTruth, PairSet, PairTruth, tell_answered, truth_folders
 from phibench.estimator.spots.gaussian_spot import SpotBlur
 from phibench.estimator.spots.image_planes import PROCESSED

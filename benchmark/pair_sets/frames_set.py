@@ -21,9 +21,9 @@ from pydantic import Field
 
 from phibench.benchmark.pair_sets.dataset_pairs import TASK_VERSION, DatasetPairs
 from phibench.benchmark.pair_sets.truth_file import truth_document, truth_of
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.common.input_files import SETTINGS_BYTES, InputFile, Name
 from phibench.datasets.frames.sensor_card import SensorCard
-from phibench.datasets.input_files import SETTINGS_BYTES, InputFile, Name
 from phibench.datasets.store.documents import from_json
 from phibench.datasets.store.files import sha256
 from phibench.datasets.store.pair_files import (

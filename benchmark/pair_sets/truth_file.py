@@ -17,8 +17,8 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from phibench.datasets.errors import DatasetError
-from phibench.datasets.input_files import InputFile
+from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.common.input_files import InputFile
 from phibench.datasets.store.documents import from_json, to_json
 from phibench.datasets.store.pair_files import MOST_PAIRS, SpotTruthRow, TruthRow
 from phibench.datasets.store.schema import Document

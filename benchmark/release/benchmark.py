@@ -16,8 +16,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
-from phibench.datasets.errors import DatasetError
-from phibench.datasets.input_files import SETTINGS_BYTES, FileName, InputFile, Name
+from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.common.input_files import SETTINGS_BYTES, FileName, InputFile, Name
 from phibench.datasets.recipe.load import recipe_text
 from phibench.datasets.store.schema import Document
 from phibench.scenes.validation import nearest

@@ -24,10 +24,10 @@ from rich.console import Console
 from phibench.benchmark.release.benchmark import MANIFEST, Archive, ReleasedPart, chosen_parts, read_manifest_file
 from phibench.benchmark.release.release_source import Partial, Source
 from phibench.datasets.build.forecast import megabytes
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.common.input_files import FILE_NAME, SETTINGS_BYTES, InputFile
+from phibench.datasets.common.progress import Steps, progress_console
 from phibench.datasets.film.film_store import verify as film_faults
-from phibench.datasets.input_files import FILE_NAME, SETTINGS_BYTES, InputFile
-from phibench.datasets.progress import Steps, progress_console
 from phibench.datasets.store import schema
 from phibench.datasets.store.checksums import damaged, differing_files, read_checksums
 from phibench.datasets.store.files import only_run, sha256, write_text

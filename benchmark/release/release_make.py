@@ -39,14 +39,14 @@ from phibench.benchmark.release.secret_seed import secret_seed
 from phibench.datasets.build.forecast import megabytes
 from phibench.datasets.build.parts import bring_all
 from phibench.datasets.build.tasks import BuildTask, Made
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.common.input_files import InputFile
+from phibench.datasets.common.progress import progress_console
 from phibench.datasets.film.film_forecast import films_forecast
 from phibench.datasets.film.film_make import make_films
 from phibench.datasets.film.film_plan import film_plans
 from phibench.datasets.film.film_store import INFO as FILM_INFO
-from phibench.datasets.input_files import InputFile
 from phibench.datasets.make import cost, make
-from phibench.datasets.progress import progress_console
 from phibench.datasets.recipe.load import parse_recipe, recipe_files, with_numbers
 from phibench.datasets.store import schema
 from phibench.datasets.store.checksums import read_checksums

@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
 from phibench.benchmark.release.benchmark import MANIFEST, Archive
-from phibench.datasets.errors import DatasetError
-from phibench.datasets.input_files import SETTINGS_BYTES
+from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.common.input_files import SETTINGS_BYTES
 from phibench.datasets.store.files import sha256
 from phibench.scenes.validation import printable_line
 

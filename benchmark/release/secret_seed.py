@@ -11,8 +11,8 @@ import secrets
 import stat
 from pathlib import Path
 
-from phibench.datasets.errors import DatasetError
-from phibench.datasets.input_files import SETTINGS_BYTES, InputFile
+from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.common.input_files import SETTINGS_BYTES, InputFile
 from phibench.scenes.random_streams import LARGEST_SEED, LEAST_SECRET_SEED
 
 

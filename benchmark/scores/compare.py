@@ -31,7 +31,7 @@ from phibench.benchmark.scores.intervals import (
 )
 from phibench.benchmark.scores.metrics import FAMILIES, METRICS, Metric, prepared, statistic_of, trusted
 from phibench.benchmark.scores.records import missed_relative, with_missed
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.scenes.frames import Array
 from phibench.scenes.random_streams import Name, generator
 

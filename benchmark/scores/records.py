@@ -28,7 +28,7 @@ from phibench.benchmark.scores.answer_errors import (
     whitened,
 )
 from phibench.benchmark.scores.pair_bounds import SpotBoundsOfImages, pair_bounds
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.estimator.geometry.least_squares_depth import nominal_depth
 from phibench.estimator.geometry.phi import outline_circle
 from phibench.estimator.geometry.triangulate import depth_exact

@@ -41,7 +41,7 @@ from phibench.benchmark.scores.score_tables import (
     refused,
     shown_parts,
 )
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.store.files import write_text
 
 _TEMPLATE = "report.html.j2"

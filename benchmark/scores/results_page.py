@@ -41,8 +41,8 @@ from phibench.benchmark.scores.score_tables import (
     refused,
     shown_parts,
 )
-from phibench.datasets.errors import DatasetError
-from phibench.datasets.shown_text import markdown_cell, markdown_text
+from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.common.shown_text import markdown_cell, markdown_text
 from phibench.datasets.store.files import write_text
 
 AGAINST = "chain_fit"

@@ -48,15 +48,15 @@ from phibench.benchmark.scores.worst_images import worst, worst_of, worst_record
 from phibench.calibration.captures.imported_set import ImportedSet, imported_pairs, is_imported, open_imported
 from phibench.calibration.captures.spot_shape import with_shape
 from phibench.calibration.rig.file import read_calibration
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.common.progress import Steps, progress_console
+from phibench.datasets.exposures.pair_draws import FrameCounts
 from phibench.datasets.frames.sensor_file import read_sensor_file
-from phibench.datasets.progress import Steps, progress_console
 from phibench.datasets.read import Dataset, open_finished
 from phibench.datasets.store.files import require_writable
 from phibench.datasets.store.pair_files import is_frames_set
 from phibench.datasets.store.short_form import ShortForm
 from phibench.estimator.interface import Box, Method, Outcome
-from phibench.estimator.limits.off_frame_bound import FrameCounts
 from phibench.estimator.methods.fit_at_truth import KeptFits
 from phibench.estimator.methods.registry import METHODS, BuiltIn
 from phibench.estimator.pair_set import CachedPairs, PairSet, truth_folders

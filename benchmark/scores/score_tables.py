@@ -27,7 +27,7 @@ from phibench.benchmark.scores.compare import Difference
 from phibench.benchmark.scores.document import PairRange, ScoreDocument, Value
 from phibench.benchmark.scores.intervals import Estimate
 from phibench.benchmark.scores.metrics import CHOSEN, METRICS, RANKS, applies
-from phibench.datasets.shown_text import csv_text, latex_text, markdown_cell, markdown_text
+from phibench.datasets.common.shown_text import csv_text, latex_text, markdown_cell, markdown_text
 from phibench.estimator.methods.registry import REFUSED
 from phibench.scenes.validation import printable_line
 

@@ -17,8 +17,8 @@ from phibench.benchmark.isolation.resolve import MethodError, Reference, RunLimi
 from phibench.benchmark.scores.document import SCORER, MethodCard, ScoreDocument
 from phibench.benchmark.scores.score import run_and_score
 from phibench.benchmark.sealed.rebuilt_score import GIVEN, differences
+from phibench.datasets.common.version import program_version
 from phibench.datasets.store.provenance import code_behind
-from phibench.datasets.version import program_version
 from phibench.estimator.pair_set import PairSet
 
 _HASH = re.compile("[0-9a-f]{64}")

@@ -17,8 +17,8 @@ import polars as pl
 from phibench.benchmark.scores.answer_errors import Rules
 from phibench.benchmark.scores.document import EncodedPicture, ScoreDocument
 from phibench.benchmark.scores.score import Scored, score_outcomes
-from phibench.datasets.errors import DatasetError
-from phibench.datasets.input_files import InputFile
+from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.common.input_files import InputFile
 from phibench.estimator.geometry.phi import CONVENTIONS
 from phibench.estimator.interface import FAILURES, Answer, Matrix2, Outcome, Spot
 from phibench.estimator.pair_set import PairSet

@@ -32,9 +32,9 @@ from phibench.benchmark.scores.document import (
 from phibench.benchmark.scores.records import COLUMN_TYPES, missed_relative, with_missed
 from phibench.benchmark.sealed.method_check import check_card, check_run
 from phibench.benchmark.sealed.rebuilt_score import ABSOLUTE, GIVEN, RELATIVE, alike, differences, rebuilt, short
-from phibench.datasets.errors import DatasetError
-from phibench.datasets.input_files import InputFile
-from phibench.datasets.progress import Steps, progress_console
+from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.common.input_files import InputFile
+from phibench.datasets.common.progress import Steps, progress_console
 from phibench.datasets.read import open_finished
 from phibench.datasets.store import schema
 from phibench.datasets.store.files import sha256

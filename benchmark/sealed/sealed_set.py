@@ -25,11 +25,11 @@ from rich.console import Console
 
 from phibench.benchmark.pair_sets.dataset_pairs import TASK_VERSION, DatasetPairs, dataset_pairs
 from phibench.benchmark.pair_sets.truth_file import Digest, truth_text
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.common.input_files import SETTINGS_BYTES, InputFile, Name
+from phibench.datasets.common.progress import Steps, progress_console
 from phibench.datasets.frames.frame_files import png_bytes
 from phibench.datasets.frames.source import Frames
-from phibench.datasets.input_files import SETTINGS_BYTES, InputFile, Name
-from phibench.datasets.progress import Steps, progress_console
 from phibench.datasets.read import open_finished
 from phibench.datasets.recipe.load import RECIPES, load_recipe
 from phibench.datasets.recipe.tables import Recipe

@@ -25,8 +25,8 @@ from phibench.benchmark.pair_sets.frames_set import pair_of_files
 from phibench.benchmark.pair_sets.truth_file import read_truth_file
 from phibench.benchmark.scores.document import MethodCard
 from phibench.benchmark.sealed.sealed_set import SEAL, Seal, read_seal
-from phibench.datasets.errors import DatasetError
-from phibench.datasets.input_files import InputFile, Name, Text
+from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.common.input_files import InputFile, Name, Text
 from phibench.datasets.store.files import write_text
 from phibench.datasets.store.pair_files import MOST_PAIRS, PairFiles, PublicPair
 from phibench.datasets.store.provenance import provenance

@@ -27,7 +27,7 @@ from phibench.calibration.rig.bundle import Bundle, KnownSpot, calibrate
 from phibench.calibration.rig.from_dataset import DatasetCalibration, Photograph, sigmas_of, write_bundle
 from phibench.calibration.rig.spots import method_for
 from phibench.calibration.rig.vertical_edges import find_vertical
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.read import place_of
 from phibench.datasets.store.files import require_writable
 from phibench.estimator.geometry.least_squares_depth import depth_general

@@ -28,11 +28,11 @@ from phibench.calibration.captures.pair_photos import PairPhotos, pair_of_photos
 from phibench.calibration.captures.picture_files import Photo, SensorChoice, require_colour, sensor_choice
 from phibench.calibration.captures.rig_file import require_camera_size
 from phibench.calibration.captures.tested_chain import PATTERNS, ChainTest, chain_test
-from phibench.datasets.camera_pictures import read_camera_picture
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.camera_pictures import read_camera_picture
+from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.common.input_files import SETTINGS_BYTES, FileName, InputFile, Name, below
 from phibench.datasets.frames.frame_files import png_bytes
 from phibench.datasets.frames.sensor_card import SensorCard
-from phibench.datasets.input_files import SETTINGS_BYTES, FileName, InputFile, Name, below
 from phibench.datasets.store.checksums import checksums_text, read_checksums
 from phibench.datasets.store.documents import from_json, to_json
 from phibench.datasets.store.files import read_rows, sha256, write_bytes, write_text

@@ -53,7 +53,7 @@ from phibench.calibration.outline.outline_result import Outline, mean_outline
 from phibench.calibration.rig.bundle import calibrate
 from phibench.calibration.rig.file import Calibration, read_calibration
 from phibench.calibration.rig.spots import method_for
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.datasets.frames.sensor_file import SensorFile, read_sensor_file
 from phibench.estimator.geometry.least_squares_depth import GeneralDepth, depth_general

@@ -20,9 +20,9 @@ from pathlib import Path
 from phibench.calibration.captures.measure import KnownNumbers, Measurement, measure
 from phibench.calibration.captures.pair_photos import LEAST_STROKE_M, MOST_STROKE_M, PairPhotos, PositionPhotos
 from phibench.calibration.captures.picture_files import read_photo
-from phibench.datasets.errors import DatasetError
-from phibench.datasets.input_files import FILE_NAME, MIB, InputFile
-from phibench.datasets.shown_text import csv_text
+from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.common.input_files import FILE_NAME, MIB, InputFile
+from phibench.datasets.common.shown_text import csv_text
 from phibench.datasets.store.files import write_text
 from phibench.datasets.store.schema import TruthFile
 from phibench.scenes.validation import nearest, printable_line

@@ -20,7 +20,7 @@ from scipy.ndimage import gaussian_filter
 
 from phibench.calibration.captures.picture_files import Photo, require_one_camera
 from phibench.calibration.captures.rig_file import MeasuredRig
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.estimator.geometry.reflection import reflect
 from phibench.estimator.geometry.triangulate import depth_exact

@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from phibench.datasets.camera_pictures import IN_WORDS, Kind, Subsampling, read_camera_picture
+from phibench.datasets.common.camera_pictures import IN_WORDS, Kind, Subsampling, read_camera_picture
+from phibench.datasets.common.input_files import InputFile
 from phibench.datasets.frames.sensor_card import SensorCard, card_of, sensor_card
 from phibench.datasets.frames.sensor_file import SensorFile
-from phibench.datasets.input_files import InputFile
 from phibench.datasets.rooms.panorama_files import is_linear, read_light
 from phibench.estimator.interface import Image
 from phibench.estimator.spots.image_planes import ImageError, linear_planes

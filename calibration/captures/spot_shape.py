@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from phibench.calibration.rig.file import Calibration
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.estimator.geometry.status import Status
 from phibench.estimator.interface import Answer, Pair, Spot
 from phibench.estimator.methods.chain_fit import spot_outputs

@@ -23,7 +23,7 @@ from scipy.special import log_ndtr
 
 from phibench.calibration.captures.pair_photos import PairPhotos, PositionPhotos
 from phibench.calibration.captures.picture_files import Photo
-from phibench.datasets.camera_pictures import Subsampling
+from phibench.datasets.common.camera_pictures import Subsampling
 from phibench.datasets.frames.sensor_card import SensorCard, sensor_card
 from phibench.estimator.interface import Image, Pair
 from phibench.estimator.methods.chain_fit import spot_outputs

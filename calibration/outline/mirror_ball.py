@@ -23,7 +23,7 @@ from PIL import Image, ImageDraw
 from phibench.calibration.outline.ball_circle import LONGEST_PX, BallCircle, find_circle, shrunk
 from phibench.calibration.outline.edge_ring import Circle
 from phibench.calibration.outline.outline_start import sphere_from_circle, sphere_from_rays
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.rooms.panorama_settings import PanoramaSettings
 from phibench.datasets.store.layers import write_exr
 from phibench.datasets.store.pictures import save_png

@@ -35,7 +35,7 @@ from phibench.calibration.rig.edge_meeting import (
 )
 from phibench.calibration.rig.outline_picture import overlay, shown, write_picture
 from phibench.calibration.rig.vertical_edges import MIN_EDGES, edges_about, measured_vertical
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.estimator.spots.camera_codes import light_of, rgb_picture
 from phibench.estimator.spots.image_planes import ImageError

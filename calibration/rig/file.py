@@ -17,8 +17,8 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict
 
 from phibench.calibration.rig.bundle import Bundle
-from phibench.datasets.errors import DatasetError
-from phibench.datasets.input_files import MIB, InputFile
+from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.common.input_files import MIB, InputFile
 from phibench.datasets.store.documents import from_json, to_json
 from phibench.datasets.store.files import write_text
 from phibench.estimator.geometry.rig_parameters import PARAMETERS, RENAMED, changed

@@ -19,13 +19,13 @@ from phibench.calibration.rig.outline_picture import write_overlay
 from phibench.calibration.rig.spots import Ruler, known_spot, measured_spot, method_for, one_per_pose
 from phibench.calibration.rig.verdict import Verdict, verdict_of
 from phibench.calibration.rig.vertical_edges import find_vertical
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.datasets.read import Dataset, Sample, open_dataset
 from phibench.datasets.store.files import require_writable
-from phibench.estimator.draw_pairs import pairs_of
 from phibench.estimator.geometry.rig_parameters import prior_sigmas
 from phibench.estimator.geometry.status import Status, describe
+from phibench.estimator.methods.draw_pairs import pairs_of
 from phibench.estimator.spots.simple_spots import find_spot
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import POSITIONS, Rig

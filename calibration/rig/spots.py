@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from phibench.calibration.rig.bundle import KnownSpot
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.datasets.read import Sample
 from phibench.estimator.interface import Answer, Pair, Spot

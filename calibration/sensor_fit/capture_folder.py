@@ -27,9 +27,9 @@ from numpy.typing import NDArray
 from PIL import Image
 from pydantic import Field
 
-from phibench.datasets.camera_pictures import PGM, pgm_values
-from phibench.datasets.errors import DatasetError
-from phibench.datasets.input_files import SETTINGS_BYTES, InputFile
+from phibench.datasets.common.camera_pictures import PGM, pgm_values
+from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.common.input_files import SETTINGS_BYTES, InputFile
 from phibench.datasets.store.schema import Document
 from phibench.scenes.frames import Array
 from phibench.scenes.validation import printable_line

@@ -25,7 +25,7 @@ from phibench.calibration.sensor_fit.capture_folder import (
     FrameGroup,
     read_notes,
 )
-from phibench.datasets.input_files import SETTINGS_BYTES, InputFile
+from phibench.datasets.common.input_files import SETTINGS_BYTES, InputFile
 from phibench.scenes.validation import printable_line
 
 _REMEDY = "a descriptor of EMVA 1288 has lines `n bits width height`, `b ns photons`, `d ns` and `i picture`"

@@ -29,9 +29,9 @@ from phibench.calibration.sensor_fit.noise_levels import stack_level
 from phibench.calibration.sensor_fit.photon_transfer import TransferFit, fit_transfer
 from phibench.calibration.sensor_fit.processed_noise import ProcessedNoise, fit_noise
 from phibench.calibration.sensor_fit.tone_curve import ToneFit, fit_tone
+from phibench.datasets.common.input_files import InputFile
 from phibench.datasets.frames.sensor_card import SensorCard, sensor_card
 from phibench.datasets.frames.sensor_file import FitTables, MeasuredQuantity, SensorFile, allowed_numbers
-from phibench.datasets.input_files import InputFile
 from phibench.scenes.frames import Array
 
 _NO_FLATS = "needs flat/LEVEL with two frames or more of each level"

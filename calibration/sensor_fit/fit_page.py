@@ -12,7 +12,7 @@ import numpy as np
 from phibench.calibration.sensor_fit.capture_folder import CaptureError
 from phibench.calibration.sensor_fit.fit import SensorFit
 from phibench.calibration.sensor_fit.tone_curve import encoded_by
-from phibench.datasets.shown_text import html_text, markdown_cell, markdown_text
+from phibench.datasets.common.shown_text import html_text, markdown_cell, markdown_text
 from phibench.datasets.store.files import write_bytes, write_text
 
 if TYPE_CHECKING:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from phibench.datasets.build.light_map_cache import light_map
 from phibench.datasets.build.tasks import Made
-from phibench.datasets.input_files import InputFile
+from phibench.datasets.common.input_files import InputFile
 from phibench.datasets.recipe.tables import AmbientTable
 from phibench.datasets.rooms.room_sources import RoomSource, room_of
 from phibench.datasets.store import schema

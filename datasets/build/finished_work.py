@@ -26,7 +26,7 @@ from phibench.datasets.build.run_tasks import held_head, listed
 from phibench.datasets.build.task_list import plan_tasks, sample_task_name
 from phibench.datasets.build.tasks import BuildTask
 from phibench.datasets.build.workers import versions
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.plan.plan import Plan, make_plan
 from phibench.datasets.recipe.load import parse_recipe
 from phibench.datasets.recipe.tables import Recipe

@@ -20,8 +20,8 @@ from typing import IO, Any
 
 from pydantic import TypeAdapter, ValidationError
 
-from phibench.datasets.errors import DatasetError
-from phibench.datasets.input_files import FileName, InputFile
+from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.common.input_files import FileName, InputFile
 from phibench.datasets.store import schema
 from phibench.datasets.store.files import sha256, write_bytes
 

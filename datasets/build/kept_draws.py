@@ -16,8 +16,8 @@ from typing import Any
 from pydantic import TypeAdapter, ValidationError
 
 from phibench.datasets.build.forecast import pair_forecasts
-from phibench.datasets.errors import DatasetError
-from phibench.datasets.input_files import InputFile
+from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.common.input_files import InputFile
 from phibench.datasets.plan.kept_samples import Causes, Kept, KeptSample
 from phibench.datasets.plan.plan import Plan
 from phibench.datasets.plan.room_draws import room_files

@@ -22,8 +22,8 @@ from pathlib import Path
 import numpy as np
 from filelock import FileLock, Timeout
 
-from phibench.datasets.errors import DatasetError
-from phibench.datasets.input_files import InputFile
+from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.common.input_files import InputFile
 from phibench.datasets.store.files import write_bytes, write_text
 from phibench.datasets.store.leftovers import remove_leftovers
 from phibench.datasets.store.provenance import code_behind

@@ -25,9 +25,9 @@ from rich.console import Console
 from phibench.datasets.build.journal import NO_HEAD, Entry, Journal, Refusal, is_intact
 from phibench.datasets.build.tasks import BuildTask, Done, Executor, Failed, Outcome, log_entry, perform
 from phibench.datasets.build.workers import local_workers
-from phibench.datasets.errors import DatasetError
-from phibench.datasets.input_files import first_fault
-from phibench.datasets.progress import Steps
+from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.common.input_files import first_fault
+from phibench.datasets.common.progress import Steps
 from phibench.datasets.store import schema
 
 Result = TypeVar("Result")

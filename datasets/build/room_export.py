@@ -22,9 +22,9 @@ from phibench.datasets.build.parts import schedule
 from phibench.datasets.build.run_tasks import missing_room_files
 from phibench.datasets.build.tasks import BuildTask, Failed, Made
 from phibench.datasets.build.workers import WorkerPool
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.common.progress import Steps
 from phibench.datasets.plan.room_draws import BOX, room_files
-from phibench.datasets.progress import Steps
 from phibench.datasets.recipe.tables import AmbientTable, Recipe
 from phibench.datasets.rooms.gltf_export import glb_of
 from phibench.datasets.rooms.panorama_settings import PanoramaSettings

@@ -24,10 +24,10 @@ from phibench.datasets.build.parts import bring, note
 from phibench.datasets.build.task_list import bake_task_name, plan_tasks, sample_task_name, spot_task_name
 from phibench.datasets.build.tasks import BuildTask, Done, Failed
 from phibench.datasets.build.workers import Environment, WorkerPool, versions
-from phibench.datasets.errors import DatasetError
-from phibench.datasets.input_files import InputFile
+from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.common.input_files import InputFile
+from phibench.datasets.common.progress import Steps
 from phibench.datasets.plan.plan import PairPlan, Plan
-from phibench.datasets.progress import Steps
 from phibench.datasets.rooms.room_files import RoomFiles, checked_data
 from phibench.datasets.rooms.room_sources import ONLY_ROOM
 from phibench.datasets.store import schema

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from phibench.datasets.build.tasks import Made
-from phibench.datasets.errors import RefusedSampleError
+from phibench.datasets.common.errors import RefusedSampleError
 from phibench.datasets.plan.plan import PairPlan
 from phibench.datasets.rooms.room_sources import RoomSource, room_of
 from phibench.datasets.store import schema

@@ -18,7 +18,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.rooms.room_files import RoomError
 from phibench.datasets.store.files import sha256, working
 from phibench.datasets.store.provenance import code_sha256

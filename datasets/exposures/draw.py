@@ -18,7 +18,9 @@ from pathlib import Path
 
 from rich.console import Console
 
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.common.parallel import parallel_map
+from phibench.datasets.common.progress import Steps, progress_console
 from phibench.datasets.frames.frame_files import (
     PREVIEW,
     TRUTH,
@@ -34,8 +36,6 @@ from phibench.datasets.frames.frame_files import (
 )
 from phibench.datasets.frames.request import FrameOptions, FrameRequest, whole_number
 from phibench.datasets.frames.source import Frame, FrameSource, has_place
-from phibench.datasets.parallel import parallel_map
-from phibench.datasets.progress import Steps, progress_console
 from phibench.datasets.read import Dataset, Sample, open_dataset, open_finished
 from phibench.datasets.store import schema
 from phibench.datasets.store.checksums import read_checksums

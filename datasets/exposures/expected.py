@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.read import Sample
 from phibench.render.sensor.camera_chain import Chain
 from phibench.render.sensor.electrons import sampled, stop_factor, vignetting

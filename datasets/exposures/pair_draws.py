@@ -16,7 +16,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.frames.distractors import Distractor, present
 from phibench.datasets.frames.request import FrameOptions, FrameRequest, whole_number
 from phibench.datasets.frames.sample_request import sample_stream
@@ -34,6 +34,24 @@ from phibench.scenes.rig import POSITIONS, Rig, View
 BOX_MARGIN_PX = 4
 """The light of a hinted spot has its centre at least this far from the edges of its box."""
 _ORDER_STREAM = "takes"  # name of a random stream: another name would draw another order
+
+
+@dataclass(frozen=True)
+class FrameCounts:
+    """Frames per position.
+
+    Attributes
+    ----------
+    on, off : int, 1 or more
+        With the laser, and without it.
+    """
+
+    on: int = 1
+    off: int = 1
+
+    def __post_init__(self) -> None:
+        if self.on < 1 or self.off < 1:
+            raise ValueError(f"{self.on} frames with the laser on and {self.off} with it off: 1 or more of each needed")
 
 
 @dataclass(frozen=True)

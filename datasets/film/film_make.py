@@ -18,7 +18,8 @@ from rich.console import Console
 from phibench.datasets.build.journal import Journal
 from phibench.datasets.build.parts import bring_all, unfinished
 from phibench.datasets.build.tasks import BuildTask
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.common.progress import progress_console
 from phibench.datasets.film.film_plan import FilmPlan, check_drives, film_plans
 from phibench.datasets.film.film_store import (
     FILM,
@@ -32,7 +33,6 @@ from phibench.datasets.film.film_store import (
 )
 from phibench.datasets.film.film_task import make_film
 from phibench.datasets.plan.plan import Plan
-from phibench.datasets.progress import progress_console
 from phibench.datasets.recipe.load import find_recipe, parse_recipe, recipe_files, recipe_text
 from phibench.datasets.store.croissant import films_croissant
 from phibench.datasets.store.filling import filling, signed, write_documents

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from phibench.datasets.errors import DatasetError, RecipeError
+from phibench.datasets.common.errors import DatasetError, RecipeError
 from phibench.datasets.plan.plan import PairPlan, Plan, make_plan
 from phibench.datasets.recipe.build import spot_albedo
 from phibench.datasets.recipe.film_tables import FilmLightTable, FilmTable

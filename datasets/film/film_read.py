@@ -23,7 +23,7 @@ import numpy as np
 import polars
 from numpy.typing import NDArray
 
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.exposures.expected import ExpectedRegion, expected_of_light
 from phibench.datasets.film.film_plan import FilmPlan, film_plans
 from phibench.datasets.film.film_store import (

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phibench.datasets.build.journal import Entry, Journal, is_intact
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.film.film_plan import FilmPlan
 from phibench.datasets.film.film_store import FilmFolder, read_view, view_name, write_view
 from phibench.datasets.plan.plan import Plan

@@ -28,8 +28,8 @@ import polars
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from phibench.datasets.errors import DatasetError
-from phibench.datasets.input_files import FileName, InputFile, first_fault
+from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.common.input_files import FileName, InputFile, first_fault
 from phibench.datasets.store.checksums import differing_files, read_checksums
 from phibench.datasets.store.files import write_bytes, write_text
 from phibench.datasets.store.layers import read_exr, write_exr

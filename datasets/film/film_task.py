@@ -14,7 +14,7 @@ import numpy as np
 
 from phibench.datasets.build.journal import NO_HEAD, Journal
 from phibench.datasets.build.tasks import Made
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.film.film_plan import FilmPlan
 from phibench.datasets.film.film_room import key_view_name, key_views, renderer
 from phibench.datasets.film.film_store import (

@@ -16,9 +16,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.common.parallel import parallel_map
 from phibench.datasets.film.film_read import Film, open_films
-from phibench.datasets.parallel import parallel_map
 from phibench.datasets.store.files import require_file, write_atomic
 from phibench.scenes.validation import printable_line
 

@@ -19,10 +19,10 @@ from rich.console import Console
 
 from phibench.datasets.build.parts import bring_all
 from phibench.datasets.build.tasks import BuildTask, Made, task_key
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.common.input_files import FileName, InputFile
+from phibench.datasets.common.progress import progress_console
 from phibench.datasets.frames.request import in_one_sentence
-from phibench.datasets.input_files import FileName, InputFile
-from phibench.datasets.progress import progress_console
 from phibench.datasets.rooms.room_sources import GeneratedRoom
 from phibench.datasets.store.documents import from_json, to_json
 from phibench.datasets.store.files import write_bytes, write_text

@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.common.input_files import FileName, InputFile
 from phibench.datasets.frames.source import Frame
-from phibench.datasets.input_files import FileName, InputFile
 from phibench.datasets.store.documents import model_table, parquet_bytes
 from phibench.datasets.store.files import read_rows, write_bytes, write_text
 from phibench.datasets.store.layers import write_exr

@@ -15,8 +15,8 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from phibench.datasets.errors import DatasetError
-from phibench.datasets.input_files import InputFile
+from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.common.input_files import InputFile
 from phibench.render.sensor.light import Region
 from phibench.render.sensor.settings import Sensor, SensorError, sensor
 

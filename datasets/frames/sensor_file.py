@@ -34,8 +34,8 @@ from typing import Any
 
 from pydantic import Field
 
-from phibench.datasets.errors import DatasetError
-from phibench.datasets.input_files import SETTINGS_BYTES, InputFile
+from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.common.input_files import SETTINGS_BYTES, InputFile
 from phibench.datasets.store.files import write_text
 from phibench.datasets.store.schema import Document
 from phibench.render.sensor.settings import Sensor, SensorError, sensor

@@ -15,7 +15,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.frames.distractors import Distractor
 from phibench.datasets.frames.request import FrameRequest, in_one_sentence, whole_number
 from phibench.datasets.store.layers import SpotWindow

@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-from phibench.datasets.errors import DatasetError, RecipeError
+from phibench.datasets.common.errors import DatasetError, RecipeError
 from phibench.datasets.plan.kept_samples import Kept, rebuilt
 from phibench.datasets.plan.rig_draws import draw_rigs
 from phibench.datasets.plan.room_draws import draw_rooms, room_files

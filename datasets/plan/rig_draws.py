@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from phibench.datasets.errors import RecipeError
+from phibench.datasets.common.errors import RecipeError
 from phibench.datasets.plan.sampling import (
     PREFIX,
     TRIES,

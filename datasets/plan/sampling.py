@@ -22,7 +22,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from phibench.datasets.errors import RecipeError
+from phibench.datasets.common.errors import RecipeError
 from phibench.datasets.recipe.build import (
     MIRROR_SHAPES,
     build_misalignment,

@@ -9,8 +9,8 @@ import re
 from pathlib import Path
 from typing import Any
 
-from phibench.datasets.errors import RecipeError
-from phibench.datasets.input_files import SETTINGS_BYTES, InputFile
+from phibench.datasets.common.errors import RecipeError
+from phibench.datasets.common.input_files import SETTINGS_BYTES, InputFile
 from phibench.datasets.recipe.checks import semantic_faults
 from phibench.datasets.recipe.room_checks import file_faults
 from phibench.datasets.recipe.tables import Recipe

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, create_model
 
-from phibench.datasets.input_files import FILE_NAME, NAME_LENGTH
+from phibench.datasets.common.input_files import FILE_NAME, NAME_LENGTH
 from phibench.datasets.recipe.distributions import Distribution, Name, Table, names_of, values_of
 from phibench.datasets.rooms.mesh_placement import MeshLamp, MeshSettings
 from phibench.datasets.rooms.panorama_settings import PanoramaSettings

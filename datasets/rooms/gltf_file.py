@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from phibench.datasets.errors import DatasetError
-from phibench.datasets.input_files import InputFile
+from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.common.input_files import InputFile
 from phibench.datasets.rooms.gltf_arrays import GltfDocument
 from phibench.datasets.rooms.mesh_parts import (
     BLACK,

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from phibench.datasets.errors import DatasetError
-from phibench.datasets.input_files import InputFile
+from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.common.input_files import InputFile
 from phibench.datasets.rooms.gltf_file import gltf_parts
 from phibench.datasets.rooms.mesh_parts import (
     REMEDY,

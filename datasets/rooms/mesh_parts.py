@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from phibench.datasets.errors import DatasetError
-from phibench.datasets.input_files import InputFile
+from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.common.input_files import InputFile
 from phibench.datasets.rooms.room_files import RoomError
 from phibench.scenes.frames import Array, Vector
 from phibench.scenes.validation import printable_line

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from phibench.datasets.input_files import InputFile
+from phibench.datasets.common.input_files import InputFile
 from phibench.datasets.rooms.mesh_parts import (
     BRIGHTEST,
     MOST_PARTS,

@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from phibench.datasets.camera_pictures import IN_WORDS, read_camera_picture
-from phibench.datasets.input_files import PICTURE_PIXELS, InputFile, quiet_terminal
+from phibench.datasets.common.camera_pictures import IN_WORDS, read_camera_picture
+from phibench.datasets.common.input_files import PICTURE_PIXELS, InputFile, quiet_terminal
 from phibench.datasets.rooms.room_files import RoomError
 from phibench.render.sensor.srgb import srgb_decoded
 from phibench.scenes.validation import printable_line

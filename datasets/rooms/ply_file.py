@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from phibench.datasets.input_files import InputFile
+from phibench.datasets.common.input_files import InputFile
 from phibench.datasets.rooms.mesh_parts import (
     MOST_TRIANGLES,
     Companions,

@@ -10,8 +10,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from phibench.datasets.errors import DatasetError
-from phibench.datasets.input_files import MIB, InputFile, below
+from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.common.input_files import MIB, InputFile, below
 from phibench.scenes.validation import SceneError
 
 LARGEST_BYTES = 64 * MIB

@@ -14,7 +14,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Literal, cast
 
-from phibench.datasets.input_files import FILE_NAME
+from phibench.datasets.common.input_files import FILE_NAME
 from phibench.datasets.rooms.mesh_placement import MeshSettings
 from phibench.datasets.rooms.panorama_settings import PanoramaSettings
 from phibench.datasets.rooms.room_files import RoomError, checked_file

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from scipy import ndimage
 
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.read import Sample
 from phibench.datasets.scene.scene_gltf import scene_glb
 from phibench.datasets.scene.scene_xml import write_scene

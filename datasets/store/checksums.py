@@ -12,8 +12,8 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
-from phibench.datasets.errors import DatasetError
-from phibench.datasets.input_files import FILE_NAME, InputFile, first_fault
+from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.common.input_files import FILE_NAME, InputFile, first_fault
 from phibench.datasets.recipe.room_tables import RoomsTable
 from phibench.datasets.rooms.room_files import RoomFiles
 from phibench.datasets.rooms.room_sources import EXPORTED

@@ -23,8 +23,8 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar, cast, get_args, get_ori
 
 from pydantic import TypeAdapter, ValidationError
 
-from phibench.datasets.errors import DatasetError
-from phibench.datasets.input_files import NAME_LENGTH, InputFile, first_fault
+from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.common.input_files import NAME_LENGTH, InputFile, first_fault
 from phibench.datasets.plan.plan import Plan, PosePlan
 from phibench.datasets.recipe.tables import Recipe
 from phibench.datasets.store import schema

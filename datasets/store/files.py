@@ -27,8 +27,8 @@ from typing import TypeVar
 from filelock import FileLock, Timeout
 from pydantic import ValidationError
 
-from phibench.datasets.errors import DatasetError
-from phibench.datasets.input_files import DIGITS, InputFile, bounds_fault, first_fault
+from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.common.input_files import DIGITS, InputFile, bounds_fault, first_fault
 from phibench.datasets.store import schema
 from phibench.datasets.store.leftovers import TEMPORARY_PREFIX, owned, remove_leftovers, remove_tree
 from phibench.datasets.store.schema import Document

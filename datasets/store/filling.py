@@ -11,7 +11,7 @@ import hashlib
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.store import schema
 from phibench.datasets.store.checksums import checksums_text
 from phibench.datasets.store.files import WriteError, only_run, remove_temporary, write_bytes

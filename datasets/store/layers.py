@@ -25,8 +25,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from phibench.datasets.errors import DatasetError
-from phibench.datasets.input_files import PICTURE_PIXELS, InputFile, quiet_terminal
+from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.common.input_files import PICTURE_PIXELS, InputFile, quiet_terminal
 from phibench.datasets.store.files import require_file, write_atomic
 from phibench.datasets.store.short_form import ShortForm
 from phibench.scenes.camera import FILTERS, LARGEST_SIDE_PX

@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import AfterValidator, Field, field_validator, model_validator
 
-from phibench.datasets.errors import DatasetError
-from phibench.datasets.input_files import FileName, InputFile, Name
+from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.common.input_files import FileName, InputFile, Name
 from phibench.datasets.store.checksums import read_checksums
 from phibench.datasets.store.documents import to_json
 from phibench.datasets.store.files import read_rows

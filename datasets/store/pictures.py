@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.store.files import write_bytes
 from phibench.render.optics.truth import SpotTruth
 from phibench.render.sensor.processing import eight_bit

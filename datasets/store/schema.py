@@ -18,7 +18,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer, field_validator, model_validator
 
-from phibench.datasets.input_files import FILE_NAME, FileName, Name, NoFileName, Text
+from phibench.datasets.common.input_files import FILE_NAME, FileName, Name, NoFileName, Text
 from phibench.datasets.rooms.room_sources import ONLY_ROOM
 
 SCHEMA_VERSION = 7

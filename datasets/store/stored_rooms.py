@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.rooms.room_sources import ONLY_ROOM, SOURCES, NamedRoom, PanoramaRoom, RoomSource, room_of
 from phibench.datasets.store import schema
 from phibench.datasets.store.documents import from_json

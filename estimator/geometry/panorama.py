@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 from scipy.spatial import cKDTree
 
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.read import Sample
 from phibench.datasets.store.pictures import display_exposure_s, to_srgb
 from phibench.estimator.geometry.mirror_image import image_of

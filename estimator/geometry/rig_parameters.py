@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.estimator.geometry.sphere_image import SphereImage, SphereImager
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.scenes.frames import Array, BoolArray

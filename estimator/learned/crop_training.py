@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.frames.request import FrameOptions
 from phibench.datasets.read import open_finished
 from phibench.datasets.training import Crop, CropSettings, SpotCrops

@@ -24,9 +24,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter, uniform_filter
 
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.common.input_files import MIB, InputFile
 from phibench.datasets.frames.sensor_card import SensorCard
-from phibench.datasets.input_files import MIB, InputFile
 from phibench.datasets.store.files import write_bytes
 from phibench.estimator.interface import Image, Spot
 from phibench.estimator.learned.network_file import NetworkFileError, Node, read_model, require_layers

@@ -24,7 +24,7 @@ from functools import partial
 
 import numpy as np
 
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.frames.sensor_card import SensorCard, sensor_card
 from phibench.estimator.geometry.rig_parameters import PARAMETERS, prior_sigmas
 from phibench.estimator.limits.processed_bound import SpotSigma, spot_sigma

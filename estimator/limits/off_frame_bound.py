@@ -29,6 +29,7 @@ from numpy.typing import ArrayLike
 from scipy.linalg import cho_factor, cho_solve
 
 from phibench.datasets.exposures.expected import ExpectedRegion
+from phibench.datasets.exposures.pair_draws import FrameCounts
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.estimator.limits.position_bound import SpotLimit, derivative_images, limit_of, raw_information
 from phibench.estimator.processed.chain_model import (
@@ -53,24 +54,6 @@ from phibench.scenes.frames import Array
 
 _REACH_PX = 10  # around the spot, for codes of their own
 _LIVE = 2e-3  # variance of an output, in steps squared, below which its coefficient says nothing
-
-
-@dataclass(frozen=True)
-class FrameCounts:
-    """Frames per position.
-
-    Attributes
-    ----------
-    on, off : int, 1 or more
-        With the laser, and without it.
-    """
-
-    on: int = 1
-    off: int = 1
-
-    def __post_init__(self) -> None:
-        if self.on < 1 or self.off < 1:
-            raise ValueError(f"{self.on} frames with the laser on and {self.off} with it off: 1 or more of each needed")
 
 
 def on_off_limit(

@@ -19,8 +19,9 @@ import numpy as np
 from numpy.polynomial.legendre import leggauss
 
 from phibench.datasets.exposures.expected import ExpectedRegion
+from phibench.datasets.exposures.pair_draws import FrameCounts
 from phibench.datasets.frames.sensor_card import SensorCard
-from phibench.estimator.limits.off_frame_bound import FrameCounts, without_room
+from phibench.estimator.limits.off_frame_bound import without_room
 from phibench.estimator.limits.position_bound import raw_information
 
 _MANY = 32  # nodes where one costs nothing: 1 % beyond saturation, 1e-3 below it

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image as Picture
 
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.estimator.interface import Box, Image
 from phibench.estimator.spots.camera_codes import light_of, rgb_codes, rgb_picture, tone_slope

@@ -66,7 +66,7 @@ def calibrate(
     from phibench.calibration.captures.imported_set import is_imported, open_imported
     from phibench.calibration.rig.from_dataset import calibrate_dataset
     from phibench.calibration.rig.spots import Ruler
-    from phibench.datasets.errors import DatasetError
+    from phibench.datasets.common.errors import DatasetError
     from phibench.datasets.store.files import require_writable
     from phibench.estimator.geometry.rig_parameters import PARAMETERS, has_effect
     from phibench.scenes.misalignment import PARAMETERS as MISALIGNMENT
@@ -183,7 +183,7 @@ def align(
         write_alignment_picture,
         write_circle_picture,
     )
-    from phibench.datasets.errors import DatasetError
+    from phibench.datasets.common.errors import DatasetError
     from phibench.datasets.frames.sensor_file import read_sensor_file
 
     numbers = SphereOptions(radius_mm, distance_mm, focal_px, cx_px, cy_px, focus_mm)

@@ -58,7 +58,7 @@ def measure(
         PNG or JPEG to write: spots, epipolar line and outline. Of a folder, CSV of the results.
     """
     from phibench.calibration.captures.measure import read_setting
-    from phibench.datasets.errors import DatasetError
+    from phibench.datasets.common.errors import DatasetError
     from phibench.datasets.store.files import require_writable
 
     if (directory is None) != bool(down and up and stroke_m is not None) or (directory and (down or up or stroke_m)):
@@ -95,7 +95,7 @@ def _measure_pair(files: tuple[Pictures, ...], stroke_m: float, setting: KnownNu
 def _measure_folder(directory: Path, setting: KnownNumbers, out: Path | None) -> int:
     """Exit code 1 if a pair could not be measured, or contradicts itself or the tape."""
     from phibench.calibration.captures.pair_list import PairOutcome, measured_pairs, write_results
-    from phibench.datasets.errors import DatasetError
+    from phibench.datasets.common.errors import DatasetError
 
     if out is None or out.suffix.lower() != ".csv":
         given = "without --out" if out is None else f"--out {out}"

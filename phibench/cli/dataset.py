@@ -73,7 +73,7 @@ def make(
     if secret_seed is not None:
         given["seed"] = _secret(secret_seed, seed, make_it=not dry_run)
     if wait_for_workers is not None and scheduler is None:
-        from phibench.datasets.errors import DatasetError
+        from phibench.datasets.common.errors import DatasetError
 
         raise DatasetError("--wait-for-workers is about workers of a scheduler: give --scheduler too")
     if dry_run:
@@ -94,7 +94,7 @@ def make(
 def _secret(path: Path, seed: int | None, make_it: bool) -> int | None:
     """Seed of a file; a dry run draws none, and takes the recipe's."""
     from phibench.benchmark.release.secret_seed import secret_seed as seed_of
-    from phibench.datasets.errors import DatasetError
+    from phibench.datasets.common.errors import DatasetError
 
     if seed is not None:
         raise DatasetError("--seed and --secret-seed are two seeds: give one of them")
@@ -162,7 +162,7 @@ def verify(
 
     if (directory / INFO).is_file():
         if mitsuba is not None:
-            from phibench.datasets.errors import DatasetError
+            from phibench.datasets.common.errors import DatasetError
 
             raise DatasetError(
                 f"{directory} is an export: --mitsuba renders the samples of a data set; name its folder"
@@ -227,7 +227,7 @@ def show(
     """
     from json import dumps
 
-    from phibench.datasets.errors import DatasetError
+    from phibench.datasets.common.errors import DatasetError
     from phibench.datasets.show import show as show_dataset
     from phibench.datasets.show import summary
 

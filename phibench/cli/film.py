@@ -140,8 +140,8 @@ def experiments(
     out
         Parquet file for the rows.
     """
+    from phibench.datasets.common.progress import Steps, progress_console
     from phibench.datasets.film.film_read import open_films
-    from phibench.datasets.progress import Steps, progress_console
     from phibench.datasets.read import open_finished
     from phibench.datasets.store.files import require_writable, write_atomic
     from phibench.studies.paper.film_experiments import FilmProcedure, closure_interval, run_film_experiments, summary
@@ -325,8 +325,8 @@ def run(
         Parquet file for the rows.
     """
     from phibench.benchmark.isolation.resolve import RunLimits
+    from phibench.datasets.common.progress import Steps, progress_console
     from phibench.datasets.frames.request import whole_number
-    from phibench.datasets.progress import Steps, progress_console
     from phibench.datasets.store.files import require_writable, write_atomic
     from phibench.robot.loop.episodes import LOST, episode_frame, episodes_of, run_foreign
     from phibench.robot.loop.foreign_policies import PolicyFile
@@ -422,7 +422,7 @@ def _setup(rooms: Path | None, fidelity: Fidelity, calibration: Path | None, as_
     import numpy as np
 
     from phibench.calibration.rig.file import read_calibration
-    from phibench.datasets.errors import DatasetError
+    from phibench.datasets.common.errors import DatasetError
     from phibench.estimator.geometry.rig_parameters import prior_sigmas
     from phibench.robot.loop.arena import baked_arenas
     from phibench.robot.loop.simulator import Setup

@@ -34,12 +34,12 @@ from phibench.cli.score import bench, compare, report, results, score
 from phibench.cli.seal import seal, submission
 from phibench.cli.start import demo, recipe, start
 from phibench.cli.studies import paper, stroke, study
-from phibench.datasets.parallel import ONE_THREAD
+from phibench.datasets.common.parallel import ONE_THREAD
 
 
 def _version_line() -> str:
     """Version as `phibench --version` prints it; in a checkout with the commit and with what differs from it."""
-    from phibench.datasets.version import program_version
+    from phibench.datasets.common.version import program_version
 
     return program_version()
 
@@ -218,7 +218,7 @@ def _stop(number: int, frame: FrameType | None) -> None:
 
 def _told(tokens: Sequence[str]) -> AbstractContextManager[object]:
     """Line every 30 s while a command runs that says nothing itself; it is named by its words before the options."""
-    from phibench.datasets.progress import StillRunning, progress_console
+    from phibench.datasets.common.progress import StillRunning, progress_console
 
     words = list(takewhile(lambda word: not word.startswith("-"), tokens))
     return StillRunning(progress_console(), f"phibench {' '.join(words[:2])}".rstrip())
@@ -230,7 +230,7 @@ TRACEBACK = "PHIBENCH_TRACEBACK"
 
 def _refuse_strange(tokens: Sequence[str]) -> None:
     """Refuse arguments that no file can be called, or that no text file can hold."""
-    from phibench.datasets.errors import DatasetError
+    from phibench.datasets.common.errors import DatasetError
 
     for token in tokens:
         if "\0" in token or any("\ud800" <= c <= "\udfff" for c in token):
@@ -253,14 +253,14 @@ def _refuse_little_memory(tokens: Sequence[str]) -> None:
 
 
 def _is_incomplete(error: Exception) -> bool:
-    from phibench.datasets.errors import IncompleteError
+    from phibench.datasets.common.errors import IncompleteError
 
     return isinstance(error, IncompleteError)
 
 
 def _is_users(error: Exception) -> bool:
     from phibench.benchmark.isolation.resolve import MethodError
-    from phibench.datasets.errors import DatasetError
+    from phibench.datasets.common.errors import DatasetError
     from phibench.scenes.validation import SceneError
 
     known = (SceneError, DatasetError, MethodError, OSError, MemoryError)

@@ -57,7 +57,7 @@ def check(
     """
     from phibench.benchmark.isolation.check import PAIRS, check_method
     from phibench.benchmark.isolation.resolve import resolve
-    from phibench.datasets.progress import Steps, progress_console
+    from phibench.datasets.common.progress import Steps, progress_console
 
     resolve(reference)  # one that is not there is told before anything begins
     with Steps(progress_console(), "easy pairs", PAIRS, announce=True) as steps:

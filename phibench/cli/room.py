@@ -142,7 +142,7 @@ def panorama(
         Rows of the panorama; it has twice as many columns.
     """
     from phibench.datasets.build.room_export import export_panorama, export_room
-    from phibench.datasets.progress import Steps, progress_console
+    from phibench.datasets.common.progress import Steps, progress_console
 
     room_of_it = export_room(room_name, seed, properties, box=True)
     with Steps(progress_console(), f"panorama of {room_of_it.name}, light and pixels", 1, announce=True) as steps:

@@ -42,7 +42,7 @@ class Output:
         DatasetError
             If several are chosen.
         """
-        from phibench.datasets.errors import DatasetError
+        from phibench.datasets.common.errors import DatasetError
 
         chosen = [name for name in ("csv", "markdown", "latex", "json") if getattr(self, name)]
         if len(chosen) > 1:
@@ -107,8 +107,8 @@ def score(
     from phibench.benchmark.scores.document import MethodCard, records_kept
     from phibench.benchmark.scores.score import open_scored, run_and_score, saved_each, wanted_pairs
     from phibench.benchmark.scores.score_tables import print_scores
-    from phibench.datasets.errors import DatasetError
-    from phibench.datasets.progress import progress_console
+    from phibench.datasets.common.errors import DatasetError
+    from phibench.datasets.common.progress import progress_console
     from phibench.datasets.store.files import require_writable
 
     if not method:
@@ -234,7 +234,7 @@ def results(
 
 def _files(out: Path | None, cards: Sequence[MethodCard]) -> list[Path | None]:
     """One file per method: `out` itself for one, with the method's name added for several."""
-    from phibench.datasets.errors import DatasetError
+    from phibench.datasets.common.errors import DatasetError
 
     if out is None:
         return [None] * len(cards)
@@ -250,7 +250,7 @@ def _files(out: Path | None, cards: Sequence[MethodCard]) -> list[Path | None]:
 
 
 def _seed(seed: int) -> int:
-    from phibench.datasets.errors import DatasetError
+    from phibench.datasets.common.errors import DatasetError
 
     if seed < 0:
         raise DatasetError(f"--bootstrap-seed {seed}: must be 0 or above")

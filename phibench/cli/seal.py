@@ -97,7 +97,7 @@ def open_(public: Path, *, truth: Path, submission: Path, out: Path | None = Non
     from phibench.benchmark.scores.score import isolated, saved, score_outcomes
     from phibench.benchmark.scores.score_tables import print_scores
     from phibench.benchmark.sealed.submission import unseal as unseal_set
-    from phibench.datasets.errors import DatasetError
+    from phibench.datasets.common.errors import DatasetError
     from phibench.datasets.store.files import require_writable
 
     if out is not None:

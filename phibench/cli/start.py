@@ -71,7 +71,7 @@ def show(name: Annotated[str, Parameter(completer=recipes(films=True))]) -> int:
     name
         Name as `phibench recipe list` shows it.
     """
-    from phibench.datasets.errors import DatasetError
+    from phibench.datasets.common.errors import DatasetError
     from phibench.datasets.recipe.load import RECIPES
 
     known = {path.stem: path for path in RECIPES.glob("*.toml")}

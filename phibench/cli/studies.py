@@ -64,11 +64,11 @@ def paper(
         _refuse("is for the misaligned experiments: give --misaligned too", *given)
         return _tables(directory, calibration, wide, out)
     if calibration is not None:
-        from phibench.datasets.errors import DatasetError
+        from phibench.datasets.common.errors import DatasetError
 
         raise DatasetError("--calibration does not go with --misaligned, which calibrates every rig itself")
     with_off = True if laser_off is None else laser_off
-    from phibench.estimator.limits.off_frame_bound import FrameCounts
+    from phibench.datasets.exposures.pair_draws import FrameCounts
     from phibench.studies.paper.experiment_tables import Procedure
 
     counts = FrameCounts() if frames is None else FrameCounts(*frames)
@@ -77,7 +77,7 @@ def paper(
 
 
 def _refuse(why: str, *values: object) -> None:
-    from phibench.datasets.errors import DatasetError
+    from phibench.datasets.common.errors import DatasetError
 
     for name, value in zip(("preset", "draws", "laser-off", "frames", "rig"), values, strict=True):
         if value is not None:
@@ -167,7 +167,7 @@ class StrokeSetting:
         """
         from phibench.calibration.captures.rig_file import read_rig_file
         from phibench.calibration.rig.file import read_calibration
-        from phibench.datasets.errors import DatasetError
+        from phibench.datasets.common.errors import DatasetError
         from phibench.datasets.frames.sensor_card import sensor_card
         from phibench.estimator.limits.best_stroke import best_stroke
         from phibench.estimator.limits.stroke_curve import Surroundings

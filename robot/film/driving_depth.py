@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.film.film_read import Film
 from phibench.estimator.geometry.mirror_image import image_of
 from phibench.estimator.geometry.reflection import room_rays

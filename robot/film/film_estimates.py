@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import polars
 
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.film.film_read import Film
 from phibench.datasets.frames.sensor_card import card_of
 from phibench.datasets.recipe.film_tables import TARGET

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.polynomial.legendre import leggauss
 from numpy.typing import NDArray
 
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.film.film_read import Film
 from phibench.datasets.frames.sensor_card import SensorCard, card_of
 from phibench.estimator.geometry.mirror_image import image_of

@@ -17,9 +17,9 @@ import polars as pl
 from scipy.stats import bootstrap
 
 from phibench.benchmark.pair_sets.dataset_pairs import DatasetPairs
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.common.parallel import parallel_map
 from phibench.datasets.exposures.pair_draws import PairDraw, pair_draws
-from phibench.datasets.parallel import parallel_map
 from phibench.datasets.read import Dataset, open_finished
 from phibench.estimator.geometry.mirror_image import image_of
 from phibench.estimator.geometry.paper_depth import Published, depth_paper, find_published

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from pydantic import Field
 
-from phibench.datasets.errors import DatasetError
-from phibench.datasets.parallel import parallel_map
+from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.common.parallel import parallel_map
 from phibench.scenes.frames import Array
 from phibench.scenes.random_streams import Name, generator
 from phibench.scenes.rig import Rig

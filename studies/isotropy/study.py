@@ -17,7 +17,7 @@ import polars as pl
 from pydantic import BeforeValidator, Field
 
 from phibench.benchmark.scores.answer_errors import Rules
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.read import Dataset, Sample
 from phibench.estimator.geometry.panorama import (
     PanoramaGrid,

@@ -17,8 +17,8 @@ import polars as pl
 from pydantic import Field
 from scipy.stats import binomtest, bootstrap
 
+from phibench.datasets.common.progress import Steps
 from phibench.datasets.film.moving_camera import INFO, bake_rooms
-from phibench.datasets.progress import Steps
 from phibench.estimator.geometry.rig_parameters import PRIOR_SIGMA, STROKE_PARAMETERS
 from phibench.robot.loop.arena import baked_arenas
 from phibench.robot.loop.episodes import Episode, run_episodes

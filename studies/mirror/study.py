@@ -10,9 +10,9 @@ import numpy as np
 import polars as pl
 from pydantic import BaseModel, ConfigDict, Field
 
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.common.progress import Steps
 from phibench.datasets.frames.sensor_card import sensor_card
-from phibench.datasets.progress import Steps
 from phibench.datasets.recipe.build import build_rig, idle_mirror_keys
 from phibench.datasets.recipe.mirror_tables import MirrorTable
 from phibench.datasets.recipe.tables import RigTable

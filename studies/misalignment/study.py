@@ -16,8 +16,8 @@ import polars as pl
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 from phibench.calibration.rig.bundle import Bundle
-from phibench.datasets.errors import DatasetError
-from phibench.datasets.progress import Steps
+from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.common.progress import Steps
 from phibench.estimator.geometry.paper_depth import load_published
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.scenes.catalog import default_rig

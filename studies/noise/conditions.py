@@ -20,8 +20,8 @@ import polars as pl
 
 from phibench.benchmark.scores.answer_errors import Rules
 from phibench.benchmark.scores.records import record_table
-from phibench.datasets.parallel import parallel_map
-from phibench.datasets.progress import Steps
+from phibench.datasets.common.parallel import parallel_map
+from phibench.datasets.common.progress import Steps
 from phibench.datasets.read import Dataset, open_dataset
 from phibench.estimator.interface import Answer, Outcome, Pair
 from phibench.estimator.methods.raw_likelihood import joint_of

@@ -12,7 +12,7 @@ import polars as pl
 from pydantic import Field
 
 from phibench.benchmark.scores.answer_errors import Rules
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.read import Dataset
 from phibench.estimator.methods.registry import METHODS
 from phibench.render.sensor.settings import SensorError

@@ -19,15 +19,14 @@ from phibench.benchmark.pair_sets.dataset_pairs import spot_bounds as bounds_of_
 from phibench.benchmark.scores.answer_errors import Rules
 from phibench.benchmark.scores.intervals import Clusters, Estimate, estimates, rate, rms_of, rms_ratio_of
 from phibench.benchmark.scores.score_tables import TextTable, cell_parts
-from phibench.datasets.errors import DatasetError
-from phibench.datasets.exposures.pair_draws import CachedSample
+from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.exposures.pair_draws import CachedSample, FrameCounts
 from phibench.datasets.frames.request import Exposure
 from phibench.datasets.frames.source import FrameSource
 from phibench.datasets.read import Dataset, Sample
 from phibench.datasets.store.files import write_bytes
-from phibench.estimator.draw_pairs import pairs_of
 from phibench.estimator.geometry.least_squares_depth import depth_general
-from phibench.estimator.limits.off_frame_bound import FrameCounts
+from phibench.estimator.methods.draw_pairs import pairs_of
 from phibench.scenes.frames import Array
 from phibench.scenes.laser import Beam
 from phibench.scenes.random_streams import generator

@@ -26,7 +26,7 @@ import polars as pl
 
 from phibench.calibration.rig.bundle import Bundle
 from phibench.calibration.rig.spots import method_for
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.film.film_read import Film, Films
 from phibench.datasets.film.film_store import FilmInfo
 from phibench.datasets.frames.sensor_card import card_of

@@ -15,7 +15,7 @@ from matplotlib.ticker import FuncFormatter, NullFormatter
 
 from phibench.benchmark.scores.figures import COLOURS, LINES, STYLE, encoded
 from phibench.benchmark.scores.score_tables import TextTable
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.store.files import write_bytes
 from phibench.estimator.limits.best_stroke import BestStroke
 from phibench.estimator.limits.stroke_curve import (

@@ -15,8 +15,8 @@ import numpy as np
 
 from phibench.benchmark.scores.answer_errors import Rules
 from phibench.benchmark.scores.intervals import Clusters, estimates, rms_of
-from phibench.datasets.parallel import parallel_map
-from phibench.datasets.progress import Steps
+from phibench.datasets.common.parallel import parallel_map
+from phibench.datasets.common.progress import Steps
 from phibench.estimator.geometry.least_squares_depth import depth_general
 from phibench.estimator.geometry.mirror_image import image_of
 from phibench.estimator.geometry.rig_parameters import (

@@ -12,9 +12,9 @@ from pydantic import Field
 
 from phibench.calibration.outline.limb_image import PoseMeasurement
 from phibench.calibration.rig.bundle import calibrate
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.common.progress import Steps
 from phibench.datasets.frames.sensor_card import SensorCard, sensor_card
-from phibench.datasets.progress import Steps
 from phibench.estimator.geometry.rig_parameters import PARAMETERS, prior_sigmas
 from phibench.estimator.limits.best_stroke import BestStroke, best_stroke, spot_bound
 from phibench.estimator.limits.processed_bound import SpotSigma

@@ -15,7 +15,7 @@ from scipy import stats
 from phibench.calibration.outline.limb_image import PoseMeasurement
 from phibench.calibration.rig.bundle import KnownSpot, calibrate
 from phibench.calibration.rig.vertical_edges import vertical_of
-from phibench.datasets.parallel import parallel_map
+from phibench.datasets.common.parallel import parallel_map
 from phibench.estimator.geometry.least_squares_depth import depth_general
 from phibench.estimator.geometry.rig_parameters import PARAMETERS, changed, prior_sigmas, stroke_of
 from phibench.estimator.geometry.triangulate import depth_exact

@@ -25,8 +25,8 @@ from phibench.calibration.rig.file import read_calibration, write_calibration
 from phibench.cli.main import main
 from phibench.datasets.build.journal import Entry, FolderHead, Journal
 from phibench.datasets.build.run_tasks import held_head, refuse_other
-from phibench.datasets.errors import DatasetError
-from phibench.datasets.input_files import DEPTH, InputFile
+from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.common.input_files import DEPTH, InputFile
 from phibench.datasets.plan.plan import parse_shard
 from phibench.datasets.recipe.load import load_recipe
 from phibench.datasets.store.checksums import read_checksums
@@ -333,7 +333,7 @@ def test_an_output_that_is_no_utf_8(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_progress_into_a_folder_called_like_markup(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    from phibench.datasets.progress import progress_console
+    from phibench.datasets.common.progress import progress_console
 
     progress_console().print(f"{tmp_path}/[/b]/:smile: is complete", soft_wrap=True)
     assert "/[/b]/:smile: is complete" in capsys.readouterr().err

@@ -24,9 +24,9 @@ from phibench.benchmark.export.export_make import verify_export
 from phibench.calibration.captures.imported_set import import_pairs
 from phibench.calibration.captures.pair_list import read_pair_list
 from phibench.calibration.sensor_fit.capture_folder import read_header
-from phibench.datasets.camera_pictures import read_camera_picture
-from phibench.datasets.errors import DatasetError
-from phibench.datasets.input_files import InputFile
+from phibench.datasets.common.camera_pictures import read_camera_picture
+from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.common.input_files import InputFile
 from phibench.datasets.rooms.mesh_files import read_mesh
 from phibench.datasets.rooms.panorama_files import read_light
 from phibench.datasets.rooms.room_files import RoomFiles, checked_data

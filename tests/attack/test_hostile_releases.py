@@ -29,7 +29,7 @@ from helpers.strange_releases import (
 from phibench.benchmark.release.fetch import fetch
 from phibench.benchmark.release.paced_http import Patience
 from phibench.cli.main import main
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 
 SOON = Patience(answer_s=0.4, document_s=0.4, window_s=0.4)
 MIB = 1 << 20

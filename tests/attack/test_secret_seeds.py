@@ -15,7 +15,7 @@ from phibench.benchmark.export.export_make import export
 from phibench.benchmark.export.pair_rows import ExportRequest
 from phibench.benchmark.release.secret_seed import secret_seed
 from phibench.cli.main import main
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.exposures.draw import draw_frames
 from phibench.datasets.frames.frame_files import read_index
 from phibench.datasets.frames.request import FrameOptions

@@ -13,7 +13,7 @@ RUN = """
 import json, os, sys, time
 from pathlib import Path
 from phibench.datasets import make
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.plan.plan import make_plan
 from phibench.datasets.recipe.load import load_recipe
 from rich.console import Console

@@ -16,8 +16,8 @@ import pytest
 from rich.console import Console
 
 from phibench.cli import main as cli
-from phibench.datasets.errors import DatasetError, RecipeError
-from phibench.datasets.progress import Steps, StillRunning
+from phibench.datasets.common.errors import DatasetError, RecipeError
+from phibench.datasets.common.progress import Steps, StillRunning
 from phibench.datasets.verify import Report
 from phibench.scenes.validation import SceneError
 from phibench.studies.paper.paper_tables import Score

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from phibench.cli.main import main
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.read import open_dataset, place_of
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from phibench.datasets.camera_pictures import read_camera_picture, upright
-from phibench.datasets.errors import DatasetError
-from phibench.datasets.input_files import InputFile
+from phibench.datasets.common.camera_pictures import read_camera_picture, upright
+from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.common.input_files import InputFile
 
 RANDOM = np.random.default_rng(3)
 COLOUR = RANDOM.integers(0, 256, (16, 32, 3), dtype=np.uint8)

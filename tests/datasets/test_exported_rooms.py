@@ -10,7 +10,7 @@ import pytest
 from helpers.inline_workers import InlineExecutor, InlineWorkerPool, make_inline
 from helpers.processes import quiet
 
-from phibench.datasets.errors import DatasetError, RecipeError
+from phibench.datasets.common.errors import DatasetError, RecipeError
 from phibench.datasets.make import dry_run, make
 from phibench.datasets.merge_repair import merge
 from phibench.datasets.plan.plan import make_plan

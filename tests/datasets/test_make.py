@@ -24,9 +24,9 @@ from phibench.datasets import make
 from phibench.datasets.build import run_tasks, spot_task
 from phibench.datasets.build.forecast import forecast
 from phibench.datasets.build.task_list import plan_tasks
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.common.progress import Steps
 from phibench.datasets.plan.plan import make_plan
-from phibench.datasets.progress import Steps
 from phibench.datasets.recipe.load import load_recipe
 from phibench.datasets.rooms.room_sources import room_of
 from phibench.datasets.store import filling, schema
@@ -241,7 +241,7 @@ def complete_but_unfinished(out: Path) -> int:
 
 
 def test_progress_without_a_terminal_is_a_line_now_and_then(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("phibench.datasets.progress.LINE_EVERY_S", 0.1)
+    monkeypatch.setattr("phibench.datasets.common.progress.LINE_EVERY_S", 0.1)
     console = quiet()
     with Steps(console, "views", 3, running=lambda: "view h0.500 (1 s)") as steps:
         time.sleep(0.35)  # a line is told while nothing ends
@@ -256,7 +256,7 @@ def test_progress_without_a_terminal_is_a_line_now_and_then(monkeypatch: pytest.
 
 def test_progress_on_a_terminal_goes_by_time_and_says_what_runs(monkeypatch: pytest.MonkeyPatch) -> None:
     """One of ten steps takes nine tenths of the time: half of the time later the bar is at its middle, not at 1/10."""
-    monkeypatch.setattr("phibench.datasets.progress._BAR_EVERY_S", 0.02)
+    monkeypatch.setattr("phibench.datasets.common.progress._BAR_EVERY_S", 0.02)
     console = Console(file=io.StringIO(), width=80, force_terminal=True, color_system=None, legacy_windows=False)
     began = time.monotonic()
     with Steps(console, "tasks", 10, lambda: max(began + 1.0 - time.monotonic(), 0.01), lambda: "bake room (60 s)" * 9):
@@ -276,7 +276,7 @@ def test_a_long_bake_is_not_silent(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         time.sleep(0.5)
         raise DatasetError("that is all")
 
-    monkeypatch.setattr("phibench.datasets.progress.LINE_EVERY_S", 0.1)
+    monkeypatch.setattr("phibench.datasets.common.progress.LINE_EVERY_S", 0.1)
     monkeypatch.setattr("phibench.datasets.build.bake_task.light_map", slow)
     console = quiet()
     with pytest.raises(DatasetError, match="that is all"):
@@ -361,7 +361,8 @@ def test_without_mitsuba_frames_may_change_and_nothing_may_be_rendered(smallest_
 
     def run(recipe: Path, out: Path, replace: str = "") -> "subprocess.CompletedProcess[str]":
         code = (
-            "import sys\nfrom phibench.datasets.make import make\nfrom phibench.datasets.errors import DatasetError\n"
+            "import sys\nfrom phibench.datasets.make import make\n"
+            "from phibench.datasets.common.errors import DatasetError\n"
             "try: make(*sys.argv[1:3], replace=bool(sys.argv[3]))\n"
             "except DatasetError as error: sys.exit(str(error))"
         )

@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 from helpers.processes import left_of, living
 
-from phibench.datasets.errors import DatasetError
-from phibench.datasets.parallel import ONE_THREAD, parallel_map
+from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.common.parallel import ONE_THREAD, parallel_map
 
 Python = Callable[..., subprocess.CompletedProcess[str]]
 
@@ -93,7 +93,7 @@ def test_ctrl_c_ends_quietly(tmp_path: Path) -> None:
     """An interrupt reaches all processes of the terminal's group, the workers too."""
     script = tmp_path / "main.py"
     script.write_text(
-        "import sys, time\nfrom phibench.datasets.parallel import parallel_map\n"
+        "import sys, time\nfrom phibench.datasets.common.parallel import parallel_map\n"
         "if __name__ == '__main__':\n"
         "    try:\n        print('ready', flush=True)\n"
         "        list(parallel_map(time.sleep, [0.0, 0.0, 60.0, 60.0], 2))\n"
@@ -119,7 +119,7 @@ def test_workers_leave_when_their_parent_is_killed(tmp_path: Path) -> None:
     """One works, the other has nothing to do; neither can be told."""
     script = tmp_path / "main.py"
     script.write_text(
-        "import time\nfrom phibench.datasets.parallel import parallel_map\n"
+        "import time\nfrom phibench.datasets.common.parallel import parallel_map\n"
         "if __name__ == '__main__':\n"
         "    for _ in parallel_map(time.sleep, [0.0, 0.0, 0.0, 60.0], 2):\n        print('ready', flush=True)\n"
     )

@@ -9,7 +9,7 @@ import pytest
 from helpers.damage import sign
 from helpers.processes import quiet
 
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.plan.plan import make_plan
 from phibench.datasets.read import Dataset, open_dataset, open_finished
 from phibench.datasets.recipe.load import load_recipe

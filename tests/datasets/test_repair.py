@@ -11,7 +11,7 @@ from helpers.damage import AMBIENT, OTHER_SPOT, SPOT, TRUTH, flip_a_bit, swap, t
 from helpers.folders import contents
 from helpers.processes import quiet, within
 
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.merge_repair import repair
 from phibench.datasets.store import schema
 from phibench.datasets.store.checksums import checksums_text, read_checksums, write_checksums

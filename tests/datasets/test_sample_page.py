@@ -21,7 +21,7 @@ from PIL import Image
 
 from phibench.cli.main import main
 from phibench.datasets.build.sample_task import _at_light
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.read import Sample, open_dataset
 from phibench.datasets.sample_page import STEPS, epipolar_line, page_data, sample_of, sample_page, write_sample_page
 from phibench.datasets.show import _cells

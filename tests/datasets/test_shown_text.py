@@ -9,7 +9,7 @@ from html.parser import HTMLParser
 
 import pytest
 
-from phibench.datasets.shown_text import csv_text, html_text, latex_text, markdown_cell, markdown_text
+from phibench.datasets.common.shown_text import csv_text, html_text, latex_text, markdown_cell, markdown_text
 
 NASTY = (
     *("<script>alert(1)</script>", "<img src=x onerror=alert(1)>", "a & b", "&lt;b&gt;", "[a](http://b)", "![a](b)"),

@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.frames.request import FrameOptions
 from phibench.datasets.read import open_dataset
 from phibench.datasets.store.layers import SpotWindow

@@ -22,7 +22,7 @@ from rich.console import Console
 
 from phibench.datasets import show as show_module
 from phibench.datasets.build.run_tasks import visibility_line
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.read import open_dataset
 from phibench.datasets.show import show
 from phibench.datasets.store import checksums, pictures, schema

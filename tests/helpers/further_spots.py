@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from phibench.datasets.build.spot_task import make_spot
-from phibench.datasets.errors import RefusedSampleError
+from phibench.datasets.common.errors import RefusedSampleError
 from phibench.datasets.plan.plan import PairPlan
 from phibench.datasets.read import Dataset, Sample
 from phibench.datasets.recipe.distributions import quantile

@@ -39,7 +39,7 @@ from phibench.calibration.sensor_fit.capture_folder import read_header
 from phibench.datasets.build import kept_draws, run_tasks
 from phibench.datasets.build.journal import Journal
 from phibench.datasets.build.run_tasks import held_head
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.film import moving_camera
 from phibench.datasets.frames import frame_files
 from phibench.datasets.frames.request import FrameOptions

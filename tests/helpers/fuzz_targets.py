@@ -30,7 +30,7 @@ from phibench.calibration.captures.rig_file import read_rig_file
 from phibench.calibration.sensor_fit.capture_folder import CaptureNotes, read_frame, read_notes
 from phibench.calibration.sensor_fit.emva_descriptor import open_descriptor
 from phibench.datasets.build.light_map_cache import cache_limit_mb
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.film.film_store import FilmInfo, read_document, read_spots, read_table, write_spots
 from phibench.datasets.film.film_video import read_frames, write_frames
 from phibench.datasets.frames.request import jpeg_tables
@@ -118,7 +118,7 @@ def _fetched(path: Path) -> object:
     part = read_manifest_file(release / "MANIFEST.json", "ask").parts[TITLE]
     fetch._claim(path.parent, TITLE, part)
     done = fetch.Source.of(str(release), 1)
-    from phibench.datasets.progress import progress_console
+    from phibench.datasets.common.progress import progress_console
 
     return fetch._archives(done, path.parent, TITLE, part, progress_console())
 

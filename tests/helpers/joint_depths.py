@@ -14,12 +14,12 @@ from pathlib import Path
 
 import numpy as np
 
+from phibench.datasets.exposures.pair_draws import FrameCounts
 from phibench.datasets.read import Dataset, Sample, open_dataset
-from phibench.estimator.draw_pairs import DrawnPairs, pairs_of
 from phibench.estimator.geometry.combine import combine
 from phibench.estimator.interface import Answer, Pair
-from phibench.estimator.limits.off_frame_bound import FrameCounts
 from phibench.estimator.methods.chain_fit import chain_fit
+from phibench.estimator.methods.draw_pairs import DrawnPairs, pairs_of
 from phibench.estimator.methods.locate import each_spot_twice
 from phibench.estimator.methods.raw_likelihood import joint_of, raw_maximum_likelihood
 from phibench.render.sensor.light import Region

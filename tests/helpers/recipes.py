@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from phibench.datasets.errors import RecipeError
+from phibench.datasets.common.errors import RecipeError
 from phibench.datasets.recipe.load import check_recipe
 
 SOUND: dict[str, Any] = {

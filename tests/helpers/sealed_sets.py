@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from phibench.benchmark.sealed.submission import unseal
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.store.checksums import checksums_text, read_checksums
 from phibench.datasets.store.files import sha256
 

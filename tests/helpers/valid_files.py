@@ -42,7 +42,7 @@ from phibench.calibration.rig.file import read_calibration, write_calibration
 from phibench.datasets.build import light_map_cache
 from phibench.datasets.build.bake_task import read_light_map
 from phibench.datasets.build.journal import Entry, FolderHead, Journal
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.frames.frame_files import read_index
 from phibench.datasets.frames.sensor_card import sensor_card
 from phibench.datasets.recipe.load import load_recipe

@@ -17,7 +17,7 @@ from helpers.recipes import changed, complaints
 from helpers.revolved_rigs import revolved
 from scipy.spatial.transform import Rotation
 
-from phibench.datasets.errors import RecipeError
+from phibench.datasets.common.errors import RecipeError
 from phibench.datasets.plan.plan import make_plan, shard_plan
 from phibench.datasets.read import open_finished
 from phibench.datasets.recipe import tables

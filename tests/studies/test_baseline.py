@@ -10,7 +10,7 @@ import polars as pl
 import pytest
 from rich.console import Console
 
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.read import open_dataset
 from phibench.estimator.geometry.paper_depth import load_published
 from phibench.estimator.geometry.triangulate import ESTIMATORS

@@ -12,7 +12,7 @@ import pytest
 from rich.console import Console
 from scipy.stats import norm
 
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.scenes.frames import Array
 from phibench.scenes.random_streams import generator
 from phibench.scenes.rig import Rig

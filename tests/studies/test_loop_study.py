@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.robot.loop.episodes import Episode
 from phibench.robot.loop.robot_pixels import Window
 from phibench.robot.loop.simulator import REACHED, WRONG, Setup

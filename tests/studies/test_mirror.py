@@ -10,7 +10,7 @@ import polars as pl
 import pytest
 from rich.console import Console
 
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.recipe.build import build_rig
 from phibench.datasets.recipe.tables import RigTable
 from phibench.estimator.geometry.mirror_image import image_of

@@ -13,7 +13,7 @@ import pytest
 from rich.console import Console
 from scipy.optimize import brentq
 
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.estimator.geometry.paper_depth import depth_paper
 from phibench.estimator.geometry.rig_parameters import PARAMETERS as CALIBRATION
 from phibench.render.optics.truth import spot_truth

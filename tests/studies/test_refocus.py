@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from phibench.calibration.rig.from_dataset import sigmas_of
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.estimator.geometry.paper_depth import load_published
 from phibench.estimator.geometry.rig_parameters import PARAMETERS, prior_sigmas
 from phibench.scenes.camera import Camera, refocused

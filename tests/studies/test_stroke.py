@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.estimator.geometry.rig_parameters import PARAMETERS, PRIOR_SIGMA, prior_sigmas
 from phibench.estimator.limits.best_stroke import LARGEST, BestStroke
 from phibench.estimator.limits.stroke_curve import CEILING, FREE, StrokeCurve

@@ -20,7 +20,7 @@ from PIL import Image
 from phibench.benchmark.export.export_make import ExportOutcome, export, verify_export
 from phibench.benchmark.export.pair_rows import ExportRequest, Form, pair_key, splits
 from phibench.cli.main import main
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.frames.request import FrameOptions
 from phibench.datasets.read import open_dataset
 

@@ -20,7 +20,7 @@ from phibench.benchmark.isolation.easy_pairs import EasyPairs
 from phibench.benchmark.isolation.pairs_ahead import PairsAhead
 from phibench.benchmark.pair_sets.dataset_pairs import dataset_pairs
 from phibench.benchmark.scores import score as scoring
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.read import open_finished
 from phibench.estimator.interface import Pair
 from phibench.estimator.pair_set import PairSet, PairTruth

@@ -17,14 +17,13 @@ from PIL import Image
 
 from phibench.benchmark.pair_sets.dataset_pairs import DatasetPairs, dataset_pairs, spot_bounds
 from phibench.benchmark.scores.worst_images import worst
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.exposures.expected import expected_of_light, expected_region
-from phibench.datasets.exposures.pair_draws import CachedSample
+from phibench.datasets.exposures.pair_draws import CachedSample, FrameCounts
 from phibench.datasets.frames.sensor_card import card_of
 from phibench.datasets.read import Dataset, open_dataset
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.estimator.interface import Pair
-from phibench.estimator.limits.off_frame_bound import FrameCounts
 from phibench.estimator.limits.position_bound import spot_limit
 from phibench.estimator.pair_set import PairTruth
 from phibench.estimator.spots.raw_pixels import noise_of

@@ -16,7 +16,7 @@ from phibench.benchmark.pair_sets.frames_set import FramesSet
 from phibench.benchmark.scored_dataset import ScoredDataset
 from phibench.benchmark.scores.score import score
 from phibench.cli.main import main
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.frames.request import FrameOptions
 from phibench.datasets.store.checksums import checksums_text
 from phibench.datasets.store.files import sha256

@@ -12,7 +12,7 @@ import pytest
 from helpers.bench_cases import cases
 
 from phibench.benchmark.pair_sets.truth_file import read_truth_file, truth_document, truth_text
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 
 TEXT = "0123456789abcdef" * 4
 Change = Callable[[dict[str, Any]], object]

@@ -23,7 +23,7 @@ from phibench.benchmark.release.benchmark import Archive
 from phibench.benchmark.release.fetch import Fetched, fetch, unpack
 from phibench.benchmark.release.release_source import SOURCE
 from phibench.benchmark.sealed.sealed_set import read_seal
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.film.film_store import verify as film_faults
 from phibench.datasets.store.checksums import damaged
 

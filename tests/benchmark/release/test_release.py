@@ -18,7 +18,7 @@ from phibench.benchmark.release.release_make import ReleaseRequest, _card, dry_r
 from phibench.benchmark.release.release_source import SOURCE
 from phibench.benchmark.sealed.sealed_set import seal
 from phibench.cli.main import main
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.plan.plan import make_plan
 from phibench.datasets.recipe.load import parse_recipe, recipe_text, with_numbers
 from phibench.datasets.store.checksums import damaged, differing_files, read_checksums

@@ -14,7 +14,7 @@ from phibench.benchmark.scores.document import MethodCard, read_score, write_sco
 from phibench.benchmark.scores.metrics import METRICS
 from phibench.benchmark.scores.records import records
 from phibench.benchmark.scores.score import score_outcomes
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.estimator.interface import Outcome
 
 RULES = Rules(resamples=999)

@@ -13,7 +13,7 @@ from scipy.linalg import cholesky, solve_triangular
 
 from phibench.benchmark.scores.answer_errors import MATCH_PX, Rules, kept, phi_of
 from phibench.benchmark.scores.records import COLUMNS, COUNTED, record_table, records, with_missed
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.estimator.geometry.phi import CONVENTIONS, outline_circle
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.estimator.interface import Answer, Outcome, Spot

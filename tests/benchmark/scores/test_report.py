@@ -29,7 +29,7 @@ from phibench.benchmark.scores.report import Section, report_html, time_section,
 from phibench.benchmark.scores.results_page import read_parts
 from phibench.benchmark.scores.score import score_outcomes
 from phibench.cli import main as cli
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.estimator.interface import Answer, Spot
 
 RULES = Rules(resamples=199)

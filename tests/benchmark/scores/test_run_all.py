@@ -22,7 +22,7 @@ from phibench.benchmark.scores import score as scoring
 from phibench.benchmark.scores.document import read_score
 from phibench.benchmark.scores.score import bench, score
 from phibench.cli import main as cli
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.read import open_finished
 from phibench.estimator.methods import locate
 from phibench.estimator.methods.locate import SharedPair

@@ -11,7 +11,7 @@ from PIL import Image
 import phibench
 from phibench.benchmark.export.export_make import export
 from phibench.benchmark.export.pair_rows import ExportRequest, pair_key
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.exposures.draw import draw_frames
 from phibench.datasets.frames.frame_files import read_index
 from phibench.datasets.frames.request import FrameOptions
@@ -92,9 +92,9 @@ def test_a_pair_is_found_by_what_a_score_says_of_it(bench_dataset: Path) -> None
     pairs = phibench.open_dataset(bench_dataset).pairs()
     truth = pairs.truth(2)
     assert pairs.number_of(truth.sample_id, truth.draw, truth.preset) == 2
-    with pytest.raises(phibench.datasets.errors.DatasetError, match="there is no such pair"):
+    with pytest.raises(phibench.datasets.common.errors.DatasetError, match="there is no such pair"):
         pairs.number_of("nothing")
-    with pytest.raises(phibench.datasets.errors.DatasetError, match="give one"):
+    with pytest.raises(phibench.datasets.common.errors.DatasetError, match="give one"):
         pairs.number_of(truth.sample_id)
 
 

@@ -18,7 +18,7 @@ from phibench.benchmark.scores.document import MethodCard, ScoreDocument, read_r
 from phibench.benchmark.scores.score import isolated, saved, score, score_outcomes
 from phibench.benchmark.sealed.score_check import check_score, schema_text
 from phibench.cli import main as cli
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.read import open_finished
 from phibench.datasets.store.files import sha256
 from phibench.estimator.interface import Answer, Outcome, Spot

@@ -32,7 +32,7 @@ from phibench.benchmark.sealed.sealed_set import (
 )
 from phibench.benchmark.sealed.submission import SealedPairs, submit
 from phibench.cli import main as cli
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.read import open_dataset
 from phibench.datasets.recipe.load import load_recipe
 from phibench.datasets.recipe.tables import Recipe

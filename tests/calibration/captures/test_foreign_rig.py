@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 from phibench.calibration.captures.rig_file import read_rig_file
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 
 K = np.array([[1432.5, 0.0, 640.25], [0.0, 1431.75, 355.5], [0.0, 0.0, 1.0]])
 D = np.array([-0.026, 1.06, 0.001, -0.002, -3.4])

@@ -20,7 +20,7 @@ from phibench.calibration.outline.outline_result import Outline
 from phibench.calibration.rig.bundle import apparent_vertical
 from phibench.calibration.rig.file import read_calibration
 from phibench.cli.main import main
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.read import Sample, open_dataset
 from phibench.estimator.geometry.rig_parameters import PARAMETERS
 from phibench.estimator.spots.image_planes import ImageError

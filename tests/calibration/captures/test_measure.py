@@ -17,7 +17,7 @@ from phibench.calibration.captures.pair_photos import PairPhotos, PositionPhotos
 from phibench.calibration.captures.picture_files import read_photo
 from phibench.calibration.outline.outline_result import Outline
 from phibench.cli.main import main
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.read import Sample, open_dataset
 from phibench.estimator.spots.image_planes import ImageError
 from phibench.scenes.rig import Rig

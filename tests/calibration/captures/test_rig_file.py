@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from phibench.calibration.captures.rig_file import read_rig_file
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.recipe.build import build_rig
 from phibench.datasets.recipe.tables import RigTable
 from phibench.scenes.laser import Beam

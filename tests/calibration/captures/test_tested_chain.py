@@ -15,7 +15,7 @@ from phibench.calibration.captures.measure import Measurement, measure, read_set
 from phibench.calibration.captures.pair_photos import PairPhotos, PositionPhotos
 from phibench.calibration.captures.picture_files import read_photo
 from phibench.calibration.captures.tested_chain import PATTERNS, comb_quality, interpolation, jpeg_behind
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.frames.sensor_card import sensor_card
 from phibench.datasets.read import Sample, open_dataset
 from phibench.estimator.spots.image_planes import ImageError

@@ -12,7 +12,7 @@ from PIL import Image
 
 from phibench.calibration.outline.mirror_ball import BallPhoto, find_ball, unwrap
 from phibench.cli.main import main
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.recipe.room_tables import PanoramaTable
 from phibench.datasets.rooms.panorama_files import read_panorama
 from phibench.datasets.rooms.panorama_room import panorama_room

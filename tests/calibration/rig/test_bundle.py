@@ -16,7 +16,7 @@ from phibench.calibration.outline.outline_result import Outline, mean_outline
 from phibench.calibration.rig.bundle import Bundle, KnownSpot, calibrate, seen_at
 from phibench.calibration.rig.file import CalibrationError, read_calibration, write_calibration
 from phibench.cli import main as cli
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.estimator.geometry.rig_parameters import PARAMETERS, changed, has_effect, prior_sigmas, stroke_of
 from phibench.scenes.rig import Rig
 

@@ -12,7 +12,7 @@ import pytest
 from helpers.valid_files import LIGHT, npy_members, npz, reshaped
 
 from phibench.datasets.build.bake_task import read_light_map
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.store import schema
 from phibench.render.room.light_map import encoded
 

@@ -11,7 +11,7 @@ from phibench.datasets.build.finished_work import lost_work
 from phibench.datasets.build.journal import Journal
 from phibench.datasets.build.task_list import plan_tasks
 from phibench.datasets.build.workers import versions
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.make import make
 from phibench.datasets.merge_repair import repair
 from phibench.datasets.plan.plan import make_plan

@@ -16,7 +16,7 @@ from helpers.processes import within
 
 from phibench.cli.main import main
 from phibench.datasets.build import light_map_cache as cache
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.render.room.light_map import BakeSettings, LightMap, texel_count
 from phibench.scenes.catalog import default_rig
 from phibench.scenes.room import Room, Sun

@@ -13,7 +13,7 @@ from helpers.processes import quiet
 from phibench.datasets.build.journal import NO_HEAD, Entry, Journal
 from phibench.datasets.build.parts import Brought, bring_all
 from phibench.datasets.build.tasks import BuildTask, Made, task_key
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.film.moving_camera import bake_rooms, open_baked_rooms
 from phibench.datasets.store import schema
 from phibench.datasets.store.filling import filling, signed, write_documents

@@ -15,7 +15,7 @@ from helpers.refusing_workers import REFUSED
 from phibench.cli.main import main
 from phibench.datasets.build import spot_task, tasks, workers
 from phibench.datasets.build.journal import Journal
-from phibench.datasets.errors import DatasetError, IncompleteError, RecipeError
+from phibench.datasets.common.errors import DatasetError, IncompleteError, RecipeError
 from phibench.datasets.make import dry_run, make
 from phibench.datasets.plan import sampling
 from phibench.datasets.plan.plan import make_plan, shard_plan

@@ -15,7 +15,7 @@ from helpers.processes import SMALLEST, left_of, quiet, said
 
 from phibench.datasets.build.journal import Entry, FolderHead, Journal
 from phibench.datasets.build.run_tasks import claimed
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.make import make
 from phibench.datasets.read import open_finished
 from phibench.datasets.store import schema
@@ -192,7 +192,7 @@ def test_a_key_covers_the_code_behind_a_task_and_no_other() -> None:
     assert {"phibench.render.room.ambient", "phibench.scenes.camera", "phibench.datasets.store.layers"} <= view
     assert "phibench.render.optics.certificate" in spot - view
     assert "phibench.render.room.ambient" in view - spot
-    assert not {"phibench.datasets.make", "phibench.datasets.progress", "phibench.datasets.build.workers"} & (
+    assert not {"phibench.datasets.make", "phibench.datasets.common.progress", "phibench.datasets.build.workers"} & (
         view | spot
     )
     # the sensor's numbers, which the noise budget takes from a table beside the code

@@ -14,7 +14,7 @@ from helpers.inline_workers import InlineWorkerPool
 from helpers.processes import SMALLEST, quiet
 
 from phibench.datasets.build.journal import Journal
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.make import make
 from phibench.datasets.merge_repair import merge
 from phibench.datasets.plan import sampling

@@ -13,7 +13,7 @@ from helpers.processes import SMALLEST, quiet
 from phibench.datasets import make
 from phibench.datasets.build import sample_task
 from phibench.datasets.build.journal import FolderHead, Journal
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.plan.plan import make_plan
 from phibench.datasets.recipe.load import load_recipe
 from phibench.datasets.store import files, filling, schema

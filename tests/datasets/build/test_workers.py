@@ -23,7 +23,7 @@ from phibench.datasets.build import workers
 from phibench.datasets.build.parts import schedule
 from phibench.datasets.build.tasks import BuildTask, Done, Failed, Made
 from phibench.datasets.build.workers import _checked, describe, local_environment, local_workers
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.make import make
 from phibench.datasets.store import schema
 

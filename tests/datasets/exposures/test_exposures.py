@@ -17,7 +17,7 @@ from scipy import stats
 
 from phibench.datasets.build.journal import Journal
 from phibench.datasets.build.task_list import plan_tasks
-from phibench.datasets.errors import DatasetError, RecipeError
+from phibench.datasets.common.errors import DatasetError, RecipeError
 from phibench.datasets.exposures import pair_draws as module
 from phibench.datasets.exposures.pair_draws import BOX_MARGIN_PX, CachedSample, PairDraw, pair_draws
 from phibench.datasets.frames.sensor_file import SensorFile

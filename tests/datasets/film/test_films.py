@@ -11,7 +11,7 @@ import polars
 import pytest
 from conftest import ROOT
 
-from phibench.datasets.errors import DatasetError, RecipeError
+from phibench.datasets.common.errors import DatasetError, RecipeError
 from phibench.datasets.film import film_room, film_task
 from phibench.datasets.film.film_forecast import dry_run, films_forecast
 from phibench.datasets.film.film_make import make_films

@@ -14,7 +14,7 @@ import pytest
 from PIL import Image
 
 from phibench.cli import main as cli
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.exposures.draw import Drawn, draw_frames
 from phibench.datasets.frames.frame_files import (
     INDEX,

@@ -16,7 +16,7 @@ import pytest
 from PIL import Image
 from scipy import stats
 
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.frames.request import FrameOptions, jpeg_tables
 from phibench.datasets.frames.source import FrameSource
 from phibench.datasets.read import Dataset, Sample, open_dataset

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from phibench.cli.main import main
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.exposures.pair_draws import pair_draws
 from phibench.datasets.frames.sensor_card import sensor_card
 from phibench.datasets.frames.sensor_file import (

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from phibench.datasets.errors import RecipeError
+from phibench.datasets.common.errors import RecipeError
 from phibench.datasets.plan import sampling
 from phibench.datasets.plan.plan import PairPlan, Plan, make_plan
 from phibench.datasets.plan.sampling import HIDDEN, SHOWN

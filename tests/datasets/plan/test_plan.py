@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from phibench.datasets.build.spot_task import answer_spot
-from phibench.datasets.errors import RecipeError
+from phibench.datasets.common.errors import RecipeError
 from phibench.datasets.plan.plan import make_plan, pose_name
 from phibench.datasets.recipe.load import check_recipe, load_recipe
 from phibench.datasets.rooms.room_sources import room_of

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from helpers.room_files import MESH, PANORAMA, recipe, write_files
 
-from phibench.datasets.errors import RecipeError
+from phibench.datasets.common.errors import RecipeError
 from phibench.datasets.plan.plan import Plan, make_plan
 from phibench.datasets.plan.room_draws import draw_rooms
 from phibench.datasets.recipe.load import check_recipe

@@ -12,7 +12,7 @@ from helpers.recipes import target
 from scipy import stats
 
 from phibench.datasets.build.task_list import plan_tasks
-from phibench.datasets.errors import RecipeError
+from phibench.datasets.common.errors import RecipeError
 from phibench.datasets.plan.plan import Plan, make_plan
 from phibench.datasets.plan.sampling import PARAMETERS, drawn_parameters, first_points
 from phibench.datasets.recipe.checks import warnings

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from phibench.datasets.errors import RecipeError
+from phibench.datasets.common.errors import RecipeError
 from phibench.datasets.plan.plan import RECIPE_RIG, make_plan, shard_plan
 from phibench.datasets.recipe.build import build_misalignment
 from phibench.datasets.recipe.load import RECIPES, check_recipe, load_recipe

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from phibench.datasets.errors import RecipeError
+from phibench.datasets.common.errors import RecipeError
 from phibench.datasets.plan.plan import make_plan
 from phibench.datasets.plan.room_draws import draw_rooms
 from phibench.datasets.recipe.load import check_recipe, load_recipe

@@ -7,7 +7,7 @@ import pytest
 from helpers.room_files import recipe
 
 from phibench.calibration.captures.rig_file import read_rig_file
-from phibench.datasets.errors import DatasetError, RecipeError
+from phibench.datasets.common.errors import DatasetError, RecipeError
 from phibench.datasets.recipe.build import HOLDER_KINDS
 from phibench.datasets.recipe.load import check_recipe, load_recipe
 from phibench.datasets.recipe.mirror_tables import HolderTable

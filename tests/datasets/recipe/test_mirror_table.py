@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from helpers.room_files import recipe
 
-from phibench.datasets.errors import RecipeError
+from phibench.datasets.common.errors import RecipeError
 from phibench.datasets.recipe.build import MIRROR_SHAPES, build_rig
 from phibench.datasets.recipe.load import check_recipe
 from phibench.datasets.recipe.mirror_tables import MirrorTable

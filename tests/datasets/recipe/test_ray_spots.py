@@ -11,7 +11,7 @@ import pytest
 from helpers.drawn_values import RAY, drawing
 
 from phibench.datasets.build.spot_task import answer_spot, manifest_row
-from phibench.datasets.errors import RecipeError
+from phibench.datasets.common.errors import RecipeError
 from phibench.datasets.plan.plan import make_plan
 from phibench.datasets.read import Dataset, Sample
 from phibench.datasets.recipe.load import check_recipe

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 from helpers.room_files import BOX, MESH, PANORAMA, recipe, write_files
 
-from phibench.datasets.errors import RecipeError
+from phibench.datasets.common.errors import RecipeError
 from phibench.datasets.recipe.load import check_recipe, load_recipe
 from phibench.datasets.rooms import room_files
 from phibench.datasets.rooms.room_files import RoomFiles

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from helpers.room_files import BOX, write_files
 
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.rooms.mesh_files import read_mesh
 from phibench.datasets.rooms.mesh_placement import MeshLamp, MeshSettings
 from phibench.datasets.rooms.panorama_settings import PanoramaSettings

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from phibench.datasets.build.spot_task import make_spot
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.plan.plan import make_plan
 from phibench.datasets.recipe.load import load_recipe
 from phibench.datasets.store.documents import differences, from_json, read_manifest, to_json, to_table, write_manifest

@@ -18,7 +18,7 @@ from rich.console import Console
 
 import phibench
 from phibench.cli.main import main
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.read import open_finished
 from phibench.datasets.store import schema
 from phibench.datasets.store.checksums import strays
@@ -117,7 +117,7 @@ TABLES: dict[str, tuple[Callable[[pl.DataFrame], pl.DataFrame], str]] = {
 def test_a_strange_table_is_refused_though_signed(
     tmp_path: Path, change: Callable[[pl.DataFrame], pl.DataFrame], words: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("phibench.datasets.input_files.TABLE_VALUES", 100)
+    monkeypatch.setattr("phibench.datasets.common.input_files.TABLE_VALUES", 100)
     (tmp_path / schema.CHECKSUMS).write_bytes(b"")
     path = tmp_path / schema.SENSITIVITIES
     path.write_bytes(sensitivity_bytes(sensitivity_table(), tmp_path))

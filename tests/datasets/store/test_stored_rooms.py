@@ -12,7 +12,7 @@ from helpers.damage import sign
 from helpers.inline_workers import InlineWorkerPool
 from helpers.processes import SMALLEST, quiet
 
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.make import make_from_plan
 from phibench.datasets.plan.plan import POSITIONS, Plan, make_plan, pose_of
 from phibench.datasets.plan.room_draws import draw_rooms

@@ -12,7 +12,7 @@ from helpers.revolved_rigs import revolved
 from PIL import Image
 
 from phibench.cli.main import main
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.read import open_dataset
 from phibench.estimator.geometry.panorama import (
     PanoramaGrid,

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from phibench.benchmark.isolation.easy_pairs import EasyPairs
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.frames.sensor_card import sensor_card
 from phibench.estimator.learned import crop_training, frame_training, networks
 from phibench.estimator.learned.crop_training import Answers, TrainingSettings, scale_of

@@ -11,7 +11,7 @@ import pytest
 from scipy.optimize import minimize_scalar
 from scipy.special import erf
 
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.frames.sensor_card import sensor_card
 from phibench.estimator.geometry.least_squares_depth import depth_general
 from phibench.estimator.geometry.mirror_image import blocked, first_blocker, image_of

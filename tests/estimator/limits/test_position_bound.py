@@ -10,7 +10,7 @@ import pytest
 from helpers.sensor_light import spot_at
 from scipy import integrate, stats
 
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.exposures.expected import ExpectedRegion, expected_of_light, expected_region
 from phibench.datasets.frames.sensor_card import card_of, sensor_card
 from phibench.estimator.geometry.status import Status

@@ -11,9 +11,9 @@ from helpers.bench_samples import with_tables
 from helpers.faint_spots import faint_spots
 
 from phibench.datasets.read import open_dataset
-from phibench.estimator.draw_pairs import pairs_of
 from phibench.estimator.interface import Answer
 from phibench.estimator.methods import raw_likelihood
+from phibench.estimator.methods.draw_pairs import pairs_of
 from phibench.estimator.methods.likelihood_maps import SpotLikelihood, claimed_px2
 from phibench.estimator.methods.raw_likelihood import with_posteriors
 from phibench.estimator.methods.registry import METHODS

@@ -9,7 +9,7 @@ from helpers.stroke_film import DEPTH_M, ENCODER_M, FRAMES, NOISE_PX, POINT, SCE
 from scipy import stats
 from scipy.special import ndtr
 
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.frames.sensor_card import card_of
 from phibench.datasets.store.layers import SpotWindow
 from phibench.estimator.geometry.mirror_image import image_of

@@ -15,7 +15,7 @@ from helpers.target_films import CODE, Outcome, RenderedRoom, StagedFilm, render
 from matplotlib.figure import Figure
 from scipy import stats
 
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.film.film_read import open_films
 from phibench.datasets.frames.sensor_card import card_of
 from phibench.estimator.interface import Box

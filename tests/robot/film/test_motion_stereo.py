@@ -7,7 +7,7 @@ import pytest
 from helpers.stroke_film import NOISE_PX, POINT, SCENE
 from scipy import stats
 
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.estimator.geometry.rig_parameters import PARAMETERS
 from phibench.render.film.moving_rows import chief_uv_px
 from phibench.robot.film.driving_depth import RobotWay, driving_depth

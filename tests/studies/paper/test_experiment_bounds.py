@@ -9,7 +9,7 @@ from pathlib import Path
 import polars as pl
 import pytest
 
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.frames.sensor_card import SensorCard, sensor_card
 from phibench.datasets.read import open_finished
 from phibench.estimator.limits.processed_bound import spot_sigma

@@ -10,7 +10,7 @@ import pytest
 from rich.console import Console
 
 from phibench.benchmark.scores.score_tables import show_grid
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.scenes.random_streams import generator
 from phibench.studies.paper.experiment_bounds import budget, budget_table, budgets
 from phibench.studies.paper.experiment_tables import COLUMNS, WITHIN

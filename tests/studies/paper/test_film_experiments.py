@@ -9,7 +9,7 @@ import pytest
 from scipy import stats
 
 from phibench.calibration.rig.bundle import Bundle
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.film.film_read import Film, open_films
 from phibench.datasets.read import open_finished
 from phibench.estimator.geometry.rig_parameters import PARAMETERS

@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from phibench.cli import main as cli
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 from phibench.estimator.limits.best_stroke import LARGEST, BestStroke
 from phibench.estimator.limits.stroke_curve import CEILING, FREE, NO_BOUND, TOO_FAINT, StrokeCurve, stroke_grid
 from phibench.studies.paper.stroke_chart import (

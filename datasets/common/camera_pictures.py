@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from phibench.datasets.input_files import PICTURE_PIXELS, InputFile
+from phibench.datasets.common.input_files import PICTURE_PIXELS, InputFile
 from phibench.scenes.validation import printable_line
 
 _JPEG = ("JPEG", "MPO")  # Pillow calls a JPEG with previews after it MPO

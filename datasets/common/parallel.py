@@ -18,7 +18,7 @@ from multiprocessing import get_context, parent_process
 from threading import Thread
 from typing import TypeVar
 
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")

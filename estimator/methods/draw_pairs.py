@@ -13,13 +13,12 @@ from typing import Any
 
 import numpy as np
 
-from phibench.datasets.errors import DatasetError
-from phibench.datasets.exposures.pair_draws import CachedSample, PairDraw, pair_draws
+from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.exposures.pair_draws import CachedSample, FrameCounts, PairDraw, pair_draws
 from phibench.datasets.frames.sensor_card import SensorCard, card_of
 from phibench.datasets.frames.source import Frame, Frames, FrameSource
 from phibench.datasets.read import Dataset, Sample
 from phibench.estimator.interface import Box, Image, Pair
-from phibench.estimator.limits.off_frame_bound import FrameCounts
 
 
 class DrawnPairs:
