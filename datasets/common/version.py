@@ -40,7 +40,7 @@ def checkout_state() -> str:
 
 def _root() -> Path:
     """Root of the checkout; for an installed package the package's folder, which has none of the root's files."""
-    return Path(__file__).resolve().parents[1]
+    return Path(__file__).resolve().parents[2]
 
 
 def _git(*arguments: str) -> str:
