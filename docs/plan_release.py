@@ -120,7 +120,7 @@ LAYOUTS = (
 
 
 def main() -> None:
-    """Print the tables of docs/release.md."""
+    """Print the tables of docs/measurements/releases.md."""
     size_gb = PAIRS * MB_A_PAIR / 1e3
     month, copy = size_gb * DOLLARS_A_GB_MONTH, size_gb * DOLLARS_A_GB_OUT
     print(f"{size_gb / 1e3:.1f} TB, {month:.0f} $ a month, {copy:.0f} $ a copy")

@@ -77,7 +77,7 @@ class Data:
 FOUR = ((1.2, 0.3), (2.0, 1.9), (3.0, 3.4), (4.0, 5.0))
 """Distances and azimuths of the calibration's spots."""
 FINE, FRAMES = (2e-6, 2e-6, 1e-5), (4e-6, 4.3e-6, 17.5e-6)
-"""Sigma of an outline: nearly ideal, and of MJPEG frames as measured in docs/calibration.md."""
+"""Sigma of an outline: nearly ideal, and of MJPEG frames as measured in docs/measurements/calibration.md."""
 DATA = {
     "outline": Data(FINE, drawn=False),
     "spots, closure": Data(FINE, 1e-3, (1e-4, math.inf, math.inf), drawn=False),
@@ -114,7 +114,7 @@ def test_accuracy_of_depth_with_drawn_misalignments() -> None:
 
 @pytest.mark.study
 def test_accuracy_of_depth_over_200_rigs() -> None:
-    """The table of docs/calibration.md, 95 % intervals by bootstrap over rigs.
+    """The table of docs/measurements/calibration.md, 95 % intervals by bootstrap over rigs.
 
     Error-free data give a closure of the fit; errors of the stated sigmas make it two to three times as large. The
     relative scatter of an rms over 200 rigs is about 1 / sqrt(2 x 200) = 5 %, with long tails twice that.

@@ -1,4 +1,4 @@
-"""Figures of docs/mirrors.md on concave mirrors, which are refused: rays in the meridian of a lens on the axis.
+"""Figures of docs/mirror_optics.md on concave mirrors, which are refused: rays in the meridian of a lens on the axis.
 
 The lens is z_c before the vertex. At the radius r the profile has the slope t and lies d behind the vertex's plane, or
 d before it if it is concave. With a = atan(r / (z_c +- d)) a ray leaves at 2 atan(t) + a from straight down, outwards,

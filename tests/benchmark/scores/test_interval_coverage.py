@@ -1,4 +1,4 @@
-"""How often intervals cover, and how often two equal methods are told apart: the figures of docs/scoring.md.
+"""How often intervals cover, and how often equal methods are told apart: figures of docs/measurements/scores.md.
 
 `pytest -s tests/benchmark/scores/test_interval_coverage.py` prints them, with fewer trials than the page.
 """

@@ -43,8 +43,8 @@ def found(u_px: float = 1.0) -> Spot:
 @pytest.mark.parametrize("preset", ["mjpeg", "bayer-raw", "srgb8", "mono-raw"])
 def test_frames_of_every_preset_calibrate(smoke: Dataset, tmp_path: Path, preset: str) -> None:
     """The nominal rig is the true one: corrections stay within 5 posterior sigmas, which 13 normal numbers leave in
-    1e-5 of the cases. MJPEG outlines understate their sigma across the axis by up to 2 (docs/calibration.md), which
-    the bound of 5 allows for.
+    1e-5 of the cases. MJPEG outlines understate their sigma across the axis by up to 2, which the bound of 5 allows for
+    (docs/measurements/calibration.md).
     """
     ids = [row.sample_id for row in smoke.rows]
     out = tmp_path / "c.json"
