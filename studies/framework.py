@@ -11,11 +11,9 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
-import matplotlib as mpl
 import polars as pl
-from matplotlib.figure import Figure
 from pydantic import BaseModel, ConfigDict
 from rich.console import Console
 
@@ -27,6 +25,9 @@ from phibench.datasets.read import Dataset, open_finished
 from phibench.datasets.recipe.load import find_recipe
 from phibench.scenes.validation import structural_faults
 from phibench.studies.findings import Finding, Row
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True)
@@ -114,8 +115,8 @@ class Drawing:
 @contextmanager
 def canvas(width_in: float = 9.0, height_in: float = 4.0) -> Iterator[Figure]:
     """A figure in the style of all studies; draw and call `drawn` inside of the block."""
-    with mpl.rc_context(figures.STYLE):
-        yield Figure(figsize=(width_in, height_in), layout="constrained", dpi=130)
+    with figures.styled(figures.STYLE, (width_in, height_in), layout="constrained", dpi=130) as figure:
+        yield figure
 
 
 def drawn(name: str, figure: Figure, alt: str, kind: str = "svg") -> Drawing:

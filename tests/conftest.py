@@ -1,10 +1,11 @@
 """What several test files share."""
 
+import gc
 import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -37,6 +38,17 @@ def pytest_cmdline_main(config: pytest.Config) -> None:
     given = getattr(option, "numprocesses", 0) is not None or option.capture == "no" or option.usepdb
     if option.keyword == PROOFS and not given and "PYTEST_XDIST_WORKER" not in os.environ:
         option.numprocesses, option.dist = min(2, os.cpu_count() or 1), "worksteal"
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Generator[None, object, object]:
+    """Collect tests without looking for garbage, and never look at modules and tests again: they all stay."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.freeze()
+        gc.enable()
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:

@@ -13,7 +13,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import matplotlib
 import pytest
 import yaml
 
@@ -76,6 +75,7 @@ def fonts() -> dict[str, str]:
 
 def test_a_mathematics_font_travels_with_the_site() -> None:
     """Every letter of the formulas is in it, also in italics: browsers draw a letter x as U+1D465, and h as U+210E."""
+    import matplotlib
     from fontTools.ttLib import TTFont
 
     convert = pytest.importorskip("latex2mathml.converter").convert

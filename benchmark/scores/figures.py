@@ -10,22 +10,23 @@ from __future__ import annotations
 import base64
 import io
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import matplotlib as mpl
 import numpy as np
 import polars as pl
-from matplotlib.axes import Axes
-from matplotlib.colors import LogNorm
-from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
-from scipy.stats import norm
+import scipy
 
 from phibench.benchmark.scores.document import ScoreDocument, StratumScore, Value
 from phibench.benchmark.scores.metrics import METRICS
 from phibench.scenes.frames import Array
+
+if TYPE_CHECKING:  # Matplotlib takes half a second, and most commands that import this file draw nothing
+    from matplotlib.axes import Axes
+    from matplotlib.colors import LogNorm
+    from matplotlib.figure import Figure
 
 # M. Okabe, K. Ito: told apart with every kind of colour vision; markers, lines and hatches repeat the distinction
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#7f7f7f")
@@ -54,6 +55,16 @@ class EmbeddedFigure:
 def line_style(i: int) -> dict[str, Any]:
     """Colour, line and marker of the i-th curve."""
     return {"color": COLOURS[i % len(COLOURS)], "linestyle": LINES[i % len(LINES)], "marker": MARKERS[i % len(MARKERS)]}
+
+
+@contextmanager
+def styled(style: Any, size_in: tuple[float, float], **options: Any) -> Iterator[Figure]:
+    """An empty figure; the style holds inside of the block."""
+    import matplotlib as mpl
+    from matplotlib.figure import Figure
+
+    with mpl.rc_context(style):
+        yield Figure(figsize=size_in, **options)
 
 
 def encoded(figure: Figure, kind: str, transparent: bool = False) -> bytes:
@@ -98,8 +109,8 @@ def error_panels(scores: Named) -> list[EmbeddedFigure]:
         for stratum, below in _COLUMNS:
             if not any(_points(score, stratum, metric) for score in scores.values()):
                 continue  # nothing found, or nothing off
-            with mpl.rc_context(_PANEL):
-                figure, axes = _panel()
+            with styled(_PANEL, _SIZE, layout="constrained") as figure:
+                axes = figure.subplots()
                 _curves(axes, scores, stratum, metric, factor)
                 if bound is not None:
                     _bound(axes, scores, stratum, bound, factor)
@@ -124,8 +135,7 @@ def error_maps(tables: Tables) -> dict[str, EmbeddedFigure]:
         return maps
     scale = _scale(tables)
     for name, table in tables.items():
-        with mpl.rc_context(_PANEL):
-            figure = Figure(figsize=_SIZE, layout="constrained", dpi=150)
+        with styled(_PANEL, _SIZE, layout="constrained", dpi=150) as figure:
             axes = figure.subplots()
             marks = _map(axes, table, scale)
             bar = figure.colorbar(marks, ax=axes, label="distance / px", orientation="horizontal", shrink=0.8)
@@ -144,8 +154,8 @@ def radius_panels(tables: Tables) -> list[EmbeddedFigure]:
     panels: list[EmbeddedFigure] = []
     tables = _placed(tables)
     for column, label in (("radial_px", "radial"), ("tangential_px", "tangential")) if tables else ():
-        with mpl.rc_context(_PANEL):
-            figure, axes = _panel()
+        with styled(_PANEL, _SIZE, layout="constrained") as figure:
+            axes = figure.subplots()
             for i, (name, table) in enumerate(tables.items()):
                 radius, rms = _binned(table, column)
                 axes.plot(radius, rms, label=name, **line_style(i))
@@ -164,9 +174,8 @@ def radius_panels(tables: Tables) -> list[EmbeddedFigure]:
 def cause_bars(scores: Named) -> EmbeddedFigure:
     """Images without a right position by cause, one bar per method."""
     causes = [c for c in next(iter(scores.values())).causes if any(sum(s.causes[c].values()) for s in scores.values())]
-    with mpl.rc_context(_PANEL):
-        height = 1.2 + 0.32 * len(scores) + 0.25 * math.ceil(len(causes) / 2)
-        figure = Figure(figsize=(1.4 * _SIZE[0], height), layout="constrained")
+    height = 1.2 + 0.32 * len(scores) + 0.25 * math.ceil(len(causes) / 2)
+    with styled(_PANEL, (1.4 * _SIZE[0], height), layout="constrained") as figure:
         axes = figure.subplots()
         start = np.zeros(len(scores))
         for i, cause in enumerate(causes):
@@ -189,16 +198,15 @@ def pull_histogram(tables: Tables) -> EmbeddedFigure | None:
     if not pulls:
         return None
     edges = np.linspace(-5.0, 5.0, 41)
-    with mpl.rc_context(_PANEL):
-        legend = 0.2 * math.ceil((len(pulls) + 1) / 2)  # inches below the axes, where it covers no curve
-        figure = Figure(figsize=(1.4 * _SIZE[0], 1.2 * _SIZE[1] + legend), layout="constrained")
+    legend = 0.2 * math.ceil((len(pulls) + 1) / 2)  # inches below the axes, where it covers no curve
+    with styled(_PANEL, (1.4 * _SIZE[0], 1.2 * _SIZE[1] + legend), layout="constrained") as figure:
         axes = figure.subplots()
         for i, (name, values) in enumerate(pulls.items()):
             density = np.histogram(np.clip(values, -5.0, 5.0), edges, density=True)[0]
             style = {key: value for key, value in line_style(i).items() if key != "marker"}
             axes.stairs(density, edges, label=f"{name} (n = {values.size})", **style)
         x = np.linspace(-5.0, 5.0, 201)
-        axes.plot(x, norm.pdf(x), color="black", linewidth=2.0, alpha=0.6, label="normal, deviation 1")
+        axes.plot(x, scipy.stats.norm.pdf(x), color="black", linewidth=2.0, alpha=0.6, label="normal, deviation 1")
         axes.set(xlabel="whitened error L⁻¹e; beyond ±5 in the outer bins", ylabel="density")
         figure.legend(loc="outside lower center", ncols=2, fontsize=8)
         shown = ", ".join(f"{name} {np.std(values):.2f}" for name, values in pulls.items())
@@ -259,6 +267,8 @@ def _strata(score: ScoreDocument, by: str) -> list[tuple[float, StratumScore]]:
 
 def _scale(tables: Tables) -> LogNorm:
     """One scale of distances for all maps, a hundredth of the largest at least."""
+    from matplotlib.colors import LogNorm
+
     largest = max(
         float(table.filter("detected")["distance_px"].to_numpy().max(initial=0.0)) for table in tables.values()
     )
@@ -301,6 +311,8 @@ def _pulls(table: pl.DataFrame) -> Array:
 
 def plain_ticks(axes: Axes, decades: float = 1e3) -> None:
     """Decimal numbers at 1, 2, 5 of a logarithmic axis, at the decades alone where it spans a ratio of `decades`."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
     for axis in (axes.xaxis, axes.yaxis):
         if axis.get_scale() == "log":
             low, high = sorted(axis.get_view_interval())
@@ -319,14 +331,8 @@ def plain_number(x: float) -> str:
     return text.rstrip("0").rstrip(".") if digits else text
 
 
-def _panel() -> tuple[Figure, Axes]:
-    figure = Figure(figsize=_SIZE, layout="constrained")
-    return figure, figure.subplots()
-
-
 def _key(i: int) -> EmbeddedFigure:
-    with mpl.rc_context(_PANEL):
-        figure = Figure(figsize=(0.5, 0.2))
+    with styled(_PANEL, (0.5, 0.2)) as figure:
         axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
         axes.plot([0.0, 0.5, 1.0], [0.0, 0.0, 0.0], markevery=[1], **line_style(i))
         axes.set(xlim=(-0.05, 1.05), ylim=(-1.0, 1.0))

@@ -27,8 +27,8 @@ from fractions import Fraction
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.stats import beta, bootstrap, t
 
 from phibench.benchmark.scores.answer_errors import Rules
 from phibench.scenes.frames import Array
@@ -213,7 +213,7 @@ def _bootstrap(statistics: Sequence[Statistic], n: int, rules: Rules, rng: np.ra
 
     with warnings.catch_warnings(), np.errstate(all="ignore"):
         warnings.simplefilter("ignore")  # degenerate statistics come back NaN and are told apart below
-        return bootstrap(
+        return scipy.stats.bootstrap(
             (np.arange(n),),
             all_of,
             n_resamples=rules.resamples,
@@ -278,8 +278,8 @@ def rate(clusters: Clusters, hits: Array, rules: Rules) -> Estimate:
 def clopper_pearson(hits: float, n: float, confidence: float) -> tuple[float, float]:
     """Exact binomial interval; hits and n need not be whole."""
     tail, misses = (1.0 - confidence) / 2.0, n - hits
-    low = 0.0 if hits <= 0.0 else float(beta.ppf(tail, hits, misses + 1.0))
-    high = 1.0 if misses <= 0.0 else float(beta.ppf(1.0 - tail, hits + 1.0, misses))
+    low = 0.0 if hits <= 0.0 else float(scipy.stats.beta.ppf(tail, hits, misses + 1.0))
+    high = 1.0 if misses <= 0.0 else float(scipy.stats.beta.ppf(1.0 - tail, hits + 1.0, misses))
     return low, high
 
 
@@ -290,5 +290,5 @@ def _effective_number(found: Array, tried: Array, value: float) -> float:
     variance = m / (m - 1) * float(np.sum((found - value * tried) ** 2)) / images**2
     if variance == 0.0:
         return float(m)
-    reduction = (t.ppf(0.975, images - 1) / t.ppf(0.975, m - 1)) ** 2 if images > m else 1.0
+    reduction = (scipy.stats.t.ppf(0.975, images - 1) / scipy.stats.t.ppf(0.975, m - 1)) ** 2 if images > m else 1.0
     return min(value * (1.0 - value) / variance * float(reduction), images)

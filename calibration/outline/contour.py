@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
-from scipy.interpolate import CubicSpline
+import scipy
 
 from phibench.calibration.outline.outline_fit import OutlinePixels, Place
 from phibench.scenes.frames import Array, BoolArray, as_vector
@@ -55,8 +55,8 @@ class Contour:
     """
 
     middle_px: Array
-    radius_px: CubicSpline
-    by_place: CubicSpline
+    radius_px: scipy.interpolate.CubicSpline
+    by_place: scipy.interpolate.CubicSpline
     rim: BoolArray
     depth_m: float
     bend: float
@@ -202,9 +202,10 @@ def _turns(count: int) -> Array:
     return np.asarray(-np.pi + 2.0 * np.pi * np.arange(count) / count)
 
 
-def _closed(t: Array, values: Array) -> CubicSpline:
+def _closed(t: Array, values: Array) -> scipy.interpolate.CubicSpline:
     """Periodic spline through values at rising turns."""
-    return CubicSpline(np.append(t, t[0] + 2.0 * np.pi), np.concatenate([values, values[:1]]), bc_type="periodic")
+    turns, closed = np.append(t, t[0] + 2.0 * np.pi), np.concatenate([values, values[:1]])
+    return scipy.interpolate.CubicSpline(turns, closed, bc_type="periodic")
 
 
 def _radius_at(turn: Array, outline_px: Array, middle: Array) -> Array:

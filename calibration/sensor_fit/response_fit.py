@@ -24,8 +24,8 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
+import scipy
 from scipy.optimize import least_squares
-from scipy.stats import chi2
 
 from phibench.calibration.sensor_fit.block_sums import jackknife_sigma, rounding_variance
 from phibench.scenes.frames import Array
@@ -261,7 +261,7 @@ def _mean(sets: list[_Set], count: int, names: int, range_dn: float, reach_dn: f
         straight_sigma=jackknife_sigma(straight),
         straight_misfit=misfits[0],
         misfit=least,
-        refused=all(chi2.sf(one.chi2, n) < _CHANCE for one, n in zip(sets, freedom, strict=True)),
+        refused=all(scipy.stats.chi2.sf(one.chi2, n) < _CHANCE for one, n in zip(sets, freedom, strict=True)),
         bent=float(1.0 - weight[0]),
         reach_dn=reach_dn,
         levels=names,

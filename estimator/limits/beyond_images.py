@@ -26,8 +26,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import polars as pl
+import scipy
 from scipy.special import log_ndtr
-from scipy.stats import binom, chi2
 
 from phibench.scenes.frames import Array
 
@@ -177,10 +177,10 @@ def _tried(records: pl.DataFrame) -> Iterator[Excess]:
         yield from _by_thirds("positions", f"{name} images", part["possible_spot_chi2"].to_numpy(), size, 2)
         yield from _by_thirds("phi", f"{name} images", part["spot_phi_chi2"].to_numpy(), size, 1)
     both = pl.concat(images.values())
-    yield _of_exact("positions", both, "possible_spot_chi2", float(chi2.ppf(EXACT / 2.0, 2)))
-    yield _of_exact("phi", both, "spot_phi_chi2", float(chi2.ppf(EXACT / 2.0, 1)))
+    yield _of_exact("positions", both, "possible_spot_chi2", float(scipy.stats.chi2.ppf(EXACT / 2.0, 2)))
+    yield _of_exact("phi", both, "spot_phi_chi2", float(scipy.stats.chi2.ppf(EXACT / 2.0, 1)))
     deep = deep.with_columns(of_depth=pl.Series(depth))
-    yield _of_exact("D", deep, "of_depth", float(chi2.ppf(EXACT, 1)))
+    yield _of_exact("D", deep, "of_depth", float(scipy.stats.chi2.ppf(EXACT, 1)))
     yield _of_finding(records)
 
 
@@ -193,7 +193,7 @@ def _found_images(records: pl.DataFrame, name: str) -> pl.DataFrame:
 
 def _of_errors(quantity: str, part: str, values: Array, freedom: int) -> Excess:
     n, total = len(values), float(values.sum())
-    chance = min(1.0, TIMES * float(chi2.cdf(total, freedom * n))) if n else 1.0
+    chance = min(1.0, TIMES * float(scipy.stats.chi2.cdf(total, freedom * n))) if n else 1.0
     return Excess(quantity, part, float(np.sqrt(freedom * n / total)) if total > 0.0 else np.inf, n, chance)
 
 
@@ -209,7 +209,7 @@ def _of_exact(quantity: str, table: pl.DataFrame, column: str, least: float) -> 
     """Pairs of which an answer is exact; each image is allowed its part of `EXACT`."""
     pairs = table.group_by("number").agg(pl.col(column).min() < least)
     n, hits = len(pairs), int(pairs[column].sum())
-    chance = min(1.0, TIMES * float(binom.sf(hits - 1, n, EXACT))) if n else 1.0
+    chance = min(1.0, TIMES * float(scipy.stats.binom.sf(hits - 1, n, EXACT))) if n else 1.0
     return Excess("exact answers", f"{quantity}, all pairs", hits / (n * EXACT) if n else 0.0, n, chance)
 
 

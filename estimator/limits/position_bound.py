@@ -19,10 +19,9 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
-from scipy.interpolate import CubicSpline
 from scipy.special import log_ndtr, ndtr
-from scipy.stats import norm, poisson
 
 from phibench.datasets.exposures.expected import ExpectedRegion
 from phibench.datasets.frames.sensor_card import SensorCard
@@ -142,7 +141,7 @@ def _interpolated(mean: Array, r: float) -> Array:
     x = np.log(flat + r * r)
     nodes = np.linspace(x.min(), x.max(), _NODES)
     table = [_poisson_gauss(max(mu, 0.0), r) * (mu + r * r) for mu in np.exp(nodes) - r * r]
-    return np.asarray(CubicSpline(nodes, table)(x)).reshape(mean.shape)
+    return np.asarray(scipy.interpolate.CubicSpline(nodes, table)(x)).reshape(mean.shape)
 
 
 def _poisson_gauss(mu: float, r: float) -> float:
@@ -152,8 +151,9 @@ def _poisson_gauss(mu: float, r: float) -> float:
     """
     n = _counts(mu)
     x = np.arange(n[0] - _SIGMAS * r, n[-1] + _SIGMAS * r, r / 3.0)
-    density = norm.pdf(x[:, None], n, r)
-    p, slope = density @ poisson.pmf(n, mu), density @ (poisson.pmf(n - 1, mu) - poisson.pmf(n, mu))
+    density = scipy.stats.norm.pdf(x[:, None], n, r)
+    chance = scipy.stats.poisson.pmf
+    p, slope = density @ chance(n, mu), density @ (chance(n - 1, mu) - chance(n, mu))
     seen = p > 0.0
     return float(np.sum(slope[seen] ** 2 / p[seen]) * r / 3.0)
 
@@ -178,7 +178,7 @@ def quantised_information(mean_e: Array, card: SensorCard, pattern_known: bool =
 def _of_codes(mu: float, r: float, card: SensorCard) -> float:
     n = _counts(mu)
     charge, well = np.minimum(n, card.full_well_e), card.full_well_e
-    chance, slope = poisson.pmf(n, mu), poisson.pmf(n - 1, mu) - poisson.pmf(n, mu)
+    chance, slope = scipy.stats.poisson.pmf(n, mu), scipy.stats.poisson.pmf(n - 1, mu) - scipy.stats.poisson.pmf(n, mu)
     low, high = (card.black_level_dn + card.dn_per_e * x for x in (charge[0] - _SIGMAS * r, charge[-1] + _SIGMAS * r))
     edges = np.arange(np.floor(max(low, 0.0)), np.ceil(min(high, card.top_dn))) + 0.5  # between one code and the next
     if charge[0] >= well or edges.size == 0:

@@ -19,9 +19,8 @@ from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.interpolate import PchipInterpolator
-from scipy.stats import qmc
 
 from phibench.estimator.geometry.least_squares_depth import depth_general
 from phibench.estimator.geometry.mirror_image import MirrorImage, first_blocker, image_of
@@ -305,7 +304,7 @@ def _between(strokes_m: Array, known_m: Array, values: Array) -> Array:
     finite = np.isfinite(values)
     if finite.sum() < 2:  # nothing to interpolate between
         return np.where(np.isin(strokes_m, known_m[finite]), values[finite].sum(), np.nan)
-    smooth = PchipInterpolator(np.log(known_m[finite]), values[finite], extrapolate=False)
+    smooth = scipy.interpolate.PchipInterpolator(np.log(known_m[finite]), values[finite], extrapolate=False)
     return np.asarray(smooth(np.log(strokes_m)))
 
 
@@ -332,5 +331,5 @@ def _chosen(strokes_m: Array) -> NDArray[np.int64]:
 def _normals(count: int) -> Array:
     """Quasi-random normal numbers, shape (count, p)."""
     p = len(PARAMETERS)
-    engine = qmc.Sobol(p, scramble=True, rng=_SEED)
-    return np.asarray(qmc.MultivariateNormalQMC(np.zeros(p), engine=engine, rng=_SEED).random(count))
+    engine = scipy.stats.qmc.Sobol(p, scramble=True, rng=_SEED)
+    return np.asarray(scipy.stats.qmc.MultivariateNormalQMC(np.zeros(p), engine=engine, rng=_SEED).random(count))

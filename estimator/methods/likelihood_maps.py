@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from scipy.interpolate import RegularGridInterpolator
+import scipy
 
 from phibench.estimator.geometry.joint_posterior import MISFIT_RANGE, LikelihoodMap, single_posterior
 from phibench.estimator.processed.interval_fit import interval_posterior
@@ -195,7 +195,7 @@ class _Wide:
 
     def between(self, off: Array) -> Array:
         """Values at places from the fit's, shape (m, 1 + k), linear; beyond the last places as on them."""
-        at = RegularGridInterpolator((self.side, self.side), self.values)
+        at = scipy.interpolate.RegularGridInterpolator((self.side, self.side), self.values)
         values = np.asarray(at(np.clip(off[:, ::-1], self.side[0], self.side[-1])))
         values[:, 1 : 1 + _PLACE] = off
         return values

@@ -26,10 +26,9 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.signal import fftconvolve
 from scipy.special import log_ndtr, ndtr
-from scipy.stats import poisson
 
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.estimator.spots.camera_codes import tone_of
@@ -350,7 +349,7 @@ def _moments(mu: float, card: SensorCard, noise: PixelNoise, curve: Array) -> Ar
 
 
 def _by_fourier(chance: Array) -> Array:
-    return np.maximum(fftconvolve(chance, chance), 0.0)
+    return np.maximum(scipy.signal.fftconvolve(chance, chance), 0.0)
 
 
 def _law(mu: float, card: SensorCard, noise: PixelNoise) -> tuple[float, Array]:
@@ -365,7 +364,7 @@ def _law(mu: float, card: SensorCard, noise: PixelNoise) -> tuple[float, Array]:
     else:
         n = np.arange(0.0, mu + 8.0 * np.sqrt(mu) + 12.0)
         r = max(float(np.sqrt(noise.gaussian_e2 + (noise.prnu * mu) ** 2)), 1e-6)
-        below = ndtr((edges[:, None] - n) / r) @ poisson.pmf(n, mu)
+        below = ndtr((edges[:, None] - n) / r) @ scipy.stats.poisson.pmf(n, mu)
     return float(low), np.diff(np.concatenate([[0.0], below, [1.0]]))
 
 

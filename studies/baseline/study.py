@@ -10,8 +10,8 @@ from typing import Literal
 
 import numpy as np
 import polars as pl
+import scipy
 from pydantic import Field
-from scipy.stats import bootstrap
 
 from phibench.estimator.spots.simple_spots import find_spot
 from phibench.scenes.frames import Array
@@ -323,7 +323,7 @@ def rms_interval(values: Array, *names: str) -> tuple[float, float]:
     """
     if len(values) < 3:
         return float("nan"), float("nan")
-    found = bootstrap(
+    found = scipy.stats.bootstrap(
         (np.square(values),),
         lambda squares, axis: np.sqrt(np.mean(squares, axis=axis)),
         n_resamples=RESAMPLES,

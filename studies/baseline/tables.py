@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import polars as pl
-from scipy.stats import bootstrap
+import scipy
 
 from phibench.benchmark.pair_sets.dataset_pairs import DatasetPairs
 from phibench.datasets.common.errors import DatasetError
@@ -74,7 +74,7 @@ def fit_power_law(
     """
     good = np.isfinite(y) & (y > 0.0)
     logs = [np.log(x[good]) for x in (*bases, y)]
-    found = bootstrap(
+    found = scipy.stats.bootstrap(
         logs,
         lambda *rows: _exponents(rows),
         paired=True,

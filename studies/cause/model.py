@@ -14,11 +14,10 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 from pydantic import Field
-from scipy.special import ndtr, ndtri
-from scipy.stats import gaussian_kde
-from scipy.stats import t as student
+from scipy.special import gammaln, ndtr, ndtri
 
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import Rig
@@ -54,7 +53,7 @@ the two counts. With it azimuths would have to run from -pi to pi.
 _DIRECTED = ("misalignment", "turn")  # their effect depends on the spot's azimuth
 COMMON = ("z_c_m", "height_1_m", "height_2_m", "height_3_m", "height_4_m")
 FREEDOM = 4.0  # of Student's t where noise has heavy tails
-_STUDENT_TOP = float(student.logpdf(0.0, FREEDOM))
+_STUDENT_TOP = float(gammaln((FREEDOM + 1.0) / 2.0) - gammaln(FREEDOM / 2.0) - 0.5 * np.log(np.pi * FREEDOM))
 _IMPOSSIBLE = -1e300  # a finite number, as samplers want it
 
 
@@ -335,7 +334,7 @@ def brute_force(model: DepthModel, point: Array, random: np.random.Generator, dr
     worlds = 1.0 / (worlds + model.experiments.rounding_m * random.uniform(-0.5, 0.5, size=worlds.shape))
     seen = 1.0 / model.experiments.estimate_m
     simulated = np.array(
-        [gaussian_kde(worlds[:, i][np.isfinite(worlds[:, i])]).logpdf(y)[0] for i, y in enumerate(seen)]
+        [scipy.stats.gaussian_kde(worlds[:, i][np.isfinite(worlds[:, i])]).logpdf(y)[0] for i, y in enumerate(seen)]
     )
     reading = model.reading(point)
     variance = np.diagonal(model.covariance(reading, point))

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy import stats
+import scipy
 
 from phibench.benchmark.scores.answer_errors import Rules
 from phibench.benchmark.scores.intervals import Clusters, Estimate, deviation_of, estimates
@@ -256,7 +256,7 @@ def _equal_scatter(groups: Sequence[Array]) -> float:
     """Probability of scatter that differs by more; NaN with fewer than two groups of three."""
     if len(groups) < _LEAST_GROUPS or min(map(len, groups)) < _LEAST_ERRORS:
         return math.nan
-    return float(stats.levene(*groups, center="median").pvalue)
+    return float(scipy.stats.levene(*groups, center="median").pvalue)
 
 
 def bounds(rig: Rig, baseline_m: float, points_m: Array, background: Array, sensor: Sensor) -> Array:

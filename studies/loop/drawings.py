@@ -6,13 +6,9 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
-from matplotlib.patches import Circle, Polygon
 from numpy.typing import NDArray
 
 from phibench.datasets.film.film_video import write_mp4
@@ -23,6 +19,9 @@ from phibench.robot.loop.simulator import REACHED, RUNNING, Observation, Setup, 
 from phibench.scenes.frames import Array
 from phibench.scenes.room import ROBOT_SIZE_M
 from phibench.studies.framework import COLOURS, Drawing, canvas, drawn
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 Ends = tuple[float, float, float]
 _CORNERS = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
@@ -157,6 +156,8 @@ def phases(track: Track) -> list[tuple[float, str]]:
 
 def top_view(ax: Axes, simulator: Simulator, track: Track) -> None:
     """Room, robot, way and target from above."""
+    from matplotlib.patches import Circle, Polygon
+
     _boxes(ax, simulator.arena)
     target = simulator.target.point_m
     x, y = map(float, target[:2])
@@ -177,6 +178,8 @@ def top_view(ax: Axes, simulator: Simulator, track: Track) -> None:
 
 
 def _boxes(ax: Axes, arena: Arena) -> None:
+    from matplotlib.patches import Polygon
+
     boxes: Boxes = arena.floor
     for centre, axes, half in zip(boxes.centre_m, boxes.axes, boxes.half_m, strict=True):
         outline = centre[:2] + (_CORNERS * np.maximum(half[:2], 0.02)) @ axes[:2, :2].T
@@ -221,6 +224,9 @@ def show_episode(setup: Setup, out: Path, policy: str, *stream: str | int) -> st
 
 def picture(simulator: Simulator, policy: Any, observation: Observation, track: Track) -> NDArray[np.uint8]:
     """One picture of an episode, shape (720, 1280, 3)."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
     figure = Figure(figsize=(12.8, 7.2), dpi=100, layout="constrained")
     grid = figure.add_gridspec(2, 2, width_ratios=(1.6, 1), height_ratios=(1.2, 1))
     frame_axes(figure.add_subplot(grid[:, 0]), simulator, policy, observation)
@@ -238,6 +244,8 @@ def picture(simulator: Simulator, policy: Any, observation: Observation, track: 
 
 def frame_axes(ax: Axes, simulator: Simulator, policy: Any, observation: Observation) -> None:
     """Frame, or the spots alone; rings around spots that were read, a cross where the target is expected."""
+    from matplotlib.patches import Circle
+
     camera = simulator.setup.rig.camera
     if observation.windows:
         ax.imshow(pasted(observation.windows, (camera.height_px, camera.width_px)), cmap="gray", vmin=0.0, vmax=1.0)

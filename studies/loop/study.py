@@ -14,8 +14,8 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import polars as pl
+import scipy
 from pydantic import Field
-from scipy.stats import binomtest, bootstrap
 
 from phibench.datasets.common.progress import Steps
 from phibench.datasets.film.moving_camera import INFO, bake_rooms
@@ -170,7 +170,7 @@ def summary(episodes: Sequence[Episode]) -> ConditionSummary:
     The share has the exact interval of Clopper and Pearson, as every rate of this package.
     """
     reached = [one for one in episodes if one.reached]
-    low, high = binomtest(len(reached), len(episodes)).proportion_ci(method="exact")
+    low, high = scipy.stats.binomtest(len(reached), len(episodes)).proportion_ci(method="exact")
     pulls = np.array([one.pull for one in episodes if math.isfinite(one.pull)])
     errors = np.array([one.stated_m / one.distance_m - 1.0 for one in episodes if math.isfinite(one.stated_m)])
     return ConditionSummary(
@@ -196,7 +196,7 @@ def interval(values: Sequence[float] | Array, statistic: Callable[..., Any] = np
     value = float(statistic(x))
     if np.ptp(x) == 0.0:
         return value, value, value
-    ends = bootstrap(
+    ends = scipy.stats.bootstrap(
         (x,), statistic, n_resamples=2000, method="percentile", rng=generator(STREAM, "bootstrap")
     ).confidence_interval
     return value, float(ends.low), float(ends.high)

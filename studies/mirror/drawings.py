@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.lines import Line2D
 
 from phibench.studies.framework import COLOURS, LINES, MARKERS, Drawing, canvas, drawn
 from phibench.studies.mirror.measured_places import DIRECTIONS
 from phibench.studies.mirror.tables import Asked, Compared
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 _LEAST = 1e-2  # per cent: what costs less is not drawn
 
 
 def comparison_drawing(found: Mapping[str, Compared], asked: Asked) -> Drawing:
     """The four panels."""
+    from matplotlib.lines import Line2D
+
     with canvas(10.0, 8.0) as figure:
         (left, right), (low, last) = figure.subplots(2, 2)
         _resolution(left, found)

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import stats
 
 from phibench.datasets.common.errors import DatasetError
 from phibench.estimator.geometry.sensitivities import PARAMETERS as ANALYTIC
@@ -144,7 +144,7 @@ class Values:
 
 def evaluated(model: Callable[[Array], Array], p: int, n: int, rng: np.random.Generator) -> Values:
     """Outputs of a model of p numbers, uniform from 0 to 1, shape (m, p), to (s, m)."""
-    points = stats.qmc.Sobol(2 * p, rng=rng).random(n)
+    points = scipy.stats.qmc.Sobol(2 * p, rng=rng).random(n)
     A, B = points[:, :p], points[:, p:]
     mixed = [np.where(np.arange(p) == i, B, A) for i in range(p)]
     return Values(model(A), model(B), np.stack([model(each) for each in mixed]))
@@ -165,7 +165,7 @@ def with_intervals(
 
 def indices_of(values: Values, powers: Array) -> Array:
     """First-order, total, sum of first-order, root of the mean of output^power, shape (s, 2 p + 2)."""
-    found = stats.sobol_indices(func={"f_A": values.A, "f_B": values.B, "f_AB": values.AB}, n=values.A.shape[1])
+    found = scipy.stats.sobol_indices(func={"f_A": values.A, "f_B": values.B, "f_AB": values.AB}, n=values.A.shape[1])
     first, total = np.atleast_2d(found.first_order), np.atleast_2d(found.total_order)
     both = np.concatenate([values.A, values.B], axis=1)
     rms = np.sqrt(np.mean(both ** powers[:, None], axis=1))

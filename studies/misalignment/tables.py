@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import polars as pl
-from scipy import stats
+import scipy
 
 from phibench.datasets.common.errors import DatasetError
 from phibench.scenes.frames import Array
@@ -398,7 +398,7 @@ def noise_intervals(noise: Array) -> tuple[Array, Array, Array]:
     squares = np.mean(noise**2, axis=-1)
     n = len(squares)
     spread = squares.std(axis=0, ddof=1) / math.sqrt(n) / squares.mean(axis=0)
-    half = np.exp(0.5 * stats.t.ppf(0.975, n - 1) * spread)  # of a root: half the relative error
+    half = np.exp(0.5 * scipy.stats.t.ppf(0.975, n - 1) * spread)  # of a root: half the relative error
     rms = np.sqrt(squares.mean(axis=0))
     return rms / half, rms, rms * half
 

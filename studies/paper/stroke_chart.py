@@ -6,14 +6,11 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import matplotlib as mpl
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, NullFormatter
 
-from phibench.benchmark.scores.figures import COLOURS, LINES, STYLE, encoded
+from phibench.benchmark.scores.figures import COLOURS, LINES, STYLE, encoded, styled
 from phibench.benchmark.scores.score_tables import TextTable
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.store.files import write_bytes
@@ -28,6 +25,9 @@ from phibench.estimator.limits.stroke_curve import (
     TOO_BRIGHT,
     TOO_FAINT,
 )
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 USUAL_M = (0.10, 0.15, 0.20, 0.30, 0.425, 0.60, 0.80, 1.00, 1.20, 1.40)
 """Strokes of the table unless others are asked for; 0.425 m is that of the paper's Table 4."""
@@ -181,8 +181,7 @@ def require_picture(path: Path) -> None:
 def write_stroke_picture(path: Path, best: BestStroke) -> Path:
     """Draw the error of D and its parts by the stroke, atomically; the same curve gives the same bytes."""
     require_picture(path)
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(7.0, 4.2), layout="constrained", dpi=110)
+    with styled(STYLE, (7.0, 4.2), layout="constrained", dpi=110) as figure:
         _draw(figure.add_subplot(), best)
         return write_bytes(path, encoded(figure, path.suffix.lower()[1:]))
 
@@ -224,6 +223,8 @@ def _shade_causes(ax: Axes, best: BestStroke) -> None:
 
 
 def _set_ticks(ax: Axes, first: float, last: float) -> None:
+    from matplotlib.ticker import FuncFormatter, NullFormatter
+
     ax.set_xticks([x for x in _TICKS if first <= 1.001 * x <= 1.01 * last] or [first, last])
     for axis in (ax.xaxis, ax.yaxis):
         axis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))

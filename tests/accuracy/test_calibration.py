@@ -9,8 +9,8 @@ from functools import partial
 
 import numpy as np
 import pytest
+import scipy
 from helpers.calibration_cases import apparent
-from scipy import stats
 
 from phibench.calibration.outline.limb_image import PoseMeasurement
 from phibench.calibration.rig.bundle import KnownSpot, calibrate
@@ -183,7 +183,7 @@ def test_accuracy_of_depth_with_drawn_strokes_and_measured_places() -> None:
     mean square would be 4 times as large, which the test notices if it is above 0.97 (median 1).
     Measured heights and azimuths never make the prediction worse.
     """
-    low, high = stats.chi2.ppf([5e-5, 1.0 - 5e-5], 8) / 8
+    low, high = scipy.stats.chi2.ppf([5e-5, 1.0 - 5e-5], 8) / 8
     means = {}
     for known in KNOWN:
         errors, predicted = calibrated_errors(known, 8)

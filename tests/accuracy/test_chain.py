@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import scipy
 from helpers.chain_scenes import COLLECTED, MIDDLE, ROOM, SQUARE, drawn, scene
 from helpers.mjpeg_grid import line
-from scipy import stats
 
 from phibench.datasets.frames.sensor_card import card_of
 from phibench.estimator.limits.position_bound import limit_of
@@ -55,7 +55,7 @@ def checked(cell: tuple[Sensor, float, float, float], positions: int, cameras: i
     draws = drawn(s, sigma_px, collected_e, background_e, positions, cameras)
     n = draws.error_px.size
     error = 1.0 / np.sqrt(2.0 * n)
-    half, ratio, pull = stats.norm.ppf(0.975) * error, draws.over_bound, float(draws.pull.std())
+    half, ratio, pull = scipy.stats.norm.ppf(0.975) * error, draws.over_bound, float(draws.pull.std())
     print(
         f"{s.output}, blur {sigma_px} px, {collected_e:.0f} e-, background {background_e:.0f} e-: rms "
         f"{1e3 * np.sqrt(np.mean(draws.error_px**2)):.1f} mpx, rms / bound {ratio:.3f} +- {ratio * half:.3f}, pull "

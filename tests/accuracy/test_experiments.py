@@ -7,8 +7,8 @@ import tomllib
 import numpy as np
 import polars as pl
 import pytest
+import scipy
 from helpers.inline_workers import make_inline
-from scipy import stats
 
 from phibench.datasets.read import Dataset, open_finished
 from phibench.datasets.recipe.load import RECIPES
@@ -54,7 +54,7 @@ def test_accuracy_of_calibrated_experiments(paper: Dataset, preset: str) -> None
     assert len(rows) == 4 * DRAWS
     assert len(found) >= 3 * DRAWS
     pulls = found["error_m"].to_numpy() / found["sigma_m"].to_numpy()
-    assert float(np.mean(pulls**2)) < stats.chi2.isf(1e-4, 1)
+    assert float(np.mean(pulls**2)) < scipy.stats.chi2.isf(1e-4, 1)
     within = found.filter(pl.col("bound_m") <= 0.5 * TARGET[preset] * pl.col("depth_m"))
     assert len(within) >= 2 * DRAWS
     judged = budget(within)

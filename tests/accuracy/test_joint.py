@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import scipy
 from helpers.joint_pairs import BAYER, MONO, RIG, drawn_pairs
-from scipy import stats
 
 from phibench.estimator.geometry.combine import joint_bound
 from phibench.estimator.geometry.status import Status
@@ -62,7 +62,7 @@ def checked(s: Sensor, depth_m: float, stroke_m: float, collected_e: float, came
     error, separate = ((x.depth_m - pairs.depth_m)[good] / bound[good] for x in (joint, apart))
     ratio, ratio_apart = (float(np.sqrt(np.mean(x * x))) for x in (error, separate))
     pull = float(np.std(((joint.depth_m - pairs.depth_m) / joint.sigma_m)[good]))
-    half = stats.norm.ppf(0.975) / np.sqrt(2.0 * n)
+    half = scipy.stats.norm.ppf(0.975) / np.sqrt(2.0 * n)
     print(
         f"{s.name}, D {depth_m} m, h {stroke_m} m, {collected_e:.0f} e-: bound {1e3 * np.sqrt(np.mean(bound**2)):.2f} "
         f"mm (without the constraint {np.sqrt(np.mean(free**2) / np.mean(bound**2)):.3f} times); rms / bound: joint "

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import scipy
 from helpers.mirror_fits import MIRRORS, drawn, places
-from scipy import stats
 
 from phibench.render.sensor.settings import Sensor, sensor
 
@@ -23,7 +23,7 @@ def checked(shape: str, s: Sensor, collected_e: float, count: int, cameras: int,
     draws = drawn(s, places(shape, count), collected_e, 100.0, cameras)
     n = draws.error_px.size
     error, ratio, pull = 1.0 / np.sqrt(2.0 * n), draws.over_bound, float(draws.pull.std())
-    half = stats.norm.ppf(0.975) * error
+    half = scipy.stats.norm.ppf(0.975) * error
     print(
         f"{shape}, {s.output}, {collected_e:.0f} e- over 100 e-: rms {1e3 * np.sqrt(np.mean(draws.error_px**2)):.1f} "
         f"mpx, rms / bound {ratio:.3f} +- {ratio * half:.3f}, pull {pull:.3f} +- {pull * half:.3f}, mean pull "

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy
 from helpers import photon_transfer as ptc
 from PIL import Image
-from scipy.stats import norm
 
 from phibench.render.sensor.camera_chain import Chain
 from phibench.render.sensor.light import Light
@@ -133,12 +133,12 @@ def plausible_saturation_e(s: Sensor) -> Array:
     gives it to sqrt(2 / n) of itself (n pixels with one degree of freedom each), and
     what is less than five standard errors of a difference below the highest may come out highest.
     """
-    spread = 1.0 + s.prnu * norm.ppf((np.arange(400) + 0.5) / 400)
+    spread = 1.0 + s.prnu * scipy.stats.norm.ppf((np.arange(400) + 0.5) / 400)
     mean = (RATE_E_PER_S * spread + s.dark_e_per_s) * EXPOSURES_S[:, None]
     sigma = np.sqrt(mean)
     a = (s.full_well_e - mean) / sigma
-    first = -norm.pdf(a) + a * norm.sf(a)
-    second = norm.cdf(a) - a * norm.pdf(a) + a * a * norm.sf(a)
+    first = -scipy.stats.norm.pdf(a) + a * scipy.stats.norm.sf(a)
+    second = scipy.stats.norm.cdf(a) - a * scipy.stats.norm.pdf(a) + a * a * scipy.stats.norm.sf(a)
     variance = (mean * (second - first**2)).mean(axis=1)
     error = np.sqrt(2.0 / (SIZE[0] * SIZE[1]))
     return RATE_E_PER_S * EXPOSURES_S[variance > variance.max() * (1.0 - 5.0 * np.sqrt(2.0) * error)]

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import scipy
 from helpers.sensor_light import spot_at
-from scipy import stats
 
 from phibench.render.sensor import processing
 from phibench.render.sensor.camera_chain import Chain
@@ -27,7 +27,7 @@ def p_of_mean(drawn: np.ndarray, mean: np.ndarray, covariance: np.ndarray) -> fl
     values, vectors = np.linalg.eigh(covariance)
     good = values > 1e-9 * values.max()
     z = vectors[:, good].T @ (drawn - mean).ravel() / np.sqrt(values[good] / DRAWS)
-    return float(stats.chi2(good.sum()).sf(z @ z))
+    return float(scipy.stats.chi2(good.sum()).sf(z @ z))
 
 
 def p_of_covariance(drawn: np.ndarray, covariance: np.ndarray) -> float:
@@ -36,7 +36,7 @@ def p_of_covariance(drawn: np.ndarray, covariance: np.ndarray) -> float:
     good = values > 1e-9 * values.max()
     ratio = np.diag(vectors[:, good].T @ drawn @ vectors[:, good]) / values[good]
     z = (ratio.mean() - 1.0) * np.sqrt(good.sum() * (DRAWS - 1) / 2.0)
-    return float(2.0 * stats.norm.sf(abs(z)))
+    return float(2.0 * scipy.stats.norm.sf(abs(z)))
 
 
 @pytest.mark.parametrize("changes", [{}, {"row_noise_e": 4.0}, {"speckle_m": 3.0}, {"prnu": 0.05, "dsnu_e": 20.0}])

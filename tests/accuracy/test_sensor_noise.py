@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy import stats
+import scipy
 
 from phibench.render.sensor.camera_chain import Chain
 from phibench.render.sensor.electrons import digitised
@@ -25,8 +25,8 @@ def p_value(counts: np.ndarray, mean: float) -> float:
     """Chi-square of counts against the Poisson law, in cells of at least 50 expected counts."""
     n = counts.size
     edges = [-1]
-    probability = stats.poisson(mean).cdf
-    for value in range(int(stats.poisson(mean).ppf(1.0 - 1e-9)) + 1):
+    probability = scipy.stats.poisson(mean).cdf
+    for value in range(int(scipy.stats.poisson(mean).ppf(1.0 - 1e-9)) + 1):
         if n * (probability(value) - probability(edges[-1])) >= 50.0:
             edges.append(value)
     edges = edges[:-1]  # the last cell is open
@@ -34,7 +34,7 @@ def p_value(counts: np.ndarray, mean: float) -> float:
     observed = np.histogram(counts, [*(np.array(edges) + 0.5), np.inf])[0]
     assert observed.sum() == n
     assert len(expected) > 3
-    return float(stats.chisquare(observed, expected).pvalue)
+    return float(scipy.stats.chisquare(observed, expected).pvalue)
 
 
 @pytest.mark.parametrize("mean", [0.5, 5.0, 50.0, 5000.0])
@@ -73,10 +73,10 @@ def test_full_well_is_exact() -> None:
     signal = Chain(well).frame(Light.flat((9000.0, 0.0, 0.0), (512, 512)), STREAM.stage("well")) - 64
     assert signal.max() == 900
     full = int((signal == 900).sum())
-    tail = stats.poisson(900.0).sf(899)
-    assert stats.binomtest(full, signal.size, tail).pvalue > FALSE_ALARM
+    tail = scipy.stats.poisson(900.0).sf(899)
+    assert scipy.stats.binomtest(full, signal.size, tail).pvalue > FALSE_ALARM
     # a mean of 3 % more: sf changes from 0.50 to 0.82
-    assert stats.binomtest(full, signal.size, stats.poisson(927.0).sf(899)).pvalue < FALSE_ALARM
+    assert scipy.stats.binomtest(full, signal.size, scipy.stats.poisson(927.0).sf(899)).pvalue < FALSE_ALARM
 
 
 def test_the_converter_clips_at_both_ends() -> None:
@@ -127,6 +127,6 @@ def test_speckle_flicker_has_the_gamma_law() -> None:
 
     s = sensor("mjpeg", speckle_m=2.5)
     gains = [speckle_gain(s, STREAM.stage("speckle test", k)) for k in range(60000)]
-    assert stats.kstest(gains, stats.gamma(2.5, scale=0.4).cdf).pvalue > FALSE_ALARM
-    assert stats.kstest(gains, stats.gamma(2.5, scale=0.4 * 1.03).cdf).pvalue < FALSE_ALARM
+    assert scipy.stats.kstest(gains, scipy.stats.gamma(2.5, scale=0.4).cdf).pvalue > FALSE_ALARM
+    assert scipy.stats.kstest(gains, scipy.stats.gamma(2.5, scale=0.4 * 1.03).cdf).pvalue < FALSE_ALARM
     assert speckle_gain(sensor("mjpeg"), STREAM) == 1.0

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+import scipy
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.frames.request import FrameOptions
@@ -95,7 +95,7 @@ def test_phases_are_uniform(tiny_dataset: Path) -> None:
     """Every phase of pixel and of JPEG unit is as likely: chi^2 over 16 bins, false alarm 1e-6 each."""
     found = crops(tiny_dataset, 1600)
     draws = [found[k] for k in range(0, 1600, 4)]
-    limit = chi2.isf(1e-6, PERIOD_PX - 1)
+    limit = scipy.stats.chi2.isf(1e-6, PERIOD_PX - 1)
     for axis in (0, 1):
         whole = np.bincount([item["phase_px"][axis] for item in draws], minlength=PERIOD_PX)
         part = np.histogram([item["uv_px"][axis] % 1.0 for item in draws], PERIOD_PX, (0.0, 1.0))[0]

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 import pytest
+import scipy
 from rich.console import Console
-from scipy.stats import norm
 
 from phibench.datasets.common.errors import DatasetError
 from phibench.scenes.frames import Array
@@ -103,10 +103,10 @@ class _Line(DepthModel):
         return ("a", "b")
 
     def point(self, shares: Array) -> Array:
-        return np.asarray(norm.ppf(shares))
+        return np.asarray(scipy.stats.norm.ppf(shares))
 
     def log_likelihood(self, point: Array) -> float:
-        return float(norm.logpdf([0.5, -1.0], point, 0.3).sum())
+        return float(scipy.stats.norm.logpdf([0.5, -1.0], point, 0.3).sum())
 
 
 def test_evidence_and_posterior_of_a_closed_form(settings: CauseSettings) -> None:
@@ -117,7 +117,7 @@ def test_evidence_and_posterior_of_a_closed_form(settings: CauseSettings) -> Non
     pytest.importorskip("dynesty")
     line = _Line(settings.explanations[0], settings.priors, DATA, Rig(), 0.0)
     found = sample(line, 200, 0.05, "line")
-    expected = norm.logpdf([0.5, -1.0], 0.0, np.hypot(1.0, 0.3)).sum()
+    expected = scipy.stats.norm.logpdf([0.5, -1.0], 0.0, np.hypot(1.0, 0.3)).sum()
     assert found.log_evidence == pytest.approx(expected, abs=4.0 * max(found.log_evidence_error, 0.13))
     assert found.points.mean(axis=0) == pytest.approx(np.array([0.5, -1.0]) / 1.09, abs=0.1)
     assert found.points.std(axis=0) == pytest.approx([0.287, 0.287], rel=0.25)

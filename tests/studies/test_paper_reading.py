@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import polars as pl
 import pytest
-from scipy.stats import multivariate_normal
+import scipy
 
 from phibench.estimator.geometry.mirror_image import image_of
 from phibench.estimator.geometry.paper_depth import depth_approx
@@ -143,7 +143,7 @@ def test_likelihood_is_a_normal_in_the_inverse(settings: CauseSettings, name: st
             if i == j:
                 rounding = 0.001 if DATA.table[i] == 3 else 0.01
                 covariance[i, j] += noise**2 * reading.by_up[i] ** 2 + rounding**2 / 12.0 * scale[i] ** 2
-    expected = multivariate_normal.logpdf(1.0 / DATA.estimate_m, reading.inverse_depth_per_m, covariance)
+    expected = scipy.stats.multivariate_normal.logpdf(1.0 / DATA.estimate_m, reading.inverse_depth_per_m, covariance)
     assert model.log_likelihood(point) == pytest.approx(expected - 2.0 * np.log(DATA.estimate_m).sum(), rel=1e-9)
 
 

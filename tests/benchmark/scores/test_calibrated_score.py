@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy
 from helpers.bench_cases import RIG, Cases, cases
-from scipy import stats
 
 from phibench.benchmark.pair_sets.dataset_pairs import CalibratedPairs, of_calibration
 from phibench.benchmark.scores import score as scoring
@@ -87,7 +87,7 @@ def test_the_predicted_error_of_depth_holds_the_calibration() -> None:
 
     False alarm rate 1e-4 for the worst case. Without the calibration's part the mean square is 4.6 instead of 0.9.
     """
-    low, high = stats.chi2.ppf([5e-5, 1.0 - 5e-5], 12) / 12
+    low, high = scipy.stats.chi2.ppf([5e-5, 1.0 - 5e-5], 12) / 12
     mean_square, without = (float(np.mean(depth_pulls(12, given) ** 2)) for given in (True, False))
     print(f"mean square {mean_square:.2f}, without {without:.2f}; {low:.2f} to {high:.2f}")
     assert low < mean_square < high

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 import pytest
+import scipy
 from helpers.bench_cases import (
     Cases,
     Oracle,
@@ -26,7 +27,6 @@ from helpers.bench_cases import (
     truth_itself,
 )
 from helpers.sandbox_pairs import GOOD, SmallPairs, method_file
-from scipy.stats import norm
 
 from phibench.benchmark.isolation.runner import Harness
 from phibench.benchmark.pair_sets.dataset_pairs import dataset_pairs
@@ -194,7 +194,7 @@ def test_finding_every_faint_spot_is_marked_and_the_best_search_is_not() -> None
 def test_the_best_search_among_two_places_and_among_many() -> None:
     """Of two places: Phi(s / sqrt 2), in closed form. Of 300: 20 000 draws, four standard errors of 0.0035."""
     s = np.array([0.0, 0.5, 2.0, 4.0])
-    assert most_found(s, np.full(4, 72.0)) == pytest.approx(norm.cdf(s / np.sqrt(2.0)), abs=1e-9)
+    assert most_found(s, np.full(4, 72.0)) == pytest.approx(scipy.stats.norm.cdf(s / np.sqrt(2.0)), abs=1e-9)
     assert most_found(s, np.full(4, 36.0)) == pytest.approx(1.0)
     rng = generator("tests", "best search")
     noise = rng.normal(size=(20_000, 299)).max(axis=1)

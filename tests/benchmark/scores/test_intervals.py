@@ -9,8 +9,8 @@ from itertools import product
 
 import numpy as np
 import pytest
+import scipy
 from helpers.bench_cases import cases, outcomes, sampler
-from scipy.stats import binomtest, bootstrap
 
 from phibench.benchmark.scores import intervals as ours
 from phibench.benchmark.scores.answer_errors import Rules
@@ -47,7 +47,8 @@ def test_one_record_per_sample_is_scipys_bootstrap():
         return np.sqrt(np.mean(x**2, axis=axis))
 
     # the batches are ours: they decide how the generator's numbers are shared out
-    theirs = bootstrap((x,), rms, n_resamples=999, rng=np.random.default_rng(5), method="BCa").confidence_interval
+    rng = np.random.default_rng(5)
+    theirs = scipy.stats.bootstrap((x,), rms, n_resamples=999, rng=rng, method="BCa").confidence_interval
     assert (mine.low, mine.high) == pytest.approx((theirs.low, theirs.high), rel=1e-12)
 
 
@@ -189,7 +190,7 @@ def test_intervals_of_rates_cover_at_least(chance):
 
 def test_clopper_pearson_is_scipys_exact_interval():
     for hits, n in ((0, 20), (1, 20), (7, 20), (20, 20)):
-        theirs = binomtest(hits, n).proportion_ci(0.95, "exact")
+        theirs = scipy.stats.binomtest(hits, n).proportion_ci(0.95, "exact")
         assert clopper_pearson(hits, n, 0.95) == pytest.approx((theirs.low, theirs.high), abs=1e-12)
 
 

@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy
 from helpers.ball_photographs import ball_photograph
-from scipy import stats
 
 from phibench.calibration.outline.ball_circle import BallCircle, circles, find_circle, refined
 from phibench.calibration.outline.edge_ring import TURNS, EdgeRing, log_colours
@@ -143,7 +143,7 @@ def test_where_the_light_is_not_steels_the_edge_is_the_outline(rig_and_light) ->
     moved = alignment(light, rig)
     found = moved.outline
     assert found.by_edge
-    error, limit = found.sphere_in_camera_m - rig.sphere_in_camera_m, stats.chi2.isf(1e-4, 3)
+    error, limit = found.sphere_in_camera_m - rig.sphere_in_camera_m, scipy.stats.chi2.isf(1e-4, 3)
     assert error @ np.linalg.solve(found.covariance_m2, error) < limit
     off = error + 5.0 * found.sigma_m
     assert off @ np.linalg.solve(found.covariance_m2, off) > limit

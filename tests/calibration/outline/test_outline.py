@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy
 from helpers.limb_frames import drawn_rig, limb_light
-from scipy import stats
 
 from phibench.calibration.outline.limb_image import Plane, Tap, binned, planes_of
 from phibench.calibration.outline.limb_sectors import Sectors, _medians, scatter
@@ -88,7 +88,7 @@ def test_frames_within_their_covariance(case, frames, preset: str) -> None:
     """Mahalanobis distance of 3 numbers, false alarm rate 1e-4; a centre 0.2 mm off is refused."""
     rig = case[0]
     found = find_outline(frames[preset], nominal(rig), sensor_card(preset))
-    limit = stats.chi2.isf(1e-4, 3)
+    limit = scipy.stats.chi2.isf(1e-4, 3)
 
     def distance(error: np.ndarray) -> float:
         return float(error @ np.linalg.solve(found.covariance_m2, error))
@@ -118,7 +118,7 @@ def test_a_long_picture_is_fitted_in_squares(case, frames, monkeypatch: pytest.M
     found = find_outline(frames["mjpeg"], rig, card)
     assert sizes == [(360, 640)]
     error = found.sphere_in_camera_m - case[0].sphere_in_camera_m
-    assert error @ np.linalg.solve(found.covariance_m2, error) < stats.chi2.isf(1e-4, 3)
+    assert error @ np.linalg.solve(found.covariance_m2, error) < scipy.stats.chi2.isf(1e-4, 3)
     assert (found.sigma_m < 1.5 * whole.sigma_m).all()
     assert found.blur_px == pytest.approx(whole.blur_px, abs=0.4)
     squares = binned(planes_of(frames["mjpeg"], card), 2)

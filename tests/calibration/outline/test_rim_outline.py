@@ -7,9 +7,10 @@ from functools import cache
 
 import numpy as np
 import pytest
+import scipy
 from helpers.limb_frames import drawn_revolved, drawn_room, limb_light
 from helpers.revolved_rigs import PROFILES, revolved
-from scipy import optimize, stats
+from scipy import optimize
 
 from phibench.calibration.outline.contour import (
     Contour,
@@ -163,7 +164,7 @@ def check(found: Outline, rig: Rig) -> None:
     assert found.ellipse_px is not None
     assert found.covariance is not None
     error = np.append(found.sphere_in_camera_m - rig.sphere_in_camera_m, found.ellipse_px)
-    limit = stats.chi2.isf(1e-5, 5)
+    limit = scipy.stats.chi2.isf(1e-5, 5)
     assert error @ np.linalg.solve(found.covariance, error) < limit
     wrong = error + [2e-4, 0.0, 0.0, 0.0, 0.0]
     assert wrong @ np.linalg.solve(found.covariance, wrong) > 2.0 * limit

@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy
 from helpers.calibration_cases import OUTLINE2, RIG, STROKE, apparent
 from helpers.oracles import true_pixel
-from scipy import stats
 
 from phibench.calibration.outline.limb_image import PoseMeasurement
 from phibench.calibration.outline.outline_result import Outline, mean_outline
@@ -73,11 +73,11 @@ def test_covariance_by_simulation(rigs: int, wrong: float) -> None:
         misfits.append(bundle.chi2)
         degrees += bundle.degrees
     n = rigs * int(own.sum())
-    low, high = stats.chi2.ppf([5e-5, 1 - 5e-5], n)
+    low, high = scipy.stats.chi2.ppf([5e-5, 1 - 5e-5], n)
     assert low < sum(pulls) < high
     assert not low < sum(pulls) * wrong < high
     assert not low < sum(pulls) / wrong < high
-    assert stats.chi2.ppf(5e-5, degrees) < sum(misfits) < stats.chi2.isf(5e-5, degrees)
+    assert scipy.stats.chi2.ppf(5e-5, degrees) < sum(misfits) < scipy.stats.chi2.isf(5e-5, degrees)
 
 
 def test_what_cannot_be_told_apart_is_named() -> None:

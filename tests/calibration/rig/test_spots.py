@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy import stats
+import scipy
 
 from phibench.calibration.rig.bundle import vertical_by_principal_point
 from phibench.calibration.rig.file import read_calibration
@@ -74,7 +74,7 @@ def test_places_are_the_truth_plus_an_error_of_the_stated_size(tiny: Dataset) ->
         assert (spot.depth_sigma_m, spot.height_sigma_m, spot.azimuth_sigma_rad) == tuple(sigma)
         errors.append((np.array([spot.depth_m, spot.height_m, spot.azimuth_rad]) - truth) / sigma)
     squares = np.sum(np.square(errors), axis=0)
-    low, high = stats.chi2.ppf([5e-5, 1.0 - 5e-5], 400)
+    low, high = scipy.stats.chi2.ppf([5e-5, 1.0 - 5e-5], 400)
     assert np.all((low < squares) & (squares < high))
     assert not np.any((low < 1.5 * squares) & (1.5 * squares < high))  # a sigma 1.22 times too small is noticed
     correlation = np.corrcoef(np.array(errors).T)[np.triu_indices(3, 1)]

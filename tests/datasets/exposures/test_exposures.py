@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+import scipy
 from helpers.bench_samples import many, with_tables
 from helpers.processes import quiet
 from helpers.recipes import changed, complaints
-from scipy import stats
 
 from phibench.datasets.build.journal import Journal
 from phibench.datasets.build.task_list import plan_tasks
@@ -70,7 +70,7 @@ def test_another_seed_draws_other_numbers(dataset: Dataset) -> None:
 
 def rank_correlation(found: tuple[PairDraw, ...]) -> float:
     return float(
-        stats.spearmanr(
+        scipy.stats.spearmanr(
             [pair_draw.number for pair_draw in found], [int(pair_draw.sample_id[-6:]) for pair_draw in found]
         )[0]
     )
@@ -103,8 +103,8 @@ def test_numbers_are_drawn_per_sample_and_shared_by_presets(dataset: Dataset) ->
 def test_exposures_have_the_recipes_distribution(bench_dataset: Path) -> None:
     found = pair_draws(many(bench_dataset, 500), "mjpeg")
     u = np.log(np.array([pair_draw.request.exposure for pair_draw in found]) / 0.004) / np.log(4.0)
-    assert stats.kstest(u, "uniform").pvalue > FALSE_ALARM
-    assert stats.kstest(u**1.3, "uniform").pvalue < FALSE_ALARM  # another law is noticed
+    assert scipy.stats.kstest(u, "uniform").pvalue > FALSE_ALARM
+    assert scipy.stats.kstest(u**1.3, "uniform").pvalue < FALSE_ALARM  # another law is noticed
     levels = np.array([pair_draw.request.laser_level for pair_draw in found])
     # two independent columns of 500: correlation 1 / sqrt(500) = 0.045; 4 sigma, false alarms 6e-5
     assert abs(np.corrcoef(u, levels)[0, 1]) < 0.18
@@ -157,8 +157,9 @@ def test_a_spot_is_anywhere_in_its_box(bench_dataset: Path) -> None:
     # 24 or 25 equally probable whole-pixel starts: chi square of their counts
     counts = np.unique(np.round(places - places.min()), return_counts=True)[1]
     assert len(counts) in (24, 25)
-    assert stats.chisquare(counts).pvalue > FALSE_ALARM
-    assert stats.chisquare(counts + np.eye(len(counts), dtype=int)[12] * 60).pvalue < FALSE_ALARM  # a favoured centre
+    assert scipy.stats.chisquare(counts).pvalue > FALSE_ALARM
+    favoured = np.eye(len(counts), dtype=int)[12] * 60  # the centre
+    assert scipy.stats.chisquare(counts + favoured).pvalue < FALSE_ALARM
 
 
 def test_a_box_at_the_border_stays_in_the_image() -> None:
@@ -180,7 +181,7 @@ def test_without_a_place_of_the_spot_the_box_is_anywhere(bench_dataset: Path) ->
     )
     dataset = replace(dataset, rows=tuple(row.model_copy(update={"down": nowhere}) for row in dataset.rows))
     starts = [pair_draw.boxes[0].u0_px for pair_draw in pair_draws(dataset, "bayer-raw") if pair_draw.boxes is not None]
-    assert stats.kstest(np.array(starts) / 288.0, "uniform").pvalue > FALSE_ALARM
+    assert scipy.stats.kstest(np.array(starts) / 288.0, "uniform").pvalue > FALSE_ALARM
     assert len(starts) == 600
 
 

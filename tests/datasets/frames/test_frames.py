@@ -13,8 +13,8 @@ from subprocess import CompletedProcess
 
 import numpy as np
 import pytest
+import scipy
 from PIL import Image
-from scipy import stats
 
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.frames.request import FrameOptions, jpeg_tables
@@ -262,10 +262,10 @@ def test_the_mean_of_many_draws_is_the_expectation(sample: Sample, preset: str) 
         signal = (moments.mean_dn - 64.0)[inside]
         z = (images.mean(axis=0) - moments.mean_dn)[inside] / np.sqrt(moments.variance_dn2[inside] / draws)
         wrong = z + 0.01 * signal / np.sqrt(moments.variance_dn2[inside] / draws)
-        assert _two_sided(stats.chi2(inside.sum()), z @ z) > 1e-6
-        assert _two_sided(stats.chi2(inside.sum()), wrong @ wrong) < 1e-6
+        assert _two_sided(scipy.stats.chi2(inside.sum()), z @ z) > 1e-6
+        assert _two_sided(scipy.stats.chi2(inside.sum()), wrong @ wrong) < 1e-6
         spread = (images.var(axis=0, ddof=1)[inside] / moments.variance_dn2[inside]).sum() * (draws - 1)
-        law = stats.norm(inside.sum() * (draws - 1), np.sqrt(2.0 * inside.sum() * (draws - 1)))
+        law = scipy.stats.norm(inside.sum() * (draws - 1), np.sqrt(2.0 * inside.sum() * (draws - 1)))
         assert _two_sided(law, spread) > 1e-6
         assert _two_sided(law, 1.03 * spread) < 1e-6
 

@@ -7,7 +7,7 @@ from collections import Counter
 
 import numpy as np
 import pytest
-from scipy import stats
+import scipy
 
 from phibench.datasets.common.errors import RecipeError
 from phibench.datasets.plan.plan import RECIPE_RIG, make_plan, shard_plan
@@ -78,7 +78,7 @@ def test_what_is_drawn_is_what_the_estimator_takes_as_prior() -> None:
     """
     plan = make_plan(shipped(count=400))
     rows = [dict(next(p for p in plan.pairs[29 * k : 29 * k + 1]).drawn) for k in range(400)]
-    low, high = stats.chi2.ppf([5e-4 / 13, 1.0 - 5e-4 / 13], 400)
+    low, high = scipy.stats.chi2.ppf([5e-4 / 13, 1.0 - 5e-4 / 13], 400)
     checked = 0
     for key in rows[0]:
         name = key.removeprefix("misalignment.")

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import scipy
 from helpers.oracles import random_rig, random_spot, true_pixel
-from scipy import optimize, stats
+from scipy import optimize
 
 from phibench.estimator.geometry.least_squares_depth import GeneralDepth, depth_general
 from phibench.estimator.geometry.rig_parameters import PARAMETERS, changed, prior_sigmas, stroke_of
@@ -100,13 +101,13 @@ def test_sigma_and_false_alarms_by_simulation() -> None:
     pulls, result = simulate(n)
     ps = result.p_value
     parts = np.array([result.sigma_spot_m, result.sigma_calibration_m, result.sigma_stroke_m])
-    low, high = stats.chi2.ppf([5e-6, 1 - 5e-6], n - 1) / (n - 1)
+    low, high = scipy.stats.chi2.ppf([5e-6, 1 - 5e-6], n - 1) / (n - 1)
     ratio = np.var(pulls, ddof=1)
     assert low < ratio < high
     assert not low < ratio / 1.25**2 < high
     assert not low < ratio * 1.25**2 < high
     alarms = int(np.sum(ps < 0.05))
-    assert stats.binom.ppf(5e-6, n, 0.05) <= alarms <= stats.binom.isf(5e-6, n, 0.05)
+    assert scipy.stats.binom.ppf(5e-6, n, 0.05) <= alarms <= scipy.stats.binom.isf(5e-6, n, 0.05)
     assert np.sqrt(np.sum(parts**2, axis=0)) == pytest.approx(result.sigma_m, rel=1e-12)
     assert np.all(parts > 0.0)
 

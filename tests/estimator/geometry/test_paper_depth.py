@@ -7,10 +7,10 @@ from functools import partial
 
 import numpy as np
 import pytest
+import scipy
 from helpers.oracles import alhazen_quartic, paper_cases
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy import stats
 
 from phibench.estimator.geometry.paper_depth import depth_approx, depth_paper, error_eq6, error_eq7
 from phibench.estimator.geometry.status import Status, covariance_of
@@ -134,7 +134,7 @@ def test_covariance_against_monte_carlo(depth):
     predicted = depth(*mean, covariance_rad2=covariance).sigma_m ** 2
     ratio = np.var(depth(draws[:, 0], draws[:, 1]).depth_m, ddof=1) / predicted
     # false alarm rate 1e-6; the interval is +-3.5 % of the variance, a sigma wrong by 10 % is 19 to 21 %
-    low, high = stats.chi2.ppf([5e-7, 1 - 5e-7], n - 1) / (n - 1)
+    low, high = scipy.stats.chi2.ppf([5e-7, 1 - 5e-7], n - 1) / (n - 1)
     assert low < ratio < high
     assert not low < ratio / 1.1**2 < high
     assert not low < ratio / 0.9**2 < high

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy
 from helpers.oracles import TARGETS, alhazen_quartic, paper_cases, true_pixel
-from scipy import stats
 
 from phibench.estimator.geometry.paper_depth import depth_paper
 from phibench.estimator.geometry.phi import CONVENTIONS, GRADIENTS, estimate_phi, outline_circle
@@ -140,7 +140,7 @@ def test_variance_against_monte_carlo(convention):
     draws = np.random.default_rng(22).multivariate_normal(uv, covariance, n)
     predicted = estimate_phi(convention, RIG.at(0.0), uv, covariance).variance_rad2
     # false alarm rate 1e-6: (n - 1) s^2 / sigma^2 is chi-squared; the interval is +-3.5 % of the variance
-    low, high = stats.chi2.ppf([5e-7, 1 - 5e-7], n - 1) / (n - 1)
+    low, high = scipy.stats.chi2.ppf([5e-7, 1 - 5e-7], n - 1) / (n - 1)
     ratio = np.var(CONVENTIONS[convention](RIG.at(0.0), draws), ddof=1) / predicted
     assert low < ratio < high
     # and a sigma wrong by 10 % is noticed

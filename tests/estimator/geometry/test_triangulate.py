@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy
 from helpers.oracles import alhazen_quartic, fermat_path, paper_cases, random_rig, random_spot, true_pixel
-from scipy import stats
 
 from phibench.estimator.geometry.status import Status
 from phibench.estimator.geometry.triangulate import depth_exact, depth_in_plane
@@ -148,7 +148,7 @@ def test_covariance_against_monte_carlo(depth):
     predicted = depth(RIG, row.baseline_m, down, up, C1, C2).sigma_m ** 2
     ratio = np.var(depth(RIG, row.baseline_m, *draws).depth_m, ddof=1) / predicted
     # false alarm rate 1e-6; the interval is +-3.5 % of the variance, a sigma wrong by 10 % is 19 to 21 %
-    low, high = stats.chi2.ppf([5e-7, 1 - 5e-7], n - 1) / (n - 1)
+    low, high = scipy.stats.chi2.ppf([5e-7, 1 - 5e-7], n - 1) / (n - 1)
     assert low < ratio < high
     assert not low < ratio / 1.1**2 < high
     assert not low < ratio / 0.9**2 < high

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import scipy
 from helpers.oracles import alhazen_quartic, paper_cases, random_rig, random_spot, true_pixel
-from scipy import stats
 
 from phibench.estimator.geometry.phi import estimate_phi
 from phibench.estimator.geometry.rig_parameters import RIG_PARAMETERS, rig_covariance, rig_gradient
@@ -53,7 +53,7 @@ def test_accuracy_depth_limit_against_draws() -> None:
     variance = depths.var(ddof=1)
     # false alarm 1e-6: +-22 % of the variance, and each part alone is further below; sigma / D is 0.4 %, second order
     # 1e-3 of it
-    low, high = stats.chi2.ppf([5e-7, 1 - 5e-7], n - 1) / (n - 1)
+    low, high = scipy.stats.chi2.ppf([5e-7, 1 - 5e-7], n - 1) / (n - 1)
     parts = 1e3 * np.array([limit.sigma_spot_m, limit.sigma_calibration_m, limit.sigma_m, np.sqrt(variance)])
     print(f"D = {row.real_depth_m} m; spot, calibration, both, drawn: {np.round(parts, 2)} mm")
     assert low < variance / limit.sigma_m**2 < high

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import scipy
 from helpers.sensor_light import spot_at
-from scipy import integrate, stats
 
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.exposures.expected import ExpectedRegion, expected_of_light, expected_region
@@ -59,7 +59,7 @@ def mortensen_variance(sigma_px: float, flux_e: float, background_e: float) -> f
     """Variance of u for maximum likelihood, K. I. Mortensen et al., Nature Methods 7, 377 (2010), eq. (5), a = 1 px."""
     s2 = sigma_px**2 + 1.0 / 12.0
     tau = 2.0 * np.pi * s2 * background_e / flux_e
-    integral, _ = integrate.quad(lambda t: np.log(t) / (1.0 + t / tau), 0.0, 1.0)
+    integral, _ = scipy.integrate.quad(lambda t: np.log(t) / (1.0 + t / tau), 0.0, 1.0)
     return s2 / flux_e / (1.0 + integral)
 
 
@@ -191,7 +191,7 @@ def test_censored_share_is_the_mean_square_of_drawn_scores(z: float) -> None:
     full, step = x >= well, 1e-3 * s
 
     def log_likelihood(mu: float) -> np.ndarray:
-        return np.where(full, stats.norm.logsf(well, mu, s), stats.norm.logpdf(x, mu, s))
+        return np.where(full, scipy.stats.norm.logsf(well, mu, s), scipy.stats.norm.logpdf(x, mu, s))
 
     score = (log_likelihood(mean + step) - log_likelihood(mean - step)) / (2.0 * step)
     share = censored_share(np.array([mean]), np.array([s * s]), well)[0]
@@ -291,7 +291,7 @@ def test_an_ideal_sampler_has_efficiency_one() -> None:
     n = 20_000
     errors = generator("limits", "ideal sampler").multivariate_normal([0.0, 0.0], limit.covariance_px2, n)
     square = np.einsum("ni,ij,nj->", errors, np.linalg.inv(limit.covariance_px2), errors)
-    low, high = stats.chi2.ppf([FALSE_ALARM / 2, 1 - FALSE_ALARM / 2], 2 * n)
+    low, high = scipy.stats.chi2.ppf([FALSE_ALARM / 2, 1 - FALSE_ALARM / 2], 2 * n)
     interval = np.sqrt(2 * n / np.array([high, square, low]))
     print("efficiency of the sampler {1:.4f}, between {0:.4f} and {2:.4f}".format(*interval))
     assert low < square < high

@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy
 from helpers.chain_scenes import COLLECTED, MIDDLE, ROOM, SQUARE, UNITS, scene
 from PIL import Image
-from scipy import integrate, stats
 
 from phibench.datasets.frames.sensor_card import card_of
 from phibench.estimator.geometry.status import Status
@@ -56,8 +56,8 @@ def test_noisy_curve_against_quadrature() -> None:
     """Smooth where the noise does not reach the cut: 1e-6; at the cut 9 nodes are good to 3 % of the deviation."""
     for mean, sigma, tolerance in ((0.3, 0.02, 1e-6), (0.0005, 0.0006, 0.03 * 12.92 * 0.0006)):
         wide = [mean + k * sigma for k in (-9.0, 9.0)]
-        exact, _ = integrate.quad(
-            lambda x, m=mean, s=sigma: float(processing.srgb_encoded(np.array(x))) * stats.norm.pdf(x, m, s),
+        exact, _ = scipy.integrate.quad(
+            lambda x, m=mean, s=sigma: float(processing.srgb_encoded(np.array(x))) * scipy.stats.norm.pdf(x, m, s),
             *wide,
             points=[0.0, 0.0031308] if wide[0] < 0 else None,
             limit=400,
@@ -104,10 +104,10 @@ def test_law_of_a_code_sums_to_one_and_gives_its_information(mean_e: float) -> N
 def test_quantiser_against_its_sum_and_against_draws() -> None:
     for mean, sigma in ((0.3, 0.05), (0.49, 0.05), (2.2, 0.3), (-1.4, 0.7), (0.5, 1.5)):
         k = np.arange(-40, 41)
-        p = np.diff(stats.norm.cdf(np.append(k - 0.5, 40.5), mean, sigma))
+        p = np.diff(scipy.stats.norm.cdf(np.append(k - 0.5, 40.5), mean, sigma))
         one = quantised(np.array([4.0 * mean]), np.array([4.0 * sigma]), np.array([4.0]))
         h = 1e-5
-        shifted = [np.diff(stats.norm.cdf(np.append(k - 0.5, 40.5), mean + d, sigma)) @ k for d in (h, -h)]
+        shifted = [np.diff(scipy.stats.norm.cdf(np.append(k - 0.5, 40.5), mean + d, sigma)) @ k for d in (h, -h)]
         assert one.mean[0] == pytest.approx(4.0 * (p @ k), abs=1e-5)
         assert one.slope[0] == pytest.approx((shifted[0] - shifted[1]) / (2 * h), abs=1e-5)
         assert one.variance[0] == pytest.approx(16.0 * (p @ k**2 - (p @ k) ** 2), rel=1e-5)

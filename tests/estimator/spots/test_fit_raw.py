@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+import scipy
 from helpers.sensor_light import FILTERS, spot_at
-from scipy import integrate, stats
 
 from phibench.datasets.exposures.expected import expected_of_light
 from phibench.datasets.frames.sensor_card import card_of
@@ -108,7 +108,7 @@ def test_accuracy_of_the_fit(s: Sensor, sigma_px: float, collected_e: float, bac
     flux_e = collected_e / (COLLECTED if s.mosaic == "bayer" else 1.0)
     draws = drawn(s, sigma_px, flux_e, background_e)
     n = draws.error_px.size
-    half = stats.norm.ppf(0.975) / np.sqrt(2.0 * n)
+    half = scipy.stats.norm.ppf(0.975) / np.sqrt(2.0 * n)
     ratio, pull = draws.over_bound, float(draws.pull.std())
     print(
         f"{s.name}, blur {sigma_px} px, {collected_e:.0f} e-, background {background_e:.0f} e-: rms "
@@ -157,7 +157,7 @@ def test_profile_against_quadrature_and_differences() -> None:
     c, s, h = np.array([4.3]), np.array([0.6]), 1e-5
     one = profile(c, s, 9)
     for pixel in range(9):
-        share, _ = integrate.quad(stats.norm(c[0], s[0]).pdf, pixel - 0.5, pixel + 0.5, epsabs=1e-13)
+        share, _ = scipy.integrate.quad(scipy.stats.norm(c[0], s[0]).pdf, pixel - 0.5, pixel + 0.5, epsabs=1e-13)
         assert one.share[0, pixel] == pytest.approx(share, abs=1e-12)
     # h^2 / 6 f''' = 1e-10, rounding 1e-16 / 1e-5
     np.testing.assert_allclose(
@@ -171,7 +171,9 @@ def test_profile_against_quadrature_and_differences() -> None:
 def perfect(uv: np.ndarray, sigma_px: float, flux_e: float, background_e: float, origin: np.ndarray) -> np.ndarray:
     """Noise-free Bayer regions of 13 x 13 pixels, by the distribution function of scipy.stats."""
     edges = np.arange(14) - 0.5
-    share = [np.diff(stats.norm.cdf(edges, uv[:, i, None] - origin[:, i, None], sigma_px), axis=1) for i in (0, 1)]
+    share = [
+        np.diff(scipy.stats.norm.cdf(edges, uv[:, i, None] - origin[:, i, None], sigma_px), axis=1) for i in (0, 1)
+    ]
     return flux_e * FILTERS[bayer_filters(origin, (13, 13))] * outer(share[1], share[0]) + background_e
 
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.integrate import quad
-from scipy.stats import norm
+import scipy
 
 from phibench.datasets.frames.sensor_card import sensor_card
 from phibench.estimator.spots.jpeg_coefficients import room_variance, steps
@@ -24,13 +23,15 @@ from phibench.estimator.spots.raw_pixels import PixelNoise
 def test_moments_are_those_of_the_cut_law(mean: float) -> None:
     """By numerical integration of min(x, W) and of its square over the normal law."""
     well, s = 12e3, 150.0
+    law = scipy.stats.norm(mean, s)
     found = cut_pixels(np.array([mean]), np.array([s * s]), well)
 
     def moment(f) -> float:
         low, high = min(mean - 12 * s, well), max(mean + 12 * s, well)
         parts = ((low, well), (well, high))
         return sum(
-            quad(lambda x: f(min(x, well)) * norm.pdf(x, mean, s), a, b, epsabs=0.0, limit=200)[0] for a, b in parts
+            scipy.integrate.quad(lambda x: f(min(x, well)) * law.pdf(x), a, b, epsabs=0.0, limit=200)[0]
+            for a, b in parts
         )
 
     first = moment(lambda y: y - well)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy import stats
+import scipy
 
 from phibench.estimator.geometry.status import Status
 from phibench.estimator.spots.simple_spots import LUMA, SIMPLE_METHODS, gaussian_least_squares, luma, windowed_centroid
@@ -26,7 +26,8 @@ def regions(sigma_px: float = 0.9, count: int = 200) -> tuple[np.ndarray, np.nda
     """Regions of 13 columns and 11 rows, and where their spots are in the image."""
     uv = np.array([6.0, 5.0]) + generator("simple spots").uniform(-0.5, 0.5, (count, 2))
     across, down = (
-        np.diff(stats.norm.cdf(np.arange(m + 1) - 0.5, uv[:, i, None], sigma_px), axis=1) for i, m in ((0, 13), (1, 11))
+        np.diff(scipy.stats.norm.cdf(np.arange(m + 1) - 0.5, uv[:, i, None], sigma_px), axis=1)
+        for i, m in ((0, 13), (1, 11))
     )
     return 4000.0 * down[:, :, None] * across[:, None, :] + 50.0, uv + ORIGIN
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy import integrate
+import scipy
 from scipy.special import i0e
 
 from phibench.render.optics.spot_samples import disc_nodes, disc_points, slices, streak_nodes
@@ -44,7 +44,7 @@ def test_disc_blurred_is_the_integral_over_its_radius(smoothness: float) -> None
     def ring(q: float) -> np.ndarray:
         return np.exp(-0.5 * (radius - smoothness * q) ** 2) * i0e(radius * smoothness * q) * 2.0 * q / (2.0 * np.pi)
 
-    exact = integrate.quad_vec(ring, 0.0, 1.0, epsabs=1e-10)[0]
+    exact = scipy.integrate.quad_vec(ring, 0.0, 1.0, epsabs=1e-10)[0]
     assert np.abs(_blurred("uniform", smoothness, at) - exact).max() <= 1e-4 * exact.max()
 
 

@@ -5,8 +5,8 @@ from functools import cache
 
 import numpy as np
 import pytest
+import scipy
 from helpers.stroke_film import DEPTH_M, ENCODER_M, FRAMES, NOISE_PX, POINT, SCENE, SPOT, drawn, exact
-from scipy import stats
 from scipy.special import ndtr
 
 from phibench.datasets.common.errors import DatasetError
@@ -62,9 +62,9 @@ def test_bundle_errors_are_within_their_covariance(understated: bool) -> None:
         offsets.append((found.offsets_m - exact()[0]) / found.offset_sigma_m)
         chi2.append(found.chi2)
     dof = 2 * FRAMES - 3
-    low, high = stats.chi2.ppf([5e-6, 1 - 5e-6], 3 * FILMS) / FILMS
+    low, high = scipy.stats.chi2.ppf([5e-6, 1 - 5e-6], 3 * FILMS) / FILMS
     ratio = np.sum(chi2) / (dof * FILMS)
-    band = stats.chi2.ppf([5e-6, 1 - 5e-6], dof * FILMS) / (dof * FILMS)
+    band = scipy.stats.chi2.ppf([5e-6, 1 - 5e-6], dof * FILMS) / (dof * FILMS)
     if understated:
         assert ratio > band[1]
         assert np.mean(pulls) > high
@@ -292,7 +292,7 @@ def test_drawn_films_have_the_claimed_errors() -> None:
         chi2, dof = chi2 + found.chi2, dof + 2 * found.frames - 3
         pulls += float(error @ np.linalg.solve(found.covariance_m2, error))
     for value, degrees in ((chi2, dof), (pulls, 18)):
-        low, high = stats.chi2.ppf([5e-6, 1 - 5e-6], degrees)
+        low, high = scipy.stats.chi2.ppf([5e-6, 1 - 5e-6], degrees)
         assert low < value < high
 
 
@@ -307,7 +307,7 @@ def test_pattern_of_a_camera_is_the_claimed_covariance() -> None:
         squares.append(error @ np.linalg.solve(total, error))
         claims.append(found.shared_px2.mean(axis=(0, 2))[0, 0] / total[0, 0])
     assert np.mean(claims) > 0.7  # most of it is pattern: six frames have averaged the noise
-    low, high = stats.chi2.ppf([5e-6, 1 - 5e-6], 80) / 40
+    low, high = scipy.stats.chi2.ppf([5e-6, 1 - 5e-6], 80) / 40
     assert low < np.mean(squares) < high
 
 
@@ -355,7 +355,7 @@ def test_single_mjpeg_frames_have_the_claimed_errors() -> None:
     times = np.array([spot_time_s(FILM, 2 * k) for k in (4, 5, 6)])
     np.testing.assert_allclose(offsets, FILM.offset_m(times), atol=1e-6)
     errors = found.uv_px - chief_uv_px(FILM, times)
-    limit = stats.chi2.ppf(1 - 1e-5, 6)
+    limit = scipy.stats.chi2.ppf(1 - 1e-5, 6)
     for beside, within in ((0.0, True), (0.3, False)):
         pulls = [e @ np.linalg.solve(C, e) for e, C in zip(errors + beside, found.noise_px2, strict=True)]
         assert (np.sum(pulls) < limit) == within
@@ -408,7 +408,7 @@ def test_beliefs_on_frames_of_films_are_consistent() -> None:
     """
     rows = np.array([nees_and_pair(seed) for seed in range(200, 200 + BELIEFS)])
     own, level = rows[:, 0].mean(), rows[:, 1].mean()
-    low, high = stats.chi2.ppf([0.025, 0.975], 3 * BELIEFS) / BELIEFS
+    low, high = scipy.stats.chi2.ppf([0.025, 0.975], 3 * BELIEFS) / BELIEFS
     error = rows[:, 2] / DEPTH_M - 1.0
     squares = ((rows[:, 2] - DEPTH_M) / rows[:, 3]) ** 2
     print(f"NEES {own:.2f}, room as a level {level:.2f}; 95 % band {low:.2f} to {high:.2f}")

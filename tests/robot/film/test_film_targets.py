@@ -9,11 +9,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+import scipy
 from conftest import ROOT
 from helpers.simple_targets import ColourIdentity, NearestBlob
 from helpers.target_films import CODE, Outcome, RenderedRoom, StagedFilm, rendered_rooms, staged, swept
-from matplotlib.figure import Figure
-from scipy import stats
 
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.film.film_read import open_films
@@ -272,7 +271,7 @@ def test_locks_within_half_a_second_in_rooms_that_nothing_was_tuned_on(pytestcon
             number, {name: firsts[name].locked if name in firsts else None for name in "0123"}, right, wrong, flush=True
         )
     count = 4 * len(FILMS)
-    low, high = stats.binomtest(right, count).proportion_ci(method="exact")
+    low, high = scipy.stats.binomtest(right, count).proportion_ci(method="exact")
     print(f"\nright {right} of {count} [{low:.1%}, {high:.1%}], wrong {wrong}, median {np.median(frames) / 30.0:.2f} s")
     assert wrong <= 1  # 0.5 % of 300
     assert right >= 0.99 * count
@@ -303,7 +302,7 @@ def at_rest(rooms: Sequence[RenderedRoom]) -> list[RenderedRoom]:
 
 
 def share(count: int, of: int) -> str:
-    low, high = stats.binomtest(count, of).proportion_ci(method="exact")
+    low, high = scipy.stats.binomtest(count, of).proportion_ci(method="exact")
     return f"{count:3d} of {of:3d} = {count / of:6.1%} [{low:5.1%}, {high:6.1%}]"
 
 
@@ -324,6 +323,8 @@ def counted(rows: Sequence[Outcome]) -> list[dict[str, Any]]:
 
 def drawn(cells: Sequence[dict[str, Any]], path: Path) -> None:
     """Draw the share of targets found within half a second against other lights, with exact intervals of 95 %."""
+    from matplotlib.figure import Figure
+
     names = ("blink code", "colour of the laser", "nearest red blob, told its place", "nearest red blob")
     colours = ("#0072b2", "#009e73", "#cc79a7", "#d55e00")
     figure = Figure(figsize=(9, 3.4), layout="constrained", dpi=110)
@@ -332,7 +333,7 @@ def drawn(cells: Sequence[dict[str, Any]], path: Path) -> None:
         for n, (way, name, colour) in enumerate(zip(WAYS, names, colours, strict=True)):
             mine = sorted((c for c in cells if (c["sigma"], c["way"]) == (sigma, way)), key=lambda c: c["lights"])
             y = np.array([c["found"] / c["of"] for c in mine])
-            ends = np.array([stats.binomtest(c["found"], c["of"]).proportion_ci(method="exact") for c in mine])
+            ends = np.array([scipy.stats.binomtest(c["found"], c["of"]).proportion_ci(method="exact") for c in mine])
             x = np.array([c["lights"] for c in mine]) + 0.5 * (n - 1.5)
             look = {"color": colour, "marker": "o", "markersize": 4, "capsize": 2, "linewidth": 1.0}
             ax.errorbar(x, 100 * y, 100 * np.abs(ends.T - y), label=name, **look)
@@ -396,7 +397,7 @@ def test_beliefs_of_tracks_in_new_rooms_are_consistent(pytestconfig: pytest.Conf
             except (SceneError, DatasetError) as error:
                 print(number, n, error)
         print(number, np.round(values[-4:], 2), flush=True)
-    low, high = stats.chi2.ppf([0.025, 0.975], 3 * len(values)) / len(values)
+    low, high = scipy.stats.chi2.ppf([0.025, 0.975], 3 * len(values)) / len(values)
     print(f"NEES of {len(values)} tracks: {np.mean(values):.2f}; 95 % band {low:.2f} to {high:.2f}")
     assert len(values) >= 20
     assert low < np.mean(values) < high

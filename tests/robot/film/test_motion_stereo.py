@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy
 from helpers.stroke_film import NOISE_PX, POINT, SCENE
-from scipy import stats
 
 from phibench.datasets.common.errors import DatasetError
 from phibench.estimator.geometry.rig_parameters import PARAMETERS
@@ -49,13 +49,13 @@ def test_motion_stereo_is_consistent(understated: bool) -> None:
         pulls.append(error @ np.linalg.solve(found.covariance_m2, error))
         ends.append(((found.depth_m[-1] - depth_m[-1]) / found.sigma_m[-1]) ** 2)
         misfits.append(found.chi2)
-    high, end, most = (stats.chi2.ppf(1 - 1e-5, k * DRIVES) for k in (3, 1, 2 * (count - 1) - 3))
+    high, end, most = (scipy.stats.chi2.ppf(1 - 1e-5, k * DRIVES) for k in (3, 1, 2 * (count - 1) - 3))
     assert (np.sum(pulls) < high) == (not understated)
     assert (np.sum(misfits) < most) == (not understated)
     if understated:
         return
     assert np.sum(ends) < end
-    assert np.sum(ends) > stats.chi2.ppf(1e-5, DRIVES)
+    assert np.sum(ends) > scipy.stats.chi2.ppf(1e-5, DRIVES)
     # a focal length that is 1 % unknown widens the claim, and moves no place of a fit without error
     covariance[PARAMETERS.index("focal_relative")][PARAMETERS.index("focal_relative")] = 0.01**2
     wide = driving_depth(SCENE.rig, way, positions, covariance)

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy
 from helpers.stroke_film import DEPTH_M, ENCODER_M, FRAMES, SCENE, drawn, exact
-from scipy import stats
 
 from phibench.robot.film.film_bundle import film_depth
 from phibench.robot.film.film_positions import FilmPositions
@@ -79,7 +79,7 @@ def test_filter_follows_the_bundle_and_is_consistent() -> None:
             joint = film_depth(SCENE.rig, positions, readings, ENCODER_M)
             differences.append((depth - joint.depth_m) / joint.sigma_m)
             assert sigma == pytest.approx(joint.sigma_m, rel=0.1)
-    low, high = stats.chi2.ppf([5e-6, 1 - 5e-6], FILTERS) / FILTERS
+    low, high = scipy.stats.chi2.ppf([5e-6, 1 - 5e-6], FILTERS) / FILTERS
     assert low < np.mean(squares) < high
     # linearised in another order: a part of sigma
     assert np.abs(differences).max() < 0.3

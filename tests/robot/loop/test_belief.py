@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy
 from helpers.target_approach import (
     OF_SPHERE,
     RIG,
@@ -18,7 +19,6 @@ from helpers.target_approach import (
     stroked,
 )
 from scipy.optimize import least_squares
-from scipy.stats import chi2
 
 from phibench.estimator.geometry.mirror_image import image_of
 from phibench.estimator.geometry.rig_parameters import PARAMETERS, PRIOR_SIGMA, RigBias, drawn_deviation
@@ -38,7 +38,7 @@ FALSE_ALARM = 1e-3  # of each band; the streams are fixed, so that a pass stays 
 
 def band(runs: int) -> tuple[float, float]:
     """Mean NEES of consistent beliefs over independent runs: chi squared of 3 degrees of freedom each."""
-    low, high = chi2.ppf([FALSE_ALARM / 2, 1 - FALSE_ALARM / 2], 3 * runs) / runs
+    low, high = scipy.stats.chi2.ppf([FALSE_ALARM / 2, 1 - FALSE_ALARM / 2], 3 * runs) / runs
     return float(low), float(high)
 
 
@@ -128,11 +128,11 @@ def test_a_lifted_robot_sees_the_same_place() -> None:
     run.flipper_rad = -1.0
     for _ in range(5):
         step(run, belief, 0.0, 0.0)
-    assert belief.nees(run.place()) < chi2.ppf(1 - 1e-4, 3)
+    assert belief.nees(run.place()) < scipy.stats.chi2.ppf(1 - 1e-4, 3)
     seen = run.look()
     assert seen is not None
     belief.predict(0.0, 0.0, 0.1)
-    assert belief.distance2(seen, run.stroke_m, run.held) < chi2.ppf(1 - 1e-4, 2)
+    assert belief.distance2(seen, run.stroke_m, run.held) < scipy.stats.chi2.ppf(1 - 1e-4, 2)
     assert belief.distance2(seen, run.stroke_m) > 1e3  # as if the robot were level
 
 
@@ -329,7 +329,7 @@ def test_films_of_a_rig_that_is_not_known_exactly() -> None:
         list(film_beliefs(RIG, VEHICLE, *film, rig_covariance=covariance))[-1][1]
         for covariance in (rig_covariance(0.5), None)
     )
-    most = chi2.ppf(1 - 1e-4, 3)
+    most = scipy.stats.chi2.ppf(1 - 1e-4, 3)
     assert told.nees(run.place()) < most
     assert untold.nees(run.place()) > 30.0 * most
 
@@ -460,7 +460,7 @@ def test_tracking_over_many_runs(capsys) -> None:
         for k in range(12):
             step(run, belief, *((0.04, 0.04) if k % 3 else (0.02, 0.05)))
         rows.append((after, belief.nees(run.place()), moved(number)[0]))
-    low, high = chi2.ppf([0.025, 0.975], 3 * n) / n
+    low, high = scipy.stats.chi2.ppf([0.025, 0.975], 3 * n) / n
     means = np.mean(rows, axis=0)
     with capsys.disabled():
         print(f"NEES of {n} runs after a stroke, a drive, moving: {means.round(2)}; 95 % band {low:.2f} to {high:.2f}")

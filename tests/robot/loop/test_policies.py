@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy
 from helpers.target_approach import rig_covariance
-from scipy.stats import binomtest
 
 from phibench.benchmark.isolation.resolve import RunLimits
 from phibench.cli import film
@@ -280,7 +280,7 @@ def test_the_process_reaches_its_target_in_twenty_rooms(capsys) -> None:
     frame = episode_frame(run_episodes(setup, "paper", 200, "test rooms 2"))
     reached = int((frame["outcome"] == "reached").sum())
     pull = float(np.sqrt(np.mean(frame["pull"].drop_nans().to_numpy() ** 2)))
-    low, high = binomtest(reached, 200).proportion_ci()
+    low, high = scipy.stats.binomtest(reached, 200).proportion_ci()
     with capsys.disabled():
         print(f"reached {reached} of 200 ({low:.3f} to {high:.3f}), pull {pull:.2f}")
     assert reached >= 190

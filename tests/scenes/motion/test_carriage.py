@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from scipy.integrate import cumulative_trapezoid
+import scipy
 
 from phibench.scenes.motion.carriage import Carriage, Encoder, Vibration
 from phibench.scenes.validation import SceneError
@@ -21,9 +21,9 @@ def test_position_is_the_integral_of_velocity_and_that_of_acceleration(carriage:
     t = np.linspace(-0.1, carriage.duration_s + 0.1, 200_001)
     x, v, a = carriage.position_m(t), carriage.velocity_m_per_s(t), carriage.acceleration(t)
     # the trapezoidal rule errs by up to (jump of a) x step^2 / 2 where a jumps, 1e-10 x a few corners
-    assert np.abs(x - x[0] - cumulative_trapezoid(v, t, initial=0.0)).max() < 1e-9
+    assert np.abs(x - x[0] - scipy.integrate.cumulative_trapezoid(v, t, initial=0.0)).max() < 1e-9
     # and by (jump of a) x step / 2 for v: 4 x 2e-5 at most, at each corner
-    assert np.abs(v - cumulative_trapezoid(a, t, initial=0.0)).max() < 12 * 4.0 * (t[1] - t[0])
+    assert np.abs(v - scipy.integrate.cumulative_trapezoid(a, t, initial=0.0)).max() < 12 * 4.0 * (t[1] - t[0])
     assert np.abs(v).max() <= carriage.speed_m_per_s * (1 + 1e-12)
     assert np.abs(a).max() == carriage.acceleration_m_per_s2
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
+import scipy
 from scipy.optimize import brentq
 
 from phibench.scenes.frames import rotation_xyz
@@ -43,7 +43,7 @@ def test_arcs_agree_with_integration_of_the_tracks_speeds() -> None:
             def slope(_: float, y: np.ndarray, speed: float = speed, rate: float = rate) -> list[float]:
                 return [speed * math.cos(y[2]), speed * math.sin(y[2]), rate]
 
-            end = solve_ivp(slope, (0, 1), [0.4, -0.3, heading], rtol=1e-12, atol=1e-13).y[:, -1]
+            end = scipy.integrate.solve_ivp(slope, (0, 1), [0.4, -0.3, heading], rtol=1e-12, atol=1e-13).y[:, -1]
             found = PlanarPose(0.4, -0.3, heading).after(ESCALADE.arc(left, right))
             assert [found.x_m, found.y_m, found.heading_rad] == pytest.approx(end, abs=1e-10)
             checked += 1

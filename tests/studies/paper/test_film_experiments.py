@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 import pytest
-from scipy import stats
+import scipy
 
 from phibench.calibration.rig.bundle import Bundle
 from phibench.datasets.common.errors import DatasetError
@@ -86,8 +86,8 @@ def test_processed_frames_on_the_way_add_to_the_bursts(film_processed: Path) -> 
         assert whole.sigma_m < 0.9 * ends.depth.sigma_m
         pulls.append((whole.depth_m - depth_m) / whole.sigma_m)
         misfits, degrees = misfits + whole.chi2, degrees + 2 * whole.frames - 3
-    assert np.sum(np.square(pulls)) < stats.chi2.ppf(1 - 1e-5, 3)
-    assert misfits < stats.chi2.ppf(1 - 1e-5, degrees)
+    assert np.sum(np.square(pulls)) < scipy.stats.chi2.ppf(1 - 1e-5, 3)
+    assert misfits < scipy.stats.chi2.ppf(1 - 1e-5, degrees)
     # a stroke that is longer by a thousandth makes D larger by as much
     found = processed_stroke(film, wide, mjpeg, 0, bursts(film, wide, mjpeg, 0))
     assert found is not None
@@ -160,7 +160,7 @@ def test_the_interval_of_a_right_budget_knows_what_rows_share(common: float, deg
         orient="row",
     )
     # 4000 draws: a quantile of 2.5 % is good to 2.5e-3 in probability; tails of one degree are flat below
-    expected = np.sqrt(stats.chi2.ppf([0.025, 0.975], degrees) / degrees)
+    expected = np.sqrt(scipy.stats.chi2.ppf([0.025, 0.975], degrees) / degrees)
     np.testing.assert_allclose(closure_interval(rows), expected, rtol=0.06, atol=0.02)
     # 20 cameras: their lower ends have nothing in common; of one camera half of the variance is a single number
     np.testing.assert_allclose(closure_interval(rows, True), expected, rtol=0.06, atol=0.02)
