@@ -6,6 +6,8 @@ Run ``python -m phibench.datasets.recipe.reference_page > datasets/RECIPE.md``; 
 from __future__ import annotations
 
 import json
+import re
+import textwrap
 from collections.abc import Iterator
 from typing import Any
 
@@ -81,6 +83,15 @@ TABLES: dict[str, type[BaseModel]] = {
     "[[distractors]]": DistractorTable,
     "a distribution": DistributionTable,
 }
+DRAWN_FROM = {
+    "[rigs.misalignment]": "[misalignment]",
+    "[random.rig]": "[rig]",
+    "[random.rig.holder]": "[rig.holder]",
+    "[random.rig.mirror]": "[rig.mirror]",
+    "[random.misalignment]": "[misalignment]",
+}
+"""Tables of distributions, and the table whose keys they draw, with that table's ranges, units and meanings."""
+
 _UNITS = {
     "_m_per_m": "m/m",
     "_m_per_s2": "m/s^2",
@@ -112,6 +123,8 @@ A recipe is a TOML file (UTF-8). `phibench dataset make NAME_OR_FILE --out FOLDE
 shipped one (`paper`, `paper-misaligned`, `random`, `worlds`, `smoke`, `bench-...`, `study-...`; in
 `datasets/recipes/`). Keys that are left out take the default; an unknown key is a fault. All faults are reported in
 one go, before anything is rendered.
+
+A range "0 to 5" holds its ends, and a number is meant where no kind is named.
 """
 _NOTES = {
     "[rig]": """A key that is left out keeps the preset's value. Three follow other keys, where those are given:
@@ -187,8 +200,8 @@ with more, and only the new ones are rendered. `[rig]` is the nominal rig of all
 at most 100 times, if it is impossible or a stroke would lead into a board or a lamp.
 Samples are called `<experiment>-<target>-h<stroke>-r<rig>`, rigs `r000000` and so on.
 """,
-    "[rigs.misalignment]": """Any key of `[misalignment]`, within its range, in place of the value there; at least one.
-Independent random streams, one per parameter.
+    "[rigs.misalignment]": """In place of the value in `[misalignment]`; at least one. Independent random streams, one
+per parameter.
 """,
     "[film]": """Optional: `phibench film make` then makes a film of every pair, beside what `dataset make` makes; see
 `docs/film.md`. The carriage starts at the first of `stops` and rests there for the first of `pauses_s`, and so
@@ -229,20 +242,20 @@ impossible is refused by itself, and the others are made. The manifest counts `t
 `independent` takes a random stream per parameter. Every distribution draws on its own: the value of one does
 not depend on which others are there.
 """,
-    "[random.rig]": """Any number of `[rig]` but the size of the image, within the range that `[rig]` allows. What is
-not drawn is as in `[rig]`, which must be a possible rig itself. A drawn `fx_px` is `fy_px` too
-(square pixels) unless `fy_px` is drawn or set in `[rig]`, and the other way round.
+    "[random.rig]": """`[rig]` must be a possible rig itself. A drawn `fx_px` is `fy_px` too (square pixels) unless
+`fy_px` is drawn or set in `[rig]`, and the other way round. `[random.rig.holder]` and `[random.rig.mirror]` draw keys of
+those tables.
 """,
-    "[random.rig.holder]": """Any key of `[rig.holder]`, and `kind` from a choice of names, such as
+    "[random.rig.holder]": """`kind` is drawn from a choice of names, such as
 `kind = { choice = ["none", "rods", "tube"] }`. A sample whose sizes do not go together is drawn again.
 """,
-    "[random.rig.mirror]": """Any key of `[rig.mirror]` but `even_terms`, and `shape` from a choice of names, such as
+    "[random.rig.mirror]": """`shape` is drawn from a choice of names, such as
 `shape = { choice = ["ellipsoid", "paraboloid", "cone"] }`. `[rig.mirror]` must be given, with what is not drawn.
 A sample takes those keys of both tables that its shape has. A `conic`, drawn or not, must suit every drawn shape
 that has one. An ellipsoid of `conic = 0` is a spherical cap.
 """,
-    "[random.misalignment]": """Any key of `[misalignment]`, within its range, in place of the value there. The rig
-that `[random.rig]` gives is the nominal one.
+    "[random.misalignment]": """In place of the value in `[misalignment]`. The rig that `[random.rig]` gives is the
+nominal one.
 """,
     "[random.spot]": """Either on a board: `target`, `across_m`, `up_m`; a Gaussian spot needs 4 sigma (its diameter) to
 every edge, a uniform one its radius. The boards themselves stand still: all samples share the
@@ -288,14 +301,16 @@ strongest light that goes out with the laser.
 """,
 }
 _NAMES = "NameChoice"
-_ABSENT: dict[type[BaseModel], str] = {
-    RigTable: "as preset",
-    HolderTable: "follows R",
-    RandomHolderTable: "as in [rig.holder]",
-    RandomRigTable: "as in [rig]",
-    RandomMisalignmentTable: "as in [misalignment]",
-    FramesTable: "as preset",
-}
+_ABSENT: dict[type[BaseModel], str] = {RigTable: "as preset", HolderTable: "follows R", FramesTable: "as preset"}
+# What `allowed` says in a sentence of a fault stands in a table's cell in fewer words.
+_IN_CELLS = (
+    (r"\ba number (?=from|above)", ""),
+    (r"\b(an integer|a whole number) ", "whole, "),
+    (r"\bfrom (\S+) up to\b", r"\1 to"),
+    (r"\b(above \S+) up to\b", r"\1 to"),
+    (r"\bone of ", ""),
+    (r"\ba list of (\d+) \(a number\)", r"\1 numbers"),
+)
 
 
 def recipe_page() -> str:
@@ -323,6 +338,9 @@ def _section(heading: str, model: type[BaseModel]) -> Iterator[str]:
     yield f"## `{heading}`\n"
     if heading in _NOTES:
         yield _NOTES[heading]
+    if heading in DRAWN_FROM:
+        yield _drawn(model, DRAWN_FROM[heading])
+        return
     presets = list(RIGS) if model is RigTable else []
     headings = ["key", "unit", "allowed", *(f"preset `{name}`" for name in presets), "default", "meaning"]
     yield _line(headings)
@@ -332,7 +350,7 @@ def _section(heading: str, model: type[BaseModel]) -> Iterator[str]:
         cells = [
             f"`{key}`",
             _unit(key),
-            _allowed(key, model),
+            _in_cell(_allowed(key, model)),
             *of_presets,
             _property_default(key) if model is RoomPropertiesTable else _default(field, model),
             str(field.description),
@@ -341,8 +359,22 @@ def _section(heading: str, model: type[BaseModel]) -> Iterator[str]:
     yield ""
 
 
+def _drawn(model: type[BaseModel], base: str) -> str:
+    """Keys of a table of distributions, which are those of another table."""
+    left_out = [f"`{key}`" for key in TABLES[base].model_fields if key not in model.model_fields]
+    keys = f"all of `{base}`" + (f" but {', '.join(left_out)}" if left_out else "")
+    text = f"Keys: {keys}, each a number or a distribution within the range there. What is left out is as there."
+    return textwrap.fill(text, 120, break_on_hyphens=False) + "\n"
+
+
 def _line(cells: list[str]) -> str:
     return f"| {' | '.join(cells)} |"
+
+
+def _in_cell(text: str) -> str:
+    for pattern, shorter in _IN_CELLS:
+        text = re.sub(pattern, shorter, text)
+    return text
 
 
 def _unit(key: str) -> str:

@@ -292,7 +292,7 @@ else:
             key: (
                 names_of(field.annotation)
                 if key == "kind"
-                else Annotated[Distribution, values_of(field.annotation)] | None,
+                else Annotated[Distribution, values_of(Annotated[field.annotation, Field(), *field.metadata])] | None,
                 Field(default=None, description=field.description),
             )
             for key, field in HolderTable.model_fields.items()
