@@ -55,6 +55,21 @@ def test_every_page_of_the_navigation_exists_and_every_page_is_reached() -> None
         assert page.name in places or f"{page.name})" in linked or f"{page.name}#" in linked, page
 
 
+def test_pages_stand_in_two_lists_and_those_to_use_it_are_short() -> None:
+    """README and the navigation have the same lists. Words are counted as `wc -w` does, columns of tables included."""
+    config = yaml.load((ROOT / "mkdocs.yml").read_text(encoding="utf-8"), Loader)
+    lists = {heading: list(navigation(part)) for entry in config["nav"] for heading, part in entry.items()}
+    readme = (ROOT / "README.md").read_text(encoding="utf-8").split("## All pages")[1]
+    use, why = readme.split("To use it:")[1].split("To know why:")
+    for heading, text in (("To use it", use), ("To know why", why.split("`make docs`")[0])):
+        linked = {link.removeprefix("docs/") for link in re.findall(r"\]\(([\w/]+\.md)\)", text)}
+        alone = ("index.md", "tutorials/", "studies/")  # README itself; tutorials and studies have lists of their own
+        assert linked == {page for page in lists[heading] if not page.startswith(alone)}
+    pages = [ROOT / ELSEWHERE.get(page, f"docs/{page}") for page in lists["To use it"]]
+    sources = [page.with_suffix(".py") if "tutorials" in page.parts else page for page in pages]
+    assert sum(len(page.read_text(encoding="utf-8").split()) for page in sources) <= 60_000
+
+
 def test_every_formula_of_the_pages_is_understood() -> None:
     convert = pytest.importorskip("latex2mathml.converter").convert
     pages = [ROOT / "README.md", *(ROOT / "docs").rglob("*.md"), *(ROOT / "datasets").glob("*.md")]

@@ -243,8 +243,8 @@ impossible is refused by itself, and the others are made. The manifest counts `t
 not depend on which others are there.
 """,
     "[random.rig]": """`[rig]` must be a possible rig itself. A drawn `fx_px` is `fy_px` too (square pixels) unless
-`fy_px` is drawn or set in `[rig]`, and the other way round. `[random.rig.holder]` and `[random.rig.mirror]` draw keys of
-those tables.
+`fy_px` is drawn or set in `[rig]`, and the other way round. `[random.rig.holder]` and `[random.rig.mirror]` draw keys
+of those tables.
 """,
     "[random.rig.holder]": """`kind` is drawn from a choice of names, such as
 `kind = { choice = ["none", "rods", "tube"] }`. A sample whose sizes do not go together is drawn again.
