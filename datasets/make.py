@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
@@ -70,6 +72,7 @@ from phibench.datasets.store.documents import dataset_info, parse_info, read_man
 from phibench.datasets.store.files import write_text
 from phibench.datasets.store.provenance import code_sha256, provenance
 from phibench.render.optics.truth import VISIBLE
+from phibench.render.setup.variant import ENVIRONMENT
 from phibench.scenes.rig import POSITIONS
 
 
@@ -378,3 +381,20 @@ def _write_run(out: Path, count: int, began: datetime, seconds: float) -> None:
         "cores": os.cpu_count(),
     }
     write_text(out / schema.RUN, json.dumps(document, indent=1) + "\n")
+
+
+def make_with_variant(variant: str, recipe: str, out: Path) -> Path:
+    """Make a data set with a variant of Mitsuba, in a process of its own, with its own light maps; return the folder.
+
+    Raises
+    ------
+    DatasetError
+        With the last line that the process said, if it fails.
+    """
+    command = [sys.executable, "-m", "phibench", "dataset", "make", recipe, "--out", str(out), "--workers", "1"]
+    environment = {**os.environ, ENVIRONMENT: variant, "XDG_CACHE_HOME": str(out.parent / f"{out.name}-cache")}
+    child = subprocess.run(command, env=environment, stdin=subprocess.DEVNULL, capture_output=True, text=True)
+    if child.returncode != 0:
+        last = (child.stderr.strip().splitlines() or [f"exit status {child.returncode}"])[-1]
+        raise DatasetError(f"{variant} does not render: {last.removeprefix('phibench: ')}")
+    return out

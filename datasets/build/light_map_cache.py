@@ -1,6 +1,7 @@
 """Cache of light maps: rooms that were baked once, in the user's cache folder, for all data sets.
 
-An entry is named after the hash of its recipe: all that enters, which is room, settings, code and packages. It holds
+An entry is named after the hash of its recipe: all that enters, which is room, settings, code, packages, the variant of
+Mitsuba and the version of LLVM. It holds
 the recipe in full, the arrays, and the SHA-256 of both. It is taken if hash and recipe are right, and if the arrays
 have the shapes of the room and values that its lamps can give. Else the room is baked again.
 
@@ -28,7 +29,8 @@ from phibench.datasets.store.files import write_bytes, write_text
 from phibench.datasets.store.leftovers import remove_leftovers
 from phibench.datasets.store.provenance import code_behind
 from phibench.render.room.light_map import ARRAYS, BakeSettings, LightMap, bake, encoded, fixed_shapes, texel_count
-from phibench.render.setup.llvm_library import cache_root
+from phibench.render.setup.llvm_library import LlvmError, cache_root
+from phibench.render.setup.variant import renders_with
 from phibench.scenes.rig import View
 from phibench.scenes.room import Room
 from phibench.scenes.shapes import Rectangle, Shape
@@ -76,7 +78,7 @@ def is_cached(view: View, room: Room, settings: BakeSettings, folder: Path | Non
     """Tell whether the cache holds the light map, so that `light_map` takes no time."""
     try:
         return _path(_recipe(view, room, settings), folder).is_file()
-    except PackageNotFoundError:  # without Mitsuba nothing has been baked
+    except (PackageNotFoundError, LlvmError):  # without Mitsuba nothing has been baked
         return False
 
 
@@ -110,6 +112,8 @@ def _recipe(view: View, room: Room, settings: BakeSettings) -> bytes:
         "settings": repr(settings),
         "packages": {name: version(name) for name in ("mitsuba", "drjit", "numpy", "scipy")},
         "code": code_behind(LightMap.__module__),
+        # sums in another order, by another compiler, differ in their last bits
+        "renderer": renders_with(),
     }
     return json.dumps(document, sort_keys=True).encode()
 

@@ -141,6 +141,8 @@ def worker_name() -> str:
 
 def fault_text(error: Exception) -> str:
     """Message of an error that is meant for people, the traceback of any other."""
+    if isinstance(error, RuntimeError) and "out of memory" in str(error):  # Dr.Jit's, of a GPU
+        return f"the device has too little memory ({str(error).splitlines()[0]}): render with --variant llvm"
     told = isinstance(error, OSError | MemoryError) or type(error).__module__.startswith("phibench")
     return (str(error) or type(error).__name__) if told else traceback.format_exc()
 

@@ -22,12 +22,10 @@ from phibench.scenes.rig import Rig
 
 def start_renderer() -> dict[str, Any]:
     """Switch Mitsuba on in this process; return what it runs on."""
-    from phibench.render.setup.llvm import find_llvm
-    from phibench.render.setup.variant import THREADS, activate
+    from phibench.render.setup.variant import THREADS, activate, renders_with
 
-    variant = activate().variant()
-    llvm = find_llvm().label if variant.startswith("llvm") else None
-    return {"variant": variant, "llvm": llvm, "threads_per_process": THREADS}
+    activate()
+    return {**renders_with(), "threads_per_process": THREADS}
 
 
 def render_view(out: Path, dataset: str, rig: Rig, source: RoomSource, pose: PosePlan, ambient: AmbientTable) -> Made:

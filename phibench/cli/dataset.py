@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from cyclopts import App, Parameter
 
 from phibench.cli.completions import parts, pictures, recipes, released
-from phibench.cli.options import DEFAULT_PRESET, START, OwnOrPreset, Preset, Whole
+from phibench.cli.options import DEFAULT_PRESET, START, OwnOrPreset, Preset, Variant, Whole
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -36,6 +36,7 @@ def make(
     room_files: Path | None = None,
     leave_out_refused: Annotated[bool, Parameter(negative="")] = False,
     dry_run: bool = False,
+    variant: Variant = None,
 ) -> int:
     """Render a data set; what is finished already is kept. Sensitivities of D come last, sensitivities.parquet.
 

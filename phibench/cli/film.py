@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import App, Parameter
 
 from phibench.cli.completions import policies, recipes
-from phibench.cli.options import DATA, SENSOR, Preset, Whole
+from phibench.cli.options import DATA, SENSOR, Preset, Variant, Whole
 
 if TYPE_CHECKING:
     from phibench.robot.loop.episodes import Episode
@@ -25,6 +25,7 @@ def make(
     out: Path,
     workers: Whole | None = None,
     dry_run: bool = False,
+    variant: Variant = None,
 ) -> int:
     """Make the films of a recipe with [film]; what is finished already is kept.
 

@@ -147,13 +147,35 @@ fi"""
 
 
 @app.command(group=INSTALLATION)
-def doctor() -> int:
+def doctor(*, variants: bool = False) -> int:
     """Show Python, packages, LLVM, cores and disk, and render a test image.
 
     The exit code is 1 if something is broken; an installation that can only score is not.
+
+    Parameters
+    ----------
+    variants
+        Render `smoke` with LLVM and with CUDA instead, a minute or two, and compare: truth to the bit, layers in sigma
+        of phi. The exit code is 1 above 0.05 sigma.
     """
+    if variants:
+        return _compare_variants()
     # a bad LLVM aborts the process that loads it: never this one
     return subprocess.run([sys.executable, "-m", "phibench.render.setup.doctor"], check=False).returncode
+
+
+def _compare_variants() -> int:
+    import tempfile
+
+    from phibench.datasets.make import make_with_variant
+    from phibench.estimator.limits.variant_difference import table_of, variant_difference
+
+    with tempfile.TemporaryDirectory(prefix="phibench-variants-") as folder:
+        # CUDA first: where there is none, it says so at once
+        cuda, llvm = (make_with_variant(name, "smoke", Path(folder) / name) for name in ("cuda", "llvm"))
+        found = variant_difference(llvm, cuda)
+    print(table_of("llvm", "cuda", found))
+    return 0 if found.agrees else 1
 
 
 def main(tokens: Sequence[str] | None = None) -> int:
@@ -268,7 +290,7 @@ def _is_users(error: Exception) -> bool:
     return isinstance(error, known) or _lacks_memory(error) or type(error).__module__.startswith("phibench.render.")
 
 
-_NO_MEMORY = ("failed to map segment", "annot allocate memory", "can't start new thread")
+_NO_MEMORY = ("failed to map segment", "annot allocate memory", "can't start new thread", "out of memory")
 
 
 def _lacks_memory(error: Exception) -> bool:

@@ -6,6 +6,7 @@ folder to write. Wherever a method runs, `Limits` are its options.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated
@@ -47,6 +48,23 @@ def number(_kind: object, tokens: Sequence[Token]) -> float:
         raise ValueError(f"{text!r} is not a number{hint}") from None
 
 
+def _variant(_kind: object, tokens: Sequence[Token]) -> str:
+    """Variant of Mitsuba for this command and all processes that it starts."""
+    known, asked = ("llvm", "cuda"), tokens[0].value
+    if asked not in known:
+        raise ValueError(f"there is no variant {asked!r}: give {' or '.join(known)}")
+    os.environ["PHIBENCH_VARIANT"] = asked
+    return asked
+
+
+Variant = Annotated[
+    str | None,
+    Parameter(
+        name="--variant",
+        converter=_variant,
+        help="What renders: llvm, on the processor, or cuda, on an NVIDIA GPU; by default PHIBENCH_VARIANT, else llvm.",
+    ),
+]
 Whole = Annotated[int, Parameter(converter=_whole)]
 Preset = Annotated[str, Parameter(completer=presets)]
 OwnOrPreset = Annotated[str | None, Parameter(completer=presets)]

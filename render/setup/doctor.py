@@ -21,7 +21,7 @@ from typing import Literal
 
 from phibench.render.setup.llvm import find_llvm
 from phibench.render.setup.llvm_library import GET_LIBRARY, MISSING_LIBRARY, LlvmError, fault_of, prove
-from phibench.render.setup.variant import ENVIRONMENT, default_variant
+from phibench.render.setup.variant import asked_variant
 
 State = Literal["ok", "optional", "warning", "fault"]
 
@@ -66,7 +66,7 @@ def examine() -> Iterator[Diagnosis]:
         yield disk_finding(Path.cwd())
         yield scoring_finding(after=packages)
         return
-    variant = os.environ.get(ENVIRONMENT) or default_variant()
+    variant = asked_variant()
     yield Diagnosis("variant", variant)
     llvm = llvm_finding(is_needed=variant.startswith("llvm"))
     yield llvm

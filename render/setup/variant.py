@@ -1,4 +1,4 @@
-"""Mitsuba, activated once per process: the variant (CUDA where there is a GPU, else LLVM), then one Dr.Jit thread.
+"""Mitsuba, activated once per process: the variant (LLVM, or CUDA where it is asked for), then one Dr.Jit thread.
 
 Dr.Jit adds floating-point numbers with atomics, in whatever order its threads come, so that two runs agree to the last
 bit only with one thread. Work is spread over processes instead. The variant is global to the process and never changed.
@@ -13,7 +13,7 @@ import sys
 from types import ModuleType
 
 from phibench.render.setup.llvm import ENVIRONMENT as LLVM_ENVIRONMENT
-from phibench.render.setup.llvm import use_llvm
+from phibench.render.setup.llvm import find_llvm, use_llvm
 from phibench.render.setup.llvm_library import GET_LIBRARY, MISSING_LIBRARY
 
 _DRIVER = {"linux": "libcuda.so.1", "win32": "nvcuda.dll"}
@@ -46,8 +46,10 @@ def _devices(driver: ctypes.CDLL | None) -> int:
 
 
 CUDA, LLVM = "cuda_ad_rgb", "llvm_ad_rgb"
+VARIANTS = {"llvm": LLVM, "cuda": CUDA}
+"""Mitsuba's name of a variant by the short one."""
 ENVIRONMENT = "PHIBENCH_VARIANT"
-"""Names a variant for everything, over what the code asks for (`scalar_rgb` where there is no LLVM)."""
+"""Names a variant for everything, over what the code asks for: "llvm", "cuda", or Mitsuba's name of another."""
 
 THREADS = 1
 """Dr.Jit counts the calling thread: 1 means that it works alone, without a pool."""
@@ -57,9 +59,25 @@ class VariantError(RuntimeError):
     """Mitsuba cannot be used as asked. The message is one sentence."""
 
 
-def default_variant() -> str:
-    """CUDA where there is a GPU, LLVM elsewhere."""
-    return CUDA if has_gpu() else LLVM
+def asked_variant() -> str:
+    """Mitsuba's name of the variant that `PHIBENCH_VARIANT` asks for; LLVM where it asks for none.
+
+    A GPU is never taken unasked: a data set's bytes must not depend on a driver.
+    """
+    asked = os.environ.get(ENVIRONMENT, "")
+    return VARIANTS.get(asked, asked) or LLVM
+
+
+def renders_with() -> dict[str, str | None]:
+    """Variant and version of LLVM that this process renders with, without loading either.
+
+    Raises
+    ------
+    LlvmError
+        If the variant needs an LLVM and there is none.
+    """
+    variant = _active() or asked_variant()
+    return {"variant": variant, "llvm": find_llvm().label if variant.startswith("llvm") else None}
 
 
 def activate(variant: str | None = None) -> ModuleType:
@@ -69,17 +87,17 @@ def activate(variant: str | None = None) -> ModuleType:
     ----------
     variant : str, optional
         Mitsuba's name of a variant; PHIBENCH_VARIANT overrules it. Without either, what this process renders with, or
-        else `default_variant`.
+        else LLVM.
 
     Raises
     ------
     VariantError
-        If Mitsuba is not installed, does not have the variant, runs another one in this process, or was imported with
-        an LLVM that nobody chose.
+        If Mitsuba is not installed, does not have the variant, runs another one in this process, was imported with
+        an LLVM that nobody chose, or is to use a GPU that does not answer.
     LlvmError
         If the variant needs an LLVM and there is none.
     """
-    wanted = os.environ.get(ENVIRONMENT) or variant or _active() or default_variant()
+    wanted = asked_variant() if os.environ.get(ENVIRONMENT) else variant or _active() or LLVM
     mitsuba = _import_mitsuba(needs_llvm=wanted.startswith("llvm"))
     active = mitsuba.variant()
     if active == wanted:
@@ -90,7 +108,13 @@ def activate(variant: str | None = None) -> ModuleType:
             f"this process renders with {active} and cannot change to {wanted}: start another process for that."
         )
     if wanted not in mitsuba.variants():
-        raise VariantError(f"Mitsuba has no variant {wanted}: choose one of {', '.join(mitsuba.variants())}.")
+        known = ", ".join([*VARIANTS, *(name for name in mitsuba.variants() if name not in VARIANTS.values())])
+        raise VariantError(f"Mitsuba has no variant {wanted}: choose one of {known}.")
+    if wanted == CUDA and not has_gpu():
+        raise VariantError(
+            "CUDA is asked for, and no NVIDIA driver with OptiX and a device answers: install one, or unset "
+            f"{ENVIRONMENT} (or leave --variant out) to render with LLVM."
+        )
     mitsuba.set_variant(wanted)
     _settle()
     return mitsuba

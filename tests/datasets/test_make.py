@@ -36,7 +36,7 @@ from phibench.datasets.store.layers import read_exr
 from phibench.datasets.store.leftovers import TEMPORARY_PREFIX
 from phibench.datasets.store.schema import ManifestRow
 from phibench.render.optics.certificate import Certificate, certify
-from phibench.render.setup.variant import default_variant
+from phibench.render.setup.variant import asked_variant
 from phibench.scenes.laser import LaserSpot
 
 Usage = namedtuple("Usage", "total used free")
@@ -72,7 +72,7 @@ def test_the_sums_are_those_of_sha256sum(smallest_dataset: Path) -> None:
 def test_the_info_says_what_made_it(smallest_dataset: Path) -> None:
     info = json.loads((smallest_dataset / schema.INFO).read_text())
     provenance = info["provenance"]
-    assert provenance["variant"] == default_variant()
+    assert provenance["variant"] == asked_variant()
     assert int(provenance["llvm"].split(".")[0]) >= 17
     assert provenance["threads_per_process"] == 1
     assert provenance["packages"]["mitsuba"]

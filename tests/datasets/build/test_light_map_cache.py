@@ -235,3 +235,16 @@ def test_the_command_shows_limits_and_clears(
     for bad in ("-1", "nan"):
         assert main(["cache", "limit", bad]) == 2
         assert "must be 0 or more" in capsys.readouterr().err
+
+
+def test_a_map_of_another_variant_or_llvm_is_another_entry(
+    tmp_path: Path, oven: Oven, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Keys alone: nothing is rendered, so that no GPU is needed."""
+    value(tmp_path)
+    for number, environment in enumerate(({"variant": "cuda_ad_rgb", "llvm": None}, {"variant": "llvm_ad_rgb"}), 2):
+        monkeypatch.setattr(cache, "renders_with", lambda changed=environment: {"llvm": "LLVM 20.1.0", **changed})
+        value(tmp_path)
+        assert oven.baked == number
+        value(tmp_path)
+        assert oven.baked == number

@@ -63,6 +63,7 @@ def test_the_environment_overrules(python: Python) -> None:
     assert (child.returncode, child.stdout.strip()) == (0, "scalar_rgb"), child.stderr
 
 
+NO_DRIVER = {"DRJIT_LIBCUDA_PATH": "/nowhere", "DRJIT_LIBOPTIX_PATH": "/nowhere"}
 FAKE = """
 int cuInit(unsigned flags) { return %d; }
 int cuDeviceGetCount(int *count) { *count = %d; return 0; }
@@ -70,23 +71,25 @@ int cuDeviceGetCount(int *count) { *count = %d; return 0; }
 
 
 @pytest.mark.skipif(shutil.which("cc") is None, reason="needs a C compiler to make a driver that answers")
-@pytest.mark.parametrize(("status", "devices", "expected"), [(0, 1, CUDA), (0, 0, LLVM), (100, 1, LLVM)])
-def test_cuda_is_taken_where_a_driver_says_that_there_is_a_gpu(
-    python: Python, tmp_path: Path, status: int, devices: int, expected: str
+@pytest.mark.parametrize(("status", "devices", "expected"), [(0, 1, True), (0, 0, False), (100, 1, False)])
+def test_a_gpu_is_there_if_a_driver_says_so_and_is_taken_only_if_asked_for(
+    python: Python, tmp_path: Path, status: int, devices: int, expected: bool
 ) -> None:
     """Drivers that answer: a device, none, and an error; a GPU itself is not needed."""
     (tmp_path / "fake.c").write_text(FAKE % (status, devices))
     library = tmp_path / "fake.so"
     subprocess.run(["cc", "-shared", "-fPIC", "-o", library, tmp_path / "fake.c"], check=True)
-    code = "from phibench.render.setup.variant import default_variant; print(default_variant())"
-    child = python(code, DRJIT_LIBCUDA_PATH=str(library), DRJIT_LIBOPTIX_PATH=str(library))
-    assert child.stdout.strip() == expected, child.stderr
-    assert python(code, DRJIT_LIBCUDA_PATH=str(library), DRJIT_LIBOPTIX_PATH="/nowhere").stdout.strip() == LLVM
+    code = "from phibench.render.setup.variant import asked_variant, has_gpu; print(has_gpu(), asked_variant())"
+    places = {"DRJIT_LIBCUDA_PATH": str(library), "DRJIT_LIBOPTIX_PATH": str(library)}
+    child = python(code, **places)
+    assert child.stdout.split() == [str(expected), LLVM], child.stderr
+    assert python(code, **places, PHIBENCH_VARIANT="cuda").stdout.split() == [str(expected), CUDA]
+    assert python(code, **{**places, "DRJIT_LIBOPTIX_PATH": "/nowhere"}).stdout.split() == ["False", LLVM]
 
 
-def test_the_environment_forces_llvm_where_there_is_a_gpu(python: Python) -> None:
-    code = "import phibench.render.setup.variant as v\nv.has_gpu = lambda: True\nprint(v.activate().variant())"
-    child = python(code, PHIBENCH_VARIANT=LLVM)
+@pytest.mark.parametrize("name", ["llvm", LLVM])
+def test_llvm_has_a_short_name(python: Python, name: str) -> None:
+    child = python(ACTIVATE + "print(mi.variant())", PHIBENCH_VARIANT=name)
     assert child.stdout.strip() == LLVM, child.stderr
 
 
@@ -94,7 +97,8 @@ def test_the_environment_forces_llvm_where_there_is_a_gpu(python: Python) -> Non
     ("code", "environment", "complaint"),
     [
         ("import sys; sys.modules['mitsuba'] = None\n" + ACTIVATE, {}, "run `pip install 'phibench[render]'`."),
-        (ACTIVATE, {"PHIBENCH_VARIANT": "llvm_nonsense"}, "Mitsuba has no variant llvm_nonsense: choose one of "),
+        (ACTIVATE, {"PHIBENCH_VARIANT": "llvm_nonsense"}, "has no variant llvm_nonsense: choose one of llvm, cuda, "),
+        (ACTIVATE, {"PHIBENCH_VARIANT": "cuda", **NO_DRIVER}, "CUDA is asked for, and no NVIDIA driver with OptiX"),
         (ACTIVATE, {"DRJIT_LIBLLVM_PATH": "/nowhere"}, "DRJIT_LIBLLVM_PATH names /nowhere, which is not a file"),
         ("import drjit\n" + ACTIVATE, {"DRJIT_LIBLLVM_PATH": ""}, "Dr.Jit was imported before its LLVM was chosen"),
         (WITHOUT_LIBATOMIC + ACTIVATE, {}, "Mitsuba cannot be loaded (libatomic.so.1: cannot open shared object file"),
