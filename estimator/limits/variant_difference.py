@@ -93,8 +93,6 @@ def variant_difference(first: str | Path, second: str | Path) -> VariantDifferen
     (first_s, first_cpu_s), (second_s, second_cpu_s) = (_times(dataset) for dataset in (one, other))
     seconds, cpu_s = (first_s, second_s), (first_cpu_s, second_cpu_s)
     return VariantDifference(one.info.name, tuple(faults), np.array(shifts), seconds, cpu_s)
-        one.info.name, tuple(faults), np.array(shifts), (times[0][0], times[1][0]), (times[0][1], times[1][1])
-    )
 
 
 _EXACT = (
