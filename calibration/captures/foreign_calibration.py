@@ -107,7 +107,7 @@ def _beyond(found: _Found) -> str:
     """Say what of the file's distortion [rig] cannot hold."""
     if found.model.lower() not in _PINHOLE_ONLY:
         return f"; its distortion '{found.model}' has no keys in [rig]: calibrate with k1, k2, p1, p2, k3 ('radtan')"
-    lost = [name for name, x in zip(_BEYOND, found.distortion[5:8], strict=False) if x != 0.0]
+    lost = [name for name, x in zip(_BEYOND, found.distortion[5:8], strict=False) if x != 0.0]  # k4 to k6
     if found.skew:
         return f"; its skew of {found.skew:g} has no key in [rig]: calibrate without it"
     return f"; its {', '.join(lost)} have no keys in [rig]: calibrate without the rational model" if lost else ""
@@ -194,6 +194,7 @@ def _basalt(text: str) -> _Found | None:
 def _matrix_file(text: str) -> _Found | None:
     """OpenCV's storage, ROS's camera_info, or a matrix and coefficients as somebody dumped them."""
     matrix = _values(text, _MATRIX, 9)
+    # its storage begins so; a dump names it near the top
     opencv = "%YAML" in text[:100] or "opencv" in text[:4000].lower()
     if len(matrix) == 9 and matrix[6] and not matrix[2]:  # by columns, as Open3D writes it
         matrix = (matrix[0], matrix[3], matrix[6], matrix[1], matrix[4], matrix[7], matrix[2], matrix[5], matrix[8])

@@ -170,7 +170,7 @@ def _import(folder: Path, listed: Sequence[ListedPair], setting: KnownNumbers, w
     write_text(work / ROWS, "".join(json.dumps(row.model_dump(mode="json"), allow_nan=False) + "\n" for row in rows))
     hashes = {path.relative_to(work).as_posix(): sha256(path) for path in work.rglob("*") if path.is_file()}
     write_text(work / CHECKSUMS, checksums_text(hashes))
-    work.chmod(0o755)
+    work.chmod(0o755)  # a temporary folder is its owner's alone
     if out.exists():
         out.rmdir()
     work.replace(out)

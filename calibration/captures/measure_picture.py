@@ -21,6 +21,7 @@ from phibench.estimator.spots.detect import epipolar_curve, mirror_box
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import POSITIONS
 
+# two panels make 1288 px: a screen shows them without scaling
 _PANEL_PX, _GAP_PX, _FONT_PX, _LINE_PX = 640, 8, 16, 22
 _INSET_PX, _AROUND_PX = 200, 10  # side of an enlarged part, and half of the pixels in it
 _OUTLINE, _CURVE, _SPOT = (0, 255, 0), (255, 225, 0), (0, 225, 255)
@@ -96,6 +97,7 @@ def _inset(image: NDArray[np.uint8], found: Measurement, spot: SeenSpot, positio
         _line(draw, scale * (curve - origin), _CURVE)
     turn = np.linspace(0.0, 2.0 * np.pi, 60)
     circle = np.stack([np.cos(turn), np.sin(turn)])
+    # two sigma: 86 % in two dimensions
     ellipse = spot.uv_px + 2.0 * (np.linalg.cholesky(spot.covariance_px2) @ circle).T
     _line(draw, scale * (ellipse - origin), _SPOT)
     u, v = (float(x) for x in scale * (spot.uv_px - origin))

@@ -37,8 +37,8 @@ _NUMBERS = {
 }
 _NEEDED = ("name", "down", "up", "stroke_m")
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
-_MOST_ROWS = 100_000
-_CONTRADICTS_SIGMAS = 5.0
+_MOST_ROWS = 100_000  # a list of pairs that somebody measured; more is another file
+_CONTRADICTS_SIGMAS = 5.0  # of D by the images against the tape
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,7 @@ from phibench.scenes.frames import Array
 from phibench.scenes.revolved_mirror import RevolvedMirror
 from phibench.scenes.rig import POSITIONS, Rig
 
-LEAST_STROKE_M, MOST_STROKE_M = 1e-3, 10.0
+LEAST_STROKE_M, MOST_STROKE_M = 1e-3, 10.0  # those of a recipe
 _FACTORS = (0.1, 10.0, 0.3, 3.0, 0.01, 100.0, 0.001)  # of the stroke: units mistaken, and a few times too much
 _SURE_SIGMAS, _EACH_SIGMAS = 12.0, 9.0  # of both spots together and of each: a fainter one may be noise
 _OUTLINE_POINTS, _INSIDE = 24, 2e-3  # and the part of the mirror's size by which rays are traced inside its outline
@@ -248,7 +248,7 @@ def _both(found: PairDetection) -> bool:
 
 MOVED_PX = 0.3
 """Shift from which on a laser-off picture does not show what is behind the spot: edges leave a light of their own."""
-_NARROW_PX, _WIDE_PX = 0.7, 4.0
+_NARROW_PX, _WIDE_PX = 0.7, 4.0  # a difference of Gaussians: edges stay, noise and shading go
 _MOST_PX = 24  # larger ones are of another position, or no shift
 _CLEAR = 0.5  # correlation that a shift must have, over that of the picture with itself
 _RELIT = 0.05  # relative change of the room's light that is no drift of a lamp

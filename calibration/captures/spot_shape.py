@@ -42,7 +42,7 @@ PRIOR_SIGMA = (0.25, 0.06, 0.04)
 """Of the blur in pixels, and of green's and blue's response over red's, of a camera that nobody has measured."""
 OUTLINE_SIGMA_PX = 0.1  # of a blur that the mirror's outline gave
 _STEP = (0.02, 0.01, 0.01)  # of differences
-_LONGEST = (0.12, 0.04, 0.04)
+_LONGEST = (0.12, 0.04, 0.04)  # of one step: blur in pixels, shares of green and blue
 _LOW, _HIGH = (0.2, 0.0, 0.0), (5.0, 1.0, 1.0)
 _ROUNDS, _REST = 6, 0.1  # steps of the fit, and the step in standard deviations at which it ends
 _FIELD = (0.02, 0.01, 0.01)

@@ -154,8 +154,9 @@ def jpeg_behind(pixels: Image) -> tuple[int, Subsampling] | None:
 def comb_quality(pixels: Image) -> int | None:
     """Quality of libjpeg on whose steps the luma's coefficients lie best, of the coarsest that will do and its like."""
     h, w = (size // 8 * 8 for size in pixels.shape[:2])
-    luma = pixels[:h, :w].astype(float) @ np.array([0.299, 0.587, 0.114])
+    luma = pixels[:h, :w].astype(float) @ np.array([0.299, 0.587, 0.114])  # JPEG's Y (BT.601)
     blocks = luma.reshape(h // 8, 8, w // 8, 8).swapaxes(1, 2).reshape(-1, 8, 8)
+    # a code that is cut has no coefficients of a JPEG
     lit = blocks[(blocks.min(axis=(1, 2)) > 8.0) & (blocks.max(axis=(1, 2)) < 247.0)]
     if len(lit) < 16:
         return None
@@ -179,7 +180,7 @@ def comb_quality(pixels: Image) -> int | None:
 _LEAST_LOG = -12.0  # of one output's chance: one that is impossible is an outlier
 _SHARED = 0.5  # of the evidence: outputs of one window are not independent
 _PRIOR = {True: 0.7, False: 0.1}  # chance that a camera is read out from red, and of each other phase
-_LEFT_OUT = 5e-3
+_LEFT_OUT = 5e-3  # chance of a phase below which it is not followed: sigma does not feel it
 _MOST_SURPRISE = 6.0  # standard deviations; drawn pairs have 1 or less
 
 
@@ -242,6 +243,7 @@ def _log_chance(z: Array, mean: Array, sigma: Array, step: Array) -> Array:
     low, high = ((z + side * step - mean) / sigma for side in (-0.5, 0.5))
     low, high = np.where(low > 0.0, -high, low), np.where(low > 0.0, -low, high)  # the tail whose logarithm is exact
     larger, smaller = log_ndtr(high), log_ndtr(low)
+    # a step far narrower than its noise leaves the logarithm of 0
     return np.maximum(larger + np.log1p(-np.exp(np.minimum(smaller - larger, -1e-12))), _LEAST_LOG)
 
 
@@ -249,7 +251,7 @@ def _log_chance(z: Array, mean: Array, sigma: Array, step: Array) -> Array:
 
 _RED_RATIO = 2.5  # of a spot's light on the brightest of four places over the next, from which on that is red
 _NO_FILTERS = 2.0  # of the brightest over the faintest, below which there are no filters
-_SPOT_SIGMAS = 12.0
+_SPOT_SIGMAS = 12.0  # a spot that tells its filter is far beyond what a map of a million places has by chance
 
 
 def raw_phase(images: Mapping[str, Image]) -> Phase | str | None:
@@ -275,7 +277,7 @@ def _spot_phase(on: Array, off: Array) -> Phase | str | None:
     match = gaussian_filter(sums, 1.0) - gaussian_filter(sums, 4.0)
     scatter = 1.4826 * float(np.median(np.abs(match)))
     v, u = np.unravel_index(int(np.argmax(match)), match.shape)
-    if match[v, u] < _SPOT_SIGMAS * max(scatter, 1e-9):
+    if match[v, u] < _SPOT_SIGMAS * max(scatter, 1e-9):  # noise-free pictures scatter by nothing
         return None
     v0, u0 = (max(2 * int(x) - 4, 0) for x in (v, u))
     part = light[v0 : v0 + 10, u0 : u0 + 10]
@@ -393,7 +395,7 @@ def _of_codes(photos: PairPhotos, card: SensorCard) -> ChainTest:
         )
         notes = "; ".join(text for text in (_phase_note({phase: 1.0}), note) if text)
         return ChainTest(photos, {phase: 1.0}, 0.0 if exact else _UNKNOWN_PX, notes)
-    chances = dict.fromkeys(PATTERNS, 0.25)
+    chances = dict.fromkeys(PATTERNS, 0.25)  # for the note alone: no phase was tested
     if not tested.residual_codes:
         return ChainTest(photos, {phase: _PRIOR[phase == (0, 0)] for phase in PATTERNS}, note=_phase_note(chances))
     doubt = (

@@ -46,12 +46,14 @@ _FLOOR_PX = 0.4  # of an edge's place in the small picture: inside the limb the 
 _LIMB_FLOOR_PX = (0.1, 0.1, 0.3)  # of u, v, radius: a plate's edge lies a pixel inside the limb, all around
 _LIMB_SHARED = 0.6  # part of the scatter of its places that neighbours share
 _LIMB_ROUNDS = ((24.0, 1.5), (14.0, 1.0), (8.0, 0.7))  # reach, and how near a limb's place must be to a circle, pixels
+# long side of the picture that votes, short side that is enough, circles looked at, and those followed to the end
 _VOTE_PX, _LEAST_SIDE, _CANDIDATES, _SETTLED = 256, 16, 30, 6
 _ELLIPSE = 0.01  # standard deviation of e1 and e2 over the radius: a sphere 8 degrees off the axis
+# triples of edges: with half of all turns on the circle 50 of 400 are wholly of it
 _DRAWS, _NEAR_PX, _NEAR_REACH_PX = 400, 1.5, 12.0
 _SCALES = (6.0, 3.0, 2.0, 1.5, 1.5, 1.5)  # of the robust weights, in steps
-_SECTORS = 12
-_OVERWHELMING = 2.5
+_SECTORS = 12  # of the jackknife: each holds what the room does to one part of the limb
+_OVERWHELMING = 2.5  # times the contrast of the next: the others are not followed
 _SAME_PX, _SAME = 3.0, 0.04  # pixels, and parts of the radius
 _AGREE = 2.0  # standard deviations by which edges and the fall of the light may differ
 _OF_EDGES, _OF_FALL = 0.75, 0.25  # of what the two are apart: error of either where it is the answer
@@ -235,6 +237,7 @@ def candidates(channels: Array, radii_px: tuple[float, float] | None = None, cou
     v, u, cosine, sine = _edge_elements(small)
     short = min(rows, columns)
     low, high = (SIZES[0] * short, SIZES[1] * short) if radii_px is None else _over(radii_px, block)
+    # steps of 1.5 px: votes are smoothed over about as much
     radii = np.arange(max(low, 4.0), max(high, low + 2.0), 1.5)
     beyond = max(rows, columns) // 4
     size = ((rows + 2 * beyond) // 2 + 1, (columns + 2 * beyond) // 2 + 1)
@@ -247,6 +250,7 @@ def candidates(channels: Array, radii_px: tuple[float, float] | None = None, cou
             fits = (i >= 0) & (i < size[0]) & (j >= 0) & (j < size[1])
             votes += np.bincount(i[fits] * size[1] + j[fits], minlength=len(votes))
         space[k] = ndimage.gaussian_filter(votes.reshape(size), 1.0) / r
+    # along the radius: a circle between two steps has both's votes
     space = ndimage.gaussian_filter1d(space, 0.7, axis=0)
     # by chance every place gets a share of the votes with a deviation as 1 / sqrt(r)
     space = (space - space.mean(axis=(1, 2), keepdims=True)) * np.sqrt(radii)[:, None, None]
@@ -254,6 +258,7 @@ def candidates(channels: Array, radii_px: tuple[float, float] | None = None, cou
     for _ in range(count):
         k, i, j = (int(x) for x in np.unravel_index(int(np.argmax(space)), space.shape))
         found.append(((2 * j - beyond + 0.5) * block - 0.5, (2 * i - beyond + 0.5) * block - 0.5, radii[k] * block))
+        # the next one is another circle
         space[max(0, k - 3) : k + 4, max(0, i - 4) : i + 5, max(0, j - 4) : j + 5] = -np.inf
     return found
 
@@ -361,6 +366,7 @@ def _consensus(ring: EdgeRing, near_px: float, seed: int) -> Array | None:
         return None
     rng = np.random.default_rng(seed)  # part of the search, not noise: the same picture has the same answer
     turns = np.sort(rng.choice(have, (_DRAWS, 3)), axis=1)
+    # a turn without an edge has no weight
     share = np.cumsum(weight, axis=1) / np.maximum(weight.sum(axis=1, keepdims=True), 1e-12)
     which = np.minimum((rng.random((_DRAWS, 3, 1)) > share[turns]).sum(axis=-1), PEAKS - 1)
     gaps = np.diff(np.concatenate([turns, turns[:, :1] + TURNS], axis=1), axis=1)
@@ -368,6 +374,7 @@ def _consensus(ring: EdgeRing, near_px: float, seed: int) -> Array | None:
     if not len(turns):
         return None
     circles = np.linalg.solve(CURVES[turns, :3], place[turns, which][..., None])[..., 0]
+    # a circle that leaves the ring has no edges there
     circles = circles[np.abs(circles).max(axis=1) <= 1.2 * ring.reach_px]
     best, most = None, -1.0
     for circle in circles:
@@ -386,6 +393,7 @@ def _least_squares(
 ) -> tuple[Array, Array]:
     """Curve through the edges near it, with Tukey's weights, and their distances from it, NaN for none."""
     place, weight = ring.peaks
+    # the circle is free, the ellipse small
     prior = np.diag([1e-9, 1e-9, 1e-9, *[(_ELLIPSE * ring.circle[2]) ** -2] * 2])
     rows, w = np.arange(TURNS), np.zeros(TURNS)
     for scale in scales_px:
@@ -454,6 +462,7 @@ def on_limb(light: NDArray[Any], near: Circle, blur_px: float) -> BallCircle | N
         As `LimbRing.blur_px`.
     """
     block = max(1, math.ceil(max(light.shape[:2]) / (2 * LONGEST_PX)))
+    # squares of pixels blur as a square of their side does; the pixel's own 1/12 is in both
     blur_px = math.sqrt(blur_px**2 / block**2 + (1.0 - 1.0 / block**2) / 12.0)
     small = shrunk(light, block)
     channels = small[None] if small.ndim == 2 else np.moveaxis(small, -1, 0)

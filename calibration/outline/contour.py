@@ -30,8 +30,8 @@ PLACES = 5
 """Numbers of a place: x, y, z of the vertex, metres; e1, e2, pixels."""
 POINTS = 240  # a spline through so many is exact to 1e-6 px
 _FEWER = 96  # exact to 1e-5 px
-_STEP_M, _TILT_RAD = 1e-5, 1e-3
-_ROUNDS, _REST_PX = 12, 1e-9
+_STEP_M, _TILT_RAD = 1e-5, 1e-3  # of differences: contours are exact to 1e-6 px, and curve little over so much
+_ROUNDS, _REST_PX = 12, 1e-9  # Newton's
 
 
 @dataclass(frozen=True)
@@ -223,6 +223,7 @@ def _seen(rig: Rig, t: Array, middle: Array) -> tuple[BoolArray, float, float]:
     assert isinstance(mirror, RevolvedMirror)
     eye = rig.T_camera_sphere.inverse().t
     P = rim_points(mirror.profile, eye, np.linspace(0.0, 2.0 * np.pi, POINTS, endpoint=False))
+    # a contour that is the rim is on it to rounding
     rim = np.hypot(P[:, 0], P[:, 1]) > (1.0 - 1e-9) * mirror.profile.rim_radius_m
     in_camera = rig.T_camera_sphere.points(P)
     off = rig.camera.project(in_camera) - middle

@@ -29,17 +29,18 @@ from phibench.calibration.outline.limb_image import convolved
 from phibench.scenes.frames import Array, BoolArray
 
 Circle = tuple[float, float, float]
-TURNS = 360
+TURNS = 360  # places around the ring: a degree is some 5 px of a usual outline
 REACH_PX = 14.0
 _ALONG_PX = 5.0  # the room's own edges are rarely along the outline: averaged away
 _SHARE = 0.7  # an edge of 0.7 times the rms of its turn has half of the full strength
 _NOISE = 0.003  # of the logarithm: below it is no edge
 _DARK = 0.02  # of the median: logarithms end there
+# curves that a contrast is taken against: beyond the edge's blur
 _BESIDE_PX = (-9.0, -7.5, -6.0, -4.5, 4.5, 6.0, 7.5, 9.0)
-_CORRELATED_PX = 10.0
-_FEWEST_TURNS = TURNS // 12
-PEAKS = 4
-_LEAST_PEAK = 0.25
+_CORRELATED_PX = 10.0  # along the curve: nearer strengths are one and the same
+_FEWEST_TURNS = TURNS // 12  # a twelfth of a circle is not told from a line
+PEAKS = 4  # edges of a turn that are kept: the limb is not always the strongest
+_LEAST_PEAK = 0.25  # of the full strength
 
 
 def log_colours(light: NDArray[Any]) -> Array:
@@ -161,6 +162,7 @@ class EdgeRing:
         if len(more) < _FEWEST_TURNS or places < 3:
             return 0.0
         means = more[: places * together].reshape(places, together).mean(axis=1)
+        # a drawn circle has no scatter at all
         return float(means.mean() / (means.std(ddof=1) / np.sqrt(places) + 1e-9))
 
     def moved(self, curve: Array, **options: float) -> tuple[Self, Array]:
@@ -262,14 +264,14 @@ class LimbRing(EdgeRing):
             left = left + own - np.square(windows @ limb).sum(axis=-1)
             right = right + own - np.square(windows @ parabola).sum(axis=-1)
         inside = np.lib.stride_tricks.sliding_window_view(wide.inside, len(x), axis=1).all(axis=-1)
-        floor = _NOISE**2 * square + 1e-300
+        floor = _NOISE**2 * square + 1e-300  # a black window has no light
         ratio = np.log((np.maximum(right, 0.0) + floor) / (np.maximum(left, 0.0) + floor))
         return np.asarray(np.where(inside & np.isfinite(ratio), np.clip(ratio, -_AGAINST, _FULL) / _FULL, 0.0))
 
     def _limb(self, x: Array) -> Array:
         """Blurred 1, T and T^2 at distances from the limb, shape (n, 3)."""
         fine = self.step_px / _FINE
-        reach = np.ceil(6.0 * self.blur_px / self.step_px) * self.step_px
+        reach = np.ceil(6.0 * self.blur_px / self.step_px) * self.step_px  # six sigma of the blur beyond the window
         d = np.arange(x[0] - reach, x[-1] + reach + 0.5 * fine, fine)
         k = np.arange(-reach, reach + 0.5 * fine, fine)
         kernel = np.exp(-0.5 * np.square(k / self.blur_px))

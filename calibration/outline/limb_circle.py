@@ -19,14 +19,17 @@ from scipy import ndimage, optimize
 from phibench.calibration.outline.edge_ring import Circle
 from phibench.scenes.frames import Array, BoolArray
 
+# each sector has a light of its own; groups of the jackknife hold five, so that what the room does to neighbours stays
+# together
 _SECTORS, _GROUPS = 60, 12
+# of the window about the limb, of the unrolled picture, of its samples, of the blur's table
 _HALF_PX, _REACH_PX, _STEP_PX, _FINE_PX = 14.0, 40.0, 0.5, 0.05
 _STARTS = ((0.0, 1.2), (0.0, 3.0), (5.0, 1.2), (5.0, 3.0), (10.0, 3.0))  # of the radius and of the blur, pixels
-_BLUR_PX = (0.4, 8.0)
+_BLUR_PX = (0.4, 8.0)  # a pixel's own blur, and that of a limb far out of focus
 _ROUNDS, _STEPS = 3, 30
 _ROBUST = 2.0  # of the usual residual
 _LEAST_SHARE = 0.5  # of the sectors, in the picture
-_RIDGE = 1e-9
+_RIDGE = 1e-9  # of the normal equations: a sector of even light does not tell its five terms apart
 
 
 @dataclass(frozen=True)
@@ -113,7 +116,7 @@ def _residual(y: Array, basis: Array) -> Array:
 
 
 def _log_rms(residual: Array) -> Array:
-    return np.asarray(0.5 * np.log(np.maximum(np.square(residual).mean(axis=1), 1e-30)))
+    return np.asarray(0.5 * np.log(np.maximum(np.square(residual).mean(axis=1), 1e-30)))  # a flat sector leaves nothing
 
 
 def _left_at(polar: _Polar, radius_px: float) -> Array:
@@ -166,7 +169,7 @@ def _fit(polar: _Polar, radius_px: float, start: tuple[float, float]) -> _Fit:
 
         rms = np.exp(_log_rms(left(theta)))
         usual = float(np.median(rms[polar.inside]))
-        weight = polar.inside / np.maximum(np.hypot(rms, 0.5 * usual), 1e-15)
+        weight = polar.inside / np.maximum(np.hypot(rms, 0.5 * usual), 1e-15)  # half of the usual one: no sector rules
 
         def weighted(p: Array, weight: Array = weight, left: Callable[[Array], Array] = left) -> Array:
             return np.asarray((left(p) * weight[:, None]).ravel())

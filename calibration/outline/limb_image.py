@@ -32,7 +32,7 @@ from phibench.scenes.rig import Rig
 
 JPEG_LUMA = (0.299, 0.587, 0.114)  # JPEG's (ITU-R BT.601): errors of its coarse chroma cancel in this sum
 _CLIPPED = 250  # of 255: JPEG moves clipped pixels by some codes
-_NEAR_FULL = 0.97
+_NEAR_FULL = 0.97  # of saturation: with noise a pixel above it may be cut
 
 
 @dataclass(frozen=True)
@@ -156,7 +156,7 @@ def _luma(image: NDArray[Any], card: SensorCard) -> Plane:
     clipped: BoolArray = np.maximum(np.maximum(image[..., 0], image[..., 1]), image[..., 2]) >= _CLIPPED
     clipped = ndimage.binary_dilation(clipped, iterations=2) if clipped.any() else clipped
     if image.dtype == np.uint8:  # 256 codes have 256 values: the tone curve of twelve megapixels would take seconds
-        light = light_of(np.arange(256) / 255.0, card)
+        light = light_of(np.arange(256) / 255.0, card)  # of every code
         values = (light * weights[0])[image[..., 0]]
         for i in (1, 2):
             values += (light * weights[i])[image[..., i]]
@@ -221,7 +221,7 @@ def _merged(taps: Iterable[Tap]) -> Taps:
 
 STEP_PX = 0.01
 """Of tables of the light across an outline."""
-_REACH_PX = 30.0
+_REACH_PX = 30.0  # of the tables, to both sides of the limb
 _PIXEL_VARIANCE_PX2 = 1.0 / 12.0  # of a square pixel, in every direction
 
 
@@ -254,6 +254,7 @@ class Limb:
 
     def all_at(self, filter_index: int, d_px: Array) -> Array:
         """Values of the five at distances, shape (..., 5), linear between the table's evenly spaced rows."""
+        # the last row has a next one no more
         at = np.clip((d_px - self.d_px[0]) / STEP_PX, 0.0, len(self.d_px) - 1.001)
         row = at.astype(np.intp)
         rows, part = self.rows[filter_index], (at - row)[..., None]

@@ -17,6 +17,8 @@ from phibench.scenes.frames import Array, BoolArray
 
 MIN_PIXELS = 12
 """Pixels that a sector needs to count: four times its coefficients."""
+# in standard deviations: pixels beyond two count less and beyond six not at all; 4.685 keeps 95 % of the efficiency on
+# normal errors
 _HUBER, _CUT, _TUKEY = 2.0, 6.0, 4.685
 _ROUNDS = 3
 NEIGHBOURS = 12
@@ -125,7 +127,7 @@ class Sectors:
 
     def _spread(self, residual: Array, mean: Array, pixels: NDArray[np.int64]) -> Array:
         """Robust standard deviation of each group; half of the usual relative one at least, so that no sector rules."""
-        spread = 1.4826 * _medians(np.abs(residual), self.group, pixels)
+        spread = 1.4826 * _medians(np.abs(residual), self.group, pixels)  # that of a normal law
         seen = (pixels >= MIN_PIXELS) & (mean > 0.0)
         if not seen.any():
             return np.ones(self.groups)
@@ -161,7 +163,7 @@ def sector_weights(where: Sectors, weight: Array, shift: Array, residual: Array)
         return SectorWeights(np.ones(where.count), np.ones(where.count))
     z = np.zeros(where.count)
     z[seen] = score[seen] / np.sqrt(information[seen])
-    scale = 1.4826 * float(np.median(np.abs(z[seen])))
+    scale = 1.4826 * float(np.median(np.abs(z[seen])))  # that of a normal law
     u2 = np.minimum((z / max(_TUKEY * scale, 1e-300)) ** 2, 1.0)
     return SectorWeights((1.0 - u2) ** 2, (1.0 - u2) * (1.0 - 5.0 * u2))
 
@@ -206,5 +208,5 @@ def _normal(group: NDArray[np.int64], groups: int, basis: Array, columns: Array,
 def _solve(normal: Array, right: Array) -> Array:
     """Solve all; a sector without pixels gets zeros, and one that cannot tell its coefficients apart small ones."""
     size = np.trace(normal, axis1=-2, axis2=-1)[:, None, None]
-    ridge = np.where(size > 0.0, 1e-10 * size, 1.0) * np.eye(normal.shape[-1])
+    ridge = np.where(size > 0.0, 1e-10 * size, 1.0) * np.eye(normal.shape[-1])  # far below what a pixel tells
     return np.asarray(np.linalg.solve(normal + ridge, right))

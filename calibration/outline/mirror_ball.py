@@ -42,7 +42,7 @@ MOST_COLUMNS = 8192
 READABLE_COLUMNS = 2880  # four planes of float32 then have less than the 64 MiB that a recipe reads
 _RIM = (0.005, 1.0)  # of the outline's radius, and pixels: inside it the background blurs into the ball
 _NODES = 20_000  # 1.6e-4 rad: linear between them errs by less than 1e-8 rad
-_ROWS_AT_ONCE = 128
+_ROWS_AT_ONCE = 128  # arrays of some tens of MB
 
 
 @dataclass(frozen=True)
@@ -80,6 +80,7 @@ class BallPhoto:
         for name, value in stated:
             if value is not None and not 0.0 < value < math.inf:
                 raise DatasetError(f"{name} {value:g}: must be above 0")
+        # nearer, the lens touches the ball
         if self.distance_m is not None and not self.distance_m > 1.02 * self.radius_m:
             raise DatasetError(
                 f"--distance-m {self.distance_m:g}: must be above 1.02 radii, {1.02 * self.radius_m:g} m"
@@ -153,7 +154,7 @@ def find_ball(light: NDArray[np.float32], photo: BallPhoto) -> Ball:
         s = sphere_from_circle(circle, camera, photo.radius_m)
     else:
         s = sphere_from_rays(camera.rays(points), photo.radius_m)
-    if not s[2] > 1.01 * photo.radius_m:
+    if not s[2] > 1.01 * photo.radius_m:  # rays of a lens at the ball have no meaning
         raise DatasetError(
             f"a focal length of {focal:.0f} px puts the lens into the ball: check focal length and outline"
         )
@@ -206,7 +207,7 @@ def unwrap(light: NDArray[np.float32], ball: Ball, surroundings_m: float, width_
     """
     if not surroundings_m > 1.5 * ball.view.rig.sphere.radius_m:
         raise DatasetError(f"--surroundings-m {surroundings_m:g}: must be above 1.5 radii of the ball")
-    native = math.pi * ball.circle_px[2]
+    native = math.pi * ball.circle_px[2]  # in the middle a pixel turns the ray by 2 / r: pi r of them are a turn
     width = min(READABLE_COLUMNS, max(32, 2 * round(native / 2.0))) if width_px is None else width_px
     if not 32 <= width <= MOST_COLUMNS or width % 2:
         raise DatasetError(f"--width {width}: must be an even number from 32 to {MOST_COLUMNS}")
@@ -264,7 +265,7 @@ class _Angles:
         length = np.linalg.norm(aside, axis=-1)
         angle = np.arctan2(length, -along)
         image = np.interp(angle, self.point_rad, self.image_rad)
-        side = aside / np.maximum(length, 1e-300)[..., None]
+        side = aside / np.maximum(length, 1e-300)[..., None]  # along the axis no side is defined, and none is needed
         camera = self.view.rig.camera
         uv = camera.project(np.cos(image)[..., None] * self.axis + np.sin(image)[..., None] * side)
         shown = (angle <= self.point_rad[-1]) & camera.contains(uv)
@@ -287,7 +288,7 @@ def write_panorama(path: Path, panorama: BallPanorama) -> Path:
     """
     require_suffix(path)
     if path.suffix.lower() == ".png":
-        if panorama.light.max() > 1.001:
+        if panorama.light.max() > 1.001:  # interpolation rounds
             raise DatasetError(f"{path}: the photograph has light above 1, which a PNG cannot hold; write an .exr file")
         codes = np.rint(255.0 * linear_to_srgb(panorama.light)).astype(np.uint8)
         return save_png(path, codes)
@@ -302,7 +303,7 @@ def write_panorama(path: Path, panorama: BallPanorama) -> Path:
     return write_exr(path, {**planes, "seen": panorama.seen.astype(np.float32)}, header)
 
 
-_POINT_M = (0.0, 0.0, 1.2)
+_POINT_M = (0.0, 0.0, 1.2)  # where nothing is stated: above the robot, at the height of a hand
 _WALL_M = (1.0, 45.0)  # distance of the example's walls: a room measures 2 to 100 m
 
 
@@ -349,7 +350,7 @@ def write_outline(path: Path, light: NDArray[np.float32], ball: Ball) -> Path:
     """Write a small copy of the photograph with the outline that was taken; PNG."""
     block = max(1, math.ceil(max(light.shape[:2]) / LONGEST_PX))
     small = shrunk(light, block)
-    bright = max(1.0, float(np.percentile(small, 99.0)))
+    bright = max(1.0, float(np.percentile(small, 99.0)))  # lamps may be cut in the picture
     picture = Image.fromarray(np.rint(255.0 * linear_to_srgb(small / bright)).astype(np.uint8))
     points = (ball.view.rig.outline_px() + 0.5) / block - 0.5
     ImageDraw.Draw(picture).polygon([(float(u), float(v)) for u, v in points], outline=(255, 0, 0), width=2)

@@ -23,8 +23,8 @@ from phibench.scenes.camera import Camera
 from phibench.scenes.frames import Array, as_vector
 from phibench.scenes.rig import Rig
 
-_OUTLINE_POINTS = 720
-_RING_MARGIN_PX = 2.5
+_OUTLINE_POINTS = 720  # two to a degree: the band of pixels is chosen by them
+_RING_MARGIN_PX = 2.5  # of the band that is looked at: the outline is taken by points and by squares
 
 
 @dataclass(frozen=True)
@@ -227,6 +227,7 @@ class Solution:
 
     def move(self, residual: Array) -> Array:
         """Step of the parameters, shape (p,), for residuals (N,)."""
+        # a direction that nothing tells gets no step
         return np.asarray(np.linalg.lstsq(self.normal(), self.J.T @ (self.weight * residual), rcond=1e-14)[0])
 
     def sector_shifts(self, residual: Array) -> Array:
@@ -241,7 +242,7 @@ class Solution:
         """Variance of the sectors' shifts that the residuals (N,) leave, over what their pixels promise."""
         where, own, trust = self.where, self.own, self.trust
         information = where.summed((own * self.shift**2)[:, None])[:, 0]
-        root = np.sqrt(np.maximum(information, 1e-300))
+        root = np.sqrt(np.maximum(information, 1e-300))  # a sector without pixels: z is 0
         left = (own * self.shift * (residual - self.J @ self.move(residual)))[:, None]
         z = np.sqrt(trust) * np.where(information > 0.0, where.summed(left)[:, 0] / root, 0.0)
         by_s = where.summed((own * self.shift)[:, None] * self.J[:, :-1])

@@ -78,6 +78,7 @@ class JpegAgain:
         units = units_of(self.pixels, (self.frame.shape[0], self.frame.shape[1]), self.card.jpeg_subsampling)
         factor = np.ones(self.frame.shape[:2])
         with np.errstate(all="ignore"):
+            # pixels next to black: their ratio says nothing
             factor[self.pixels.v, self.pixels.u] = np.clip(np.nan_to_num(model / self.pixels.y, nan=1.0), 0.25, 4.0)
         linear = light_of(self.frame[units.v, units.u] / 255.0, self.card) * factor[units.v, units.u][..., None]
         return np.array([self._seen(units, linear, k) for k in range(draws)])

@@ -20,11 +20,11 @@ from phibench.scenes.camera import Camera
 from phibench.scenes.frames import Array, BoolArray, as_vector
 from phibench.scenes.rig import Rig
 
-SECTORS = 120
+SECTORS = 120  # three degrees, some 18 px of the limb
 JPEG_DRAWS = (2, 8)
 """Draws of noise and JPEG from which the change of an outline by JPEG is taken, in a first and a second round."""
 _BESIDE_LAMP_PX, _FEWEST_FULL = 4.0, 2  # pixels on both sides of an outline, and of 9 places there
-_SHARED = 0.55
+_SHARED = 0.55  # of the scatter, and the scatter from which on it counts: measured in 60 rooms, see `shared_px2`
 _SMOOTH, _SMOOTH_JPEG = 2.5, 10.0
 _FROM_EDGE_PX = 1.0  # the steepest place of the light is some tenths of a pixel inside the limb
 
@@ -194,7 +194,7 @@ def shared_px2(shifts_px: Array, scatter: float, jpeg: bool) -> float:
     The edges of a room lie at one height all around. The share of the sectors' scatter was measured in 60 rooms; a
     scatter of a few times the pixels' noise is JPEG's, and of rooms without edges.
     """
-    usual = 1.4826 * float(np.nanmedian(np.abs(shifts_px)))
+    usual = 1.4826 * float(np.nanmedian(np.abs(shifts_px)))  # that of a normal law
     return float((_SHARED * usual) ** 2 * max(1.0 - (_SMOOTH_JPEG if jpeg else _SMOOTH) / scatter, 0.0))
 
 

@@ -20,10 +20,10 @@ from phibench.scenes.camera import Camera
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import Rig
 
-_FEW, _CANDIDATES = 6, 12
+_FEW, _CANDIDATES = 6, 12  # circles about the nominal size, and of all sizes
 _NEAR = (0.95, 1.05)  # of the nominal rig's outline: looked at first
-_RADII = (0.7, 1.4)
-_LEAST_RADIUS_PX = 30.0
+_RADII = (0.7, 1.4)  # of the nominal outline's: sizes that are looked at
+_LEAST_RADIUS_PX = 30.0  # a smaller outline has too few pixels for its sectors
 _LEVEL_PX = 1000  # rows and columns that are enough for a level
 PICTURE_BLUR_PX2 = 0.5 + 1.0 / 6.0 + 1.0 / 12.0
 """Variance of the blur of `grey` besides the lens: the mosaic's mean, linear interpolation, the pixel."""
@@ -35,6 +35,7 @@ def grey(planes: tuple[Plane, ...]) -> Array:
     if len(planes) == 3 and planes[0].values is not planes[1].values:
         picture = np.mean([plane.values for plane in planes], axis=0)
     elif len(planes) == 3:
+        # each place has the same share of all three filters
         picture = ndimage.convolve(picture, np.outer([1, 2, 1], [1, 2, 1]) / 16.0, mode="mirror")
     every = max(1, max(picture.shape) // _LEVEL_PX)
     some = picture[::every, ::every]

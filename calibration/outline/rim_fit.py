@@ -54,7 +54,7 @@ def rim_light(rig: Rig, contour: Contour, blur_px2: float) -> EdgeLight:
     """Light across a rim: 1 outside, 1 inside, and d on either side."""
     d = distances_px()
     kernel = line_spread(rig.camera, contour.depth_m, blur_px2)
-    outside = np.where(np.abs(d) < 0.25 * STEP_PX, 0.5, (d > 0.0).astype(float))
+    outside = np.where(np.abs(d) < 0.25 * STEP_PX, 0.5, (d > 0.0).astype(float))  # the middle of a step is half of it
     columns = [blurred(one, kernel) for one in (outside, 1.0 - outside, outside * d, (1.0 - outside) * d)]
     return EdgeLight(np.broadcast_to(_with_derivatives(columns), (3, len(d), 3 * _COLUMNS)))
 

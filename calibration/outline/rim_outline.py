@@ -46,12 +46,14 @@ from phibench.scenes.frames import Array
 from phibench.scenes.rig import Rig
 from phibench.scenes.validation import SceneError
 
+# of the band of pixels: in the end, at the start, and to compare with
 _HALF_PX, _COARSE_HALF_PX, _NARROW_PX = 5.0, 8.0, 3.5
 _LEAST_GAIN = 0.1  # of a variance: by a band of 5 px over one of 3.5 px
-_COARSE_STEPS, _CHOOSE, _STEPS = 8, 3, 24
+_COARSE_STEPS, _CHOOSE, _STEPS = 8, 3, 24  # of the start, those that choose pixels anew, and of the fit
+# steps at which the start ends, and at which the fit has come to rest: whichever of the two is longer
 _NEAR_M, _REST_M, _REST_SIGMAS = 5e-5, 1e-7, 0.05
-_LARGEST_MOVE_M, _LARGEST_ELLIPSE_PX = 3e-3, 3.0
-_BLUR_RANGE_PX2 = (0.02, 9.0)
+_LARGEST_MOVE_M, _LARGEST_ELLIPSE_PX = 3e-3, 3.0  # of a step: beyond it the light is not linear in the place
+_BLUR_RANGE_PX2 = (0.02, 9.0)  # of the lens: sharper than a pixel, and three pixels
 _MIN_ARC, _MIN_USED = 0.5, 0.2
 _RIM_FLOOR_PX = 0.2  # of an edge's place, all around, besides its scatter
 _EDGE_SIGMA_PX = 0.25  # of a sector that has an edge
@@ -205,6 +207,7 @@ def _settle(
         if count <= _CHOOSE:  # later the pixels stay, so that the steps come to rest
             pixels = _pixels(planes, rig, contour, _HALF_PX)
         step = rim_step(pixels, planes, rig, contour, blur, SECTORS, _HALF_PX, near=True)
+        # after six steps shorter ones: a fit that goes round in circles comes to rest
         move = step.move * min(1.0, 6.0 / count)
         sigma = np.sqrt(np.diag(step.covariance)[:PLACES]) if count >= _CHOOSE else np.zeros(PLACES)
         if count >= _CHOOSE and np.all(np.abs(move[:3]) < np.maximum(_REST_M, _REST_SIGMAS * sigma[:3])):
@@ -212,7 +215,7 @@ def _settle(
         place = _moved(place, move[:PLACES])
         blur = float(np.clip(blur + move[PLACES], *_BLUR_RANGE_PX2))
     else:
-        if np.any(np.abs(move[:3]) > np.maximum(1e-6, sigma[:3])):
+        if np.any(np.abs(move[:3]) > np.maximum(1e-6, sigma[:3])):  # a step of a sigma or a micrometre is good enough
             raise ImageError("an image without a mirror: the fit of the rim does not come to rest")
     _require_edges(step, arc)
     change, covariance = (step.move, step.covariance) if again is None else without_jpeg(pixels, step, *again)

@@ -52,14 +52,15 @@ from phibench.estimator.spots.image_planes import ImageError
 from phibench.scenes.frames import Array, BoolArray, as_vector
 from phibench.scenes.rig import Rig
 
-HALF_WIDTH_PX = 5.0
+HALF_WIDTH_PX = 5.0  # of the band of pixels along the limb
 MIN_ARC = 0.5
 """Part of the outline that must lie in the image."""
 MIN_USED = 0.6
 """Part of that whose light must be as the model has it: with less, the rest is not to be trusted either."""
-_COARSE_HALF_PX, _COARSE_STEPS = 8.0, 6
+_COARSE_HALF_PX, _COARSE_STEPS = 8.0, 6  # the start is some pixels off
 _NEAR_M = (3e-5, 3e-5, 1.2e-4)  # about 0.15 px of the outline
 _CHOOSE = 3  # steps that choose their pixels anew
+# at rest: a step below 0.1 um or a twentieth of sigma; without rest: one above 1 um and sigma
 _STEPS, _REST_M, _REST_SIGMAS, _UNREST_M = 30, 1e-7, 0.05, 1e-6
 _MIN_CONTRAST, _MAX_CONTRAST = 0.5, 1.6
 _BINNED_PX = 1000
@@ -67,7 +68,7 @@ _BINNED_PX = 1000
 light follows over some 15 degrees of turn: 5 squares of 4 px reach as far as 5 px of a small picture do, 5 px of a
 large one do not."""
 _HOPELESS = (6, 0.25, 2.2)  # step at which a fit with a contrast beyond these is given up
-_BLUR_RANGE_PX2 = (0.02, 9.0)
+_BLUR_RANGE_PX2 = (0.02, 9.0)  # of the lens: sharper than a pixel, and three pixels
 _LEAST_CONTRAST = 9.0  # of a circle whose light is worth a fit; patterns and noise give up to 8
 _MOST_TRIED = 4  # circles whose light is fitted, which takes seconds where it does not come to rest
 _MOST_OFF = 0.06  # of the distance, for an outline by its edge alone: a holder's plates are clear circles, too
@@ -277,7 +278,7 @@ def _settle(
 
 def _moved(s: Array, move: Array, rig: Rig) -> Array:
     """Take a step of at most 3 mm; a centre that runs away is no mirror's."""
-    s = s + move * min(1.0, 3e-3 / max(float(np.abs(move).max()), 1e-12))
+    s = s + move * min(1.0, 3e-3 / max(float(np.abs(move).max()), 1e-12))  # no move: no division by 0
     if not (np.isfinite(s).all() and s[2] > 1.02 * rig.sphere.radius_m):
         raise ImageError("an image without a mirror: no outline of a sphere fits the light")
     return s

@@ -51,7 +51,7 @@ _EDGE, _TO_MEETING = (0, 200, 255), (0, 110, 160)
 _EDGES_LEGEND = "blue: vertical edges, and their lines"
 _CONTRADICTED = 13.8  # chi^2 of two degrees of freedom: 0.1 % of true statements give more
 _SQUARE = 0.65  # of the outline's radius: half a square whose corners stay inside the mirror
-_RADIUS_MM, _DISTANCE_MM = 60.0, 260.0
+_RADIUS_MM, _DISTANCE_MM = 60.0, 260.0  # the paper's mirror, and the default rig's distance
 _NEAREST, _FARTHEST_MM = 1.02, 1e4  # in radii; nearer, the lens is at the mirror
 _ARROW_TIMES = 20.0  # the move is a few pixels: the picture draws it larger
 

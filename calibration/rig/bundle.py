@@ -42,12 +42,12 @@ from phibench.scenes.revolved_mirror import RevolvedMirror
 from phibench.scenes.rig import Rig, View
 from phibench.scenes.validation import SceneError
 
-_NEWTON = 3
+_NEWTON = 3  # steps from pixels nearby: each squares what is left
 _TURNS = ("mirror_tilt_x_rad", "mirror_tilt_y_rad")
 _TURN_RAD = 0.01  # for differences of a tilt
 _PART = 0.1  # of a prior sigma, for differences
 _REACH = 8.0  # sigmas on both sides of a fit without the ellipse
-_NODES = (121, 801)
+_NODES = (121, 801)  # of the sum over tilts: more where the misfit is steep
 _HELD_RAD = 1e-9  # of a tilt that is exact: the covariance of both keeps its inverse
 _WEAK = 0.9  # of the prior's variance: a direction that keeps so much was not measured
 
@@ -268,6 +268,7 @@ def _with_ellipse(problem: _Problem, fit: _Fit, vertex_rows: Array) -> _Fit:
     mean = weight @ z
     spread = (z - mean).T @ ((z - mean) * weight[:, None])
     spread[2:, 2:] += Q - gain @ Q
+    # tilts may be held, with a variance of 0
     G = fit.covariance @ of_x.T @ np.linalg.pinv(P, rcond=1e-12, hermitian=True)
     covariance = fit.covariance - G @ (P - spread) @ G.T
     return _Fit(fit.x + G @ mean, 0.5 * (covariance + covariance.T), fit.chi2 + float(misfit.min()))
@@ -377,6 +378,7 @@ def _undetermined(covariance: Array, names: Sequence[str]) -> tuple[WeakDirectio
     """Eigenvectors of the covariance in units of the prior, those with nearly all of its variance left."""
     size, vectors = np.linalg.eigh(covariance)
     weak = [i for i in np.argsort(-size) if size[i] > _WEAK]
+    # 4 % of a direction's length: less does not help a reader
     parts = [{n: float(x) for n, x in zip(names, vectors[:, i], strict=True) if abs(x) > 0.2} for i in weak]
     return tuple(WeakDirection(part, float(np.sqrt(size[i]))) for part, i in zip(parts, weak, strict=True))
 
@@ -389,9 +391,9 @@ def with_radius(measured: PoseMeasurement, nominal_m: float, other_m: float) -> 
 
 # -- outline and vertical of a true rig, as the nominal one gives them -------------------------------------------------
 
-_STEP_PX = 2.0
-_EDGES, _POINTS = 12, 8
-_DISTANCE_M = 2.5
+_STEP_PX = 2.0  # of the principal point, for differences: the vertical is smooth in it
+_EDGES, _POINTS = 12, 8  # upright lines all around the sphere, and points of each
+_DISTANCE_M = 2.5  # of a wall; it matters little, as in `vertical_edges`
 _ELEVATIONS_RAD = (-0.35, 0.5)  # walls of a room
 
 

@@ -168,6 +168,7 @@ def _require_sound(path: Path, nominal: Rig, rig: Rig, values: Array, covariance
     scale = np.sqrt(np.abs(np.diag(covariance)))
     whole = np.where(scale > 0.0, scale, 1.0)
     unit = covariance / np.outer(whole, whole)
+    # of a correlation: digits of the file
     if not np.allclose(unit, unit.T, atol=1e-9) or np.linalg.eigvalsh((unit + unit.T) / 2.0).min() < -1e-9:
         raise CalibrationError(
             f"{path} has no covariance: its matrix is not symmetric with eigenvalues of 0 or above; make it again"
@@ -214,7 +215,7 @@ def _close(a: Any, b: Any) -> bool:
     if isinstance(a, list | tuple) and isinstance(b, list | tuple):
         return len(a) == len(b) and all(_close(x, y) for x, y in zip(a, b, strict=True))
     if isinstance(a, float) and isinstance(b, float | int):
-        return math.isclose(a, b, rel_tol=1e-9, abs_tol=1e-12)
+        return math.isclose(a, b, rel_tol=1e-9, abs_tol=1e-12)  # another Python or program may print fewer digits
     return bool(a == b)
 
 

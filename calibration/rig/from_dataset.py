@@ -33,7 +33,7 @@ from phibench.scenes.rig import POSITIONS, Rig
 LAYERS = "layers"
 SPOT_SIGMA_PX = 0.02
 """Of the centroid in noise-free layers."""
-MOST_FOCAL_SIGMA = 0.2
+MOST_FOCAL_SIGMA = 0.2  # parts of the focal length: beyond it the nominal rig is no start
 
 
 @dataclass(frozen=True)

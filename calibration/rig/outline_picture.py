@@ -22,7 +22,7 @@ from phibench.scenes.frames import Array
 from phibench.scenes.rig import Rig
 
 _LONGEST_PX = 1600  # writing a PNG of twelve megapixels takes longer than finding the outline in it
-_LONGEST_RESIDUAL_PX, _FONT_PX = 45.0, 18
+_LONGEST_RESIDUAL_PX, _FONT_PX = 45.0, 18  # enlarged residuals stay beside the outline
 _GAINS = (5000.0, 2000.0, 1000.0, 500.0, 200.0, 100.0, 50.0, 20.0, 10.0)
 _FOUND, _RESIDUAL, _UNUSED = (0, 255, 0), (255, 225, 0), (150, 150, 150)
 
@@ -155,5 +155,5 @@ def visible_picture(image: NDArray[Any], card: SensorCard | None) -> NDArray[np.
     if image.dtype == np.uint8:
         return np.ascontiguousarray(image)
     level = grey(planes_of(image, card))
-    white = max(float(np.percentile(level, 98.0)), 1e-300)
+    white = max(float(np.percentile(level, 98.0)), 1e-300)  # lamps do not set the white; a black picture stays black
     return np.rint(255.0 * np.clip(0.8 * level / white, 0.0, 1.0) ** (1.0 / 2.2)).astype(np.uint8)

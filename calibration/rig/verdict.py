@@ -70,6 +70,7 @@ def verdict_of(bundle: Bundle, prior: Array, outlines: list[Outline]) -> Verdict
     least = _ARC if outlines[0].ellipse_px is None else _RIM_ARC
     shift_px = max(one.shift_rms_px for one in outlines)
     faults = [
+        # an underflow of p is a bad fit
         (_level(-np.log(max(p, 1e-300)), *(-np.log(_P))), f"chi2 is too large, p = {p:.1e}"),
         (_level(far[worst], *_FAR_SIGMAS), f"{PARAMETERS[worst]} is corrected by {far[worst]:.1f} prior sigmas"),
         (_level(-arc, -least), f"only {100.0 * arc:.0f} % of an outline could be used"),

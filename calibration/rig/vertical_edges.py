@@ -38,15 +38,16 @@ from phibench.scenes.rig import Rig
 Rows = NDArray[np.int64]
 RADII = (0.55, 0.93)
 """Rows of the unwrapped image, over the outline's radius: walls; the floor is inside, the ceiling outside."""
+# of Hough's segments, in the unwrapped image; a tilt of 0.05 rad and a decentre lean edges by less
 _LENGTH_PX, _GAP_PX, _LEAN_RAD = 18, 2, 0.12
 _STEP_PX = 0.5  # across the edge
-_REACH_PX = 4.0
+_REACH_PX = 4.0  # of the steepest place about a segment
 _SMOOTH_PX = (1.5, 0.8)  # along the radius, along the azimuth
-_LEVEL_PX = 20.0
+_LEVEL_PX = 20.0  # of the light that an edge is measured against: wider than an edge, narrower than a wall
 _MIN_STEP = 0.012  # of the light, per pixel
 _MIN_OVER_NOISE = 4.0  # of an edge over the usual gradient, which is noise, JPEG's waves and shading
-_MIN_POINTS = 14
-_NEAR_PX = 5.0
+_MIN_POINTS = 14  # of an edge: fewer are a corner, and have no direction
+_NEAR_PX = 5.0  # about an edge that was taken: a second segment there is the same edge
 
 
 @dataclass(frozen=True)
@@ -89,7 +90,7 @@ def edges_about(picture: Array, circle: Circle) -> list[Array]:
     polar = unwrapped(picture, circle)
     across = _gradient(polar.light)
     found, taken = [], np.zeros(across.shape, bool)
-    noise = 1.4826 * float(np.median(np.abs(across)))
+    noise = 1.4826 * float(np.median(np.abs(across)))  # that of a normal law: edges are few
     least = max(_MIN_STEP, _MIN_OVER_NOISE * noise)
     for (c0, r0), (c1, r1) in _segments(polar, least):
         track = _track(across, least, min(r0, r1), max(r0, r1), *((c0, c1) if r0 < r1 else (c1, c0)))
@@ -99,7 +100,7 @@ def edges_about(picture: Array, circle: Circle) -> list[Array]:
         if _is_block_border(polar.pixels(row.astype(float), column)):
             continue
         cell = np.rint(column).astype(int) % across.shape[1]
-        if taken[row, cell].mean() > 0.2:
+        if taken[row, cell].mean() > 0.2:  # most of this edge is part of another
             continue
         for k in range(-int(_NEAR_PX / _STEP_PX), int(_NEAR_PX / _STEP_PX) + 1):
             taken[row, (cell + k) % across.shape[1]] = True
@@ -134,7 +135,7 @@ def _segments(polar: Unwrapped, least: float) -> list[tuple[tuple[int, int], tup
 
 def _is_block_border(uv_px: Array) -> bool:
     """Tell an edge along the border of JPEG's blocks, pixels 7.5 mod 8: it may be JPEG's own."""
-    off = np.abs((uv_px - 7.5 + 4.0) % 8.0 - 4.0)
+    off = np.abs((uv_px - 7.5 + 4.0) % 8.0 - 4.0)  # distance from the nearest border
     return bool(np.any((np.ptp(uv_px, axis=0) < 2.5) & (np.median(off, axis=0) < 1.0)))
 
 
@@ -177,13 +178,13 @@ def _steepest(across: Array, row: Rows, near: Array, reach_px: float) -> tuple[A
 
 # -- vertical ----------------------------------------------------------------------------------------------------------
 
-MIN_EDGES = 3
+MIN_EDGES = 3  # two always agree on some vertical
 MAX_TILT_RAD = 0.05
 """How far the vertical may be from the nominal one; farther ones are other lines of the room."""
 _PER_M = (0.35, 0.65)  # an edge's inverse distance, as taken and one standard deviation nearer
 _TOGETHER = 6.0  # points of an edge that are wrong together: smoothing, and JPEG's blocks of 8 px
 _SLOPE_LIMIT = 4.0  # of an edge's slope against the others' vertical, over its own sigma
-_TUKEY, _LEAST_SCALE = 4.685, 0.5
+_TUKEY, _LEAST_SCALE = 4.685, 0.5  # of the usual residual: 95 % of the efficiency on normal errors
 _LEAST_SLOPE_RAD = 1e-4  # of an edge's own sigma: rooms are not built better
 _ROUNDS = 12
 
@@ -309,6 +310,7 @@ def _azimuth_and_slope(rays: EdgeRays, up: Array, per_m: float = _PER_M[0]) -> t
     square = float(centred @ centred)
     slope = float(centred @ along / square)
     left = along - along.mean() - slope * centred
+    # an exact line leaves nothing
     return azimuth, slope, square / (_TOGETHER * float(left @ left) / max(left.size - 2, 1) + 1e-300)
 
 
@@ -327,6 +329,7 @@ def agreeing(azimuth: Array, value: Array, weight: Array, most: float) -> list[i
     across = np.stack([-np.sin(azimuth), np.cos(azimuth)], axis=-1)
     i, j = np.triu_indices(len(value), 1)
     sine = across[i, 0] * across[j, 1] - across[i, 1] * across[j, 0]
+    # edges of nearly one azimuth tell one direction of the tilt only
     i, j, sine = i[np.abs(sine) > 0.3], j[np.abs(sine) > 0.3], sine[np.abs(sine) > 0.3]
     shift = np.stack(
         [value[i] * across[j, 1] - value[j] * across[i, 1], value[j] * across[i, 0] - value[i] * across[j, 0]]
@@ -373,11 +376,13 @@ def regression(azimuth: Array, value: Array, weight: Array) -> Regression:
         inverse = np.linalg.inv(across.T @ (w[:, None] * across))
         shift = inverse @ across.T @ (w * value)
         off = np.sqrt(weight) * (value - across @ shift)
+        # two numbers are fitted
         scale = 1.4826 * float(np.median(np.abs(off))) * np.sqrt(value.size / (value.size - 2.0))
         scale = max(scale, _LEAST_SCALE)  # few edges may agree by chance
         trust = np.clip(1.0 - (off / (_TUKEY * scale)) ** 2, 0.0, None) ** 2
     u2 = np.minimum((off / (_TUKEY * scale)) ** 2, 1.0)
     slack = np.clip(np.sum(weight * (1.0 - u2) * (1.0 - 5.0 * u2)) / np.sum(w), 0.5, 1.0)  # psi' over psi / x
+    # a single edge that decides: 1 / 0
     leverage = np.clip(np.einsum("ki,ij,kj->k", across, inverse, across) * w, 0.0, 0.9)
     scores = across * (trust * np.sqrt(weight) * off / np.sqrt(1.0 - leverage))[:, None]
     meat = across.T @ ((w * trust)[:, None] * across)

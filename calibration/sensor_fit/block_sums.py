@@ -19,7 +19,7 @@ from phibench.scenes.frames import Array
 
 _BLOCKS = 8  # along each side; sigma of sigma is 1 / sqrt(2 x 63) = 9 %
 _BOX = 5  # pixels of one filter
-_ROW_SIGMAS = 4.0
+_ROW_SIGMAS = 4.0  # below it row noise is not told from none, and is left out
 _FRAME_SIGMAS = 8.0  # chi-square with 1 degree of freedom exceeds 1 + 8 sqrt 2 once in 2e3, with 15 once in 1e6
 
 
@@ -174,7 +174,7 @@ def rounded_moments(mean: float, temporal_sd: float, spatial_sd: float) -> Array
 
     A pixel's mean is Gaussian about `mean` with `spatial_sd`; its values are Gaussian about that with `temporal_sd`.
     """
-    z = np.linspace(-5.0, 5.0, 201)
+    z = np.linspace(-5.0, 5.0, 201)  # a normal law: 6e-7 lies beyond
     weights = np.exp(-0.5 * z * z)
     weights /= weights.sum()
     centre = mean + max(spatial_sd, 1e-9) * z

@@ -40,8 +40,8 @@ MANIFEST = "capture.toml"
 _SUFFIXES = (".png", ".pgm", ".tif", ".tiff", ".bmp", ".yuyv", ".jpg", ".jpeg")
 _DRIFT = 0.02  # of the mean, from the least to the largest frame mean of one level
 _DRIFT_OF_RANGE = 0.0025  # of full scale: levels near zero jitter by more than a share of themselves
-_DRIFT_SIGMAS = 8.0
-_FRAME_BYTES = 512 * 2**20
+_DRIFT_SIGMAS = 8.0  # of the frames' means: their own noise is no drift
+_FRAME_BYTES = 512 * 2**20  # 250 million pixels of 16 bits
 
 
 class CaptureError(DatasetError):
@@ -285,7 +285,7 @@ def luma(image: NDArray[Any], kind: Kind) -> Array:
     """Y' of a processed frame, shape (h, w), BT.601, on 0 to 255 (that of YUYV as it is)."""
     if kind == "yuyv":
         return image[..., 0].astype(float)
-    return np.asarray(image.astype(float) @ np.array([0.299, 0.587, 0.114]))
+    return np.asarray(image.astype(float) @ np.array([0.299, 0.587, 0.114]))  # BT.601
 
 
 # -- header of a JPEG file --------------------------------------------------------------------------------------------
@@ -354,9 +354,9 @@ def _restart_interval(data: bytes) -> int:
     place = 2
     while place + 4 <= len(data) and data[place] == 0xFF:
         marker, length = data[place + 1], int.from_bytes(data[place + 2 : place + 4], "big")
-        if marker == 0xDD:
+        if marker == 0xDD:  # DRI: the restart interval
             return int.from_bytes(data[place + 4 : place + 6], "big")
-        if marker == 0xDA:
+        if marker == 0xDA:  # SOS: the coded image begins
             return 0
         place += 2 + length
     return 0

@@ -25,17 +25,17 @@ from scipy.special import ndtr
 from phibench.calibration.sensor_fit.tone_curve import Curve, decoded_by, encoded_by
 from phibench.scenes.frames import Array
 
-_WINDOW = 24
-_STRIDE = 12
+_WINDOW = 24  # pixels: an edge with both its plateaus
+_STRIDE = 12  # half a window: no edge lies between two
 _CONTRAST = 40.0  # codes; smaller steps say little
 _LEAST, _MOST = 6.0, 247.0  # codes of plateaus that are surely not cut
 _STRAIGHT_PX = 0.2  # rms of the places of rows about the line; sharp edges have steps there
 _SLANT_DEG = (2.0, 30.0)  # from rows or columns; nearer, the pixels sample the edge at few distances
-_REACH_PX = 7.0
+_REACH_PX = 7.0  # of the profile: sharpening and denoising of 5 x 5 end before
 _PLATEAU_PX = 4.5  # from the edge
-_STEP_PX = 0.25
-_FINE_PX = 0.08
-_MOST_EDGES = 60
+_STEP_PX = 0.25  # of the profile's bins
+_FINE_PX = 0.08  # of the model's table, that is interpolated linearly
+_MOST_EDGES = 60  # more tell no more: the model's own error remains
 _BINOMIAL = {0: 0.5, 1: 0.25}
 _TAPS = {1: (0.25, 0.5, 0.25), 2: (0.0625, 0.25, 0.375, 0.25, 0.0625)}
 _MODEL = (0.008, 0.01, 0.02)
@@ -136,8 +136,8 @@ def edge_in(window: Array) -> Edge | None:
 
 def _line(values: Array) -> tuple[float, float] | None:
     """Column = at + slope row of the edge: the middle of the step in each row."""
-    smooth = gaussian_filter1d(values, 0.7, axis=1)
-    low, high = np.percentile(smooth, (5.0, 95.0))
+    smooth = gaussian_filter1d(values, 0.7, axis=1)  # noise would cross the middle several times
+    low, high = np.percentile(smooth, (5.0, 95.0))  # both plateaus
     half = 0.5 * (low + high)
     places = []
     for row in smooth:
@@ -393,7 +393,7 @@ def _fit_one(edge: Edge, model: EdgeModel, sharpness: float | None) -> tuple[flo
     done = least_squares(residuals, first, bounds=(low, high), x_scale=scale, max_nfev=25, loss="soft_l1")
     found = numbers(done.x)
     wanted = [found.sigma_px, found.sharpness]
-    at_end = not 0.16 < found.sigma_px < 3.9 or abs(found.shift_px) > 1.4
+    at_end = not 0.16 < found.sigma_px < 3.9 or abs(found.shift_px) > 1.4  # a fit at a bound says nothing
     if model.smoothing is not None:
         wanted.append(found.threshold_codes)
         at_end = at_end or found.threshold_codes < 1.01 * _THRESHOLD[0]
@@ -403,7 +403,7 @@ def _fit_one(edge: Edge, model: EdgeModel, sharpness: float | None) -> tuple[flo
 def _robust(values: Array) -> tuple[Array, Array]:
     """Means without what lies beyond 3.5 robust deviations, with their standard errors."""
     middle = np.median(values, axis=0)
-    spread = 1.4826 * np.median(np.abs(values - middle), axis=0) + 1e-9
+    spread = 1.4826 * np.median(np.abs(values - middle), axis=0) + 1e-9  # equal values lie within
     inside = np.all(np.abs(values - middle) < 3.5 * spread, axis=1)
     kept = values[inside] if inside.sum() >= 5 else values
     return kept.mean(axis=0), kept.std(axis=0, ddof=1) / np.sqrt(len(kept))

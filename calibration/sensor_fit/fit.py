@@ -171,6 +171,7 @@ def _take_end(draft: _Draft, codes: float, capture: Capture) -> None:
     gain = draft.numbers["gain_dn_per_e"]
     if isinstance(gain, float):
         draft.missing["full_well_e"] += "; set beyond the last code, where it changes nothing"
+        # 5 % beyond the last code
         draft.assume("full_well_e", float(round(1.05 * codes / (gain * capture.notes.analogue_gain))))
 
 
@@ -202,7 +203,7 @@ def _fit_noise(draft: _Draft, capture: Capture, tone: ToneFit | None) -> Process
     for group in capture.flats:
         frames = capture.stack(group)
         levels.append(stack_level(group.name, frames, _mean_rgb(frames, capture, card)))
-    if not any(max(one.codes) < 254.0 for one in levels):
+    if not any(max(one.codes) < 254.0 for one in levels):  # 255 is cut, and 254 may be
         raise CaptureError(f"{capture.folder}: every level of flat/ is saturated; take levels from code 20 to 240")
     return fit_noise(levels, _toned(card, tone), capture.notes.analogue_gain)
 

@@ -21,8 +21,8 @@ NEAR: Lags = ((0, 0), (0, 1), (1, 0), (1, 1), (0, 2), (2, 0))
 FAR: Lags = (*NEAR, (1, 2), (2, 1), (2, 2), (0, 3), (3, 0))
 BESIDE: Lags = ((0, 0), (0, -1), (0, 1))
 """Lags (rows, columns): of chroma, of other planes, and from a pixel of chroma to one of Y'."""
-BOX_PX = 5
-_BLOCKS = 8
+BOX_PX = 5  # noise is what a pixel differs by from its surroundings: shading goes
+_BLOCKS = 8  # along each side, for the jackknife
 _EDGE = 3  # largest lag
 
 

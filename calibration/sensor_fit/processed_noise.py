@@ -26,11 +26,12 @@ from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.scenes.frames import Array
 
 _LEAST_VARIANCE = 0.15  # codes^2 of Y': below, terms of the rounding that are left out count
-_LEAST_CODE, _MOST_CODE = 12.0, 243.0
+_LEAST_CODE, _MOST_CODE = 12.0, 243.0  # of a level whose noise is surely not cut
 _FLOOR = 3e-4  # codes^2, of each autocovariance: what models of rounding and clipping leave
 _BETTER = 30.0  # sum of squares by which another filter must fit better
 _FOUND = 3.0  # sigmas from 0
 _BASE = ("white_e", "read_noise_e", "sharpen", "chroma", "red", "blue")
+# reach and numbers of denoising that are tried: one that fits no better is not taken
 _CHAINS = ((1, ("denoise",)), (2, ("denoise", "vertical")))
 _LOW = {"white_e": np.log(100.0), "sharpen": -1.0, "red": 0.2, "blue": 0.2, "left": -0.1, "right": -0.1}
 _HIGH = {"white_e": np.log(1e6), "read_noise_e": 300.0, "sharpen": 4.0, "red": 8.0, "blue": 8.0}

@@ -31,7 +31,7 @@ from phibench.calibration.sensor_fit.block_sums import jackknife_sigma, rounding
 from phibench.scenes.frames import Array
 
 _TERMS = (1, 2, 3)
-_STRAIGHT_PRIOR = 0.5
+_STRAIGHT_PRIOR = 0.5  # the seven bends share the other half
 _BENT = 0.95  # posterior share of the bent sets from which on the response is said to bend
 _UNSEEN = 0.003  # standard deviation of the bend at u = 1 that a response has which is taken for straight
 _UNSEEN_BY_ONE = 0.03  # the same where one level cannot show a bend: sensors of the EMVA sets bend by 2 to 5 %
@@ -289,9 +289,9 @@ def _padded(one: _Set) -> Array:
 # -- signal against stated light -------------------------------------------------------------------------------------
 
 _LEAST, _MOST = 0.05, 0.95  # of the brightest signal that is not saturated
-_NEEDED = 4
+_NEEDED = 4  # levels of stated light: a line, and what is left of it
 _SAID_PERCENT = 0.3  # deviations below it are within what lamps and clocks hold
-_SIGMAS = 5.0
+_SIGMAS = 5.0  # a finding is said where it is no chance
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from phibench.scenes.frames import Array
 Curve = Literal["srgb", "rec709", "table"]
 _LEAST, _MOST = 4.0, 248.0  # codes that are surely not cut
 _GOOD_CODES = 0.8  # rms; the curves of sRGB and Rec. 709 differ by up to 20 codes
-_NEEDED = 4
+_NEEDED = 4  # times: two numbers of a curve, and a misfit
 _KNEE, _SLOPE = 0.018, 4.5  # of Rec. 709
 
 

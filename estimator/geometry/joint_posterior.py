@@ -26,7 +26,7 @@ FARTHEST_M = 50.0  # of D; what is farther cannot be told from it by any pair
 MISFIT_RANGE = 30.0  # above the least misfit: beyond it lies 3e-7 of a posterior of two unknowns
 _WALL = 2.0 * MISFIT_RANGE  # above which a misfit is not told from a larger one
 _COARSE = (17, 17, 41)  # nodes along u, v, 1 / D that find where the posterior is
-_FINE = (41, 41, 81)
+_FINE = (41, 41, 81)  # over the part that holds the posterior; 1 / D is the longest valley
 _SINGLE = 4  # nodes of a single image's posterior for each step of its map
 _NODES = (4, 4, 6)  # of the polynomial that stands for `up_image`, exact on them
 _MOST_AT_SIDES = 0.01  # part of the posterior that may lie within a step of a map's sides
@@ -253,6 +253,7 @@ def _moments(on: _Grid) -> JointPosterior:
     mean_m = float(depth @ q)
     sigma_m = float(np.sqrt(np.maximum((depth - mean_m) ** 2 @ q, 0.0)))
     below = np.concatenate([[0.0], np.cumsum(0.5 * (q[1:] + q[:-1]))])
+    # 1 / D falls with D: its upper quantile is the near end of the interval
     near, far = (1.0 / float(np.interp(p * below[-1], below, axes[2])) for p in (0.975, 0.025))
     return JointPosterior(mean, up_mean, C_down, C_up, mean_m, sigma_m, (near, far), least, Status.OK)
 

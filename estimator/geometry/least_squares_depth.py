@@ -131,7 +131,7 @@ def depth_general(
     )
 
 
-_ROUND_PX2 = 0.1**2
+_ROUND_PX2 = 0.1**2  # of the round spots that stand for those of a method without a covariance
 
 
 @dataclass(frozen=True)
@@ -186,7 +186,7 @@ def _calibration_sigma_m(rig: Rig, stroke_m: Array, uv_px: tuple[Array, Array], 
 def _joint(down_px2: Array, up_px2: Array, rig: Array, stroke_sigma_m: Array, lead: tuple[int, ...]) -> Array:
     """Block-diagonal covariance (..., n, n) of z."""
     p = len(rig)
-    C = np.zeros((*lead, p + 5, p + 5))
+    C = np.zeros((*lead, p + 5, p + 5))  # two pixels of two images, p of the rig, and the stroke
     for start, block in ((0, down_px2), (2, up_px2), (4, rig)):
         block = np.asarray(block, float)
         stop = start + block.shape[-1]

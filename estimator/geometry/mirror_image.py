@@ -28,11 +28,11 @@ from phibench.scenes.shapes import Cuboid
 from phibench.scenes.validation import SceneError
 
 _BISECTIONS = 4  # the error of the start falls by R / distance in each
-_HALVINGS = 40
+_HALVINGS = 40  # of the rim's diameter: the place is known to 1e-13 m
 _WIDER = (1.2, 1.1, 1.05, 1.02, 1.01)  # times the rim's radius
 _UNEVEN = 0.999  # so that no middle is on the axis, where a cone has its tip
 _NEWTON_STEPS = 12
-_TOLERANCE_PX = 1e-10
+_TOLERANCE_PX = 1e-10  # of a step: the next one, of the order of its square, is below rounding
 
 
 @dataclass(frozen=True)

@@ -33,8 +33,8 @@ from phibench.scenes.shapes import Cuboid, Rectangle, Shape, faces
 from phibench.scenes.validation import nearest
 
 FAR_M = 1e9  # a far scene: 60 mm of mirror at this distance are 6e-11 rad
-_AT_ONCE = 32768
-_WIDTHS = (16, 16384)
+_AT_ONCE = 32768  # directions: arrays of a MB or so stay in the cache
+_WIDTHS = (16, 16384)  # columns that are allowed: 16384 are a degree in 46 parts
 
 
 @dataclass(frozen=True)
@@ -152,12 +152,12 @@ def unrolled(image: NDArray[np.generic], uv_px: Array) -> Array:
 
 # -- upright edges of a room -------------------------------------------------------------------------------------------
 
-_HALF_WIDTH_PX = 6
+_HALF_WIDTH_PX = 6  # of a row's window: its outer columns are beside the blurred edge
 _LEVEL_PX = 2  # columns at each end of a row's window that give the levels beside the edge
-_LEAST_CONTRAST = 0.15
+_LEAST_CONTRAST = 0.15  # difference of the levels over their mean
 _LEAST_ROWS = 8
 _TRIMMED = 0.3  # of the height, at both ends: what stands before its foot, and what is above it
-_TRACK = 65
+_TRACK = 65  # points of an edge: its image hardly bends between two
 
 
 @dataclass(frozen=True)
@@ -322,7 +322,7 @@ def _places_of_normals(normals: Array, view: View) -> Array:
         )
     across = np.hypot(n[..., 0], n[..., 1])
     r = profile.radius_at_slope(-across / n[..., 2])
-    share = r / np.maximum(across, 1e-300)
+    share = r / np.maximum(across, 1e-300)  # at the vertex 0 / 0: r is 0 as well
     P = np.stack([share * n[..., 0], share * n[..., 1], profile.sag(r * r).z_m], axis=-1)
     return view.T_world_sphere.points(P)
 
@@ -353,6 +353,7 @@ def _steps(r: Array, v: NDArray[np.intp], u: NDArray[np.intp], wanted: Array) ->
     here, left, right, above, below = r[v, u], r[v, u - 1], r[v, u + 1], r[v - 1, u], r[v + 1, u]
     by_u, by_v = 0.5 * (right - left), 0.5 * (below - above)
     uu, vv = right - 2.0 * here + left, below - 2.0 * here + above
+    # mixed derivative by central differences
     uv = 0.25 * (r[v + 1, u + 1] - r[v + 1, u - 1] - r[v - 1, u + 1] + r[v - 1, u - 1])
     step = np.zeros((len(v), 2))
     for _ in range(_ROUNDS):

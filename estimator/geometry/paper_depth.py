@@ -29,7 +29,7 @@ from phibench.scenes.revolved_mirror import Profile
 
 # Sine of the disparity below which two rays count as parallel: the depth would be more than 1e8 strokes.
 PARALLEL_SINE = 1e-9
-ON_AXIS_SINE = 1e-9
+ON_AXIS_SINE = 1e-9  # of an angle below which a ray is on the axis, where the azimuth is not defined
 
 
 @dataclass(frozen=True)
@@ -248,7 +248,7 @@ def _depth_and_hs(
 # -- published results -------------------------------------------------------------------------------------------------
 
 PUBLISHED_CSV = Path(__file__).with_name("published.csv")
-_SAME_M = 1e-6
+_SAME_M = 1e-6  # the tables are printed to millimetres: depths closer than this are the same number
 
 
 @dataclass(frozen=True)

@@ -329,7 +329,7 @@ def formed_meeting(origin_m: Array, directions: Array, surface: FormedProfile) -
 # -- hit on a mirror with a form error ---------------------------------------------------------------------------------
 
 _NEAREST_STEPS = 4  # Newton's, from the foot of the perpendicular: the form's slope, 1e-3, falls to its square in each
-_STEPS = 12
+_STEPS = 12  # Newton's, from a sphere's place that the form moves little; it ends at `_CLOSE_M`
 _CLOSE_M = 1e-12  # the step after such a one is below rounding
 
 

@@ -60,6 +60,7 @@ RENAMED = {
 """Names of version 0.1. `f_px` was in pixels, added to fx and fy; `focal_relative` is relative to them."""
 LEAST_PX = 0.001
 """Rms shift of the pixels below which a direction is left out: a fiftieth of a frame's noise."""
+# all around, not in steps that a symmetry would repeat; from the floor to above the mirror, near and far
 _AZIMUTHS_RAD = (-2.0, -1.0, 0.0, 1.0, 2.0, math.pi)
 _RISES = (-0.4, 0.0, 0.4)
 _DISTANCES_M = (1.0, 3.0)
@@ -117,7 +118,7 @@ def _scaled_eigen(covariance: Array) -> tuple[Array, Array]:
     sigma = np.sqrt(np.maximum(np.diag(P), 0.0))
     scale = np.where(sigma == 0.0, 1.0, sigma)
     values, vectors = np.linalg.eigh(P / np.outer(scale, scale))
-    if values[0] < -1e-9:
+    if values[0] < -1e-9:  # of a correlation's eigenvalues: rounding of a file's digits stays far below
         raise SceneError("rig covariance: must have no negative eigenvalue; give the covariance of a calibration")
     return np.maximum(values, 0.0), sigma[:, None] * vectors
 
@@ -189,7 +190,7 @@ def rig_gradient(rig: Rig, stroke_m: ArrayLike, uv_down_px: Array, uv_up_px: Arr
             continue
         f, size = partial(depth, name), step * MISALIGNMENT[name].step
         near, far = f(size) - f(-size), f(2.0 * size) - f(-2.0 * size)
-        slopes.append((8.0 * near - far) / (12.0 * size))
+        slopes.append((8.0 * near - far) / (12.0 * size))  # five points: the error is of the fourth order
     return np.stack(slopes, axis=-1)
 
 
@@ -278,6 +279,7 @@ class RigBias:
 def _points() -> list[tuple[Array, float]]:
     """Points around the robot, about the height of the mirror, with strokes."""
     return [
+        # 0.7 m: the default rig's mirror above the floor
         (np.array([D * math.cos(a), D * math.sin(a), 0.7 + D * k]), h)
         for a in _AZIMUTHS_RAD
         for k in _RISES

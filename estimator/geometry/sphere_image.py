@@ -27,7 +27,7 @@ from phibench.scenes.rig import Rig
 from phibench.scenes.validation import SceneError
 
 _STEPS = 30  # 4 to 6 do, but for points close to the mirror
-_CLOSE_RAD = 1e-13
+_CLOSE_RAD = 1e-13  # a step below which the angle has all its digits
 _NODES = 512  # of the reflectance, which is smooth in the cosine: interpolated to 1e-6
 
 
@@ -115,6 +115,7 @@ class SphereImager:
         y = dx * ex + dy * ey + dz * ez
         ax, ay, az = dx - y * ex, dy - y * ey, dz - y * ez
         w = math.sqrt(ax * ax + ay * ay + az * az)
+        # on the axis the azimuth is not defined, and a point within the ball has no image
         if not (w > 1e-9 and w * w + y * y > self.radius_m**2):
             return None
         ax, ay, az = ax / w, ay / w, az / w
@@ -154,6 +155,7 @@ class SphereImager:
     def _reflection(self, w: float, y: float) -> tuple[float, float, float, float]:
         """Angles p and b, the derivative b' of b by p, and |f'|; NaN where Newton's method does not come to rest."""
         R, dist = self.radius_m, self.distance_m
+        # near the axis b = R p / (dist - R), and a far point is seen at 2 p + b; a start on the limb has no slope
         p = min(math.atan2(w, y) / (2.0 + R / (dist - R)), 0.99 * self._limb_rad)
         for _ in range(_STEPS):
             s, c = math.sin(p), math.cos(p)

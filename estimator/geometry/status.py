@@ -102,7 +102,7 @@ def stroke_status(stroke_m: ArrayLike) -> StatusArray:
 
 LINEAR = 0.05
 """Sigma of D over D up to which intervals and pulls are those of D itself."""
-_NORMAL_95 = 1.959964
+_NORMAL_95 = 1.959964  # quantile 0.975 of the standard normal law
 
 
 def depth_pull(depth_m: ArrayLike, sigma_m: ArrayLike, true_m: ArrayLike) -> Array:

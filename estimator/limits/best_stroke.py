@@ -45,8 +45,8 @@ STROKES_M = (0.10, 1.40)
 LEAST, LARGEST = "shortest stroke", "longest stroke"
 ROOM_E_PER_S = (5.8e4, 4.9e4, 2.5e4)
 """Electrons per second and pixel behind R, G, B of a white wall of the lab, whose floor receives about 460 lx."""
-_DEPTH_M = (0.05, 100.0)
-_STROKE_M = (1e-3, 20.0)
+_DEPTH_M = (0.05, 100.0)  # allowed D: from just outside the default mirror to beyond any room
+_STROKE_M = (1e-3, 20.0)  # from a recipe's shortest stroke to twice its longest
 _FINE = 21  # strokes between two of the grid: 0.3 % apart, and the minimum is flat
 
 
@@ -160,7 +160,7 @@ def best_stroke(
     )
     curve = curve_of(strokes_m=stroke_grid(*strokes_m))
     if not np.isfinite(curve.allowed_sigma_m).any():
-        nothing = (math.nan,) * 6
+        nothing = (math.nan,) * 6  # all of `BestStroke` between D and its limits
         return BestStroke(depth_m, *nothing, tuple(dict.fromkeys(curve.causes)), curve)
     index = int(np.argmin(curve.allowed_sigma_m))
     fine = curve_of(strokes_m=np.linspace(*grid_neighbours(curve.strokes_m.tolist(), index), _FINE))
@@ -192,7 +192,7 @@ def spot_bound(rig: Rig, card: SensorCard, room_e_per_s: tuple[float, float, flo
     """
     centre = rig.camera.project(rig.sphere_in_camera_m)
     rim = rig.outline_px(4)[0]
-    blur = spot_blur(rig, 0.4 * centre + 0.6 * rim)
+    blur = spot_blur(rig, 0.4 * centre + 0.6 * rim)  # one place stands for all: defocus changes little over the mirror
     r, g, b = rig.camera.detector.laser_filter_response
     room = [rate * card.exposure_s for rate in room_e_per_s]
     # behind the processing every flux costs a covariance of the codes; the bound is smooth enough for 9 of them

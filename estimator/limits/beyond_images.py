@@ -57,7 +57,7 @@ _CELL_PX2 = 36.0
 """Places whose answers within 3 px have nothing in common are 6 px apart."""
 _OF_THE_DISC = 0.25
 """Part of the mirror's disc that a search is told to look at: spots are not spread evenly over it."""
-_SURE = 0.99
+_SURE = 0.99  # a pair that everybody finds tells nothing of who knows more
 
 
 @dataclass(frozen=True)

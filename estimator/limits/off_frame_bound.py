@@ -215,4 +215,4 @@ def _of_window(
 
 def _hidden(off: _Readings, step: Array, count: int) -> Array:
     """Variance of the room's coefficients by the quantiser in a mean of off frames, shape (n,)."""
-    return np.asarray(step**2 / 12.0 * hidden_share(off.sigma / step, count))
+    return np.asarray(step**2 / 12.0 * hidden_share(off.sigma / step, count))  # a uniform error over one step

@@ -183,10 +183,11 @@ def _of_codes(mu: float, r: float, card: SensorCard) -> float:
     edges = np.arange(np.floor(max(low, 0.0)), np.ceil(min(high, card.top_dn))) + 0.5  # between one code and the next
     if charge[0] >= well or edges.size == 0:
         return 0.0
+    # without read noise the law is a step: a width that is not 0 keeps it a number
     below = ndtr((edges[:, None] - card.black_level_dn - card.dn_per_e * charge) / (card.dn_per_e * max(r, 1e-9)))
     shares = np.diff(np.vstack([np.zeros_like(charge), below, np.ones_like(charge)]), axis=0)
     P, dP = shares @ chance, shares @ slope
-    seen = P > 1e-300
+    seen = P > 1e-300  # codes that never occur say nothing, and would be 0 / 0
     return float(np.sum(dP[seen] ** 2 / P[seen]))
 
 

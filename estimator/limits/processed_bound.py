@@ -38,6 +38,7 @@ _REACH_PX = 10  # around the spot, for "srgb8"
 _SIDE_PX = 16  # of the window of raw pixels
 _MCU_PX = (16, 8)  # of 4:2:2; an even number of Bayer cells
 _PLASTIC = 1.324717957244746  # root of x^3 = x + 1: steps of 1 / x and 1 / x^2 fill the square most evenly
+# from too faint to be found to far beyond saturation, four to a decade: the bound is smooth between them
 _FLUXES_E = tuple(float(x) for x in np.geomspace(100.0, 3e6, 19))
 
 

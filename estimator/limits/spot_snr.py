@@ -27,7 +27,7 @@ from phibench.estimator.limits.position_bound import raw_information
 _MANY = 32  # nodes where one costs nothing: 1 % beyond saturation, 1e-3 below it
 # Radau's rule with the end of the way, where the bound of the position is computed anyway
 _RADAU = (((4.0 - 6.0**0.5) / 10.0, (16.0 + 6.0**0.5) / 36.0), ((4.0 + 6.0**0.5) / 10.0, (16.0 - 6.0**0.5) / 36.0))
-_END = 1.0 / 9.0
+_END = 1.0 / 9.0  # its weight there
 
 
 def raw_snr(

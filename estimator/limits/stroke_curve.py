@@ -234,7 +234,7 @@ def outline_distance_px(rig: Rig, uv_px: Array) -> Array:
 
 def stroke_grid(low_m: float, high_m: float, count: int = 81) -> Array:
     """Strokes from low to high, evenly in their logarithm."""
-    return np.geomspace(low_m, high_m, count)
+    return np.geomspace(low_m, high_m, count)  # the error of D goes with ratios of strokes
 
 
 def grid_neighbours(grid: Sequence[float], index: int) -> tuple[float, float]:

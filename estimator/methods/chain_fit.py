@@ -168,6 +168,7 @@ def _background(
     """
     seen, rounding = undone_mean(frames, origin, card)
     x = regained(seen, origin, card)
+    # the converter rounds each frame; codes of 8 bits are counted apart, as `rounding`
     variance = unrounded(card, not own).variance_e2(x) + 1.0 / (12.0 * card.dn_per_e**2)
     everywhere = np.ones(x.shape) if known is None else known
     pattern = None if own else PatternNoise.of(card)

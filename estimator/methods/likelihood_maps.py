@@ -30,7 +30,7 @@ _AT_ONCE = 48  # hypotheses, whose arrays take some 50 MB
 _WIDE_PX = (1.25, 2.25, 3.25)  # half sides of the first map, the next one where a posterior reaches its sides
 _WIDE_STEP_PX = 0.25
 _AT_SIDES = 1e-3  # part of a posterior on the outermost places of the first map, above which the next one is made
-_SIGMAS = 4.5
+_SIGMAS = 4.5  # half side of the second map: 4e-5 of a Gaussian lie outside in two dimensions
 _STEP_SIGMAS = 0.6  # of the second map: cubic splines between are within 1 % of a unit of misfit
 _MOST_STEP_PX = 0.2  # of the second map: where a place is flat to its curvature, what surrounds it is steeper
 _MOST_SIDE = 41
@@ -212,7 +212,7 @@ def _wide_enough(one: SpotLikelihood, least: float, C: Array) -> _Wide:
 
 
 def _wide(one: SpotLikelihood, half_px: float) -> _Wide:
-    side = np.arange(-half_px, half_px + 1e-9, _WIDE_STEP_PX)
+    side = np.arange(-half_px, half_px + 1e-9, _WIDE_STEP_PX)  # 1e-9: both ends are places
     off = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, _PLACE)
     theta = np.repeat(one.theta[None], len(off), axis=0)
     theta[:, :_PLACE] += off

@@ -73,7 +73,7 @@ def _added(region: SearchRegion) -> Array:
     return region.planes[0] - linear_planes(off, region.pair.card, region.origin_px)[0]
 
 
-TRACKPY_DIAMETER_PX = 7
+TRACKPY_DIAMETER_PX = 7  # odd, as trackpy asks
 
 
 def photutils_centroid_2dg(region: SearchRegion) -> Spot:
@@ -108,7 +108,7 @@ def _above(near: SearchRegion) -> Array:
     red = _laser_in(near)
     edge = np.concatenate([red[0], red[-1], red[1:-1, 0], red[1:-1, -1]])
     above = red - np.median(edge)
-    return np.asarray(above / max(float(above.max()), 1e-12))
+    return np.asarray(above / max(float(above.max()), 1e-12))  # nothing above the border stays 0
 
 
 def _laser_in(near: SearchRegion) -> Array:

@@ -94,4 +94,4 @@ def _doubled(samples: Array, axis: int, smooth: bool) -> Array:
         return each
     padded = np.moveaxis(np.pad(each, [(2, 2) if k == axis else (0, 0) for k in range(3)], mode="edge"), axis, -1)
     beside = np.where(np.arange(each.shape[axis]) % 2 == 0, padded[..., :-4], padded[..., 4:])
-    return 0.75 * each + 0.25 * np.moveaxis(beside, -1, axis)
+    return 0.75 * each + 0.25 * np.moveaxis(beside, -1, axis)  # libjpeg's triangle filter between chroma samples

@@ -337,6 +337,7 @@ def _cut(x: Array, extra: Array, middle: NDArray[np.int64]) -> tuple[Array, Arra
 def _collected(
     rows: list[tuple[WindowFit, Array]], origin: NDArray[np.int64], widths: Array, free_width: bool
 ) -> SpotFit:
+    # u, v, flux, three levels, width
     theta = np.array([fit.theta for fit, _ in rows]).reshape(-1, 7 if free_width else 6)
     covariance = np.stack([covariance_bound(fit.fisher, keep=3) for fit, _ in rows]) if rows else np.zeros((0, 3, 3))
     off = np.array([off for _, off in rows]).reshape(-1, 2)
@@ -365,6 +366,7 @@ def _on_grid(origin: NDArray[np.int64], shape: tuple[int, int], card: SensorCard
 def unrounded(card: SensorCard, pattern_known: bool = False) -> PixelNoise:
     """Noise of a sensor's pixels before the converter rounds; errors as `noise_of`."""
     noise = noise_of(card, pattern_known)
+    # rounding is in `noise_of`
     return PixelNoise(max(noise.gaussian_e2 - 1.0 / (12.0 * card.dn_per_e**2), 0.0), noise.prnu)
 
 
@@ -386,6 +388,7 @@ def undone(images: NDArray[Any], origin: NDArray[np.int64], card: SensorCard) ->
     code = np.clip(_unsharpened(np.asarray(rgb, float), card.sharpen_amount) / 255.0, 0.0, 1.0)
     linear = light_of(code, card)
     spread = np.sqrt(np.sum(RGB_FROM_YCC**2, axis=1)) if card.output == "yuyv" else np.ones(3)
+    # a cut code has slope 0: its light is not known
     width = spread / (255.0 * np.maximum(tone_slope(linear, card), 1e-3))
     inverse = np.linalg.inv(np.asarray(card.colour_matrix)) / np.asarray(card.white_balance)[:, None]
     own = inverse[filters] * full_scale_e(card)  # (n, h, w, 3): row of the inverse for the pixel's filter

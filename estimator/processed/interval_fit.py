@@ -33,7 +33,7 @@ _CLOSER = 0.15  # of the prior's deviations: hypotheses that count in the first 
 _FAR = 6.0  # standard deviations from the edges of its step beyond which an output tells nothing
 _ROUNDS = 10  # of linearisation
 _SWEEPS = (8, 4)  # in the first round, and in the others
-_DAMPING = 0.8
+_DAMPING = 0.8  # of a site's change after the first sweep: full ones may go round in circles
 _STEP_PX = 0.4
 _SETTLED = 0.03  # last step in standard deviations
 _TOLD = 1e6  # variance in steps squared from which an interval's Gaussian tells nothing
@@ -216,7 +216,7 @@ def _near(inputs: Inputs, covariance: Array, steps: QuantiserSteps) -> NDArray[n
     variance = np.einsum("rn,rn->n", F, F) + inputs.own + np.einsum("kn,kl,ln->n", J, covariance, J)
     if steps.frames > 1:
         variance += inputs.spread
-    apart = steps.last - steps.first > 1.5 * steps.step
+    apart = steps.last - steps.first > 1.5 * steps.step  # frames lie on several steps: an edge is among them
     room = np.where(apart, 0.0, np.minimum(steps.last - inputs.mean, inputs.mean - steps.first))
     return np.flatnonzero(room < _FAR * np.sqrt(variance))
 

@@ -107,7 +107,7 @@ class QuantiserSteps:
         """Sites of outputs that the noise spreads over many steps."""
         levels = np.arange(len(self.counts)) + 0.5
         middle = self.first + self.step * (levels @ self.counts) / self.frames
-        precision = 12.0 * self.frames / self.step**2
+        precision = 12.0 * self.frames / self.step**2  # of a mean of uniform errors over a step
         return Sites(precision, precision * middle)
 
     def _of_several(self, mean: Array, variance: Array, spread: Array) -> Sites:
@@ -158,6 +158,7 @@ class QuantiserSteps:
             mirrored = low + high > 0.0
             low, high = np.where(mirrored, -high, low), np.where(mirrored, -low, high)
             whole = log_ndtr(high)
+            # a step far below its noise leaves the logarithm of 0: 1e-12 of its chance is the least
             total[:, index] += count[index] * (whole + np.log1p(-np.exp(np.minimum(log_ndtr(low) - whole, -1e-12))))
         return total
 
@@ -203,7 +204,7 @@ def _of_exponential(a: Array, b: Array) -> tuple[Array, Array]:
     far = np.maximum(a, 1.0)
     rate = np.where(steep, far + 0.5 * np.minimum(width, 1.0 / far), 0.5 * (a + b))
     x = 0.5 * rate * width
-    flat, gone = x < 1e-2, x > _STEEP
+    flat, gone = x < 1e-2, x > _STEEP  # 1 / x - coth x loses its digits where x is small: a series
     some = np.where(flat | gone, 1.0, x)
     middle = 0.5 * (a + b) - 0.5 * width * np.where(flat, x / 3.0, 1.0 / np.tanh(some) - 1.0 / some)
     variance = 0.25 * width**2 * np.where(flat, 1.0 / 3.0 - x * x / 15.0, 1.0 / some**2 - 1.0 / np.sinh(some) ** 2)

@@ -135,6 +135,7 @@ class EdgeSparing:
         v = own[self.centre] + own[self.near] - 2.0 * C[self.centre, self.near]
         m = y[self.near] - y[self.centre]
         total = self.threshold_codes**2 + v
+        # mean of d exp(-d^2 / 2 T^2) over the Gaussian noise v of d: the exponent's width grows to T^2 + v
         e = (self.threshold_codes**2 / total) ** 1.5 * np.exp(-0.5 * m**2 / total) * self.weights[:, None]
         return (m * e).sum(axis=0), e * (1.0 - m**2 / total)
 

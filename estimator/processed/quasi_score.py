@@ -38,9 +38,9 @@ _LIVE = 2e-3  # variance of the output, in steps squared, from which a coefficie
 _LEAST = 1e-3  # and that is taken for one whose variance falls below it
 _FRESH = 5  # times that the covariance is computed
 _STEPS = 24  # of the fit in all; the covariance stays after `_FRESH` of them, so that the misfit can only fall
-_SCREENING_STEPS = 3
+_SCREENING_STEPS = 3  # of each start; the best one goes on
 _STEP_PX = 0.4  # shorter than on raw pixels: a coarse quantiser has plateaus
-_HALVINGS = 3
+_HALVINGS = 3  # of a step that makes the misfit larger
 _SMALL = 1e-4  # squared step in standard deviations at which the fit ends
 _REST = 1e-2  # and at which it has come to rest, if it ends for its number of steps
 
@@ -350,7 +350,7 @@ def _descended(
     for halving in range(_HALVINGS + 1):
         tried = _moved(window, theta[None], 0.5**halving * step)
         new_r, new_J = window.residual(noise, tried)
-        if new_r[0] @ new_r[0] <= r[0] @ r[0] * (1.0 + 1e-12):
+        if new_r[0] @ new_r[0] <= r[0] @ r[0] * (1.0 + 1e-12):  # 1e-12: rounding is no rise
             return tried[0], new_r, new_J, length
     return theta, r, J, 0.0  # at the bottom of a misfit with corners
 

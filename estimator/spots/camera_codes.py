@@ -23,7 +23,7 @@ from phibench.scenes.frames import Array
 
 _KNEE, _SLOPE = 0.0031308, 12.92  # of the sRGB curve's straight part
 _ALPHA, _BETA = 1.099296826809442, 0.018053968510807  # of Rec. 709: the power's factor, and where it begins
-_NODES, _WEIGHTS = np.polynomial.hermite_e.hermegauss(9)
+_NODES, _WEIGHTS = np.polynomial.hermite_e.hermegauss(9)  # exact for polynomials up to the order 17 of Gaussian noise
 _WEIGHTS = _WEIGHTS / _WEIGHTS.sum()
 
 
@@ -46,7 +46,7 @@ def srgb_slope(linear: Array) -> Array:
     """Derivative of `linear_to_srgb`, any shape; 0 outside [0, 1]."""
     x = np.asarray(linear, float)
     inside = (x >= 0.0) & (x <= 1.0)
-    power = 1.055 / 2.4 * np.maximum(x, _KNEE) ** (1.0 / 2.4 - 1.0)
+    power = 1.055 / 2.4 * np.maximum(x, _KNEE) ** (1.0 / 2.4 - 1.0)  # the power has no slope at 0, where it is not used
     return np.asarray(np.where(inside, np.where(x <= _KNEE, _SLOPE, power), 0.0))
 
 
@@ -129,13 +129,13 @@ def noisy_code(mean: Array, sigma: Array, card: SensorCard) -> NoisyCode:
 
 # -- Y'CbCr 4:2:2 ----------------------------------------------------------------------------------------------------
 
-_MIDDLE = 128.0
+_MIDDLE = 128.0  # code of chroma 0
 
 
 def _scale(card: SensorCard) -> tuple[float, Array]:
     """Y' of black, and codes of Y', Cb, Cr per code of R, G, B."""
     limited = card.ycbcr_range == "limited"
-    return (16.0, np.array([219.0, 224.0, 224.0]) / 255.0) if limited else (0.0, np.ones(3))
+    return (16.0, np.array([219.0, 224.0, 224.0]) / 255.0) if limited else (0.0, np.ones(3))  # BT.601
 
 
 def rgb_codes(image: NDArray[Any], card: SensorCard, origin_px: ArrayLike = (0, 0)) -> NDArray[Any]:
@@ -204,5 +204,6 @@ def yuyv_image(rgb: NDArray[Any], card: SensorCard) -> NDArray[np.uint8]:
     width = ycc.shape[1]
     samples = sum(tap * chroma[:, k : k + width : 2] for k, tap in enumerate(card.chroma_taps))
     codes = np.stack([ycc[..., 0] + black, np.asarray(samples).reshape(len(ycc), width) + _MIDDLE], axis=-1)
+    # 0 and 255 of a limited range are kept for synchronisation
     low, high = (1, 254) if card.ycbcr_range == "limited" else (0, 255)
     return np.clip(np.rint(codes), low, high).astype(np.uint8)

@@ -30,7 +30,7 @@ from phibench.scenes.frames import Array, BoolArray
 # -- map of a matched filter -----------------------------------------------------------------------------------------
 
 _KERNEL_REACH_PX = 4
-_PHASES = (0.0, 0.5)
+_PHASES = (0.0, 0.5)  # of a pixel: the matched filter loses little at a quarter of one
 _AROUND_PX, _CORE_PX = 13, 5  # of the surroundings that a background is taken from, and what is left out of them
 # coarse chroma spreads red into green: what is taken off would move the peak
 _GREEN_TAKEN = {"raw": 1.0, "srgb8": 1.0, "yuyv": 0.0, "mjpeg": 0.0}
@@ -149,6 +149,7 @@ def _squares(kernel: Array, on: ColourPlanes, axis: int) -> Array:
 def _map_spread(z: NDArray[Any], inside: BoolArray) -> float:
     """Scale of the map, 1 for independent noise of the variance that was taken."""
     values = z[::3, ::3][inside[::3, ::3]]
+    # 1.4826 times the median deviation is the standard deviation of a normal law; spots and edges leave it alone
     spread = 1.4826 * np.median(np.abs(values - np.median(values))) if values.size else 1.0
     return float(max(spread / _NOISE, 0.5))
 
@@ -159,9 +160,9 @@ def _map_spread(z: NDArray[Any], inside: BoolArray) -> float:
 _PATCH_REACH_PX = {True: 6, False: 4}
 # of white light's green: where red ends; the laser's is 0.1, but for coarse chroma
 _GREEN_SHARE = {"raw": 0.5, "srgb8": 0.5, "yuyv": 0.75, "mjpeg": 0.75}
-_FULLER = 0.5
+_FULLER = 0.5  # of the red's share of full pixels: green that is as full says white
 _OUTSHINES = 0.7  # peak of a spot over the level around it, more than the contrast of walls and furniture
-_LATTICE_PX = 17
+_LATTICE_PX = 17  # odd: all phases of the mosaic and of JPEG's blocks occur
 _CHI2_SHARE = 0.75  # of places without a spot that count as fitted well: JPEG leaves many all but empty
 _SHAPE = 0.1  # of a spot's light in a pixel: what blur, defocus and demosaicing leave unknown of it
 _FULL_PX = 3  # a saturated spot is not wider
@@ -275,14 +276,14 @@ def candidate_noise(
         # no structure is left that the misfit of a mean, small against that of one frame, would have to tell
         return CandidateNoise(float(np.sqrt(0.5 / frames[0] + 0.5 / frames[1])))
     tests = candidates_at(on, off, card, places, sigma_px)
-    chi2 = float(max(np.quantile(tests.chi2, _CHI2_SHARE), 0.1))
+    chi2 = float(max(np.quantile(tests.chi2, _CHI2_SHARE), 0.1))  # noise-free and empty JPEG places have none
     z = tests.z * np.sqrt(np.maximum(tests.chi2, 1.0) / np.maximum(tests.chi2 / chi2, 1.0))
     return CandidateNoise(max(_tail_spread(z), 0.5), chi2)
 
 
 def _tail_spread(z: Array) -> float:
     """Standard deviation of a normal law with the middle, or with the tails of `z`, whichever is wider."""
-    tail = np.max(np.abs(np.quantile(z, (0.01, 0.99)))) / 2.326
+    tail = np.max(np.abs(np.quantile(z, (0.01, 0.99)))) / 2.326  # quantile 0.99 of the normal law
     return float(max(1.4826 * np.median(np.abs(z - np.median(z))), tail))
 
 
@@ -352,7 +353,7 @@ def _least_squares(y: Array, weight: Array, columns: Array) -> _Fit:
     X = np.concatenate([flat_columns, np.broadcast_to(plane, (n, *plane.shape))], axis=1)
     w, flat = weight.reshape(n, 1, size * size), y.reshape(n, size * size)
     normal = (X * w) @ np.swapaxes(X, 1, 2)
-    normal = normal + 1e-12 * np.eye(k + 3)
+    normal = normal + 1e-12 * np.eye(k + 3)  # a patch of no weight is singular
     solution = np.linalg.solve(normal, (X * w) @ flat[..., None])[..., 0]
     rest = flat - (solution[:, None] @ X)[:, 0]
     freedom = np.maximum((w[:, 0] > 0.0).sum(axis=1) - k - 3, 1)

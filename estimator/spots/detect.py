@@ -34,7 +34,7 @@ from phibench.scenes.rig import Rig
 # -- lamps -----------------------------------------------------------------------------------------------------------
 
 _BRIGHT = 3.0  # times the median inside the mirror
-_LEAST_AREA_PX = 80
+_LEAST_AREA_PX = 80  # of a lamp: a full spot has fewer pixels
 _HALO_PX, _JPEG_HALO_PX = 5, 12  # a JPEG's block and its neighbour's interpolation
 _IN_HALO = 3.0  # times the threshold of a candidate alone, where a laser-off frame shows the lamp
 
@@ -62,7 +62,7 @@ def lamp_halo(planes: ColourPlanes, inside: BoolArray, card: SensorCard, laser_o
 
 NEAREST_M, FARTHEST_M = 0.3, 12.0  # of D
 NEAR_CURVE_PX = 4.0  # shift of the curve for a rig that differs a little from the nominal one
-_POINTS = 48
+_POINTS = 48  # of the curve, evenly in 1 / D: there it hardly bends between two
 _FLUX_RATIO = 6.0  # of one spot in both images, for 98 % of all surfaces
 _FLUX_RATIO_ALONE = 30.0  # where each is sure by itself: 17 at most in 900 pairs, times 2 for a sharp one on a mosaic
 _STRONGER = 1.5  # a single candidate over a pair's: others have half the spot's light at most
@@ -101,7 +101,7 @@ def choose(rig: Rig, stroke_m: float, down: Candidates, up: Candidates, least: T
         The candidates are known to be red or the laser's; otherwise a pair is always preferred.
     """
     fits = consistent(rig, stroke_m, down.uv_px[:_MOST], up.uv_px[:_MOST])
-    ratio = up.electrons[None, :_MOST] / np.maximum(down.electrons[:_MOST, None], 1e-9)
+    ratio = up.electrons[None, :_MOST] / np.maximum(down.electrons[:_MOST, None], 1e-9)  # no light: far beyond `most`
     z_down, z_up = down.z[:_MOST, None], up.z[None, :_MOST]
     most = np.where(np.minimum(z_down, z_up) >= least.alone, _FLUX_RATIO_ALONE, _FLUX_RATIO)
     fits &= (ratio < most) & (ratio > 1.0 / most)
@@ -172,12 +172,12 @@ JPEG = Thresholds(alone=7.5, each=4.6, together=5.5)
 PROCESSED_ONE_FRAME = Thresholds(alone=8.5, each=5.0, together=6.5)  # without a laser-off frame
 UNSURE = Thresholds(alone=16.0, each=5.0, together=10.0)  # neither filters nor a laser-off frame
 _IN_A_BOX = 0.7  # less than in the whole mirror, see above
-_SMALL_BOX_PX2 = 10_000
-_LEAST_PEAK = 3.8
+_SMALL_BOX_PX2 = 10_000  # in larger ones chance finds as much as in the whole mirror
+_LEAST_PEAK = 3.8  # of the map: below every threshold, because the fit's own test decides
 _MOST_PEAKS = 3000
 _MOST_TESTED = 200  # at the second scale
 _WIDER = 1.8  # than the blur: a rough mirror's or a saturated spot
-_MARGIN_PX = 8
+_MARGIN_PX = 8  # around the outline: spots at the rim keep their surroundings
 
 
 @dataclass(frozen=True)

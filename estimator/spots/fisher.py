@@ -18,8 +18,8 @@ _RELATIVE_RIDGE, _RIDGE = 1e-9, 1e-12  # added to the diagonal: unknowns that no
 STEP_PX = 0.5  # the longest step of a position: beyond it a spot of 0.7 px is no parabola
 _FLUX_FALL = 0.1  # a flux falls to no less in one step
 _WIDTH_CHANGE = (0.7, 1.4)  # of a free width in one step
-_WIDTH_RANGE_PX = (0.15, 10.0)
-_TINY = 1e-300
+_WIDTH_RANGE_PX = (0.15, 10.0)  # of a free width: narrower ones are a point on any pixel, wider ones a part of the room
+_TINY = 1e-300  # instead of 0 as a divisor
 
 
 def fisher_matrix(derivatives: Array, information: Array) -> Array:

@@ -148,6 +148,7 @@ def _guess(data: SpotData, start_px: Array) -> Array:
         above -= levels[-1][:, None, None] * pixels.levels[:, i]
     seen = regions.used * pixels.response
     share = np.sum(seen, axis=(1, 2)) / np.maximum(np.sum(regions.used, axis=(1, 2)), 1)
+    # a start: a flux of 0 has no derivative by the position
     flux = np.maximum(np.sum(regions.used * above * pixels.response, axis=(1, 2)) / np.maximum(share, 1e-6), 100.0)
     return np.column_stack([start_px, flux, *levels])
 

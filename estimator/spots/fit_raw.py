@@ -169,7 +169,7 @@ def _first_guess(data: SpotData, near_px: Array | None) -> Array:
     above = regions.x_e - pixels.background_e - np.einsum("nc,nchw->nhw", b, pixels.levels)
     kernel = profile(np.array([4.0]), np.array([np.median(pixels.blur.sigma_px)]), 9).share[0]
     match = _blurred(np.where(regions.used, above * pixels.response, 0.0), kernel)
-    norm = _blurred(np.where(regions.used, pixels.response**2, 0.0), kernel**2) + 1e-12
+    norm = _blurred(np.where(regions.used, pixels.response**2, 0.0), kernel**2) + 1e-12  # no used pixel near: 0 / 0
     gain = np.maximum(match, 0.0) ** 2 / norm
     if near_px is not None:
         gain = near_alone(gain, near_px - regions.origin_px)

@@ -207,6 +207,7 @@ def variance_e2(mean_e: Array, card: SensorCard, alike: bool) -> Array:
         The fixed pattern cancels, as in the difference of two frames of one camera.
     """
     mean = np.maximum(mean_e, 0.0)
+    # rounding is uniform over a code
     constant = card.read_noise_e**2 + card.row_noise_e**2 + 1.0 / (12.0 * card.dn_per_e**2)
     pattern = 0.0 if alike else card.dsnu_e**2 + (card.prnu * mean) ** 2
     code = 0.0 if card.output == "raw" else _code_step_e(mean, card) ** 2 / 12.0
@@ -225,7 +226,7 @@ def _raw(part: Image, card: SensorCard, box: Box) -> ColourPlanes:
 
 def _developed(part: Image, card: SensorCard, box: Box) -> ColourPlanes:
     planes = [np.ascontiguousarray(part[..., c]) for c in range(3 if card.mosaic == "bayer" else 1)]
-    curve = (light_of(np.arange(256) / 255.0, card) * full_scale_e(card)).astype(np.float32)
+    curve = (light_of(np.arange(256) / 255.0, card) * full_scale_e(card)).astype(np.float32)  # a look-up of 256 codes
     linear = np.stack([curve.take(plane) for plane in planes])
     if card.mosaic == "bayer":  # as a product of matrices: einsum leaves the planes interleaved, for slow filters
         linear = (_to_sensor(card).astype(np.float32) @ linear.reshape(3, -1)).reshape(linear.shape)

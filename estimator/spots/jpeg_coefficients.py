@@ -64,8 +64,9 @@ def quantisation(quality: int | Tables) -> tuple[Array, Array]:
         return first, second
     if not 1 <= quality <= 100:
         raise ValueError(f"JPEG quality {quality}: allowed range is 1 to 100")
-    percent = 5000 // quality if quality < 50 else 200 - 2 * quality
+    percent = 5000 // quality if quality < 50 else 200 - 2 * quality  # libjpeg's jpeg_quality_scaling, in whole numbers
     tables = (np.array(text.split(), int).reshape(8, 8) for text in (_LUMA, _CHROMA))
+    # baseline tables have 8 bits, and no step is 0
     luma, chroma = (np.clip((table * percent + 50) // 100, 1, 255).astype(float) for table in tables)
     return luma, chroma
 
@@ -137,7 +138,7 @@ def room_variance(coefficients: Array, step: Array, hidden: float | Array = 1.0)
     power = blocks * blocks
     power[:, 0, 0] = 0.0  # the level says nothing of the structure
     near = uniform_filter(power, (0, _NEAR, _NEAR), mode="constant") * _NEAR**2 / _counts()
-    quantised = hidden * step * step / 12.0
+    quantised = hidden * step * step / 12.0  # an error that is uniform over a step
     mean = near.ravel()
     variance = quantised * mean / (mean + quantised)
     levels = np.zeros((_SIDE, _SIDE), bool)
@@ -195,7 +196,7 @@ def quantised(mean: Array, sigma: Array, step: Array) -> Quantised:
     """Round to multiples of `step`, halves either way; arrays broadcast together."""
     m, s, q = np.broadcast_arrays(mean / step, np.maximum(sigma / step, _LEAST), step)
     fine = s >= _FINE
-    result = Quantised(m * q, np.ones_like(m), (s**2 + 1.0 / 12.0) * q**2)
+    result = Quantised(m * q, np.ones_like(m), (s**2 + 1.0 / 12.0) * q**2)  # Sheppard: rounding adds a uniform error
     if fine.all():
         return result
     coarse = ~fine

@@ -33,7 +33,7 @@ from phibench.estimator.spots.jpeg_coefficients import (
 )
 from phibench.scenes.frames import Array, BoolArray
 
-_SHIFT = 128.0
+_SHIFT = 128.0  # JPEG's level shift
 _SAME_CODES = 1.5  # of pixels that libjpeg's inverse DCT rounds the other way
 _MOST_ROUNDS = 40
 _MOST_STEPS = 24  # of a block's luma coefficients, one at a time
@@ -116,7 +116,7 @@ def _interpolation(size: int, step: int, first: bool, last: bool) -> _Axis:
     for pixel in range(size):
         near = pixel // 2
         far = near + (1 if pixel % 2 else -1)
-        up[pixel, near + before] += 0.75
+        up[pixel, near + before] += 0.75  # libjpeg's "fancy" upsampling: 3/4 of the nearer sample, 1/4 of the next
         up[pixel, min(max(far + before, 0), up.shape[1] - 1)] += 0.25
     return _Axis(up, np.asarray(np.linalg.pinv(up), float), before, after)
 

@@ -86,6 +86,7 @@ def code_table(card: SensorCard) -> CodeTable:
 def _ends(codes: NDArray[np.int64], top_dn: int) -> tuple[Array, Array]:
     """DN between which each of 256 codes lies, from the code of each DN, which rises."""
     there = np.unique(codes)
+    # a code that no DN has is the next one's
     k = there[np.minimum(np.searchsorted(there, np.arange(256)), len(there) - 1)]
     first, last = np.searchsorted(codes, k, "left"), np.searchsorted(codes, k, "right") - 1
     return np.where(first == 0, -np.inf, first - 0.5), np.where(last == top_dn, np.inf, last + 0.5)
@@ -125,6 +126,7 @@ class CodeLaw:
         chance, change = _interval(a, b, s, by_mean)
         near = np.where(a > 0.0, a, b)
         far = (np.minimum(np.abs(a), np.abs(b)) > _FAR) & ((a > 0.0) == (b > 0.0))
+        # a chance that underflows is `far`
         return np.asarray(np.where(far, near / s, change / np.maximum(chance, 1e-300)))
 
     def information(self, mean: Array) -> Array:
@@ -142,6 +144,7 @@ class CodeLaw:
         # the smaller tail of the two keeps its digits
         a, b = np.where(a > 0.0, -b, a), np.where(a > 0.0, -a, b)
         upper = log_ndtr(b)
+        # log of a difference of two tails, by the larger one: neither underflows
         return np.asarray(-2.0 * (upper + np.log(np.maximum(-np.expm1(log_ndtr(a) - upper), 1e-300))))
 
 
@@ -168,6 +171,7 @@ def code_law(
 @lru_cache(maxsize=8)
 def _information_table(card: SensorCard, noise: PixelNoise) -> tuple[float, Array]:
     """Distance of the nodes and information on them, shape (3, m), read only; kept, because fits repeat a card."""
+    # even in the root, in which shot noise is the same everywhere; fits try light beyond saturation
     root, step = np.linspace(-_BELOW, np.sqrt(1.3 * card.saturation_e), _LAW_NODES, retstep=True)
     mean, table = (np.sign(root) * root**2)[:, None], code_table(card)
     ends = zip(table.low_e, table.high_e, strict=True)
@@ -222,7 +226,7 @@ _TABLES = ("mean", "by_mean", "regression", "excess")
 _MEAN_NODES = 400  # even in sqrt(mu)
 _AT_ONCE = 4  # nodes that are worked out together
 _POISSON_UP_TO_E = 300.0  # from there a Gaussian: skewness 0.06
-_SIGMAS = 8.0
+_SIGMAS = 8.0  # of a mean: 1e-15 of its law lies beyond
 _SHORT = 1000  # values of a law up to which a sum of products is quicker than Fourier's way
 
 
@@ -244,6 +248,7 @@ class MeanCodes:
     """
 
     def __init__(self, card: SensorCard, noise: PixelNoise, curve: Array) -> None:
+        # as above, without dark pixels
         root, step = np.linspace(0.0, np.sqrt(1.3 * card.saturation_e), _MEAN_NODES, retstep=True)
         self._of, self._step, self._mean_e = (card, noise, curve), float(step), root**2
         self._known = range(0)
@@ -362,7 +367,9 @@ def _law(mu: float, card: SensorCard, noise: PixelNoise) -> tuple[float, Array]:
     if mu > _POISSON_UP_TO_E:
         below = ndtr((edges - mu) / np.sqrt(variance_e2))
     else:
+        # 12: eight sigma of few electrons are not the end of Poisson's tail
         n = np.arange(0.0, mu + 8.0 * np.sqrt(mu) + 12.0)
+        # a sensor without noise: a step, not 0 / 0
         r = max(float(np.sqrt(noise.gaussian_e2 + (noise.prnu * mu) ** 2)), 1e-6)
         below = ndtr((edges[:, None] - n) / r) @ scipy.stats.poisson.pmf(n, mu)
     return float(low), np.diff(np.concatenate([[0.0], below, [1.0]]))

@@ -75,6 +75,7 @@ def windowed_centroid(images: NDArray[Any], origin_px: ArrayLike = (0, 0), sigma
             weighted = signal * np.exp(-0.5 * (du[:, None, :] ** 2 + dv[:, :, None] ** 2) / sigma_px**2)
             total = weighted.sum(axis=(1, 2))
             across, down = (np.sum(weighted.sum(axis=axis) * d, axis=1) for axis, d in ((1, du), (2, dv)))
+            # longer than the mean: a window pulls towards its middle
             step = 1.5 * np.stack([across, down], axis=1) / total[:, None]
             uv, moved = uv + step, np.abs(step).max(axis=1)
             if not (moved >= _WINDOW_TOLERANCE_PX).any():
@@ -167,6 +168,7 @@ def _gaussian_fit(image: Array, start: Array) -> tuple[Array, bool]:
         tall = theta[2] * shape / s**2
         return np.stack([tall * du, tall * dv, shape, tall * r2 / s, np.ones_like(shape)], axis=1)
 
+    # an amplitude of 0 has no derivative by place and width
     fit = least_squares(residual, [*start, max(data.max(), 1e-12), 1.0, 0.0], jac=jacobian, method="lm", max_nfev=200)
     return fit.x[:2], bool(fit.success)
 
@@ -186,7 +188,7 @@ def _positions(signal: Array, uv: Array, origin_px: ArrayLike, converged: BoolAr
 # -- noise-free frames -----------------------------------------------------------------------------------------------
 
 EMPTY = 1e-9  # of the peak: a border below this holds no flux; 1e-9 at 10 px distance moves a centroid by about 1e-7 px
-MAX_WIDTH_PX = 201
+MAX_WIDTH_PX = 201  # of a region that grows until its border is empty: what is wider is no spot
 
 Region = tuple[int, int, int, int]  # u0, v0, u1, v1: first column and row, last column and row + 1
 

@@ -141,7 +141,9 @@ def _defocus_px2(view: View, uv_px: Array, point_m: Array | None) -> Array:
     ahead_m = into_camera.points(hit.origin_world_m)[2] + behind * camera.rays(uv_px)[2]
     disc = camera.fx_px * camera.aperture_radius_m * (1.0 / ahead_m - 1.0 / camera.focus_distance_m)
     away = uv_px - camera.project(into_camera.points(view.sphere_centre_m))
+    # on the axis no direction is radial
     along = np.outer(away, away) / max(float(away @ away), 1e-12)  # the radial direction
+    # a disc of radius r: r^2 / 4 an axis
     return np.asarray(0.25 * (disc[0] ** 2 * along + disc[1] ** 2 * (np.eye(2) - along)))
 
 
