@@ -45,7 +45,7 @@ STEPS = {
 _PARTS = ("sample_page.html", "sample_room.js", "sample_page.js")
 _MOST = 65_534  # largest code; 16 bits
 _GRID_PX = 16  # between the reflection points that the 3-D view interpolates
-_LINE_POINTS = 400
+_LINE_POINTS = 400  # of an epipolar line: no corner is seen
 _NEAREST_M, _FARTHEST_M = 0.01, 1000.0  # along the ray of an epipolar line
 _MARKS_M = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 10.0)  # distances D marked on it
 _MOST_TRIANGLES = 1500  # of one mesh; a larger one is drawn as the box around it
@@ -343,6 +343,7 @@ def _colour(shape: Shape) -> list[int]:
         return list(_LAMP)
     if isinstance(shape.texture, Bitmap):
         albedo = shape.texture.values[..., :3].reshape(-1, 3).mean(axis=0)
+        # a picture's light has no albedo: its hue is shown
         albedo = 0.6 * albedo / max(float(albedo.max()), 1e-12) if shape.texture.is_radiance else albedo
     else:
         size = np.array(shape.size_m[:2]) if isinstance(shape, Rectangle | Cuboid | Prism) else np.ones(2)

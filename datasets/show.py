@@ -139,7 +139,7 @@ def narrow_table(dataset: Dataset) -> Table:
 
 def _print_table(dataset: Dataset, console: Console) -> None:
     """Print the table that fits, or the narrow one uncut: neither numbers nor names are shortened."""
-    endless = console.options.update(width=10_000)
+    endless = console.options.update(width=10_000)  # to measure a table that nothing cuts
     wide, narrow = table(dataset), narrow_table(dataset)
     grid = wide if console.measure(wide, options=endless).maximum <= console.width else narrow
     width = console.width

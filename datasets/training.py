@@ -41,7 +41,7 @@ from phibench.scenes.rig import POSITIONS, Rig
 Item = dict[str, Any]
 PERIOD_PX = 16  # of JPEG units with chroma of half resolution; a multiple of the mosaic's 2
 _MARGIN_PX = 32  # of a crop: what demosaicing, denoising and the units beside it look at
-_OPENED_SOURCES = 8
+_OPENED_SOURCES = 8  # layers of pairs that are kept: a loader comes back to some of them
 
 
 class PairDataset(ShortForm):

@@ -116,6 +116,7 @@ def card(dataset: Dataset, request: ExportRequest, table: DataFrame) -> str:
 
 def _header(dataset: Dataset, request: ExportRequest, table: DataFrame) -> list[str]:
     """YAML; what is nested is JSON, which is YAML too."""
+    # size_categories of the Hub's cards
     sizes = (("n<1K", 1e3), ("1K<n<10K", 1e4), ("10K<n<100K", 1e5), ("100K<n<1M", 1e6))
     size = next((text for text, limit in sizes if table.height < limit), "n>1M")
     ends = {"parquet": "-*.parquet", "webdataset": "-*.tar", "frames": "/**"}

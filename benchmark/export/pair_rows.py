@@ -189,6 +189,7 @@ def splits(dataset: Dataset, request: ExportRequest) -> dict[str, str]:
     room = {"test": request.test * total, "validation": request.validation * total}
     for number in order:
         group = groups[number]
+        # a share times a whole number rounds
         fits = next((name for name in room if len(group) <= room[name] + 1e-9), "train")
         if fits in room:
             room[fits] -= len(group)

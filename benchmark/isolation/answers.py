@@ -90,14 +90,14 @@ def to_bytes(document: dict[str, Any]) -> bytes:
 
 
 _SYMMETRIC = 1e-6  # relative: a covariance in single precision passes
-_STATUS_LENGTH = 120
+_STATUS_LENGTH = 120  # of a method's own words: a line of a table
 
 # What is beyond these comes from a fit that diverged. Squares, and errors in units of claimed deviations, stay finite.
 _FAR_PX = 1e6
-_VARIANCE_PX2 = (1e-18, 1e12)
+_VARIANCE_PX2 = (1e-18, 1e12)  # deviations from 1e-9 px, below any rounding, to `_FAR_PX`
 _ELONGATION = 1e12  # largest over least eigenvalue: beyond it the least one is a rounding error
-_DEPTH_M = (1e-6, 1e6)
-_SIGMA_DEPTH_M = (1e-9, 1e9)
+_DEPTH_M = (1e-6, 1e6)  # a micrometre to a thousand kilometres
+_SIGMA_DEPTH_M = (1e-9, 1e9)  # a thousandth of the least D, a thousand times the largest
 
 
 class AnswerError(ValueError):

@@ -233,7 +233,7 @@ _OFFSET_PX = 0.25  # mean offset that is no accident of a coarse method, if it i
 _OFFSET_SIGMAS = 5.0  # false alarm below 1e-5 for 20 spots, 2 axes
 _HALF_PX = 0.2  # by which a half-pixel offset may miss a half
 _PULL = (0.5, 2.0)  # of 40 numbers: outside by chance 3e-8 (chi squared)
-_LEAST_PULLS = 10
+_LEAST_PULLS = 10  # of fewer the deviation is uncertain by more than a fifth
 _LEAST_BLUE = 2  # spots: two answers within 2 px of a blue one are no accident in 4e5 pixels
 
 
@@ -388,7 +388,7 @@ def _median_distance(a_px: Array, b_px: Array) -> float:
 
 _NEAR_RAD = 0.02  # 3 px of the default rig; the senses of phi differ by 0.08 on easy pairs
 _NEAR_DEPTH = 0.5  # relative: a spot that is off by some pixels stays within
-_UNITS = {1000.0: "millimetres", 100.0: "centimetres"}
+_UNITS = {1000.0: "millimetres", 100.0: "centimetres"}  # times the metres that were asked for
 
 
 def phi_fault(angles: Sequence[tuple[float, str, dict[str, float]]]) -> str:

@@ -40,7 +40,7 @@ from phibench.scenes.random_streams import Name, generator
 from phibench.scenes.rig import Rig
 from phibench.scenes.validation import nearest
 
-DEPTH_M, STROKE_M, HEIGHT_M = (1.2, 3.2), (0.35, 0.6), (0.35, 0.65)
+DEPTH_M, STROKE_M, HEIGHT_M = (1.2, 3.2), (0.35, 0.6), (0.35, 0.65)  # all of these the default rig shows in both images
 FLUX_E = (25_000.0, 35_000.0)  # behind the red filter: an eighth of it in the brightest pixel
 
 
@@ -200,7 +200,7 @@ def _raw(card: SensorCard) -> SensorCard:
     return replace(card, output="raw")
 
 
-BOX_PX = 64
+BOX_PX = 64  # as the recipes' `hint_box_px`
 _SPAN_PX = 20  # by which a box may be off the spot
 _BLUE_SHARE = 0.4  # of the red spot's light: half of it after the white balance, less in luma and in the sum of colours
 

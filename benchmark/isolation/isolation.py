@@ -114,11 +114,11 @@ def isolate(access: Access) -> Isolation:
 
 # -- files ---------------------------------------------------------------------------------------------------------
 
-_EXECUTE, _WRITE, _READ, _LIST = 1, 2, 4, 8
+_EXECUTE, _WRITE, _READ, _LIST = 1, 2, 4, 8  # LANDLOCK_ACCESS_FS_EXECUTE, _WRITE_FILE, _READ_FILE, _READ_DIR
 _DEVICES = 1 << 6 | 1 << 11  # making character and block devices
-_TRUNCATE, _IOCTL = 1 << 14, 1 << 15
+_TRUNCATE, _IOCTL = 1 << 14, 1 << 15  # LANDLOCK_ACCESS_FS_TRUNCATE, _IOCTL_DEV
 _RIGHTS = {1: 13, 2: 14, 3: 15, 5: 16}  # bits of rights to files, by the first ABI that knows them
-_ABI_NETWORK, _ABI_SCOPE = 4, 6
+_ABI_NETWORK, _ABI_SCOPE = 4, 6  # first ABI of Landlock that knows TCP, and scopes
 _LOOK = _EXECUTE | _READ | _LIST
 _ON_FILES = _EXECUTE | _WRITE | _READ | _TRUNCATE | _IOCTL  # others are refused in the rule of a file
 _SHARED_MEMORY = Path("/dev/shm")  # where locks of multiprocessing are
@@ -220,9 +220,9 @@ _CREATE, _ADD, _RESTRICT = 444, 445, 446  # Landlock's system calls, the same on
 _BENEATH = 1  # a rule about a path and what is beneath it
 _TCP, _SCOPES = 3, 3  # bind and connect; abstract sockets and signals
 _SET_NO_NEW_PRIVS, _SET_SECCOMP, _DROP_BOUND = 38, 22, 24  # of prctl(2)
-_NEW_USER, _NEW_MOUNTS = 0x10000000, 0x00020000
+_NEW_USER, _NEW_MOUNTS = 0x10000000, 0x00020000  # CLONE_NEWUSER, CLONE_NEWNS of unshare(2)
 _READ_ONLY, _NOSUID_NODEV, _BIND, _REC_PRIVATE = 1, 2 | 4, 4096, 16384 | 1 << 18  # of mount(2)
-_MOUNT_SETATTR, _AT_FDCWD, _RECURSIVE = 442, -100, 0x8000
+_MOUNT_SETATTR, _AT_FDCWD, _RECURSIVE = 442, -100, 0x8000  # number of the call; AT_RECURSIVE
 _KEPT_CAPABILITIES = 1 << 0 | 1 << 1 | 1 << 3  # of root: owners and permissions of files, within the rules
 _CAPABILITIES_3 = 0x20080522  # version of capset(2)
 
@@ -307,7 +307,7 @@ class _Kernel:
 
     def drop_privileges(self) -> None:
         """Take root's powers off, those of a new user namespace included: rules are for who cannot mount or trace."""
-        for capability in range(64):
+        for capability in range(64):  # a capability set has 64 bits; unknown ones are refused and change nothing
             if not _KEPT_CAPABILITIES >> capability & 1:
                 self._library.prctl(_DROP_BOUND, capability, 0, 0, 0)
         kept = _KEPT_CAPABILITIES if os.geteuid() == 0 else 0
@@ -366,11 +366,11 @@ _NUMBERS = {
         **dict(zip(_CLOCKS, (107, 113, 115), strict=True)),
     },
 }
-_LOAD, _EQUAL, _AT_LEAST, _AND, _RETURN = 0x20, 0x15, 0x35, 0x54, 0x06
-_ALLOW, _DENY = (0, 0, 0x7FFF0000), (0, 0, 0x00050000 | errno.EACCES)
+_LOAD, _EQUAL, _AT_LEAST, _AND, _RETURN = 0x20, 0x15, 0x35, 0x54, 0x06  # of classic BPF: LD W ABS, JEQ, JGE, AND, RET
+_ALLOW, _DENY = (0, 0, 0x7FFF0000), (0, 0, 0x00050000 | errno.EACCES)  # SECCOMP_RET_ALLOW, SECCOMP_RET_ERRNO
 _NUMBER, _MACHINE, _ARGUMENT = 0, 4, 16  # places in seccomp_data; an argument has 8 bytes, the lower half first
-_X32 = 0x40000000
-_AF_UNIX, _SOCK_DGRAM, _TYPE = 1, 2, 0xF
+_X32 = 0x40000000  # bit of the numbers of x32, a second table of the same machine
+_AF_UNIX, _SOCK_DGRAM, _TYPE = 1, 2, 0xF  # _TYPE: the bits of a socket's type without its flags
 _REQUESTS = {
     # F_SETOWN(_EX), F_SETLEASE, F_NOTIFY, F_SET_(FILE_)RW_HINT; FIOSETOWN, SIOCSPGRP
     "fcntl": (8, 15, 1024, 1026, 1036, 1038),
@@ -387,7 +387,7 @@ def _filter(numbers: dict[str, int], denied: Sequence[int], supervisor: int) -> 
     """Program of (code, jump if true, jump if false, value) that denies calls with EACCES, see seccomp(2)."""
     deny, allow = (_RETURN, *_DENY), (_RETURN, *_ALLOW)
     lines = [(_LOAD, 0, 0, _MACHINE), (_EQUAL, 1, 0, numbers["machine"]), deny, (_LOAD, 0, 0, _NUMBER)]
-    if numbers["machine"] == 0xC000003E:
+    if numbers["machine"] == 0xC000003E:  # AUDIT_ARCH_X86_64
         lines += [(_AT_LEAST, 0, 1, _X32), deny]
     for number in denied:
         lines += [(_EQUAL, 0, 1, number), deny]
@@ -418,6 +418,7 @@ def _outward(numbers: dict[str, int], supervisor: int) -> list[_Line]:
     lines = [line for name in _SIGNALS for line in denied(name, 0, (supervisor, -os.getpgid(supervisor), -1))]
     lines += _of_other_processes(numbers)
     kinds = [line for kind in _OF_FILE_SYSTEMS for line in ((_EQUAL, 0, 1, kind), deny)]
+    # second argument; bits 8 to 15 are the driver's letter
     kinds = [(_LOAD, 0, 0, _ARGUMENT + 8), (_AND, 0, 0, 0xFF00), *kinds]
     lines += [(_EQUAL, 0, len(kinds), numbers["ioctl"]), *kinds, (_LOAD, 0, 0, _NUMBER)]
     for name, requests in _REQUESTS.items():

@@ -20,7 +20,7 @@ from phibench.scenes.validation import printable_line
 
 MOST_NAMES = 4096
 """Modules that a process tells of."""
-_LONGEST_NAME = 100
+_LONGEST_NAME = 100  # of a module: what is longer is no package's
 
 
 def loaded_names(folder: str = "") -> list[str]:
@@ -129,7 +129,7 @@ def _listed(owner: Distribution | None) -> Iterator[tuple[str, Path]]:
             yield name, path
 
 
-_MOST_FILES = 20_000
+_MOST_FILES = 20_000  # of a package: what is beyond is not hashed
 
 
 def _beside(top: str) -> Iterator[tuple[str, Path]]:

@@ -21,8 +21,8 @@ from phibench.scenes.validation import printable_line
 _OPEN, _FOLDER_EVENT, _LOST = 0x20, 0x40000000, 0x4000  # IN_OPEN, IN_ISDIR, IN_Q_OVERFLOW
 _FLAGS = os.O_NONBLOCK | os.O_CLOEXEC
 _EVENT = struct.Struct("iIII")  # watch, kind, cookie, length of the name
-_DEPTH, _FOLDERS = 6, 1000
-_READ_BYTES = 1 << 16
+_DEPTH, _FOLDERS = 6, 1000  # levels of folders, and folders, that are watched: a user has some thousand watches
+_READ_BYTES = 1 << 16  # many events at a time
 _MOST_FILES, _MOST_BYTES = 200, 1 << 34
 """Files of a method that are hashed; 16 GiB take half a minute."""
 

@@ -48,7 +48,7 @@ from phibench.datasets.store.leftovers import OwnedFolder
 from phibench.estimator.interface import FAILURES, Outcome, Pair
 from phibench.scenes.validation import printable_line
 
-_KEPT_BYTES = 65536
+_KEPT_BYTES = 65536  # of what a method prints: its end tells why it failed
 _NO_PAIR: Pair | None = None
 _READS = 16  # of 64 kB at a time
 _LOOK_MS = 500  # between looks at whether anybody listens
@@ -170,10 +170,10 @@ def environment(folder: str, inherited: Mapping[str, str]) -> dict[str, str]:
 
 
 _SUPERVISOR = "phibench.benchmark.isolation.supervisor"
-_REPLY_BYTES = 1 << 20
+_REPLY_BYTES = 1 << 20  # an answer has some hundreds
 _MOST_STALE = 64  # replies to other questions that are dropped before the process is given up
-_END_SECONDS = KILL_SECONDS + 1.0
-_MESSAGE_LENGTH = 400
+_END_SECONDS = KILL_SECONDS + 1.0  # the supervisor needs the first part
+_MESSAGE_LENGTH = 400  # of a fault: some lines of a terminal
 _STACK_SECONDS = 0.3  # for a stack to be printed, and for the pipe to end
 _NOT_RESTARTED = ("", "invalid")  # the process is as sound as before
 
@@ -469,7 +469,7 @@ class GuestProcess:
             If the other side is gone or sends anything but the reply.
         """
         for _ in range(_MOST_STALE):
-            left = max(end - time.monotonic(), 1e-3)
+            left = max(end - time.monotonic(), 1e-3)  # 0 would mean to wait for ever
             try:
                 reply = json.loads(self._connection.receive(left, _REPLY_BYTES))
             except (ValueError, RecursionError):  # no JSON, or brackets without end

@@ -187,7 +187,7 @@ def _together(references: Sequence[Reference]) -> list[list[int]]:
     return [[place] for place in range(len(references)) if place not in built_in] + [built_in] * bool(built_in)
 
 
-_WAKE_SECONDS = 0.2
+_WAKE_SECONDS = 0.2  # between looks at whether somebody pressed Ctrl-C
 
 
 def _in_order(asked: list[Future[tuple[Outcome, ...]]]) -> Iterator[tuple[Outcome, ...]]:

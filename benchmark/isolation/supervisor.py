@@ -87,7 +87,7 @@ def _wait(worker: int, line: int, runner: int) -> int | None:
             if handle == line:
                 return None
             with contextlib.suppress(BlockingIOError):
-                os.read(told, 4096)
+                os.read(told, 4096)  # signals are one byte each
 
 
 def _ended() -> Iterator[tuple[int, int]]:
@@ -124,7 +124,7 @@ def end_descendants(worker: int, seconds: float = KILL_SECONDS) -> None:
         except ChildProcessError:  # without a child there is no descendant
             return
         if len(groups) == known:
-            time.sleep(0.001)
+            time.sleep(0.001)  # a group that was killed takes a moment to end
 
 
 def _children(parent: int) -> dict[int, int]:

@@ -98,6 +98,7 @@ class Connection:
     def _exactly(self, count: int, end: float | None) -> bytes:
         parts, missing = [], count
         while missing:
+            # 0 would mean not to wait
             self._socket.settimeout(None if end is None else max(end - time.monotonic(), 1e-6))
             try:
                 part = self._socket.recv(missing)
@@ -119,7 +120,7 @@ _IN_MEMORY = Path("/dev/shm")
 LEAST_BYTES = 1 << 26
 """Memory for a pair, as address space: pages that nothing is written to take none."""
 _SEALS = 0x1 | 0x2 | 0x4 | 0x10  # F_SEAL_SEAL, SHRINK, GROW, FUTURE_WRITE (Linux 5.1) of linux/fcntl.h
-_OLD_SEALS = 0x1 | 0x2 | 0x4
+_OLD_SEALS = 0x1 | 0x2 | 0x4  # for a system without the last one
 
 
 class MemoryFile:

@@ -210,7 +210,7 @@ def require_method(function: Any, title: str) -> None:
 
 
 _READ_ONLY = "read-only"  # in numpy's words: "assignment destination is read-only", "output array is read-only"
-_LONGEST_MESSAGE = 2000
+_LONGEST_MESSAGE = 2000  # of a method's error: a library's may hold an array
 _MOST_CAUSES = 32  # a chain of causes may be a circle
 
 

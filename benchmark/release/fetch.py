@@ -45,8 +45,8 @@ if TYPE_CHECKING:
     from phibench.benchmark.release.paced_http import Patience
 
 _STATE, _SET, _ARCHIVES = "fetch.json", "set", "archives"
-_TRIES = 3
-_CHUNK = 1 << 20
+_TRIES = 3  # of an archive with a wrong hash
+_CHUNK = 1 << 20  # bytes that are hashed and written at a time
 _BLOCK = tarfile.BLOCKSIZE
 
 

@@ -285,7 +285,7 @@ def _pieces(response: requests.Response) -> Iterator[bytes]:
 
 
 def _unpacked(pieces: Iterator[bytes]) -> Iterator[bytes]:
-    unpacker = zlib.decompressobj(16 + zlib.MAX_WBITS)
+    unpacker = zlib.decompressobj(16 + zlib.MAX_WBITS)  # 16: the header is gzip's
     try:
         for piece in pieces:
             while piece and not unpacker.eof:

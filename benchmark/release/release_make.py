@@ -58,7 +58,7 @@ from phibench.datasets.store.leftovers import folder_for_work
 
 Seal = Callable[[Path, Path], object]
 """Sealing of a data set: (folder, public folder); `benchmark.sealed.sealed_set.seal`."""
-ARCHIVE_BYTES = 500_000_000
+ARCHIVE_BYTES = 500_000_000  # that a fetch that breaks off repeats at most
 README = "README.md"
 _TIME_S = 315532800  # 1980-01-01, as all files of a sealed set have
 _SEAL = "seal.json"

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 SOURCE = "PHIBENCH_SOURCE"
 """Environment variable: the default place of releases, a folder or an HTTP address."""
-_CHUNK = 1 << 20
+_CHUNK = 1 << 20  # bytes of a local file at a time
 
 
 @dataclass(frozen=True)

@@ -87,7 +87,7 @@ class Rules:
                 f"{self.least_missed_relative:g}, or above"
             )
         _above("missed_phi_rad", self.missed_phi_rad, 0.0)
-        _above("resamples", self.resamples, 98)
+        _above("resamples", self.resamples, 98)  # 99 are the least that hold an interval of 95 %
         _above("least_samples", self.least_samples, 1)
         _above("least_compared", self.least_compared, 1)
         if not 0.5 <= self.confidence < 1.0:
@@ -223,6 +223,7 @@ def usable_covariance(covariance_px2: Array) -> Array:
     """Covariances, shape (n, 2, 2), NaN where one is not symmetric and positive definite."""
     C = np.asarray(covariance_px2, float)
     with np.errstate(invalid="ignore"):
+        # both halves come through the same arithmetic
         symmetric = np.isclose(C[:, 0, 1], C[:, 1, 0], rtol=1e-9, atol=0.0)
         definite = (C[:, 0, 0] > 0.0) & (C[:, 0, 0] * C[:, 1, 1] - C[:, 0, 1] * C[:, 1, 0] > 0.0)
         finite = np.isfinite(C).all(axis=(1, 2))

@@ -83,7 +83,7 @@ def picture(data: bytes, kind: str, alt: str) -> EmbeddedFigure:
 _PANEL: Any = {**STYLE, "font.size": 10.0, "svg.fonttype": "none", "text.parse_math": False}
 _SIZE = (4.2, 3.1)  # inches of 96 px
 _HATCHES = ("", "///", "...", "xx", "\\\\\\", "++", "oo", "--", "**", "||", "//", "O.", "xx..", "+++")
-_BINS = 12
+_BINS = 12  # rings of the image's radius: each has some errors
 _LEAST_IN_BIN = 3  # errors: the rms of fewer is noise
 _ROWS = (
     ("rms_phi_rad", None, "rms error of phi"),
@@ -197,7 +197,7 @@ def pull_histogram(tables: Tables) -> EmbeddedFigure | None:
     pulls = {name: values for name, values in pulls.items() if values.size}
     if not pulls:
         return None
-    edges = np.linspace(-5.0, 5.0, 41)
+    edges = np.linspace(-5.0, 5.0, 41)  # a quarter of a deviation each
     legend = 0.2 * math.ceil((len(pulls) + 1) / 2)  # inches below the axes, where it covers no curve
     with styled(_PANEL, (1.4 * _SIZE[0], 1.2 * _SIZE[1] + legend), layout="constrained") as figure:
         axes = figure.subplots()
@@ -220,6 +220,7 @@ def pull_histogram(tables: Tables) -> EmbeddedFigure | None:
 
 def _curves(axes: Axes, scores: Named, by: str, metric: str, factor: float) -> None:
     for i, (name, score) in enumerate(scores.items()):
+        # 2 % aside: intervals of several methods do not cover each other
         shown = [(x * 1.02 ** (i - len(scores) / 2), value) for x, value in _points(score, by, metric)]
         if not shown:
             continue
@@ -273,7 +274,7 @@ def _scale(tables: Tables) -> LogNorm:
         float(table.filter("detected")["distance_px"].to_numpy().max(initial=0.0)) for table in tables.values()
     )
     largest = largest or 1.0  # nothing found, or nothing off
-    return LogNorm(0.01 * largest, largest, clip=True)
+    return LogNorm(0.01 * largest, largest, clip=True)  # two decades of errors have colours
 
 
 def _map(axes: Axes, table: pl.DataFrame, scale: LogNorm) -> Any:
@@ -316,7 +317,7 @@ def plain_ticks(axes: Axes, decades: float = 1e3) -> None:
     for axis in (axes.xaxis, axes.yaxis):
         if axis.get_scale() == "log":
             low, high = sorted(axis.get_view_interval())
-            wide = high > decades * max(low, 1e-300)
+            wide = high > decades * max(low, 1e-300)  # an empty axis begins at 0
             axis.set_major_locator(LogLocator(subs=(1.0,) if wide else (1.0, 2.0, 5.0), numticks=12))
             axis.set_major_formatter(FuncFormatter(lambda x, _: plain_number(x)))
             axis.set_minor_formatter(NullFormatter())

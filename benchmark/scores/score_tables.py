@@ -50,7 +50,7 @@ HEADS = {
     "beyond_5_sigma": "beyond 5 sigma",
 }
 """Metrics of a ranking with their heads; a narrow table has the first `NARROW` of them."""
-NARROW = 8
+NARROW = 8  # columns that fit into 80 signs
 DIGITS = 3
 """Significant digits of a value in a table."""
 WIDE = 210

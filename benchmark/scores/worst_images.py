@@ -22,13 +22,13 @@ from phibench.estimator.pair_set import Pairs
 from phibench.estimator.spots.camera_codes import rgb_picture
 from phibench.scenes.frames import Array
 
-CROP_PX = 48
-COUNT = 10
+CROP_PX = 48  # a spot and what is around it
+COUNT = 10  # of a score's images
 FRAMES = 3
 """Images that are also shown whole."""
 _DARKEST, _BRIGHTEST = 0.5, 99.8  # percentiles of a frame: black, and white; the spot and lamps are the rest
 _GAMMA = 1.0 / 2.2  # raw pixels are linear in the light
-_JPEG_QUALITY = 70
+_JPEG_QUALITY = 70  # of frames in the report: to look at, not to measure
 
 
 def worst(records: pl.DataFrame, pairs: Pairs, count: int = COUNT, before: pl.DataFrame | None = None) -> list[Worst]:
@@ -67,7 +67,7 @@ def crop(image: NDArray[Any], uv_px: Array, side_px: int = CROP_PX) -> tuple[NDA
     u0, v0 = max(u, 0), max(v, 0)
     part = np.asarray(image[v0 : max(v + side_px, 0), u0 : max(u + side_px, 0)], float)
     low, high = (part.min(), part.max()) if part.size else (0.0, 1.0)
-    return np.round(255.0 * (part - low) / max(high - low, 1e-9)).astype(np.uint8), (u0, v0)
+    return np.round(255.0 * (part - low) / max(high - low, 1e-9)).astype(np.uint8), (u0, v0)  # an even crop is black
 
 
 def half_size(image: NDArray[Any], card: SensorCard) -> NDArray[np.uint8]:
@@ -83,7 +83,7 @@ def half_size(image: NDArray[Any], card: SensorCard) -> NDArray[np.uint8]:
 
 def _brightened(values: Array) -> NDArray[np.uint8]:
     low, high = np.percentile(values, [_DARKEST, _BRIGHTEST])
-    share = np.clip((values - low) / max(high - low, 1e-9), 0.0, 1.0)
+    share = np.clip((values - low) / max(high - low, 1e-9), 0.0, 1.0)  # an even frame is black
     return np.round(255.0 * share**_GAMMA).astype(np.uint8)
 
 

@@ -313,7 +313,7 @@ def _unequal(given: Any, right: Any, place: str, source: str = "the records give
         yield f"{place}: {len(found) - _MOST} more are not what {source}"
 
 
-_MOST = 3
+_MOST = 3  # differences of a file that are told: the first ones show the cause
 
 
 def _leaves(given: Any, right: Any, place: str) -> Iterator[tuple[str, Any, Any]]:

@@ -103,7 +103,7 @@ def read_seal(folder: Path) -> Seal:
 
 
 _FILE_TIME_S = 315532800  # 1980-01-01: a file's own time would tell the order of the work
-_SALT_BYTES = 32
+_SALT_BYTES = 32  # 256 bits: a truth that somebody guesses cannot be tried against the seal
 _TRUTH_FILE = "seal_{}" + SEALED_TRUTH
 
 
@@ -265,7 +265,7 @@ def _publish(work: Path, public: Path) -> None:
     """Give every file the same time, then the folder its name."""
     umask = os.umask(0)
     os.umask(umask)
-    work.chmod(0o777 & ~umask)
+    work.chmod(0o777 & ~umask)  # a temporary folder is its owner's alone
     for path in (*work.rglob("*"), work):
         os.utime(path, (_FILE_TIME_S, _FILE_TIME_S))
     if public.exists():

@@ -54,10 +54,10 @@ _TRUST_S = 2.0  # the first guess weighs as much as tasks that should take this 
 # Bytes.
 _AMBIENT_BYTES_PX = 24.0  # six noisy float32 planes do not compress
 _TRUTH_BYTES_PX = 13.5  # ten float32 planes; what is outside the mirror compresses to nothing
-_PREVIEW_BYTES_PX = 2.8
+_PREVIEW_BYTES_PX = 2.8  # PNG of 8 bits a colour
 _SPOT_BYTES = 8192
 _TEXEL_BYTES = 25.0  # six float32 and a bool
-_RESERVE = 1.1
+_RESERVE = 1.1  # of a disc that is too small one learns too late
 
 
 @dataclass(frozen=True)
@@ -161,7 +161,7 @@ def light_map_s(plan: Plan, room: Room) -> float:
     """Seconds of baking the light map of a room: rays are texels times rays per texel."""
     ambient = plan.recipe.ambient
     table = face_table(fixed_shapes(room))
-    doubled = math.log2(max(len(table.patch), 64))
+    doubled = math.log2(max(len(table.patch), 64))  # below 64 triangles a ray costs as much as with 64
     fine = TexelGrid.of(table, ambient.texel_m).count
     sizes = (max(ambient.indirect_texel_m, ambient.texel_m), max(BOUNCE_TEXEL_M, ambient.texel_m))
     indirect, coarse = (
@@ -169,6 +169,7 @@ def light_map_s(plan: Plan, room: Room) -> float:
         for size, rays in zip(sizes, (ambient.final_rays, ambient.bounce_rays), strict=True)
     )
     # every other texel faces a lamp
+    # the rest: twice
     lamps = 0.5 * fine * table.emits.sum() * (FIRST_RAYS + 2.0 * _PENUMBRA * doubled * ambient.lamp_rays)
     rays = lamps + 2.0 * indirect + coarse
     return float(rays * (_TRIANGLES[0] * doubled + _TRIANGLES[1]) + fine * BAKE_S_PER_MEGATEXEL) / 1e6
@@ -210,8 +211,9 @@ def slowdown(workers: int) -> float:
     """
     cores, wall_s, cpu_s = os.cpu_count() or 1, time.perf_counter(), time.process_time()
     _probe()
-    cpu_s = max(time.process_time() - cpu_s, 1e-3)
+    cpu_s = max(time.process_time() - cpu_s, 1e-3)  # a clock of a coarse system may not have moved
     waiting = (time.perf_counter() - wall_s) / cpu_s
+    # a probe that had to wait tells more than the load, which is a mean of the last minute
     others = max(waiting * cores - 1.0, 0.0) if waiting > 1.2 else min(os.getloadavg()[0], cores - 1.0)
     return cpu_s / _PROBE_CPU_S * max((others + workers) / cores, 1.0)
 
@@ -219,7 +221,7 @@ def slowdown(workers: int) -> float:
 def _probe() -> None:
     """Arithmetic and scattered reads, as tracing has; sorting would tell whether the processor has AVX-512."""
     values = np.linspace(0.0, 1.0, 200_000)
-    scattered = np.arange(values.size) * 7919 % values.size
+    scattered = np.arange(values.size) * 7919 % values.size  # a prime: all places, none beside the one before
     for _ in range(20):
         values = np.sin(values[scattered] + 1e-3)
 

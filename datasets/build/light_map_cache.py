@@ -41,8 +41,8 @@ LIMIT_MB = 1000.0
 _FORM = b"phibench light map 3"
 _SUFFIX = ".lightmap"
 _LOCK, _LIMIT = ".lock", "limit.txt"
-_PATIENCE_S = 10.0
-_ENTRY_MB = 1000
+_PATIENCE_S = 10.0  # for another process that writes: a map is written in less
+_ENTRY_MB = 1000  # as much as the cache holds by default
 # a quadrature point on a lamp may stand nearer to a texel than to the next point, and then counts for too much
 _GLARE = 1e3
 

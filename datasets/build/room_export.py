@@ -44,7 +44,7 @@ from phibench.scenes.worlds.generated_room import generate_room
 from phibench.scenes.worlds.properties import PROPERTIES, drawn_properties
 
 SETTINGS = BakeSettings(texel_m=0.05, indirect_texel_m=0.1, lamp_rays=32, bounces=8, bounce_rays=32, final_rays=128)
-_LEAST_ROWS, _MOST_ROWS = 16, 4096
+_LEAST_ROWS, _MOST_ROWS = 16, 4096  # of a panorama; those that a recipe takes
 _CLOSED = 0.75  # part of the directions from a point of a room that meet a surface
 
 

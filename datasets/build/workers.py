@@ -33,11 +33,11 @@ from phibench.datasets.store.files import write_text
 from phibench.datasets.store.provenance import code_sha256, provenance
 
 CONNECT_S = 10.0  # a scheduler that is up answers at once: a longer wait would only hide a wrong address
-WORKERS_S = 60.0
+WORKERS_S = 60.0  # for the first worker, by default: `--wait-for-workers`
 # The queue of a cluster may replace a lost worker only after minutes. Finished work is on disk either way.
 LOST_S = 300.0
 DEATH_S = 10.0  # a worker whose pipe has ended is on its way out
-_POLL_S = 0.005
+_POLL_S = 0.005  # between looks for a task that has ended: short beside any task
 _LEAST_S = 0.5  # between two looks for a scheduler that is still to start
 _CENSUS_S = 2.0  # counting the workers is a call to the scheduler: not before every task
 # glibc returns large arrays at once; a view's arrays of 45 MB would then fault every page anew, 1 s a view

@@ -34,7 +34,8 @@ Subsampling = Literal["4:4:4", "4:2:2", "4:2:0"]
 _ORIENTATION, _MAKE, _MODEL, _DNG = 0x0112, 0x010F, 0x0110, 0xC612  # EXIF and TIFF tags
 _LIT_CODE, _LIT_SHARE = 32, 0.01  # below, JPEG rounds all chroma away
 _WHITE_IS_0 = 0  # TIFF's photometric interpretation
-_PHOTOMETRIC = 0x0106
+_PHOTOMETRIC = 0x0106  # TIFF's tag
+# factors of Y in a JPEG
 _SAMPLING: dict[tuple[int, int], Subsampling] = {(1, 1): "4:4:4", (2, 1): "4:2:2", (2, 2): "4:2:0"}
 _SIXTEEN = ("I;16", "I;16B", "I;16L", "I")
 _PGM = re.compile(rb"P[25](?:\s+|\s*#[^\n]*\n\s*)+(\d+)(?:\s+|\s*#[^\n]*\n\s*)+(\d+)(?:\s+|\s*#[^\n]*\n\s*)+(\d+)\s")
@@ -124,6 +125,7 @@ def _with_tables(file: InputFile, picture: Image.Image, found: CameraPicture) ->
     if _without_chroma(picture):
         return replace(found, kind="rgb")
     if found.orientation > 1:
+        # a JPEG is turned by whole units: a cut one at an edge would lie inside
         down, across = {"4:4:4": (8, 8), "4:2:2": (8, 16), "4:2:0": (16, 16)}[sampling]
         aside = found.orientation > 4
         if picture.height % down or picture.width % across or (aside and sampling == "4:2:2"):
@@ -154,6 +156,7 @@ def upright(pixels: NDArray[Any], orientation: int) -> NDArray[Any]:
     """Stored rows turned as the orientation 1 to 8 of EXIF says, a copy."""
     if orientation > 4:  # rows are stored as columns
         pixels = np.swapaxes(pixels, 0, 1)
+    # EXIF 2.3, tag 274
     rows, columns = {2: (1, -1), 3: (-1, -1), 4: (-1, 1), 6: (1, -1), 7: (-1, -1), 8: (-1, 1)}.get(orientation, (1, 1))
     return np.ascontiguousarray(pixels[::rows, ::columns])
 
@@ -195,6 +198,7 @@ def pgm_values(file: InputFile, data: bytes) -> NDArray[np.uint16]:
         Of the file's own kind, if it is damaged; in one sentence.
     """
     head = _PGM.match(data[:1000])
+    # a million columns: no picture, and slow as a number
     if head is None or any(len(text) > 6 for text in head.groups()):
         raise file.fault("is not a picture of the format PGM")
     width, height, top = (int(text) for text in head.groups())
@@ -247,7 +251,7 @@ _MAGIC = {
 def _other_format(data: bytes, suffix: str) -> str:
     """Fault of a format that is known and not read; "" for all others."""
     if data[4:8] == b"ftyp":
-        brand = data[8:12]
+        brand = data[8:12]  # ISO base media: after size and "ftyp"
         named = next((name for name, (brands, _) in _BRANDS.items() if brand in brands), None)
         if named == "HEIC" and any(one in data[16:64] for one in _BRANDS["AVIF"][0]):
             named = "AVIF"

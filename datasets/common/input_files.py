@@ -37,9 +37,9 @@ if TYPE_CHECKING:
 MIB = 1 << 20
 DOCUMENT_BYTES = 512 * MIB  # a submission of 1e6 pairs has 400 MiB
 SETTINGS_BYTES = 1 * MIB  # TOML and other files that people write
-TABLE_ROWS = 20_000_000
+TABLE_ROWS = 20_000_000  # ten times those of a score of 1e6 pairs
 TABLE_VALUES = 500_000_000  # rows times columns; a column of one value takes no room in the file, but in memory
-PICTURE_PIXELS = 50_000_000
+PICTURE_PIXELS = 50_000_000  # of one picture: a small file may unpack to gigabytes
 DEPTH = 64  # of lists and tables in each other
 DIGITS = 40  # of a whole number; a seed of 128 bits has 39
 NAME_LENGTH = 200  # of a key, and of a name of ours

@@ -15,8 +15,8 @@ from rich.progress import MofNCompleteColumn, Progress, ProgressColumn, Task, Te
 from rich.progress_bar import ProgressBar
 from rich.table import Column
 
-LINE_EVERY_S = 30.0
-_BAR_EVERY_S = 1.0
+LINE_EVERY_S = 30.0  # in a log file
+_BAR_EVERY_S = 1.0  # on a terminal
 _TELLER = "phibench progress"  # name of the threads of `Steps`, by which `StillRunning` knows that one tells
 _BAR_COLUMNS = 16
 
@@ -145,7 +145,7 @@ class StillRunning:
 
     def _keep_telling(self) -> None:
         heard = self._started
-        while not self._end.wait(self._every_s / 30.0):
+        while not self._end.wait(self._every_s / 30.0):  # late by a thirtieth at most
             now = time.monotonic()
             if any(thread.name == _TELLER for thread in threading.enumerate()):
                 heard = now

@@ -12,7 +12,7 @@ import re
 
 from phibench.scenes.validation import printable_line
 
-_MOST = 2000
+_MOST = 2000  # signs of a stranger's text
 
 _LATEX = {
     "\\": r"\textbackslash{}",

@@ -169,6 +169,7 @@ def _draw(
                 steps.advance()
                 if (now := time.monotonic()) > due:
                     write_index(out, rows.values())
+                    # writing the index takes a twentieth of the time at most
                     due = now + max(_SAVE_EVERY_S, 20.0 * (time.monotonic() - now))
     finally:  # what an interrupted run has drawn is found by the next one
         write_index(out, rows.values())

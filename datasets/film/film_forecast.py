@@ -24,12 +24,12 @@ from phibench.datasets.recipe.load import load_recipe, recipe_files
 from phibench.render.film.moving_rows import spot_time_s
 
 FILM_S = 0.5  # hashes, tables
-VIEW_S = 0.15
+VIEW_S = 0.15  # of a key view, and more by its size
 VIEW_S_PER_MEGAPIXEL = 2.0
 POSE_S = 0.010  # spot layer in a pose of its own
 DOUBLED = 1.5  # views made over those to begin with: half of 75 films double theirs once until their proof holds
 FRAME_S = 0.004  # rows of a frame, and their truth
-_VIEW_BYTES_PX = 11.8
+_VIEW_BYTES_PX = 11.8  # three float32 planes with noise
 _LIGHT_BYTES = 8_600  # image of a spot in a frame
 _TRUTH_BYTES = 300  # a row of a table
 

@@ -29,11 +29,11 @@ from phibench.scenes.motion.vehicle import Vehicle
 from phibench.scenes.room import Room
 from phibench.scenes.validation import SceneError
 
-TILE_PX = 32
+TILE_PX = 32  # of the noise: a region of whole tiles has the pixels of the frame
 MARGIN_PX = 20  # a JPEG's unit and what demosaicing looks at, around a window
 KEY_PX, DRIVE_KEY_PX = 1.2, 1.8  # motion of the spot's image from key view to key view, before the proof is asked
-_SAMPLES = 257
-_CEILING_M = 2.6
+_SAMPLES = 257  # instants of a leg: the image's way is summed between them
+_CEILING_M = 2.6  # of a usual room: the highest places that move in the image
 _DISC_ALBEDO = 0.5  # of a light, where the laser's spot takes that of the surface
 
 
@@ -230,7 +230,7 @@ def _keys(scene: FilmScene, uv: Array, whole: bool) -> tuple[int, ...]:
     parts = PoseParts.of(scene).parts
     counts = []
     for number, part in enumerate(parts):
-        if part.high - part.low < 1e-9:
+        if part.high - part.low < 1e-9:  # a carriage that rests: one view
             counts.append(1)
             continue
         if scene.drive is None:
@@ -252,6 +252,7 @@ def _surroundings(scene: FilmScene) -> Iterator[FilmScene]:
     """Films of places as far away as the spot, all around, at its height and near the ceiling."""
     here, spot = scene.rig.T_world_camera.t, np.array(scene.spot.position_world_m)
     distance = float(np.linalg.norm((spot - here)[:2]))
+    # eight directions: on a leg, the fastest places are ahead or aside
     for turn in np.arange(0.0, 2.0 * np.pi, 0.25 * np.pi):
         for height in (float(spot[2]), _CEILING_M):
             place = np.array([here[0] + distance * np.cos(turn), here[1] + distance * np.sin(turn), height])
@@ -267,6 +268,7 @@ def _way_px(scene: FilmScene, times_s: Array) -> float:
 # -- what the robot runs into ----------------------------------------------------------------------------------------
 
 _STEP_M, _GRID_M = 0.03, 0.03  # way of the robot's ends from check to check; thinner things may slip through
+# of the robot about its middle: ends, half width, and heights that are looked at
 _ENDS_M, _SIDE_M, _LEVELS_M = (-0.45, 0.43), 0.255, (0.05, 0.17, 0.29)
 _FLOOR_M = 0.03  # rugs and wires are no obstacles
 
@@ -291,7 +293,7 @@ def _collision(scene: FilmScene, room: Room) -> str:
     for number, (leg, profile) in enumerate(zip(drive.legs, drive.profiles, strict=True)):
         up_m = float(scene.carriage.position_m(profile.start_s))
         starts, ends = _robot_lines(scene, up_m)
-        way_m = abs(leg.length_m) + _ENDS_M[1] * abs(leg.turn_rad) if leg.drives else 0.3
+        way_m = abs(leg.length_m) + _ENDS_M[1] * abs(leg.turn_rad) if leg.drives else 0.3  # flippers: their ends' way
         count = math.ceil(way_m / _STEP_M) + 1
         places = np.linspace(profile.start_m, profile.end_m, count)
         turns, origins = placement(drive.vehicle, drive.state_on_leg(number, places))

@@ -34,7 +34,7 @@ from phibench.scenes.room import Room
 if TYPE_CHECKING:  # they import Mitsuba
     from phibench.render.room.light_map import BakeSettings, LightMap
 
-_DOUBLINGS = 5
+_DOUBLINGS = 5  # of the views: 32 times as many do not help any more
 _BAKE_M, _HALF_ROBOT_M = 0.25, 0.45  # way of the robot's ends from light map to light map
 Render = Callable[[View, tuple[int, float], int], NDArray[np.float32]]
 """Room of a view on the film's region, shape (3, h, w), at a part and place of the poses, from a seed."""

@@ -18,7 +18,7 @@ from phibench.render.sensor.light import Region
 
 Picture = NDArray[np.uint8]
 _LINE_PX = 16
-_ZOOM, _INSET_PX = 5, 36
+_ZOOM, _INSET_PX = 5, 36  # the spot's surroundings of 36 px, five times as large
 _GREEN, _YELLOW = (80, 255, 80), (255, 210, 60)
 
 
@@ -41,7 +41,7 @@ def picture(film: Film, frame: FilmFrame) -> Picture:
         _marks(whole, film, frame, frame.region, 0.5)
         whole.paste(_inset(film, frame, colours), (0, 0))
         return _with_numbers(whole, film, frame)
-    zoom = max(1, 480 // colours.shape[1])
+    zoom = max(1, 480 // colours.shape[1])  # a window is shown as large as a small video
     size = colours.shape[1] * zoom, colours.shape[0] * zoom
     enlarged = Image.fromarray(colours).resize(size, Image.Resampling.NEAREST)
     _marks(enlarged, film, frame, frame.region, zoom)
@@ -56,6 +56,7 @@ def _colours(frame: FilmFrame) -> Picture:
     if image.ndim == 3:  # YUYV
         return np.repeat(image[..., :1], 3, axis=2).astype(np.uint8)
     low, top = frame.sensor.black_level_dn, frame.sensor.top_dn
+    # raw pixels are linear in the light
     grey = np.clip((image.astype(float) - low) / (top - low), 0.0, 1.0) ** (1 / 2.2)
     return np.repeat(np.rint(255.0 * grey).astype(np.uint8)[..., None], 3, axis=2)
 

@@ -217,7 +217,7 @@ def read_spots(path: Path, frames: int) -> list[RowsImage]:
     origins, shapes, values = (arrays[name] for name in _ARRAYS)
     if shapes.shape[1:] != (2,) or (shapes < 0).any() or (shapes > LARGEST_SIDE_PX).any():
         raise DatasetError(f"{path} is damaged: its images have no size; {_AGAIN}")
-    sizes = 9 * np.prod(shapes, axis=1)
+    sizes = 9 * np.prod(shapes, axis=1)  # three planes, and their derivatives by u and v
     if origins.shape != (frames, 2) or shapes.shape != (frames, 2) or sizes.sum() != len(values):
         raise DatasetError(f"{path} is damaged: it does not hold {frames} images; {_AGAIN}")
     ends = np.cumsum(sizes)

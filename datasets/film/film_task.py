@@ -177,7 +177,7 @@ def _moves(film: FilmPlan, frame: int) -> bool:
         return True
     times = scene.times
     half = 0.5 * (times.exposure_s + times.readout_s)
-    ends = times.frame_s[frame] + half * np.linspace(-1.0, 1.0, 9)
+    ends = times.frame_s[frame] + half * np.linspace(-1.0, 1.0, 9)  # instants of a frame, its rows included
     ways = scene.spot_m(ends), scene.robot_state(ends)
     return bool(np.ptp(scene.offset_m(ends)) or any(np.ptp(way, axis=0).any() for way in ways))
 

@@ -54,7 +54,7 @@ def write_frames(path: Path, frames: Iterable[bytes], codec: Codec, size: tuple[
     name, pixels = _CODECS[codec]
 
     def write(temporary: Path) -> None:
-        rate = Fraction(rate_hz).limit_denominator(1001)
+        rate = Fraction(rate_hz).limit_denominator(1001)  # 29.97 is 30000 / 1001
         with av.open(str(temporary), "w", format=form, options={"fflags": "+bitexact"}) as container:
             stream = container.add_stream(name, rate=rate)
             stream.height, stream.width, stream.pix_fmt = *size, pixels

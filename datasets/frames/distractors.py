@@ -34,7 +34,7 @@ from phibench.scenes.room import Room
 
 MIN_APART_PX = 12.0
 """Nearer than this a distractor would lie in the spot's window, and the spot's own place would be in doubt."""
-TRIES = 20
+TRIES = 20  # places that are drawn for one: a room that shows none of them has none
 
 Names = tuple[str, int, str]
 

@@ -70,6 +70,7 @@ def write_preview(path: Path, frame: Frame) -> Path:
 def png_bytes(image: NDArray[Any]) -> bytes:
     """PNG of an image, shape (h, w) of 16 bits, (h, w, 2) or (h, w, 3) of 8; two planes are grey and opacity."""
     buffer = io.BytesIO()
+    # stated: the bytes must not follow Pillow's default
     Image.fromarray(image).save(buffer, format="PNG", compress_level=6)
     return buffer.getvalue()
 

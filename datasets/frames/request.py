@@ -25,6 +25,7 @@ AUTO: Literal["auto"] = "auto"
 """Exposure where neither caller nor recipe gives one, in every preset: a camera exposes by itself."""
 
 _JPEG = b"\xff\xd8"  # start of image
+# as wide as a recipe's: beyond them numbers overflow
 _RANGES = {"lamp_level": (0.0, 1e6), "laser_level": (0.0, 1e6), "carriage_speed_m_s": (-1e3, 1e3)}
 
 
@@ -167,7 +168,7 @@ def jpeg_tables(path: Path) -> tuple[tuple[int, ...], tuple[int, ...]]:
         words = " ".join(line.partition("#")[0] for line in file.text(data).splitlines()).split()
         if len(words) not in (64, 128) or not all(word.isascii() and word.isdigit() for word in words):
             raise file.fault("holds no quantisation tables")
-        steps = [int(word[:6]) for word in words]
+        steps = [int(word[:6]) for word in words]  # a word of thousands of digits is no step, and slow
         tables = [tuple(steps[k : k + 64]) for k in range(0, len(steps), 64)]
     if not all(1 <= step <= 255 for table in tables for step in table):
         raise file.fault("has steps outside 1 to 255")

@@ -17,7 +17,7 @@ from phibench.datasets.recipe.tables import SENSOR_KEYS, FramesTable
 from phibench.scenes.random_streams import LEAST_SECRET_SEED, Name, generator, philox_key
 
 Names = tuple[str, int, str]
-_CAMERAS = 2**31
+_CAMERAS = 2**31  # numbers of cameras; those of a secret seed have all 128 bits
 _STREAM = "take"  # name of the random streams: another name would draw other numbers
 
 

@@ -38,7 +38,7 @@ BOX: dict[str, float | str] = {"heading_deg": 0.0, "l_shape": 0.0}
 """Properties of a generated room whose walls are a box along the world's axes: what a panorama is laid on."""
 # Every generated room leaves a cylinder of 0.20 m about the stroke axis free up to its ceiling, here for the camera.
 _CAMERA_RADIUS_M = 0.12
-_CAMERA_HEIGHTS_M = (1.1, 1.7)
+_CAMERA_HEIGHTS_M = (1.1, 1.7)  # at which one holds a camera
 
 
 def draw_rooms(recipe: Recipe, files: RoomFiles | None = None) -> dict[str, RoomSource]:

@@ -106,7 +106,7 @@ def further_points(
 
 # Samples of `[random]`.
 
-TRIES = 100
+TRIES = 100  # of a sample: one in a hundred that can be is found, and the next one waits no longer
 HIDDEN_TRIES = 1000
 """Of samples whose spot one image is to hide: in the worst rooms one draw in some 50 does."""
 UNDRAWN = "has no possible rig, spot and stroke"

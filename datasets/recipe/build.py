@@ -119,7 +119,7 @@ MIRROR_SHAPES: Mapping[str, tuple[str, ...]] = {
 """Shapes that a key of `[rig.mirror]` belongs to."""
 
 _VERTEX_M = 0.220  # from the lens: rims of 60 mm fit the image
-_VERTEX_RADIUS_M = 0.060
+_VERTEX_RADIUS_M = 0.060  # as the sphere's radius
 CONIC_RANGES = {"ellipsoid": (-1.0, np.inf), "hyperboloid": (-np.inf, -1.0)}
 """Open ranges of the conic constants of shapes that do not take every one."""
 _CONICS = {"ellipsoid": -0.5, "paraboloid": -1.0, "hyperboloid": -1.5625, "polynomial": -1.0}
@@ -341,7 +341,7 @@ def ceiling_m(room: Room) -> float:
 def _axis_distance_m(triangles_m: Array) -> Array:
     """Distances of the origin from triangles of the plane, shape (N,), for corners (N, 3, 2)."""
     side = np.roll(triangles_m, -1, axis=1) - triangles_m
-    squared = np.maximum(np.einsum("nki,nki->nk", side, side), 1e-300)
+    squared = np.maximum(np.einsum("nki,nki->nk", side, side), 1e-300)  # a side without a length
     part = np.clip(-np.einsum("nki,nki->nk", triangles_m, side) / squared, 0.0, 1.0)
     nearest = np.linalg.norm(triangles_m + part[..., None] * side, axis=-1).min(axis=1)
     turn = triangles_m[..., 0] * side[..., 1] - triangles_m[..., 1] * side[..., 0]

@@ -124,7 +124,7 @@ class FilmTable(Table):
         """Check what no single key shows."""
         if len(self.pauses_s) != len(self.stops):
             raise ValueError(f"{len(self.pauses_s)} pauses_s for {len(self.stops)} stops; give one pause for each stop")
-        longest = 1.0 / self.rate_hz * (1.0 + 1e-9)
+        longest = 1.0 / self.rate_hz * (1.0 + 1e-9)  # 1 / 30 as it is typed
         for name in ("exposure_s", "readout_s"):
             if getattr(self, name) > longest:
                 raise ValueError(

@@ -44,7 +44,7 @@ from phibench.scenes.mirror import MetalName
 from phibench.scenes.misalignment import OF_REVOLVED, PARAMETERS
 from phibench.scenes.random_streams import LARGEST_SEED
 
-MIN_STROKE_M, MAX_STROKE_M = 1e-3, 10.0
+MIN_STROKE_M, MAX_STROKE_M = 1e-3, 10.0  # below a millimetre there is no parallax to measure
 DatasetName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$", max_length=64)]
 StrokeM = Annotated[float, Field(ge=MIN_STROKE_M, le=MAX_STROKE_M)]
 Decentre = Annotated[float, Field(ge=-0.1, le=0.1)]

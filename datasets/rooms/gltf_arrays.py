@@ -19,9 +19,9 @@ from phibench.datasets.rooms.mesh_parts import MOST_TRIANGLES, Companions, damag
 from phibench.scenes.frames import Array
 from phibench.scenes.validation import printable_line
 
-_KINDS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+_KINDS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}  # componentType of glTF
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
-MOST_ENTRIES = 3 * MOST_TRIANGLES
+MOST_ENTRIES = 3 * MOST_TRIANGLES  # each corner a place of its own
 _MOST_READ = 8 * MOST_ENTRIES  # of all arrays: places, corners, colours and texture coordinates, most of them twice
 
 
@@ -57,7 +57,7 @@ class GltfDocument:
     def _chunks(self, data: bytes) -> tuple[bytes, bytes]:
         """Text and binary chunk of a .glb file."""
         found: dict[bytes, bytes] = {}
-        at = 12
+        at = 12  # after magic, version and length
         while at + 8 <= len(data):
             length, kind = int.from_bytes(data[at : at + 4], "little"), data[at + 4 : at + 8]
             if at + 8 + length > len(data):
@@ -121,7 +121,7 @@ class GltfDocument:
         start, length = self.whole(view, "byteOffset", 0), self.whole(view, "byteLength")
         if start + length > len(data):
             raise damaged(self.file)
-        return data[start : start + length], self.whole(view, "byteStride", 0, 252)
+        return data[start : start + length], self.whole(view, "byteStride", 0, 252)  # 252: glTF's largest stride
 
     def _buffer(self, number: int) -> bytes:
         if number not in self._buffers:

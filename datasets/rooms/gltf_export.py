@@ -24,8 +24,8 @@ from phibench.scenes.shapes import Shape
 from phibench.scenes.textures import Bitmap, Checker, Texture, Uniform
 
 _CELL = 64  # texels along a side of a checker's cell
-_MAGIC, _JSON, _BIN = 0x46546C67, 0x4E4F534A, 0x004E4942
-_FLOAT, _UNSIGNED, _PLACES, _VERTICES = 5126, 5125, "VEC2", "VEC3"
+_MAGIC, _JSON, _BIN = 0x46546C67, 0x4E4F534A, 0x004E4942  # "glTF", "JSON" and "BIN" as numbers
+_FLOAT, _UNSIGNED, _PLACES, _VERTICES = 5126, 5125, "VEC2", "VEC3"  # componentType and type of glTF
 _STRENGTH = "KHR_materials_emissive_strength"
 
 
@@ -119,7 +119,7 @@ class GltfWriter:
         if table.emits[0]:
             material |= _emission(float(light.max())) | {"emissiveFactor": (light / light.max()).tolist()}
         elif isinstance(texture, Bitmap) and texture.is_radiance:
-            strength = max(float(texture.values[..., :3].max()), 1e-6)
+            strength = max(float(texture.values[..., :3].max()), 1e-6)  # a dark screen: no division by 0
             material |= _emission(strength) | {"emissiveFactor": [1.0, 1.0, 1.0]}
             material["emissiveTexture"] = {"index": self._texture(texture, texture.values[..., :3] / strength)}
         elif isinstance(texture, Uniform):

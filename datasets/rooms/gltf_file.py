@@ -53,9 +53,9 @@ _CONVERTERS = {
 }
 _GLOSSY = "KHR_materials_pbrSpecularGlossiness"
 _DEPTH = 100  # of nodes in nodes
-_LIST, _STRIP, _FAN = 4, 5, 6
-_WITHOUT_SURFACE = (0, 1, 2, 3)
-_REPEAT, _MIRRORED, _CLAMPED = 10497, 33648, 33071
+_LIST, _STRIP, _FAN = 4, 5, 6  # modes of primitives: TRIANGLES, TRIANGLE_STRIP, TRIANGLE_FAN
+_WITHOUT_SURFACE = (0, 1, 2, 3)  # POINTS, LINES, LINE_LOOP, LINE_STRIP
+_REPEAT, _MIRRORED, _CLAMPED = 10497, 33648, 33071  # wrapS and wrapT
 
 
 @dataclass(frozen=True)
@@ -149,7 +149,7 @@ class _Reader:
     def _transform(self, node: dict[str, Any]) -> Array:
         document = self.document
         if "matrix" in node:
-            matrix = np.array(document.numbers(node, "matrix", (0.0,) * 16)).reshape(4, 4).T
+            matrix = np.array(document.numbers(node, "matrix", (0.0,) * 16)).reshape(4, 4).T  # glTF stores columns
         else:
             x, y, z, w = document.numbers(node, "rotation", (0.0, 0.0, 0.0, 1.0))
             length = math.sqrt(x * x + y * y + z * z + w * w)

@@ -173,7 +173,7 @@ def _pixels(owner: InputFile, data: bytes) -> Picture:
         grey = np.asarray(image, float)
         if image.format not in ("PNG", "TIFF") or grey.min() < 0.0 or grey.max() > 65535.0:
             raise owner.fault("has a picture of more than 16 bits: save it with 8 bits a colour")
-        return np.repeat(np.rint(grey / 257.0).astype(np.uint8)[..., None], 3, axis=2)
+        return np.repeat(np.rint(grey / 257.0).astype(np.uint8)[..., None], 3, axis=2)  # 65535 / 255
     if image.mode not in _OF_8_BITS:
         raise owner.fault(
             f"has a picture with colours of the kind {image.mode}: save it as red, green and blue of 8 bits"
@@ -214,6 +214,7 @@ def leaves_picture(uv: Array, axis: int) -> bool:
 
 
 _STEPS = 16  # of a triangle's sides, at whose places its opacity is looked at
+# middles of parts
 _INSIDE = np.array([(i + 1 / 3, j + 1 / 3) for i in range(_STEPS) for j in range(_STEPS - i)]) / _STEPS
 _WEIGHTS = np.column_stack([1.0 - _INSIDE.sum(axis=1), _INSIDE])
 

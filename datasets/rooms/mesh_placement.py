@@ -22,7 +22,7 @@ from phibench.scenes.frames import Array, Vector
 from phibench.scenes.room import chassis
 from phibench.scenes.validation import finite_vector, positive, unit_vector, within
 
-EXTENT_M = (2.0, 100.0)
+EXTENT_M = (2.0, 100.0)  # of a room: a wrong unit leaves these limits
 FLOOR_REACH_M = 0.10
 """Largest distance of the stated point from the floor."""
 MIRROR_TOP_M = 0.80

@@ -39,7 +39,7 @@ MOST_VALUES = 16_000_000
 """Of all bitmaps of a room, four a texel."""
 MOST_LAMPS = 12
 """Rectangles that are sampled as lamps; what else shines is found by chance alone."""
-_LINEAR = srgb_decoded(np.arange(256) / 255.0)
+_LINEAR = srgb_decoded(np.arange(256) / 255.0)  # of every code of a picture
 _LEAST_LIGHT = 1e-3  # of an emission texture: below it a texel counts as dark
 _BLACK = Uniform((0.0, 0.0, 0.0))
 _SQUARE = 1e-4  # by which a rectangle's sides and angles may be off
@@ -159,7 +159,7 @@ def _merged(part: MeshPart) -> NDArray[np.int64]:
 
     Places are told apart by a 64-bit sum of their coordinates: two of a million collide with a chance of 3e-8.
     """
-    grid = np.rint(part.vertices * 1e6).astype(np.int64).view(np.uint64)
+    grid = np.rint(part.vertices * 1e6).astype(np.int64).view(np.uint64)  # micrometres: the same corner written twice
     place = np.unique((grid * _MIXING).sum(axis=1), return_inverse=True)[1].reshape(-1)
     return np.asarray(place[part.triangles], np.int64)
 
@@ -238,7 +238,7 @@ def _common_factor(shrink: dict[Key, float], sizes: dict[Key, tuple[int, ...]], 
         total = sum(4 * math.prod(_shape(sizes[key], times * shrink[key])) for key in sizes)
         if total + fixed <= MOST_VALUES or max(map(max, sizes.values()), default=0) < times:
             return times
-        times *= max(1.01, math.sqrt(total / max(MOST_VALUES - fixed, 1)))
+        times *= max(1.01, math.sqrt(total / max(MOST_VALUES - fixed, 1)))  # 1.01: rounding of sizes may stand still
 
 
 def _shape(size: tuple[int, ...], shrink: float) -> tuple[int, int]:

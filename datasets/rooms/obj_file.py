@@ -38,7 +38,7 @@ _OF_NO_SHAPE = (
     "vn", "vp", "p", "l", "s", "mg", "end", "bevel", "c_interp", "d_interp", "lod", "shadow_obj", "trace_obj", "ctech",
     "stech", "maplib",
 )  # fmt: skip
-_MOST_CORNERS = 10_000
+_MOST_CORNERS = 10_000  # of a polygon: cutting it takes the square of them
 _MOST_VERTICES = 3 * MOST_TRIANGLES  # and as many texture coordinates
 _MOST_LINES = 4 * _MOST_VERTICES
 _OPTIONS = {
@@ -119,7 +119,7 @@ class _Reader:
 
     def _vertex(self, values: list[str]) -> None:
         numbers = tuple(float(word) for word in values)
-        if len(numbers) not in (3, 4, 6, 7):
+        if len(numbers) not in (3, 4, 6, 7):  # x, y, z; with w; with a colour; with both
             raise self.file.fault(f"has a vertex of {len(numbers)} numbers: 3, 4, 6 or 7 are read")
         self.vertices.append(numbers[:3])
         if len(numbers) > 4:

@@ -24,8 +24,8 @@ from phibench.scenes.validation import printable_line
 Light = NDArray[np.float32]
 """Shape (rows, columns, 3), linear, 0 or more, finite."""
 
-ASPECT = 2.0
-_ASPECT_TOLERANCE = 0.01
+ASPECT = 2.0  # columns over rows of an equirectangular picture
+_ASPECT_TOLERANCE = 0.01  # a picture that was scaled has lost a row or column
 _LEAST_ROWS = 16
 _REMEDY = f"give a picture as {IN_WORDS}, OpenEXR or Radiance HDR"
 _HDR_MAGIC = (b"#?RADIANCE", b"#?RGBE")
@@ -138,6 +138,7 @@ def _hdr(file: InputFile, data: bytes) -> Light:
     light = np.empty((rows, columns, 3), np.float32)
     for start in range(0, rows, _ROWS):
         part = coded[start : start + _ROWS]
+        # RGBE: 128 of the exponent, 8 of the mantissa's bits
         scale = np.exp2(part[..., 3].astype(np.int32) - 136.0) * (part[..., 3] > 0)
         light[start : start + _ROWS] = part[..., :3] * (scale / exposure)[..., None]
     return light
@@ -148,7 +149,7 @@ def _exposure(file: InputFile, head: bytes) -> float:
     exposure = 1.0
     for text in re.findall(rb"^EXPOSURE=(.*)$", head, re.M):
         exposure *= float(text) if _EXPOSURE.fullmatch(text.strip()) else 0.0
-        if not 1e-30 < exposure < 1e30:
+        if not 1e-30 < exposure < 1e30:  # float32 ends at 1e38
             shown = printable_line(text.decode("latin-1").strip(), 40)
             raise file.fault(f"has EXPOSURE={shown}: a number above 0 is needed")
     return exposure
@@ -156,7 +157,7 @@ def _exposure(file: InputFile, head: bytes) -> float:
 
 def _hdr_pixels(data: bytes, rows: int, columns: int) -> NDArray[np.uint8]:
     """Mantissas and exponents, shape (rows, columns, 4)."""
-    if data[:2] != b"\x02\x02" or not 8 <= columns < 32768:
+    if data[:2] != b"\x02\x02" or not 8 <= columns < 32768:  # the newer code's limits, by Radiance's own reader
         if len(data) != 4 * rows * columns:
             raise ValueError("neither plain nor of the newer run-length code")
         return np.frombuffer(data, np.uint8).reshape(rows, columns, 4)
@@ -176,7 +177,7 @@ def _hdr_row(data: bytes, at: int, row: NDArray[np.uint8]) -> int:
         decoded = bytearray()
         while len(decoded) < columns:
             count = data[at]
-            if count > 128:
+            if count > 128:  # a run; otherwise as many single bytes
                 decoded += data[at + 1 : at + 2] * (count - 128)
                 at += 2
             else:

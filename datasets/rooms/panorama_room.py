@@ -35,7 +35,7 @@ from phibench.scenes.textures import Bitmap
 
 MEAN_IRRADIANCE_W_M2 = 1.0
 """Pi times the mean radiance of all directions, mean of the three bands, unless a scale is stated: about 300 lx."""
-_RAYS = 32
+_RAYS = 32  # all around from the camera, to see whether it is inside
 _INSIDE = 0.75  # part of the rays from the camera that must meet the mesh: a window or a door may be open
 _FILLED = 0.98  # of an atlas, at best: shelves leave gaps
 _AT_ONCE = 1 << 16  # texels
@@ -91,7 +91,7 @@ class _Panorama:
         self.point, self.heading = np.array(settings.point_m), math.radians(settings.heading_deg)
         self.step_rad = math.pi / len(light)
         self.levels = [light]
-        while min(self.levels[-1].shape[:2]) >= 32:
+        while min(self.levels[-1].shape[:2]) >= 32:  # the coarsest level still has some texels a wall
             self.levels.append(_halved(self.levels[-1]))
 
     def texel_m(self, texel_m: float, distance_m: Array) -> Array:
@@ -173,7 +173,7 @@ def _box(settings: PanoramaSettings, picture: _Panorama) -> tuple[Rectangle, ...
     ]
     times = 1.0
     while sum(4 * math.prod(_texels(wall, picture, times * settings.texel_m)) for wall in walls) > MOST_VALUES:
-        times *= 1.02
+        times *= 1.02  # until all bitmaps together fit
     return tuple(_photographed(settings, wall, picture, times * settings.texel_m) for wall in walls)
 
 
@@ -266,7 +266,7 @@ def _atlas(settings: PanoramaSettings, picture: _Panorama, corners: Array) -> tu
             raise RoomError(
                 f"the mesh has too many triangles ({len(corners)}) for the texels of a panorama: simplify it"
             )
-        texel_m *= max(1.02, math.sqrt(4.0 * width * height / MOST_VALUES))
+        texel_m *= max(1.02, math.sqrt(4.0 * width * height / MOST_VALUES))  # 1.02: rounding may stand still
     radiance = np.zeros((height * width, 3), np.float32)
     counts = block.columns * block.rows
     ends = np.cumsum(counts)
@@ -289,6 +289,7 @@ def _blocks(picture: _Panorama, corners: Array, texel_m: float) -> _Block:
     along, other = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     normal = np.cross(along, other)
     area, length = np.linalg.norm(normal, axis=1), np.linalg.norm(along, axis=1)
+    # a triangle without a plane of its own
     flat = area <= 1e-12 * np.maximum(length, np.linalg.norm(other, axis=1)) ** 2
     safe = np.where(flat, 1.0, area)[:, None]
     normal = np.where(flat[:, None], [0.0, 0.0, 1.0], normal / safe)
@@ -301,6 +302,7 @@ def _blocks(picture: _Panorama, corners: Array, texel_m: float) -> _Block:
     origin = corners[:, 0] + low[:, :1] * x + low[:, 1:] * y
     distance = np.abs(np.einsum("ni,ni->n", corners[:, 0] - picture.point, normal))
     size = picture.texel_m(texel_m, distance)
+    # a texel around each for interpolation
     count = np.ceil(local.max(axis=1) / size[:, None] - 1e-9).astype(np.int64) + 2
     return _Block(origin, x, y, local, size, count[:, 0], count[:, 1])
 

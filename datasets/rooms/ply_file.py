@@ -376,7 +376,7 @@ def _colours(file: InputFile, table: Table, kinds: dict[str, str]) -> Array | No
     found = []
     for name in names:
         values, kind = np.asarray(table[name], float), kinds[name]
-        scale = 1.0 if kind in ("f4", "f8") else 65535.0 if kind == "u2" else 255.0
+        scale = 1.0 if kind in ("f4", "f8") else 65535.0 if kind == "u2" else 255.0  # largest value of the type
         if not (np.isfinite(values).all() and values.min() >= 0.0 and values.max() <= scale):
             raise file.fault(f"has colours outside 0 to {scale:g}, which are the ends of their type")
         found.append(values / scale)

@@ -14,7 +14,7 @@ from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import MIB, InputFile, below
 from phibench.scenes.validation import SceneError
 
-LARGEST_BYTES = 64 * MIB
+LARGEST_BYTES = 64 * MIB  # a data set keeps a copy of every file
 _REMEDY = "put a file of at most 64 MiB there, or give the name of another one"
 
 

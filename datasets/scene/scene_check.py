@@ -37,8 +37,8 @@ from phibench.scenes.validation import SceneError
 
 LIGHT_TOLERANCE = 0.005
 """Of means of ambient light, and of the spot's flux, beside three standard errors."""
-CENTROID_TOLERANCE_PX, OUTLINE_TOLERANCE_PX = 0.02, 0.02
-SIGMAS = 3.0
+CENTROID_TOLERANCE_PX, OUTLINE_TOLERANCE_PX = 0.02, 0.02  # beside three standard errors
+SIGMAS = 3.0  # of the path tracer's noise
 NEAREST_M = 0.5
 _SIDES = {"in the mirror": 11.0, "beside it": 5.5}  # height of the image over the side of a square, independent ones
 _SAMPLES = 16  # of a pixel of the ambient image; with 4 the sampler has 3 % too much of the lab's ceiling
@@ -318,7 +318,7 @@ def _half_px(scene: LoadedScene) -> float:
     return _LEAST_PX + _SPREADS * float(np.sqrt(max(spread, 0.0)))
 
 
-_LEAST_PX, _SPREADS = 0.5, 6.0
+_LEAST_PX, _SPREADS = 0.5, 6.0  # six sigma of a Gaussian spot hold all but 1e-8 of its light
 
 
 def _variance(weights: Array) -> float:

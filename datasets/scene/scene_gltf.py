@@ -21,8 +21,8 @@ from phibench.scenes.rig import View
 from phibench.scenes.room import MIRROR_NAME, Room
 
 _RINGS, _SPOKES = 91, 180  # of the mirror's mesh, two degrees apart
-_SPOT_SIDES = 32
-_SPOT_LIFT_M = 1e-4
+_SPOT_SIDES = 32  # of the polygon that is shown for the spot
+_SPOT_LIFT_M = 1e-4  # off the surface: two faces in one plane flicker
 
 
 def scene_glb(view: View, room: Room, spot: LaserSpot | None = None) -> bytes:
@@ -88,7 +88,7 @@ def _add_camera(document: GltfWriter, view: View) -> None:
         {
             "yfov": 2.0 * math.atan(0.5 * camera.height_px / camera.fy_px),
             "aspectRatio": camera.width_px / camera.height_px * camera.fy_px / camera.fx_px,
-            "znear": 0.001,
+            "znear": 0.001,  # metres; the mirror is decimetres away
         },
         matrix,
     )

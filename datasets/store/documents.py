@@ -105,7 +105,7 @@ def from_json(kind: type[T], document: Any) -> T:
 
 _LATER = {"form", "form_radius_m", "coat", "window", "sun", "holder", "metal", "reflectance_table", *OF_TUBES}
 """Fields that older versions do not have, whose default is what these versions meant: `mirror.form` in version 4."""
-_LARGEST = 1e12
+_LARGEST = 1e12  # of a number in a document: squares and products stay finite
 _LARGEST_WHOLE = LARGEST_SEED  # seeds and names of random streams
 
 
@@ -289,7 +289,7 @@ def to_table(rows: Sequence[ManifestRow]) -> DataFrame:
     return model_table(ManifestRow, rows).with_columns(drawn)
 
 
-_LARGEST_INTEGER = 2**63 - 1
+_LARGEST_INTEGER = 2**63 - 1  # of a column Int64
 
 
 def model_table(model: type[Document], rows: Sequence[Document]) -> DataFrame:
@@ -363,6 +363,7 @@ def _leaf(document: dict[str, Any], name: str) -> Any:
     return value
 
 
+# closed forms round to some 1e-15; another machine's library differs by some units in the last place of each step
 def same_number(a: float, b: float, relative: float = 1e-11, absolute: float = 1e-12) -> bool:
     """True if two doubles agree to rounding; two NaN do."""
     return (math.isnan(a) and math.isnan(b)) or math.isclose(a, b, rel_tol=relative, abs_tol=absolute)

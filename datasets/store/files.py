@@ -148,7 +148,7 @@ def _temporary(path: Path, secret: bool) -> Path:
         return Path(name)
     umask = os.umask(0)
     os.umask(umask)
-    Path(name).chmod(0o666 & ~umask)
+    Path(name).chmod(0o666 & ~umask)  # a temporary file is its owner's alone
     return Path(name)
 
 
@@ -207,9 +207,9 @@ def _nearest_folder(folder: Path) -> Path:
 
 # Locks: one run at a time in a folder, and none beside the workers of a killed one.
 
-PATIENCE_S = 60.0
+PATIENCE_S = 60.0  # for workers of a killed run, which end with their task
 _NAMED_S = 1.0  # the holder writes its number at once; a machine that swaps may take longer
-_AT_ONCE_S, _POLL_S = 0.2, 0.05
+_AT_ONCE_S, _POLL_S = 0.2, 0.05  # a holder that is just leaving; time between two looks
 _WORKING_PREFIX = f"{TEMPORARY_PREFIX}working-"
 
 

@@ -28,7 +28,7 @@ from phibench.scenes.camera import LARGEST_SIDE_PX, Camera
 PAIRS, FRAMES = "pairs.jsonl", "frames"
 FRAMES_SET = TruthFolder.FRAMES_SET.value
 """File that says of a folder that it is a frames set."""
-MOST_PAIRS = 1_000_000
+MOST_PAIRS = 1_000_000  # of a set: its index then has 400 MiB
 LEAST_BOX_PX = 16
 """Side of the smallest box, as in a recipe."""
 IMAGES = {"down", "up"}

@@ -27,8 +27,8 @@ from phibench.scenes.camera import Detector
 
 
 Picture = NDArray[np.uint8]
-_WHITE_PERCENTILE = 98.0
-_WHITE_LEVEL = 0.8
+_WHITE_PERCENTILE = 98.0  # of the picture's light: lamps may be cut
+_WHITE_LEVEL = 0.8  # of the largest code: what is brighter is still told apart
 _MIDDLE_PERCENTILE, _MOST_CONTRAST = 60.0, 4.0  # a lamp that fills a tenth of the picture does not make the rest dark
 _DARK_ROOM_ELECTRONS_PER_S = 1e5  # a room below this is shown black, the spot at its own exposure
 
@@ -63,6 +63,7 @@ def save_png(path: Path, picture: Picture) -> Path:
     if path.suffix.lower() != ".png":
         raise DatasetError(f"{path}: pictures are written as PNG; give a name that ends in .png")
     buffer = io.BytesIO()
+    # stated: the bytes must not follow Pillow's default
     Image.fromarray(picture).save(buffer, format="PNG", compress_level=6)
     return write_bytes(path, buffer.getvalue())
 

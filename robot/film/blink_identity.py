@@ -37,7 +37,7 @@ REGAIN = 3.0
 _WRONG = 0.02  # of frames
 _RELATIVE = 0.1  # of a light, that changes from frame to frame: its place in the mosaic
 _LONGEST = 60  # frames that count
-_PHASES_PER_BIT = 4
+_PHASES_PER_BIT = 4  # of a code whose beginning is not known: a quarter of a bit off loses little
 _LEAST_SPREAD = 0.3  # of the levels: without an on and an off frame nothing is known
 _STEADY = -1.0  # log odds of such a light
 _CHANGES = 4.0  # standard deviations of chi^2 of a light that is steady
@@ -122,7 +122,7 @@ class Exposures:
     def of(cls, middle_s: Array, exposure_s: float, bit_s: float, start_s: float) -> Exposures:
         """Exposures about `middle_s`, of a clock that starts at `start_s`."""
         low = (middle_s - 0.5 * exposure_s - start_s) / bit_s
-        first, length = np.floor(low), max(exposure_s / bit_s, 1e-9)
+        first, length = np.floor(low), max(exposure_s / bit_s, 1e-9)  # an instant has a bit, too
         ends = first[:, None] + np.arange(math.ceil(length) + 2)
         passed = np.clip(ends - low[:, None], 0.0, length)
         return cls(first.astype(np.int64), np.diff(passed, axis=1) / length)
@@ -158,7 +158,7 @@ def _of_phase(y: Array, sigma: Array, exposures: Exposures, bits: str) -> Eviden
     C, A, sigma_A = _fitted(y, sigma, x)
     if sigma_A * _FOLLOWS > A:
         return Evidence(_STEADY, A, sigma_A)
-    flat = _WRONG / (A + 6.0 * float(np.median(sigma)))
+    flat = _WRONG / (A + 6.0 * float(np.median(sigma)))  # evenly over all levels that a light can have
     own = np.log(_likelihood(y, C, A, sigma, x[:, None], flat)).sum()
     return Evidence(float(own) - _by_chance(y, C, A, sigma, exposures, flat), A, sigma_A)
 
@@ -172,6 +172,7 @@ def _fitted(y: Array, sigma: Array, x: Array) -> tuple[float, float, float]:
         C, A = np.linalg.solve(F, (X * weight) @ y)
         spread = np.hypot(sigma, _RELATIVE * (abs(C) + A * x))
         rest = np.abs(y - C - A * x)
+        # a wrong frame counts less, however far off it is
         weight = np.where(rest < 4.0 * spread, 1.0, (4.0 * spread / np.maximum(rest, 1e-12)) ** 2) / spread**2
     return float(C), float(A), float(math.sqrt(np.linalg.inv(F)[1, 1]))
 
@@ -478,7 +479,7 @@ def _check(times: FilmTimes, codes: Sequence[TargetCode]) -> None:
     if len({one.name for one in codes}) < len(codes):
         raise SceneError(f"targets {[one.name for one in codes]} share a name; name each differently")
     for one in codes:
-        if times.duration_s < one.code.duration_s * (1.0 - 1e-9):
+        if times.duration_s < one.code.duration_s * (1.0 - 1e-9):  # a film of just so many frames holds it
             raise SceneError(
                 f"film of {times.frames} frames takes {times.duration_s:.3g} s, and the code of '{one.name}' "
                 f"{one.code.duration_s:.3g} s: give a film that holds the whole code, or a shorter code"

@@ -36,10 +36,10 @@ from phibench.scenes.motion.drive import placement
 from phibench.scenes.motion.vehicle import PlanarPose, Vehicle
 from phibench.scenes.rig import Rig
 
-_STARTS_M = tuple(np.geomspace(0.6, 12.0, 9))
+_STARTS_M = tuple(np.geomspace(0.6, 12.0, 9))  # of D: each within a factor of 1.2 of a possible one
 _STEPS, _SETTLED = 30, 1e-3  # of the least squares, and standard deviations of X that it stops at
 _ROUNDS, _SAME = 6, 0.02  # of positions, and standard deviations of D that they stop at
-_LEAST_WAY_M = 1e-2
+_LEAST_WAY_M = 1e-2  # below it odometry's own noise is the way
 _POINT, _SLIP, _SKID, _OWN = slice(0, 3), 3, 4, 5  # entries of the unknowns; then n, left and right, and q
 _SMALL = 1e-4  # of slip and skid, for differences
 
@@ -158,7 +158,7 @@ def driving_depth(
             "m apart are the least that give a depth; drive farther, or make a stroke"
         )
     problem = _Problem(rig, way, keep, positions.some(keep), _independent(covariance_rig))
-    starts = [problem.solved(x, 6) for x in problem.starts()]
+    starts = [problem.solved(x, 6) for x in problem.starts()]  # six steps tell which start leads on
     finite = [one for one in starts if np.isfinite(one[1])]
     if not finite:
         raise DatasetError("no point before the robot explains the film's positions: they are no spot's")
@@ -171,6 +171,7 @@ def _independent(covariance: Array | None) -> Array:
     if covariance is None:
         return np.zeros((len(PARAMETERS), 0))
     values, vectors = np.linalg.eigh(covariance)
+    # parameters that are held have no variance
     return np.asarray((vectors * np.sqrt(np.maximum(values, 0.0)))[:, values > 1e-12 * values.max()])
 
 
@@ -207,6 +208,7 @@ class _Problem:
                 return x, float("nan")
             step = -np.linalg.lstsq(J, r, rcond=None)[0]
             far = float(np.linalg.norm(x[_POINT]))
+            # half of the distance at most
             x = x + step * min(1.0, 0.5 * far / max(float(np.linalg.norm(step[_POINT])), 1e-12))
             covariance = np.linalg.inv(J.T @ J)[_POINT, _POINT]
             if step[_POINT] @ np.linalg.solve(covariance, step[_POINT]) < _SETTLED**2:

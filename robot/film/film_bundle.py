@@ -27,9 +27,9 @@ from phibench.scenes.frames import Array, BoolArray
 from phibench.scenes.misalignment import PARAMETERS as MISALIGNMENT
 from phibench.scenes.rig import Rig
 
-_STEPS = 30
-_SETTLED_M = 1e-9
-_LEAST_STROKE_M = 1e-3
+_STEPS = 30  # of Gauss and Newton; it ends at `_SETTLED_M`
+_SETTLED_M = 1e-9  # of the point: far below any sigma
+_LEAST_STROKE_M = 1e-3  # as a recipe's: what moves by less gives no depth
 _PROPOSE = 8  # frames at each end: half of them may be astray, and one pair in four is right
 _AGREE_PX = 3.0  # a faint spot behind a mosaic settles up to a pixel of its filter away
 
@@ -118,7 +118,7 @@ def film_depth(
         step = np.linalg.solve(information, at.by_point.T @ cho_solve(S, y - at.uv))
         # nearly all of a step is along the line of sight: half of the distance at most
         far = float(np.linalg.norm(X - rig.at(0.0).sphere_centre_m))
-        X = X + step * min(1.0, 0.5 * far / max(float(np.linalg.norm(step)), 1e-12))
+        X = X + step * min(1.0, 0.5 * far / max(float(np.linalg.norm(step)), 1e-12))  # no step: no division by 0
         if float(np.linalg.norm(step)) < _SETTLED_M:
             break
     places = np.full(positions.uv_px.shape, np.nan)

@@ -30,7 +30,7 @@ from phibench.scenes.validation import SceneError
 
 _ROUNDS = 2  # of the frames' own fits: the second one knows distance and motion
 _STEPS, _SETTLED = 8, 0.02  # of the bundle, and standard deviations that it stops at
-_REST_M = 1e-9
+_REST_M = 1e-9  # rounding of the carriage's place
 _AROUND_PX = 24  # of a tracked spot
 _BEYOND_CHANCE = 20.0  # chi squared of 2: one fit in 2e4
 _LEAST_SNR = 10.0  # of all frames: noise within reach, searched for the place that all agree on, has 6
@@ -182,6 +182,7 @@ def burst_depth(seen: SeenFilm, covariance_rig: Array | None = None) -> FilmDept
 def _rests(frames: FilmFrames, numbers: Index) -> BoolArray:
     """Frames during whose exposure the carriage was told to rest at an end of the stroke."""
     half = 0.5 * (frames.times.exposure_s + frames.times.readout_s)
+    # instants of a frame, rows included
     inner = frames.times.frame_s[numbers][:, None] + half * np.linspace(-1.0, 1.0, 9)
     at, stops = frames.carriage.position_m(inner), frames.carriage.stops_m
     return np.any([np.all(np.abs(at - stop) < _REST_M, axis=1) for stop in (min(stops), max(stops))], axis=0)

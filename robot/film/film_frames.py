@@ -45,7 +45,7 @@ LIT = 0.99  # of an exposure: a frame with less, and more than none, is no frame
 LENGTH_PX = 1.5  # l: edges of the room, blurred by 0.9 px, are interpolated to a tenth of their noise
 STRUCTURE = 300.0  # S^2 over the noise of a pixel: edges of 800 e behind 50 e
 _FARTHEST_PX = 2.0 * LENGTH_PX  # from a frame with the laser off: beyond it the room is not known
-_ANY_LEVEL = 1e6
+_ANY_LEVEL = 1e6  # variance of an even level, over the noise: it is free, and kriging leaves it out
 Index = NDArray[np.int64]
 
 

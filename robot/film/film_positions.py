@@ -201,7 +201,7 @@ def _slope(image: Array, axis: int) -> Array:
     padded = np.pad(image, [(2, 2) if k == axis else (0, 0) for k in (0, 1)], mode="edge")
     count = image.shape[axis]
     high, low = (padded.take(np.arange(count) + start, axis=axis) for start in (4, 0))
-    return np.asarray(0.25 * (high - low))
+    return np.asarray(0.25 * (high - low))  # central difference over four pixels of the mosaic: the same filter
 
 
 def _most_outstanding(frames: FilmFrames, interpolation: RoomWeights) -> NDArray[np.int64]:
@@ -244,6 +244,7 @@ def _covariances(uv_px: Array, theta: Array, pixels: SpotPixels, windows: _Windo
     new += by_motion @ by_motion.transpose(0, 2, 1)
     common = _common(influence * room, origins) * (windows.weights @ windows.weights.T)[:, None, :, None]
     shared = common + windows.prnu**2 * _common(influence * mean[:, None], origins)
+    # signal to noise
     return FilmPositions(uv_px, new, shared, theta[:, 2] / np.sqrt(np.maximum(inverse[:, 2, 2], 1e-12)))
 
 

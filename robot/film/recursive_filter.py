@@ -29,7 +29,7 @@ PATTERN_PX = 1.0  # l: a move by which half of the pixels that locate a spot are
 GATE = 16.0
 _PRIOR_Q, _PRIOR_SIGMA_Q = 0.5, 0.4  # 1/m: from 0.6 m to beyond all rooms within two deviations
 _RESTS = 5.0  # encoder's standard deviations from the first frame: what moves by less tells nothing of q
-_ROUNDS = 8
+_ROUNDS = 8  # of linearisation about the mean
 _SETTLED = 1e-2  # standard deviations: far below what the linear map of a frame errs by
 
 
@@ -110,7 +110,7 @@ def first_state(
     )
     _, J, by_offset = _image(rig, state, offset_m)
     sight = np.linalg.inv(J[:, :2])
-    covariance = np.zeros((5, 5))
+    covariance = np.zeros((5, 5))  # of a, b and 1 / D, and of the pattern's shift in u and v
     covariance[2, 2] = _PRIOR_SIGMA_Q**2
     covariance[3:, 3:] = pattern_px2
     # a and b are what they are because the position errs by noise, reading and pattern
@@ -142,7 +142,7 @@ def updated(
         K = P @ H.T @ np.linalg.inv(S)
         innovation = uv_px - predicted - x[3:] - H @ (mean - x)
         before, x = x, mean + K @ innovation
-        x[2] = max(x[2], 1e-3)
+        x[2] = max(x[2], 1e-3)  # 1 / D stays above 0: a kilometre
         if np.all(np.abs(x - before) <= _SETTLED * np.sqrt(np.diag(P))):
             break
     squared = float(innovation @ np.linalg.solve(S, innovation))

@@ -52,8 +52,8 @@ _CROSS = 0.5 * np.array([(0, 0), (-1, 0), (1, 0), (0, -1), (0, 1)], float)
 _SIDE_SHARE = 0.3  # of a spot's light in the next site, about
 _SAME_PX = 1.0  # of a track from a light that follows a code
 _OFFSETS = 0.5 * np.stack(np.meshgrid(np.arange(-2, 3), np.arange(-2, 3)), axis=-1).reshape(-1, 2)
-_LEAST_PEAK = 4.0
-_MOST_PEAKS = 600
+_LEAST_PEAK = 4.0  # of the map; low, because the code must agree, too
+_MOST_PEAKS = 600  # of a frame, the strongest
 _GATE2 = 16.0  # chi squared of 2: 3e-4 of a track's own spots lie beyond
 _FARTHEST_PX = 4.0  # of a track's own spot from where it is expected, however long it was dark
 _PLACE_PX = 0.35  # of a detection: noise of a spot of 7 sigma, and minima of the mosaic
@@ -141,6 +141,7 @@ class FrameSearch:
         for axis, (low, high) in enumerate(((1, 2), (3, 4))):
             bend = gain[:, low] - 2.0 * gain[:, 0] + gain[:, high]
             slope = 0.5 * (gain[:, low] - gain[:, high])
+            # top of a parabola
             shift[:, axis] = np.where(bend < 0.0, np.clip(slope / np.minimum(bend, -1e-9), -1.0, 1.0), 0.0)
         return uv_px + 0.5 * shift
 
@@ -450,6 +451,7 @@ def _assigned(tracks: Sequence[SpotTrack], expected: Array, spots: FrameSpots) -
     # a wide gate must not win against a narrow one: the logarithm of the likelihood, not the distance alone
     cost = distance2 + np.log(np.linalg.det(spread))[:, None]
     near: BoolArray = (distance2 < _GATE2) & (np.linalg.norm(apart, axis=-1) < _FARTHEST_PX)
+    # 1e6: beyond the gate, never chosen
     rows, columns = linear_sum_assignment(np.where(near, cost - cost.min() + 1.0, 1e6))
     good = near[rows, columns]
     return dict(zip(rows[good].tolist(), columns[good].tolist(), strict=True))

@@ -29,7 +29,7 @@ _END_M = 3e-3  # of a line of sight: the spot lies on a box
 _LOW_M, _HIGH_M = 0.03, 0.95  # what the robot can run into: not rugs and wires, not what hangs above the mirror
 _ROBOT_M = 0.40  # beside the way; the robot is 0.53 m wide
 _BODY_M = 0.28  # about the base; boxes nearer than that are run into
-_TRIES = 400
+_TRIES = 400  # random directions: a room in which none of them is free has no place for the task
 _SAME_M = 2e-3  # a box and the shape that it stands for, where a spot lies
 
 
@@ -158,7 +158,7 @@ class Arena:
             hit = self._first_hit(np.array([0.0, 0.0, height]), ahead, distances_m[1])
             if hit is None or hit[0] < distances_m[0] or hit[1] @ ahead > -0.5:
                 continue
-            way = np.arange(0.0, hit[0] - stand_off_m + 0.05, 0.05)
+            way = np.arange(0.0, hit[0] - stand_off_m + 0.05, 0.05)  # 5 cm: an eighth of what is kept free beside it
             if self.floor.distance_m(way[:, None] * ahead[:2]).min(initial=np.inf) > _ROBOT_M:
                 return Target(np.array([0.0, 0.0, height]) + hit[0] * ahead, hit[1])
         raise SceneError(
@@ -199,7 +199,7 @@ def arena_of(room: Room) -> Arena:
 
 def _upright(boxes: Boxes) -> Boxes:
     """The boxes, leaning ones replaced by the upright boxes around them."""
-    leans = np.abs(boxes.axes[:, 2, 2]) < 1.0 - 1e-9
+    leans = np.abs(boxes.axes[:, 2, 2]) < 1.0 - 1e-9  # rounding of an upright box
     around = np.einsum("nij,nj->ni", np.abs(boxes.axes), boxes.half_m)
     return Boxes(
         boxes.centre_m,

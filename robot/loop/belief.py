@@ -34,8 +34,8 @@ from phibench.scenes.validation import SceneError, finite, positive
 
 LEAST_Q = 0.02  # states at 50 m and beyond count as there
 PLACE = 3  # first entries of the state
-SLIP, SKID = 3, 4
-VELOCITY = slice(5, 8)
+SLIP, SKID = 3, 4  # entries of the state
+VELOCITY = slice(5, 8)  # of a target that moves, over D
 _ALPHA, _BETA, _KAPPA = 0.6, 2.0, 0.0  # of Merwe's sigma points: 1.3 deviations away for 5 states
 
 
@@ -145,7 +145,7 @@ class Belief(abc.ABC):
     def distance_m(self) -> float:
         """D from the stroke axis, the mean of 1 / q to second order."""
         q, variance = self.mean[2], self.covariance[2, 2]
-        return float((1.0 + min(variance / q**2, 0.25)) / q)
+        return float((1.0 + min(variance / q**2, 0.25)) / q)  # the series holds for small variances only
 
     @property
     def distance_sigma_m(self) -> float:
@@ -265,6 +265,7 @@ class TargetBelief(Belief):
         to_q = np.array([0.0, stroke_m, 1.0])
         P[:3, :3] += spread**2 * np.outer(to_q, to_q)
         P[1, 1] += (2.0 * rig.sphere.radius_m * spread) ** 2  # what the radius does to the first rise
+        # a vehicle may be exact
         P[SLIP, SLIP], P[SKID, SKID] = vehicle.slip_sigma**2 + 1e-12, vehicle.skid_sigma**2 + 1e-12
         if prior.moves:
             P[VELOCITY, VELOCITY] = (prior.speed_m_per_s * q) ** 2 * np.eye(3)
@@ -298,7 +299,7 @@ class TargetBelief(Belief):
         """Take in a step of the tracks, as their encoders count it, and the time that it took."""
         mean = self.mean
         Q = self._process_noise(mean, left_m, right_m, step_s)
-        self._filter.Q = Q + 1e-16 * np.eye(len(mean))
+        self._filter.Q = Q + 1e-16 * np.eye(len(mean))  # the root of the covariance needs it positive
         self._filter.predict(fx=lambda x, _: self._moved(x, left_m, right_m, step_s, float(mean[0])))
         self._filter.P = 0.5 * (self._filter.P + self._filter.P.T)
 

@@ -30,7 +30,7 @@ from phibench.scenes.validation import SceneError, nearest, printable_line
 ANSWER_S = 5.0
 """Time of a policy for one answer."""
 _BEGINS = -1  # in place of the number of a step: the policy is made
-_MESSAGE_LENGTH = 200
+_MESSAGE_LENGTH = 200  # of a policy's fault: two lines
 
 
 @dataclass(frozen=True)

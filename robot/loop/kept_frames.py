@@ -19,6 +19,7 @@ import numpy as np
 from phibench.scenes.frames import Array
 from phibench.scenes.motion.vehicle import Vehicle, arc_covariance
 
+# lengths over which what frames share falls to 1 / e: apart in the image, and driven
 _PATTERN_REACH_PX, _TEXTURE_REACH_M = 1.0, 0.5
 
 
@@ -178,6 +179,7 @@ def shared_by_motion(acceleration_m2_per_s3: float, lag_s: Array, F: Array) -> A
     """Covariance of residuals by the velocity of a target that walks, shape (N, 2, N, 2)."""
     n = len(lag_s)
     short, long = np.minimum.outer(lag_s, lag_s), np.maximum.outer(lag_s, lag_s)
+    # covariance of a walk whose speed walks: integrated twice
     K = acceleration_m2_per_s3 * short**2 * (3.0 * long - short) / 6.0
     flat = F.reshape(2 * n, 3)
     return np.asarray(K[:, None, :, None] * (flat @ flat.T).reshape(n, 2, n, 2))

@@ -27,17 +27,17 @@ from phibench.scenes.random_streams import generator
 
 PAPER_STROKE_M = 0.425
 """Stroke of the paper's table 4."""
-CODED, STEADY = 2, 1
+CODED, STEADY = 2, 1  # of an action's `code`
 _SAME_PX = 4.0  # a spot at rest stays within this
 _AGREEMENT = 0.9  # of frames with the code; a light that is always on agrees in 8 of 15
 _GATE = 25.0  # chi squared of 2: 4e-6 of the target's own spots lie beyond
 _NEAR_PX = 60.0  # spots farther from what is expected are not asked: a target's own never are
-_LOST_STEPS = 15
-_HIDDEN_STEPS = 2
+_LOST_STEPS = 15  # a second and a half without the target: it is searched again
+_HIDDEN_STEPS = 2  # missed in a row: noise hides a spot for one
 _STROKE_SPEED = 0.2  # m/s: a frame every 2 cm
-_LEVEL_RAD, _LEVEL_M = 1e-3, 0.01
-_ALIGNED_RAD = 0.03
-_SEARCH_RAD_PER_S, _SEARCH_STEPS = 0.8, 15
+_LEVEL_RAD, _LEVEL_M = 1e-3, 0.01  # of the robot's lean and lift: what is below counts as level
+_ALIGNED_RAD = 0.03  # of the bearing: the drive turns the rest
+_SEARCH_RAD_PER_S, _SEARCH_STEPS = 0.8, 15  # 1.2 rad between two looks
 _EXPOSURES = (4, 5, 3, 2)  # in the order in which they are tried
 _GOAL_SHARE = 0.3  # of the tolerances, for the standard deviation of D
 
@@ -209,7 +209,7 @@ class SearchingPolicy(abc.ABC):
     def stroke(self, to_m: float) -> Iterator[Action]:
         """Move the carriage, a frame every few centimetres; back to where the target was seen last if it is hidden."""
         step_s, was_seen = self.known.task.step_s, self._missed == 0
-        while abs(way := to_m - self.observation.stroke_m) > 1e-6:
+        while abs(way := to_m - self.observation.stroke_m) > 1e-6:  # rounding of the carriage's steps
             if self.belief is not None and was_seen and self._missed > _HIDDEN_STEPS:
                 to_m = self._seen_stroke_m
                 way = to_m - self.observation.stroke_m
@@ -341,7 +341,7 @@ class GreedyInformation(SearchingPolicy):
             seen = direction_read(self.known.rig, spot)
             if seen is not None and self.target.distance2(seen, self.observation.stroke_m) < _GATE:
                 return seen.covariance
-        return 1e-6 * np.eye(2)
+        return 1e-6 * np.eye(2)  # of a spot that is not seen: a milliradian
 
 
 class RandomPolicy:

@@ -37,13 +37,13 @@ from phibench.scenes.validation import SceneError
 
 Fidelity = Literal["exact", "windows", "frames"]
 FIDELITIES: tuple[Fidelity, ...] = get_args(Fidelity)
-WINDOW_PX = 32
+WINDOW_PX = 32  # a spot anywhere within its offset, and its surroundings
 _OFFSET_PX = 6  # of a window's middle from the spot, at most
-_FIT_REACH_PX = 6
+_FIT_REACH_PX = 6  # pixels around a peak that are fitted
 _MOST_FITTED = 64  # places of a whole frame
 _LEAST_Z = {"windows": 5.0, "frames": RAW.alone}  # a window has 4000 places: 1e-3 false spots
 _PATTERN_PX = 0.006  # of a spot's place by the sensor's fixed pattern, measured: docs/measurements/loop.md
-_APART_PX, _MOST_SPOTS = 4.0, 24
+_APART_PX, _MOST_SPOTS = 4.0, 24  # of spots in a frame: nearer ones are one and the same
 
 
 @dataclass(frozen=True)

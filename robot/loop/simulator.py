@@ -273,6 +273,7 @@ class Simulator:
             )
             for _ in range(task.lights)
         ]
+        # a track that slips by more does not drive
         self.slip = float(np.clip(setup.vehicle.slip + setup.vehicle.slip_sigma * rng.standard_normal(), -0.2, 0.5))
         self.skid = max(setup.vehicle.skid + setup.vehicle.skid_sigma * float(rng.standard_normal()), 0.5)
         self.obstacles = self._obstacles()
@@ -418,7 +419,7 @@ class Simulator:
         limit = task.stroke_speed_m_per_s
         wanted = self.stroke_m + float(np.clip(rate, -limit, limit)) * task.step_s
         self.stroke_m = float(np.clip(wanted, 0.0, task.stroke_m))
-        if abs(wanted - self.stroke_m) > 1e-12:
+        if abs(wanted - self.stroke_m) > 1e-12:  # rounding of a step that ends at a stop
             self.refused = (
                 f"stroke {wanted:.3f} m: the carriage goes from 0 to {task.stroke_m:g} m; stop before its end"
             )

@@ -39,7 +39,7 @@ from phibench.scenes.validation import SceneError
 _STEP = 0.1  # of a standard deviation: differences by theta err by 1 % of the slope
 _STALE = 0.2  # of one: slopes by theta are taken anew beyond
 _ROUNDS, _HALVINGS, _AT_REST = 6, 8, 0.1  # of standard deviations
-_PIXEL_STEP_PX = 1e-3
+_PIXEL_STEP_PX = 1e-3  # of differences by pixels: smooth over it, and far above rounding
 _MOST_FRAMES = 160  # kept: older ones are thinned, which loses what they say and adds nothing
 
 
@@ -205,7 +205,7 @@ class SmoothedBelief(Belief):
                 continue
             if np.isfinite(residuals).all() and x[2] > LEAST_Q:
                 after = self._chi2(solve_triangular(factor, residuals, lower=True), x)
-                if after <= before + 1e-6:
+                if after <= before + 1e-6:  # rounding of chi^2 is no rise
                     self._x = x
                     return True
         return False
