@@ -110,7 +110,7 @@ def _poster() -> Checker:
 
 
 def _lamps() -> tuple[Rectangle, ...]:
-    places = [(x, y) for x in (-2.8, 0.2, 3.2) for y in (-2.3, 2.1)]
+    places = [(x, y) for x in (-2.8, 0.2, 3.2) for y in (-2.3, 2.1)]  # six panels, evenly over the ceiling
     return tuple(
         rectangle(
             f"lamp_{i}",

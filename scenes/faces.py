@@ -169,7 +169,7 @@ def _table(shape: Shape) -> FaceTable:
 
 _Faces = tuple[Array, Array, Array, Array, Array, Array, IntArray]
 _SQUARE = 0.5 * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
-_HALVES = np.array([[0, 1, 2], [0, 2, 3]])
+_HALVES = np.array([[0, 1, 2], [0, 2, 3]])  # corners of a rectangle's two triangles
 
 
 def _flat_faces(shape: Rectangle | Cuboid) -> _Faces:
@@ -248,7 +248,7 @@ def _mesh_faces(shape: Mesh) -> _Faces:
     along, other = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     normal = np.cross(along, other)
     double_area, length = np.linalg.norm(normal, axis=1), np.linalg.norm(along, axis=1)
-    whole = double_area > 1e-12 * np.maximum(length, np.linalg.norm(other, axis=1)) ** 2
+    whole = double_area > 1e-12 * np.maximum(length, np.linalg.norm(other, axis=1)) ** 2  # a triangle without a plane
     corners, along, normal = corners[whole], along[whole], normal[whole]
     x = along / length[whole, None]
     y = np.cross(normal / double_area[whole, None], x)

@@ -89,7 +89,7 @@ class Pose:
         return Pose(self.target, other.source, as_vector(self.points(other.t)), as_matrix(self.R @ other.R))
 
 
-_ORTHOGONAL = 1e-9
+_ORTHOGONAL = 1e-9  # of R R^T: products of many rotations stay far below
 
 
 def _is_rotation(rows: tuple[Vector, ...]) -> bool:
@@ -134,7 +134,7 @@ def rotation_facing(normal: Sequence[float], up: Sequence[float] = (0.0, 0.0, 1.
     """
     z = np.asarray(normal, float) / np.linalg.norm(normal)
     y = np.asarray(up, float) - np.dot(up, z) * z
-    if np.linalg.norm(y) < 1e-9:
+    if np.linalg.norm(y) < 1e-9:  # the normal is parallel to `up`
         y = np.array([0.0, 1.0, 0.0]) - z[1] * z
     y /= np.linalg.norm(y)
     return as_matrix(np.stack([np.cross(y, z), y, z], axis=1))

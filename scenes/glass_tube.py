@@ -27,7 +27,7 @@ import numpy as np
 from phibench.scenes.frames import Array, BoolArray
 
 _STEPS = 60  # four or five do, unless the wall is thick and the point near
-_SETTLED_M = 1e-13
+_SETTLED_M = 1e-13  # of a step: below rounding of a room
 _ENOUGH_M = 1e-12  # rounding of a room 100 m wide
 
 

@@ -38,12 +38,12 @@ from phibench.scenes.validation import SceneError, finite, within
 HolderKind = Literal["rods", "post", "tube"]
 Part = Prism | Cuboid
 
-SIDES = 24
-PLATE_SIDES = 48
+SIDES = 24  # of rods: their outline errs by 0.6 % of the radius
+PLATE_SIDES = 48  # larger, so that the same error is as small in millimetres
 _PLATE_M = 0.004  # thickness
 _BELOW_LENS_M = 0.034  # top of the plate below the camera, whose housing ends 1 mm above
-_BLACK_METAL = Uniform((0.10, 0.10, 0.10))
-_RODS = 3
+_BLACK_METAL = Uniform((0.10, 0.10, 0.10))  # albedo of a painted part
+_RODS = 3  # the least that hold plates parallel
 LARGEST_INDEX = 2.5  # of a tube: diamond has 2.42
 
 
@@ -152,6 +152,7 @@ class Holder:
             )
         outer = self.circle_m + self.wall_m
         if outer > self.plate_m * math.cos(math.pi / PLATE_SIDES):
+            # rounded up, so that what is proposed is allowed
             least = math.ceil(1e4 * outer / math.cos(math.pi / PLATE_SIDES)) / 1e4
             raise SceneError(
                 f"Holder.plate_m = {self.plate_m:g}: the tube's wall would stand outside the plate; give at least "
@@ -179,7 +180,7 @@ def fitted(kind: HolderKind, wide_m: float, depth_m: float | None = None, **give
     depth_m : float or None
         Of the rim over the vertex; None is a ball.
     """
-    sizes = {"radius_m": wide_m / 15.0, "wall_m": Holder.wall_m, **given}
+    sizes = {"radius_m": wide_m / 15.0, "wall_m": Holder.wall_m, **given}  # 4 mm for a ball of 60 mm
     tube = kind == "tube"
     sizes.setdefault("circle_m", 1.25 * wide_m + (0.0 if tube else sizes["radius_m"]))
     beyond = sizes["wall_m"] + 2.0 * sizes["radius_m"] if tube else 3.0 * sizes["radius_m"]

@@ -119,6 +119,7 @@ class LaserSpot:
 
 def _spanning(n: Array) -> tuple[Array, Array]:
     """Two unit vectors that span the plane of a normal."""
+    # never near the normal: no small cross product
     helper = np.array([0.0, 0.0, 1.0]) if abs(n[2]) < 0.9 else np.array([1.0, 0.0, 0.0])
     a = np.cross(helper, n)
     a /= np.linalg.norm(a)

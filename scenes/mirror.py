@@ -142,7 +142,7 @@ def deviation(points_m: Array, form: Form) -> Level:
     Q, T = form.tensors
     rho = np.linalg.norm(points_m, axis=-1)
     n, I3 = points_m / rho[..., None], np.eye(3)
-    q, t2 = n @ Q, (n @ T.reshape(3, 9)).reshape(*n.shape, 3)
+    q, t2 = n @ Q, (n @ T.reshape(3, 9)).reshape(*n.shape, 3)  # the cubic form contracted with n once
     t1 = np.einsum("...ij,...j->...i", t2, n)
     parts = (
         (2, np.einsum("...i,...i", q, n), 2.0 * q, 2.0 * Q),
@@ -180,7 +180,7 @@ def curvatures(surface: Level) -> tuple[Array, Array]:
 def directions(count: int) -> Array:
     """Unit vectors that cover the sphere evenly (a Fibonacci lattice), shape (count, 3)."""
     i = np.arange(count) + 0.5
-    z, turn = 1.0 - 2.0 * i / count, np.pi * (1.0 + math.sqrt(5.0)) * i
+    z, turn = 1.0 - 2.0 * i / count, np.pi * (1.0 + math.sqrt(5.0)) * i  # turns by the golden ratio
     s = np.sqrt(1.0 - z * z)
     return np.stack([s * np.cos(turn), s * np.sin(turn), z], axis=-1)
 
@@ -265,7 +265,7 @@ METALS = MappingProxyType({"steel": STEEL, "aluminium": _ALUMINIUM, "gold": _GOL
 for _table in METALS.values():
     _table.setflags(write=False)
 
-_SHORTEST_NM, _LONGEST_NM = 400.0, 700.0
+_SHORTEST_NM, _LONGEST_NM = 400.0, 700.0  # that the tables cover: the camera's filters and any visible laser
 
 
 def known_metal(owner: str, name: str) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 from phibench.scenes.frames import Array
 
 Name = str | int
-LEAST_SECRET_SEED = 2**128
+LEAST_SECRET_SEED = 2**128  # no whole number that somebody types is as large
 LARGEST_SEED = 2 * LEAST_SECRET_SEED - 1
 """Root seeds go from 0; those from `LEAST_SECRET_SEED` on hold 128 bits that the system drew."""
 
@@ -21,6 +21,7 @@ LARGEST_SEED = 2 * LEAST_SECRET_SEED - 1
 def seed_sequence(*names: Name) -> np.random.SeedSequence:
     """Seed sequence of a stream; ("a", "bc") differs from ("ab", "c"), and 1 differs from "1"."""
     digest = _digest(names)
+    # all 256 bits of the hash, as words of 32
     return np.random.SeedSequence([int.from_bytes(digest[i : i + 4], "little") for i in range(0, 32, 4)])
 
 

@@ -273,7 +273,7 @@ class Rig:
         s = self.sphere_in_camera_m
         distance = float(np.linalg.norm(s))
         axis = s / distance
-        side = np.cross(axis, [0.0, 1.0, 0.0] if abs(axis[1]) < 0.9 else [1.0, 0.0, 0.0])
+        side = np.cross(axis, [0.0, 1.0, 0.0] if abs(axis[1]) < 0.9 else [1.0, 0.0, 0.0])  # never near the axis
         side /= np.linalg.norm(side)
         turn = np.linspace(0.0, 2.0 * np.pi, count, endpoint=False)[:, None]
         rim = np.cos(turn) * side + np.sin(turn) * np.cross(axis, side)

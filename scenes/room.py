@@ -34,7 +34,7 @@ _GREY, _BLACK, _OLIVE = (0.10, 0.10, 0.10), (0.03, 0.03, 0.03), (0.16, 0.17, 0.1
 FLIPPER_RAD = math.radians(25.0)
 """Angle at which the flippers are drawn unless a robot turns them; 0 is ahead, up counts."""
 _AXLE_M = np.array([0.23, 0.0, 0.10])  # of the front rollers, about which the flippers turn
-_TRACK_M, _FLIPPER_M = (0.78, 0.11, 0.20), (0.28, 0.05, 0.08)
+_TRACK_M, _FLIPPER_M = (0.78, 0.11, 0.20), (0.28, 0.05, 0.08)  # within the paper's size of the robot
 _TRACK_Y_M = 0.5 * (ROBOT_SIZE_M[1] - _TRACK_M[1])  # of the middles, half of the gauge
 # of the flippers' middles: the tips' upper corners end the length
 _FLIPPER_X_M = 0.5 * (ROBOT_SIZE_M[0] - _FLIPPER_M[0] * math.cos(FLIPPER_RAD) - _FLIPPER_M[2] * math.sin(FLIPPER_RAD))
@@ -79,7 +79,7 @@ def carriage(view: View) -> tuple[Cuboid, ...]:
     foot = T_world_camera.points(np.array([0.0, 0.0, -_LENS_CLEARANCE_M - height]))
     if view.robot is not None:
         foot = view.robot.T_world_rig.inverse().points(foot)
-    rise = max(float(foot[2]) - BODY_TOP_M, 1e-3)
+    rise = max(float(foot[2]) - BODY_TOP_M, 1e-3)  # a camera at the body's top has a mast of 1 mm
     mast = cuboid(
         "robot_mast", as_vector(np.array([foot[0], foot[1], BODY_TOP_M + rise / 2.0])), (0.03, 0.02, rise), _GREY
     )

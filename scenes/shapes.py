@@ -82,7 +82,7 @@ class Cuboid:
     def contains(self, point_world_m: Vector) -> bool:
         """Return True for a world point strictly inside."""
         local = self.T_world_shape.inverse().points(np.asarray(point_world_m, float))
-        return bool(np.all(np.abs(local) < 0.5 * np.array(self.size_m) - 1e-9))
+        return bool(np.all(np.abs(local) < 0.5 * np.array(self.size_m) - 1e-9))  # a point on a face is outside
 
     def distance_m(self, point_world_m: Array) -> float:
         """Distance of a world point from the solid, 0 inside."""
@@ -94,6 +94,7 @@ class Cuboid:
         a, b = self.T_world_shape.R, other.T_world_shape.R
         axes = np.concatenate([a.T, b.T, np.cross(a.T[:, None], b.T[None]).reshape(-1, 3)])
         reach = (np.abs(axes @ a) @ np.array(self.size_m) + np.abs(axes @ b) @ np.array(other.size_m)) / 2.0
+        # the cross product of parallel edges is 0, and must not separate
         return bool(np.all(np.abs(axes @ (self.T_world_shape.t - other.T_world_shape.t)) < reach + 1e-12))
 
 
@@ -145,6 +146,7 @@ class Prism:
         middle = math.pi / self.sides
         normals = np.arange(self.sides) * 2.0 * middle + middle
         reach = (np.cos(normals) * x + np.sin(normals) * y).max()
+        # a point on a face is outside
         return bool(reach < self.radius_m * math.cos(middle) - 1e-9 and abs(z) < 0.5 * self.height_m - 1e-9)
 
 
@@ -238,7 +240,7 @@ def _check_size(shape: Rectangle | Cuboid, length: int) -> None:
 
 def _check_coat(name: str, coat: float) -> None:
     if coat != 0.0:
-        within(name, "coat", coat, 1.05, 3.0)
+        within(name, "coat", coat, 1.05, 3.0)  # refractive indices: below 1.05 nothing is mirrored
 
 
 def rectangle(name: str, centre_m: Vector, normal: Vector, size_m: Vector, **options: object) -> Rectangle:

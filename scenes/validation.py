@@ -58,7 +58,7 @@ def unit_vector(owner: str, name: str, value: Sequence[float]) -> tuple[float, .
     """Return the 3-vector `value` scaled to length 1; raise `SceneError` for a zero vector."""
     vector = finite_vector(owner, name, value, 3)
     length = math.hypot(*vector)
-    if length < 1e-9:
+    if length < 1e-9:  # shorter ones have no direction but rounding's
         raise SceneError(f"{owner}.{name} = {vector}: a direction must not be the zero vector")
     return tuple(x / length for x in vector)
 

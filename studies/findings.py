@@ -98,7 +98,7 @@ def number(value: float | None) -> str:
     """A number with three digits, whole from 1000 on; a dash for none."""
     if value is None or not math.isfinite(value):
         return "-"
-    if value == round(value) and abs(value) < 1e15:
+    if value == round(value) and abs(value) < 1e15:  # beyond it every double is whole
         return f"{value:.0f}"
     if abs(value) >= _WHOLE_FROM:
         return f"{value:.0f}"

@@ -32,7 +32,7 @@ from phibench.scenes.rig import POSITIONS, Rig, Stroke, View
 from phibench.scenes.room import Room
 
 _UNIT_PX = (16, 16)  # JPEG units of every subsampling
-_CAMERAS = 2**31
+_CAMERAS = 2**31  # numbers of cameras
 
 
 def cut_region(uv_px: Sequence[tuple[float, float]], size: tuple[int, int], margin_px: int) -> Region:

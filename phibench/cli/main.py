@@ -197,10 +197,10 @@ def main(tokens: Sequence[str] | None = None) -> int:
         return 2  # cyclopts has said what is wrong
     except _Stopped as stop:
         print(f"Stopped by {stop.number.name}.", file=sys.stderr)
-        return 128 + stop.number
+        return 128 + stop.number  # as shells report a signal
     except KeyboardInterrupt:
         print("Interrupted: stopped at your request.", file=sys.stderr)
-        return 130
+        return 130  # 128 + SIGINT
     except Exception as error:  # the last resort: a fault in a file that no reader has seen
         if _is_users(error):
             print(f"phibench: {_sentence(error)}", file=sys.stderr)

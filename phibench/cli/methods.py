@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 
-_TABLE_WIDTH = 120
+_TABLE_WIDTH = 120  # where the output is no terminal
 
 
 method = App(

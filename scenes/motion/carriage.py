@@ -244,7 +244,7 @@ class Encoder:
     @property
     def sigma_m(self) -> float:
         """Standard deviation of a reading, rounding (step / sqrt(12)) included."""
-        return math.hypot(self.rms_m, self.step_m / math.sqrt(12.0))
+        return math.hypot(self.rms_m, self.step_m / math.sqrt(12.0))  # an error that is uniform over a step
 
     def readings_m(self, offsets_m: Array, *names: Name) -> Array:
         """Readings of true offsets, shape (N,), from the named stream; reading k is the same whatever N."""

@@ -103,7 +103,7 @@ class Drive:
                 self.vehicle.check_flipper(leg.flipper_rad)
         ends = [profile.start_s + profile.duration_s for profile in self.profiles]
         for number, leg in enumerate(self.legs[1:], 1):
-            if leg.start_s < ends[number - 1] - 1e-9:
+            if leg.start_s < ends[number - 1] - 1e-9:  # a leg may start at the printed end of the one before
                 raise SceneError(
                     f"leg {number + 1} of the drive starts at {leg.start_s:g} s and leg {number} ends at "
                     f"{ends[number - 1]:.3f} s: start it then or later"
@@ -178,7 +178,7 @@ class Drive:
 
         if lifts(low) == lifts(high):
             return ()
-        for _ in range(60):
+        for _ in range(60):  # halvings: to the last digit of a double
             middle = 0.5 * (low + high)
             low, high = (middle, high) if lifts(middle) == lifts(low) else (low, middle)
         return (high,)

@@ -78,7 +78,7 @@ def across_and_up(spot: LaserSpot) -> Array:
     """Unit vectors in the plane of a spot, shape (2, 3): to the right seen from its front, and up."""
     n = np.array(spot.normal_world)
     up = np.array([0.0, 0.0, 1.0]) - n[2] * n
-    if np.linalg.norm(up) < 1e-9:
+    if np.linalg.norm(up) < 1e-9:  # a spot on floor or ceiling has no "up" of its own
         up = np.array([0.0, 1.0, 0.0]) - n[1] * n
     up = up / np.linalg.norm(up)
     return np.stack([np.cross(up, n), up])
@@ -150,7 +150,7 @@ class FilmScene:
             positive("FilmScene", "stroke_m", self.stroke_m)
         if self.spot.beam_direction_world is not None and self.path.waypoints:
             raise SceneError("FilmScene.path: the spot of a beam stays where its beam ends; give a spot without beam")
-        if self.code.duration_s > self.times.duration_s * (1.0 + 1e-9):
+        if self.code.duration_s > self.times.duration_s * (1.0 + 1e-9):  # a film of just so many frames holds it
             raise SceneError(
                 f"the code takes {self.code.duration_s:g} s and the film {self.times.duration_s:g} s: a film "
                 "must hold the whole code; give more frames or a shorter code"
@@ -256,4 +256,4 @@ class FilmScene:
 def frames_of(carriage: Carriage, rate_hz: float, drive: Drive | None = None) -> int:
     """Number of frames that show the whole motion of carriage and robot, the first one at the time 0."""
     end_s = max(carriage.duration_s, 0.0 if drive is None else drive.end_s)
-    return math.floor(end_s * rate_hz + 1e-9) + 1
+    return math.floor(end_s * rate_hz + 1e-9) + 1  # a product that rounds below its whole number

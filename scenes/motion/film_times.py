@@ -45,7 +45,7 @@ class FilmTimes:
         finite("FilmTimes", "first_s", self.first_s)
         for name in ("exposure_s", "readout_s"):
             longest = 1.0 / self.rate_hz
-            if not 0.0 <= getattr(self, name) <= longest * (1.0 + 1e-9):
+            if not 0.0 <= getattr(self, name) <= longest * (1.0 + 1e-9):  # 1 / 30 as it is typed
                 raise SceneError(
                     f"FilmTimes.{name} = {getattr(self, name):g}: must be 0 to {longest:g} at {self.rate_hz:g} frames "
                     "per second; shorten it or lower the rate"

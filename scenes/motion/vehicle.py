@@ -128,7 +128,7 @@ class Arc:
         """End of the arc in the base at its start, x and y."""
         s, a = self.length_m, self.turn_rad
         if abs(a) < _SMALL_TURN_RAD:
-            return s * (1.0 - a * a / 6.0), s * a * (0.5 - a * a / 24.0)
+            return s * (1.0 - a * a / 6.0), s * a * (0.5 - a * a / 24.0)  # series of the next line, which is 0 / 0 at 0
         return s * math.sin(a) / a, 2.0 * s * math.sin(0.5 * a) ** 2 / a
 
     def jacobian(self) -> Array:

@@ -304,7 +304,7 @@ def _place(spot: Spot) -> tuple[float, float]:
     return _NOWHERE if spot.uv_px is None else spot.uv_px
 
 
-BAND = (0.025, 0.975)
+BAND = (0.025, 0.975)  # quantiles of an interval of 95 %
 
 
 @dataclass(frozen=True)

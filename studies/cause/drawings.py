@@ -14,7 +14,7 @@ from phibench.studies.cause.paper_reading import TABLES, published_experiments
 from phibench.studies.cause.tables import DECIDED, Posteriors, band, grid_of
 from phibench.studies.framework import COLOURS, LINES, Drawing, canvas, drawn
 
-LEVEL = 0.9
+LEVEL = 0.9  # of the bands that are drawn
 _TITLES = ("Figure 9: D = 2.18 m", "Figure 10: D = 3.18 m", "Figure 11: D = 4.18 m", "Table 4: h = 0.425 m")
 _SCALES = {1.0: "priors as stated", 0.5: "half as wide", 2.0: "twice as wide"}
 
@@ -79,6 +79,7 @@ def posterior_drawing(settings: CauseSettings, posteriors: Posteriors, alt: str)
             if "misalignment" in explanation.free:
                 x, y = np.degrees(named["tilt_y_rad"]), 1e3 * named["decentre_x_m"]
                 plane.plot(x, y, ".", ms=2, alpha=0.5, color=COLOURS[i], label=explanation.text)
+        # deviation of an error uniform over a pixel
         noise.axvline(12.0**-0.5, color=COLOURS[7], linestyle=":", label="whole pixels")
         noise.set(xlabel="reading noise of a radius (px)", ylabel="posterior density (1/px)")
         plane.set(xlabel="tilt (deg)", ylabel="decentre along the tilt (mm)")

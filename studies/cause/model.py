@@ -225,7 +225,7 @@ class DepthModel:
 
     @cached_property
     def _rounding_m2(self) -> Array:
-        return self.experiments.rounding_m**2 / 12.0
+        return self.experiments.rounding_m**2 / 12.0  # printed digits: an error uniform over the last one
 
     @cached_property
     def _targets(self) -> NDArray[np.int64]:

@@ -28,7 +28,7 @@ from phibench.studies.findings import Finding, Row
 from phibench.studies.framework import Study, StudyDatasets, StudyResult
 
 ALIKE = 0.95  # cosine from which two parameters do the same
-SMALL_P = 0.05
+SMALL_P = 0.05  # of a posterior predictive check: the explanation does not describe the data
 
 _LIMITS = (
     "no azimuth, spot height, lens distance or way of reading is in the paper: all are drawn from priors, "
@@ -170,6 +170,7 @@ def offset_findings(table: pl.DataFrame, offsets: pl.DataFrame) -> Iterator[Find
     for row in offsets.iter_rows(named=True):
         text = texts[row["explanation"]]
         offset = Finding(f"offset of the sphere's image: {text}", row["mean_px"], row["low_px"], row["high_px"], "px")
+        # half as much again: more than the prior's own band would give
         yield offset.judged(">=", 1.5 * row["prior_low_px"])
         prior = (row["prior_mean_px"], row["prior_low_px"], row["prior_high_px"])
         yield Finding(f"offset of the sphere's image, prior: {text}", *prior, "px")

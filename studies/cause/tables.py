@@ -185,7 +185,7 @@ def verdict(difference: float, error: float) -> Verdict:
     return "favoured" if difference > 0.0 else "disfavoured"
 
 
-INTERVAL = (0.025, 0.975)
+INTERVAL = (0.025, 0.975)  # quantiles of an interval of 95 %
 COVERED = 0.9
 Posteriors = Mapping[tuple[Name, ...], Posterior]
 
@@ -274,6 +274,7 @@ def offset_table(settings: CauseSettings, posteriors: Posteriors) -> pl.DataFram
     for explanation in settings.explanations:
         if "misalignment" in explanation.free and not explanation.centred:
             model = settings.model(explanation.name, published_experiments())
+            # ends of the prior's band to some 2 %
             shares = generator("study", "cause", "offset").uniform(size=(4000, len(model.names)))
             row: dict[str, object] = {"explanation": explanation.name}
             points = posteriors["published", explanation.name].points

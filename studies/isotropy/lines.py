@@ -168,5 +168,6 @@ def half_width_rad(rig: Rig, apart_m: float, depth_m: float, height_m: float) ->
     B = 2.0 * cosine2 * level * m * b
     C = b * b + cosine2 * level * level - rig.sphere.radius_m**2
     roots = np.roots([A, B, C])
+    # rounding of a real root
     inside = [float(root.real) for root in roots if abs(root.imag) < 1e-12 and 0.0 < root.real < 1.0]
     return math.acos(max(inside)) if inside and A + B + C < 0.0 else 0.0

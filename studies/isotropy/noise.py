@@ -157,7 +157,7 @@ def _fitted(pair: BaselinePair, i: int, sensor: Sensor, draws: int, names: tuple
     return np.where((fit.status == Status.OK)[:, None], fit.uv_px, np.nan)
 
 
-_LEAST_GROUPS, _LEAST_ERRORS = 2, 3
+_LEAST_GROUPS, _LEAST_ERRORS = 2, 3  # for a deviation with an interval
 _PHASES = 4  # per axis, over the two pixels of a Bayer cell
 _STREAM = ("study", "isotropy")
 

@@ -80,7 +80,7 @@ class IsotropySettings(Settings):
 
 
 VERTICAL, HORIZONTAL = "vertical stroke", "horizontal baseline"
-_LOW_RAD, _HIGH_RAD = math.radians(-20.0), math.radians(20.0)
+_LOW_RAD, _HIGH_RAD = math.radians(-20.0), math.radians(20.0)  # elevations of the walls of a room
 _LEAST_P = 1e-9  # smaller ones say no more
 _NORMAL_95 = 1.96  # standard errors on both sides of an interval of 95 %
 _STRAIGHT_PX = 0.1  # a tenth of a pixel matters, less does not
@@ -165,6 +165,7 @@ def run(settings: IsotropySettings, datasets: StudyDatasets) -> StudyResult:
 def _scene(pairs: Sequence[BaselinePair]) -> _Scene:
     first = pairs[0]
     light, (u, v) = first.lights[0], np.rint(first.uv_px[0]).astype(int)
+    # the level under a spot: its median leaves edges out
     around = light.ambient_electrons_per_s[:, v - 4 : v + 5, u - 4 : u + 5]
     level = np.median(np.asarray(around, float), axis=(1, 2))
     return _Scene(first.rig, first.baseline_m, first.depth_m, float(first.point_m[2]), level)

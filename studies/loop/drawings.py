@@ -141,6 +141,7 @@ def process_drawing(seed: int = 4) -> Drawing:
 def phases(track: Track) -> list[tuple[float, str]]:
     """Begin of each part of the process."""
     time, known = np.array(track.time_s), np.isfinite(track.sigma_m)
+    # moves in a step
     stroke, way = np.abs(np.diff(track.stroke_m)) > 1e-9, np.hypot(*np.diff(track.place_m, axis=0).T) > 0.01
     found = [(0.0, "identify")]
     if known.any():
@@ -270,7 +271,7 @@ def pasted(windows: Sequence[Window], size: tuple[int, int]) -> Array:
     picture = np.zeros(size)
     for window in windows:
         values = window.pixels.astype(float)
-        values = np.maximum(values - np.quantile(values, 0.001), 0.0)
+        values = np.maximum(values - np.quantile(values, 0.001), 0.0)  # black, without the darkest pixels of the noise
         height, width = values.shape
         place = slice(window.v0_px, window.v0_px + height), slice(window.u0_px, window.u0_px + width)
         # lamps and spots may be white: the room is shown by what most of its pixels have

@@ -25,7 +25,7 @@ from phibench.scenes.rig import Rig
 from phibench.scenes.room import escalade360
 
 _FIRST_PX = 1.0  # a ray on the axis has no azimuth, and a cone has its tip there
-_STEP_PX = 0.25
+_STEP_PX = 0.25  # of the radius: a mirror's edges are found to a quarter of a pixel
 _INSIDE_PX = 1e-3  # of the outline, where a ray still hits the mirror
 _REACH_M = 20.0  # beyond every part of the robot
 

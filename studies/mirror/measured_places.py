@@ -37,7 +37,7 @@ from phibench.scenes.room import escalade360
 from phibench.scenes.validation import SceneError
 
 _WALL_NORMAL = np.array([-1.0, 0.0, 0.0])  # an upright wall along world x, facing the mirror
-_FLOOR_M, _FLOOR_STEP_M = 0.1, 0.02
+_FLOOR_M, _FLOOR_STEP_M = 0.1, 0.02  # nearest place of the floor that is tried, and from one to the next
 _LARGEST = 256.0  # of the sizes that are tried, over the usual one
 _NO_ERROR = 1e-9  # of D
 _WIDER, _HALVINGS = 1.2, 6  # to 0.15 %: tables have two digits
@@ -151,6 +151,7 @@ class BlurBounds:
 def blur_bounds(card: SensorCard, response: tuple[float, float, float], blurs_px: Sequence[float]) -> BlurBounds:
     """Table of bounds for a sensor, over a white wall of the lab."""
     room = [rate * card.exposure_s for rate in ROOM_E_PER_S]
+    # a processed bound costs a covariance of the codes at every flux
     fluxes = tuple(np.geomspace(100.0, 1e6, 25 if card.output == "raw" else 9).tolist())
     found = tuple(spot_sigma(card, blur, room, response, flux_e=fluxes) for blur in blurs_px)
     return BlurBounds(tuple(blurs_px), found, card.exposure_s)

@@ -24,6 +24,7 @@ from phibench.studies.mirror.measured_places import (
 ALL_KINDS = tuple(DIRECTIONS)
 _NONE, _LOST = "-", "lost"
 _FEW = 2  # names that a cell holds
+# as people state tolerances
 _SHOWN_UNITS = {"m": ("mm", 1e3), "rad": ("deg", math.degrees(1.0)), "px": ("px", 1.0), "1": ("", 1.0)}
 
 

@@ -12,7 +12,7 @@ from phibench.studies.framework import Drawing, canvas, drawn, line_style
 from phibench.studies.misalignment.interactions import Interactions
 from phibench.studies.misalignment.tables import Rank, percent, shown
 
-_CURVES, _BARS = 5, 14
+_CURVES, _BARS = 5, 14  # as many as can be told apart
 
 
 def azimuth_drawing(table: pl.DataFrame, rendered: pl.DataFrame, ranks: Sequence[Rank], stroke_m: float) -> Drawing:
@@ -69,7 +69,7 @@ def interaction_drawing(found: Sequence[Interactions]) -> Drawing:
     """First-order and total indices of the relative error with intervals, at the farthest D."""
     one = [each for each in found if each.output == "error"][-1]
     p = len(one.parameters)
-    order = np.argsort(-one.total, kind="stable")[:10]
+    order = np.argsort(-one.total, kind="stable")[:10]  # the others have no effect that a bar shows
     with canvas(9.0, 4.0) as figure:
         ax = figure.subplots()
         for i, (label, start) in enumerate((("first order", 0), ("total", p))):

@@ -159,7 +159,7 @@ def with_intervals(
     """
     n = values.A.shape[1]
     drawn = np.stack([indices_of(values.taken(rng.integers(0, n, (n,))), powers) for _ in range(resamples)])
-    low, high = np.quantile(drawn, [0.025, 0.975], axis=0)
+    low, high = np.quantile(drawn, [0.025, 0.975], axis=0)  # an interval of 95 %
     return indices_of(values, powers), low, high
 
 

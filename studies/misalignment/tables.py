@@ -310,6 +310,7 @@ def slope_misses(table: pl.DataFrame, estimator: str) -> tuple[str, float, float
 _LISTED = 5  # costliest parameters
 _LEFT = 3  # of them after a calibration
 _NOTABLE = 1e-3  # of D: a smaller change counts as none
+# as people state tolerances
 _SCALES = {"m": (1e3, "mm"), "rad": (math.degrees(1.0), "deg"), "px": (1.0, "px"), "1": (1.0, "")}
 
 

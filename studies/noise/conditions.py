@@ -43,7 +43,7 @@ from phibench.studies.image_cutout import (
     without_off,
 )
 
-OFF = 0.0
+OFF = 0.0  # level of a factor that is switched off
 _QUALITY = 85  # of the base case's JPEG, which the study's figures were measured with
 BASE = "base"
 """Name of the factor of a cell in which nothing is changed."""
@@ -133,7 +133,7 @@ def applied(factor: str, preset: str, rig: Rig, level: float) -> tuple[Shot, Rig
 
 NAMES: tuple[Name, ...] = ("study", "noise")
 KEPT = ("du_px", "dv_px", "distance_px", "radial_px", "phi_error_rad", "depth_relative", "detected", "depth_found")
-_MARGIN_PX = 32
+_MARGIN_PX = 32  # around a spot: what the chain's stages and JPEG's units look at
 _REACH_PX = 1.7  # places are drawn from a square of twice as many pixels
 _RAD_PER_PX = 7.6e-3  # of elevation, on the default rig
 

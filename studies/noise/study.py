@@ -134,6 +134,7 @@ def _levels(settings: NoiseSettings, preset: str) -> Iterator[tuple[str, float]]
     for name, levels in settings.levels.given.items():
         factor = FACTORS[name]
         if preset in factor.presets:
+            # the base's own level is the base case
             yield from ((name, x) for x in levels if abs(x - factor.base) > 1e-9)
 
 

@@ -132,6 +132,7 @@ def _columns(name: str, measured: MetricEstimate) -> dict[str, float]:
 def _slope(
     records: pl.DataFrame, span: tuple[float, float], rules: Rules, key: tuple[str, ...]
 ) -> tuple[Estimate, float]:
+    # a level as a file printed it
     ends = [records.filter((pl.col("level") - level).abs() <= 1e-9 * level) for level in span]
     sums = [rms_by_place(end) for end in ends]
     width = math.log(span[1] / span[0])

@@ -250,7 +250,7 @@ def resting_frames(film: Film) -> tuple[list[int], list[int]]:
     """Frames that are exposed while the carriage rests at its first and at its last stop."""
     scene, times = film.plan.nominal, film.plan.nominal.times
     half = 0.5 * (times.exposure_s + times.readout_s)
-    inner = times.frame_s[:, None] + half * np.linspace(-1.0, 1.0, 9)
+    inner = times.frame_s[:, None] + half * np.linspace(-1.0, 1.0, 9)  # instants of a frame, its rows included
     at = scene.carriage.position_m(inner)
     stops = (scene.carriage.stops_m[0], scene.carriage.stops_m[-1])
     first, last = (np.flatnonzero(np.all(np.abs(at - stop) < 1e-9, axis=1)).tolist() for stop in stops)
@@ -355,5 +355,5 @@ def closure_interval(rows: pl.DataFrame, common_end: bool = False) -> tuple[floa
         mine = (good["rig"] == rig).to_numpy()
         errors[:, mine] += rng.standard_normal((_DRAWS, common.shape[1])) @ (common[mine] / D[mine, None]).T
     ratio = np.sqrt(np.mean(errors**2, axis=1) / np.mean((sigma / D) ** 2))
-    low, high = np.quantile(ratio, [0.025, 0.975])
+    low, high = np.quantile(ratio, [0.025, 0.975])  # an interval of 95 %
     return float(low), float(high)

@@ -128,6 +128,7 @@ def loss_table(best: BestStroke, strokes_m: Sequence[float] | None = None) -> Te
     """
     require_measured(best)
     first, last = best.curve.strokes_m[[0, -1]]
+    # ends of the curve, with rounding
     wanted = strokes_m or [stroke for stroke in USUAL_M if first * (1 - 1e-9) <= stroke <= last * (1 + 1e-9)]
     rows = [
         (f"{loss.stroke_m:.3f}", *_millimetres(best, loss), loss.cause or _verdict(loss))

@@ -20,6 +20,7 @@ def best_drawing(found: Found, tolerances: Sequence[str], depths_m: Sequence[flo
             bound = np.array([bool(b.limits) for b in best])
             for ax, y in ((left, h), (right, 100.0 * sigma / np.array(depths_m))):
                 ax.plot(depths_m, y, label=tolerance, **line_style(i))
+                # hollow: a limit stopped it
                 ax.plot(np.array(depths_m)[bound], y[bound], "o", color="white", markersize=3.0, zorder=5)
         left.set_ylabel("best stroke h, m")
         right.set_ylabel("sigma of D at the best stroke, %")

@@ -44,8 +44,8 @@ from phibench.studies.image_cutout import Shot, SpotPair, cut_region, cut_rig, d
 METHOD = {"bayer-raw": "raw_maximum_likelihood", "srgb8": "chain_fit", "mjpeg": "chain_fit"}
 _NAMES: tuple[Name, ...] = ("study", "stroke")
 _ROOM = Room("wall", ())  # the robot stands in it
-_BOX_PX = 48
-_MARGIN_PX = 32
+_BOX_PX = 48  # of the search: the fit starts as it does with a hint
+_MARGIN_PX = 32  # around it: what the chain's stages and JPEG's units look at
 _TURN = 0.618033988749895  # golden: azimuths, and with them sub-pixel phases, never repeat
 
 
@@ -103,6 +103,7 @@ class RenderedOutcome:
         """95 % interval of the rms, by bootstrap: errors of rigs as built have long tails."""
         n = len(self.errors_m)
         rms = rms_of(Clusters(np.arange(n), n), np.square(self.errors_m))
+        # ends good to some per cent
         (estimate,) = estimates([rms], n, Rules(resamples=999), generator(*_NAMES, "interval"))
         return estimate.low, estimate.high
 
