@@ -8,8 +8,10 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import TypedDict, Unpack
 
 from rich.console import Console
 
@@ -76,18 +78,48 @@ from phibench.render.setup.variant import ENVIRONMENT
 from phibench.scenes.rig import POSITIONS
 
 
+@dataclass(frozen=True)
+class MakeOptions:
+    """Part of a recipe that is made, and what may become of work that is there.
+
+    Attributes
+    ----------
+    shard : part of the recipe, "i/n"
+    samples, seed : numbers instead of the recipe's `[random].samples` and `[dataset].seed`
+    replace : whether finished work that does not fit may be deleted or made again; what fits is kept
+    room_files : folder of the files that the recipe names for rooms; by default the recipe's own
+    leave_out_refused : whether the data set is finished without the samples that are refused, if others are not
+    """
+
+    shard: str | None = None
+    samples: int | None = None
+    seed: int | None = None
+    replace: bool = False
+    room_files: str | Path | None = None
+    leave_out_refused: bool = False
+
+
+_AS_IT_IS = MakeOptions()
+
+
+class MakeKeywords(TypedDict, total=False):
+    """`MakeOptions` as keywords of `make`."""
+
+    shard: str | None
+    samples: int | None
+    seed: int | None
+    replace: bool
+    room_files: str | Path | None
+    leave_out_refused: bool
+
+
 def make(
     recipe: str | Path,
     out: str | Path,
     workers: int | None = None,
     console: Console | None = None,
     scheduler: str | None = None,
-    shard: str | None = None,
-    samples: int | None = None,
-    seed: int | None = None,
-    replace: bool = False,
-    room_files: str | Path | None = None,
-    leave_out_refused: bool = False,
+    **options: Unpack[MakeKeywords],
 ) -> Path:
     """Render the data set of a recipe into a folder; what is finished there is kept, whatever ended the last run.
 
@@ -101,11 +133,7 @@ def make(
     workers : processes; by default one per core
     console : where progress goes; by default the standard error
     scheduler : address or scheduler file of a running dask scheduler, whose workers are used instead
-    shard : part of the recipe, "i/n"
-    samples, seed : numbers instead of the recipe's `[random].samples` and `[dataset].seed`
-    replace : whether finished work that does not fit may be deleted or made again; what fits is kept
-    room_files : folder of the files that the recipe names for rooms; by default the recipe's own
-    leave_out_refused : whether the data set is finished without the samples that are refused, if others are not
+    **options : fields of `MakeOptions`
 
     Returns
     -------
@@ -122,18 +150,18 @@ def make(
         If nothing but samples by themselves cannot be made; the others are finished first, and `SHA256SUMS` is
         missing. With `leave_out_refused`, if not one sample can be made.
     """
-    console, out, exported = console or progress_console(), Path(out), list[str]()
+    console, out, wanted, exported = console or progress_console(), Path(out), MakeOptions(**options), list[str]()
 
     def export(asked: Recipe, files: RoomFiles) -> RoomFiles:
-        return _export(asked, files, out, workers, console, scheduler, replace, exported)
+        return _export(asked, files, out, workers, console, scheduler, wanted.replace, exported)
 
-    plan, text, note = _planned(recipe, out, shard, samples, seed, replace, room_files, export)
+    plan, text, note = _planned(recipe, out, wanted, export)
     causes = seen_causes(plan)
     for warning in [*warnings(plan.recipe), *_hidden(causes)]:
         console.print(f"warning: {warning}", highlight=False, soft_wrap=True)
     draws = draws_bytes(plan, causes) if plan.recipe.random is not None else b""
     try:
-        make_from_plan(plan, text, out, workers, console, scheduler, replace, leave_out_refused, draws)
+        make_from_plan(plan, text, out, workers, console, scheduler, wanted, draws)
     except LostWorkError:
         remove_files(out, exported)  # the folder is as it was
         raise
@@ -143,17 +171,7 @@ def make(
     return out
 
 
-def dry_run(
-    recipe: str | Path,
-    out: str | Path,
-    workers: int | None = None,
-    shard: str | None = None,
-    samples: int | None = None,
-    seed: int | None = None,
-    replace: bool = False,
-    room_files: str | Path | None = None,
-    leave_out_refused: bool = False,
-) -> str:
+def dry_run(recipe: str | Path, out: str | Path, workers: int | None = None, **options: Unpack[MakeKeywords]) -> str:
     """Say what `make` would do, and render and write nothing: what will be seen, how many tasks, bytes, seconds.
 
     Raises
@@ -161,25 +179,26 @@ def dry_run(
     DatasetError
         If recipe or folder will not do.
     """
-    out, count = Path(out), _count(workers)
-    plan, _, note = _planned(recipe, out, shard, samples, seed, replace, room_files, lambda _, files: held(files, out))
-    refuse_other(out, None if replace else plan.recipe.dataset.name)
+    out, count, wanted = Path(out), _count(workers), MakeOptions(**options)
+    leave_out = wanted.leave_out_refused
+    plan, _, note = _planned(recipe, out, wanted, lambda _, files: held(files, out))
+    refuse_other(out, None if wanted.replace else plan.recipe.dataset.name)
     pairs, journal = list(pair_forecasts(plan)), Journal(out)
     tasks, todo, told = plan_tasks(plan, {}), [], [note] if note else []
     if journal.entries:
         build = Build(plan, "", out, journal, _environment(WorkerPool(out, count), journal)[0])
         forget_others(journal, build.tasks)
-        lost = None if replace else _lost(build, leave_out_refused)
+        lost = None if wanted.replace else _lost(build, leave_out)
         told += [f"will be refused: {lost}"] if lost else []
-        if leave_out_refused:
+        if leave_out:
             build = build.without(settled_samples(plan, build.tasks, journal))
             plan, pairs = build.plan, list(pair_forecasts(build.plan))
-        tasks, todo = build.tasks, _todo(build, leave_out_refused)
+        tasks, todo = build.tasks, _todo(build, leave_out)
     chosen = [tasks[name] for name in (todo if journal.entries else tasks)]
     cost = forecast(plan, chosen).text(count, slowdown(count)) if chosen else "to make: nothing"
     seen = f"{sum(pair.visible for pair in pairs)} of {len(pairs)} pairs will be visible in both images"
     told += rim_lines(plan, pairs) + [f"warning: {warning}" for warning in warnings(plan.recipe)]
-    verb = "left out" if leave_out_refused else "refused"
+    verb = "left out" if leave_out else "refused"
     told += [f"will be {verb}: {name}: {reason}" for name, reason in {**plan.left_out, **plan.refused}.items()]
     told += export_lines(unexported(plan.recipe, plan.files))
     return "\n".join([*pair_table(pairs), seen, *told, f"{cost}, {len(tasks)} tasks in all; nothing was rendered"])
@@ -194,7 +213,8 @@ def cost(recipe: str | Path, out: str | Path, samples: int | None = None) -> For
         If the recipe will not do.
     """
     out = Path(out)
-    plan, _, _ = _planned(recipe, out, None, samples, None, True, None, lambda _, files: held(files, out))
+    wanted = MakeOptions(samples=samples, replace=True)
+    plan, _, _ = _planned(recipe, out, wanted, lambda _, files: held(files, out))
     return forecast(plan, plan_tasks(plan, {}).values())
 
 
@@ -219,11 +239,7 @@ def _count(workers: int | None) -> int:
 def _planned(
     recipe: str | Path,
     out: Path,
-    shard: str | None,
-    samples: int | None,
-    seed: int | None,
-    replace: bool,
-    room_files: str | Path | None,
+    wanted: MakeOptions,
     exported: Callable[[Recipe, RoomFiles], RoomFiles],
 ) -> tuple[Plan, str, str]:
     """Plan, text of its recipe, and a line on samples that are kept although fewer are asked for.
@@ -231,18 +247,18 @@ def _planned(
     `exported` sees to the files that the data set makes itself, and gives those of all rooms.
     """
     text, source, note = recipe_text(recipe), str(find_recipe(recipe)), ""
-    files = recipe_files(recipe) if room_files is None else RoomFiles(Path(room_files))
-    if samples is not None or seed is not None:
-        text = with_numbers(text, source, samples, seed)
+    files = recipe_files(recipe) if wanted.room_files is None else RoomFiles(Path(wanted.room_files))
+    if wanted.samples is not None or wanted.seed is not None:
+        text = with_numbers(text, source, wanted.samples, wanted.seed)
     asked = parse_recipe(text, source)
-    held = None if replace or shard is not None else kept_samples(out, asked)
+    held = None if wanted.replace or wanted.shard is not None else kept_samples(out, asked)
     if held is not None and asked.random is not None:
         text, count = with_numbers(text, source, held, None), asked.random.samples
         note = f"{out} keeps its {held} samples; the first {count} of them are those that were asked for"
     parsed = parse_recipe(text, source, files)
     if parsed.rooms is not None and parsed.rooms.exported:
         files = exported(parsed, files)
-    return make_plan(parsed, files, shard, read_draws(out, parsed, files)), text, note
+    return make_plan(parsed, files, wanted.shard, read_draws(out, parsed, files)), text, note
 
 
 def _export(
@@ -279,32 +295,32 @@ def make_from_plan(
     workers: int | None,
     console: Console,
     scheduler: str | None = None,
-    replace: bool = False,
-    leave_out: bool = False,
+    wanted: MakeOptions = _AS_IT_IS,
     draws: bytes = b"",
 ) -> list[str]:
     """Make what is unfinished or damaged of a plan; return the names of the tasks done and documents written.
 
-    With `leave_out` the data set is finished without the samples that are refused. `draws` are kept for the next start.
+    Of what is `wanted`, `replace` and `leave_out_refused` count. `draws` are kept for the next start.
     """
     with (
-        claimed(out, None if replace else plan.recipe.dataset.name),
+        claimed(out, None if wanted.replace else plan.recipe.dataset.name),
         WorkerPool(out, _count(workers), scheduler) as pool,
         Journal(out) as journal,
     ):
         if draws:
             write_draws(out, draws)
-        return _make(plan, recipe, out, pool, journal, console, replace, leave_out)
+        return _make(plan, recipe, out, pool, journal, console, wanted)
 
 
 def _make(
-    plan: Plan, recipe: str, out: Path, pool: WorkerPool, journal: Journal, console: Console, replace: bool, leave: bool
+    plan: Plan, recipe: str, out: Path, pool: WorkerPool, journal: Journal, console: Console, wanted: MakeOptions
 ) -> list[str]:
+    leave = wanted.leave_out_refused
     started, began = time.monotonic(), datetime.now(UTC)
     environment, no_renderer = _environment(pool, journal)
     whole = Build(plan, recipe, out, journal, environment)
     forget_others(journal, whole.tasks)
-    if not replace and (lost := _lost(whole, leave)):
+    if not wanted.replace and (lost := _lost(whole, leave)):
         raise LostWorkError(lost)
     settled = settled_samples(plan, whole.tasks, journal) if leave else {}
     build = whole.without(settled)

@@ -21,7 +21,7 @@ from phibench.datasets.build.run_tasks import claimed, copy_room_files, finish, 
 from phibench.datasets.build.task_list import task_names
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.progress import Steps, progress_console
-from phibench.datasets.make import make_from_plan
+from phibench.datasets.make import MakeOptions, make_from_plan
 from phibench.datasets.plan.plan import Plan, make_plan, parse_shard
 from phibench.datasets.recipe.load import parse_recipe, recipe_text
 from phibench.datasets.recipe.tables import Recipe
@@ -176,7 +176,8 @@ def repair(
     _clear(folder, [schema.LOCK], console)  # without it nobody can hold the folder
     with only_run(folder):
         _clear(folder, _places(plan), console)
-    return make_from_plan(plan, recipe, folder, workers, console, scheduler, leave_out=leave_out)
+    wanted = MakeOptions(leave_out_refused=leave_out)
+    return make_from_plan(plan, recipe, folder, workers, console, scheduler, wanted)
 
 
 def _held_plan(folder: Path) -> tuple[Plan, str, bool]:

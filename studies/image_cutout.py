@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from phibench.benchmark.pair_sets.dataset_pairs import SpotBounds, spot_bounds
+from phibench.benchmark.pair_sets.dataset_pairs import SpotBounds, SpotInImage, spot_bounds
 from phibench.datasets.frames.sensor_card import card_of
 from phibench.datasets.frames.source import PositionLight
 from phibench.estimator.interface import Box, Pair
@@ -216,8 +216,8 @@ def _bounds(shot: Shot, pair: SpotPair, position: str, flicker: float) -> SpotBo
     view = pair.views[position]
     rates = tuple(float(x) for x in view.layer.total_electrons_per_s)
     uv = (view.truth.u_px, view.truth.v_px)
-    side = shot.side(pair, position, 0, flicker)
-    return spot_bounds(side, pair.rig, uv, rates, view.truth.visible, beam=pair.beam, depth_m=pair.depth_m)
+    spot = SpotInImage(uv, rates, view.truth.visible, pair.depth_m, pair.beam)
+    return spot_bounds(shot.side(pair, position, 0, flicker), pair.rig, spot)
 
 
 def _flicker(shot: Shot, names: tuple[Name, ...], position: str) -> float:

@@ -251,10 +251,9 @@ def _spot_truth(sample: CachedSample, source: FrameSource, position: str, frames
     row, side = sample.row.position(position), source.sides[position]
     centre = row.centre
     uv_px = (centre.u_px, centre.v_px)
-    beam, depth_m = Beam(sample.row.spot_diameter_m, 0.0), sample.row.centre_depth_m
-    bounds = spot_bounds(
-        side, sample.rig, uv_px, row.electrons_per_s, row.visible, depth_m=depth_m, beam=beam, frames=frames
-    )
+    beam = Beam(sample.row.spot_diameter_m, 0.0)
+    spot = SpotInImage(uv_px, row.electrons_per_s, row.visible, sample.row.centre_depth_m, beam)
+    bounds = spot_bounds(side, sample.rig, spot, frames=frames)
     return ImageTruth(
         uv_px=uv_px,
         phi_rad={"ray": centre.phi_ray_rad, "normal": centre.phi_normal_rad, "incidence": centre.phi_incidence_rad},
@@ -293,16 +292,30 @@ class SpotBounds:
     raw_bound_px2: Array | None
 
 
+@dataclass(frozen=True)
+class SpotInImage:
+    """A spot as one image has it.
+
+    Attributes
+    ----------
+    uv_px : (u, v), true
+    rates_per_s : 3 floats
+        Electrons per second of the whole spot behind R, G, B at laser level 1.
+    visible : bool
+        Whether the spot is seen; there are no bounds of one that is not.
+    depth_m, beam
+        As for `spot_blur`: the spot's own size. Raw pixels' bound does not need it, it takes the light as it is.
+    """
+
+    uv_px: tuple[float, float]
+    rates_per_s: tuple[float, ...]
+    visible: bool
+    depth_m: float | None = None
+    beam: Beam | None = None
+
+
 def spot_bounds(
-    side: PositionLight,
-    rig: Rig,
-    uv_px: tuple[float, float],
-    rates_per_s: tuple[float, ...],
-    visible: bool,
-    pattern_known: bool = False,
-    depth_m: float | None = None,
-    beam: Beam | None = None,
-    frames: FrameCounts | None = None,
+    side: PositionLight, rig: Rig, spot: SpotInImage, pattern_known: bool = False, frames: FrameCounts | None = None
 ) -> SpotBounds:
     """Bounds of a spot in the image of a sensor and in the raw pixels behind it.
 
@@ -311,15 +324,9 @@ def spot_bounds(
     side : Side
         Light and sensor; its region is not used.
     rig : Rig
-    uv_px : (u, v), true
-    rates_per_s : 3 floats
-        Electrons per second of the whole spot behind R, G, B at laser level 1.
-    visible : bool
-        Whether the spot is seen; there are no bounds of one that is not.
+    spot : SpotInImage
     pattern_known : bool
         Whether the camera's PRNU and DSNU are calibrated; otherwise the bounds count them as noise.
-    depth_m, beam
-        As for `spot_blur`: the spot's own size. Raw pixels' bound does not need it, it takes the light as it is.
     frames : FrameCounts, optional
         Frames with the laser on and off, from which alone the room is known; by default one frame with the laser on,
         and the room a level per filter.
@@ -327,15 +334,15 @@ def spot_bounds(
     sensor = side.chain.sensor
     raw = sensor.replace(output="raw")
     card = card_of(raw)
-    region = expected_of_light(side.light, raw, rig.camera) if visible else None
+    region = expected_of_light(side.light, raw, rig.camera) if spot.visible else None
     raw_limit = None if region is None else _raw_limit(region, card, pattern_known, frames)
-    limit, electrons, snr = raw_limit, spot_electrons(rates_per_s, side), 0.0
+    limit, electrons, snr = raw_limit, spot_electrons(spot.rates_per_s, side), 0.0
     if region is not None and sensor.output in PROCESSED:
-        blur = spot_blur(rig, uv_px, depth_m, beam)
+        blur = spot_blur(rig, spot.uv_px, spot.depth_m, spot.beam)
 
         def limit_of_part(part: float) -> SpotLimit:
-            light = part * electrons
-            return _processed_limit(region, card_of(sensor), rig, uv_px, blur, light, pattern_known, frames)
+            known = card_of(sensor), rig, spot.uv_px, blur, part * electrons
+            return _processed_limit(region, *known, pattern_known, frames)
 
         limit = limit_of_part(1.0)
         snr = processed_snr(lambda part: _information(limit_of_part(part), electrons), _information(limit, electrons))
@@ -385,7 +392,8 @@ def _processed_limit(
     upright = SpotBlur(blur.sigma_px, blur.ratio)  # the mixed moment would change the bound by 3 % at most
     if frames is None:
         return chain_limit(card, uv_px, upright, electrons, levels, (r, g, b), pattern_known)
-    return processed_on_off_limit(card, uv_px, upright, electrons, levels, frames, (r, g, b), pattern_known)
+    card = replace(card, prnu=0.0) if pattern_known else card
+    return processed_on_off_limit(card, uv_px, upright, electrons, levels, frames, (r, g, b))
 
 
 def _bound(limit: SpotLimit | None) -> Array | None:

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import polars as pl
 from rich.console import Console
@@ -22,14 +22,9 @@ from rich.console import Console
 from phibench.benchmark.isolation.pairs_ahead import PairsAhead
 from phibench.benchmark.isolation.resolve import MethodError, RunLimits, code_of_function, installed, resolve
 from phibench.benchmark.isolation.runner import Harness, Ran, asked_here, function_name, ran_here
-from phibench.benchmark.pair_sets.dataset_pairs import (
-    TASK_VERSION,
-    CalibratedPairs,
-    DatasetPairs,
-    dataset_pairs,
-    of_calibration,
-)
+from phibench.benchmark.pair_sets.dataset_pairs import CalibratedPairs, DatasetPairs
 from phibench.benchmark.pair_sets.frames_set import FramesSet
+from phibench.benchmark.pair_sets.wanted_pairs import ChoiceKeywords, PairChoice, open_scored, wanted_pairs
 from phibench.benchmark.scores.answer_errors import Rules
 from phibench.benchmark.scores.causes import with_causes
 from phibench.benchmark.scores.document import (
@@ -45,16 +40,11 @@ from phibench.benchmark.scores.records import in_order, missed_relative, record_
 from phibench.benchmark.scores.report import time_section, write_report
 from phibench.benchmark.scores.score_tables import score_table, text_of
 from phibench.benchmark.scores.worst_images import worst, worst_of, worst_records
-from phibench.calibration.captures.imported_set import ImportedSet, imported_pairs, is_imported, open_imported
-from phibench.calibration.captures.spot_shape import with_shape
-from phibench.calibration.rig.file import read_calibration
+from phibench.calibration.captures.imported_set import ImportedSet
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.progress import Steps, progress_console
-from phibench.datasets.exposures.pair_draws import FrameCounts
-from phibench.datasets.frames.sensor_file import read_sensor_file
-from phibench.datasets.read import Dataset, open_finished
+from phibench.datasets.read import Dataset
 from phibench.datasets.store.files import require_writable
-from phibench.datasets.store.pair_files import is_frames_set
 from phibench.datasets.store.short_form import ShortForm
 from phibench.estimator.interface import Box, Method, Outcome
 from phibench.estimator.methods.fit_at_truth import KeptFits
@@ -267,18 +257,12 @@ def score(
     method: str | Method,
     preset: str | None = None,
     *,
-    draws: int | None = None,
-    pairs: int | None = None,
-    hints: bool = True,
-    calibration: str | Path | None = None,
-    boxes_px: int | None = None,
-    sensor: str | Path | None = None,
-    frames: tuple[int, int] | None = None,
     limits: RunLimits | None = None,
     workers: int = 1,
     seed: int = 0,
     out: str | Path | None = None,
     console: Console | None = None,
+    **choice: Unpack[ChoiceKeywords],
 ) -> Scored:
     """Score one method on the pairs of a data set: `phibench.score`.
 
@@ -290,8 +274,6 @@ def score(
         in this process: no limits, and it can be stopped with a debugger.
     preset : str, optional
         Preset of the sensor; by default those of the recipe's `[frames]`.
-    draws, pairs, hints, calibration, boxes_px, sensor, frames
-        As for `wanted_pairs`.
     limits : RunLimits, optional
         Of time and memory; not for a function.
     workers : int
@@ -302,6 +284,8 @@ def score(
         JSON file to write, with its Parquet file beside it.
     console : Console, optional
         Where progress goes; by default the standard error.
+    **choice
+        Fields of `PairChoice` but the preset: draws, pairs, hints, boxes_px, calibration, sensor, frames.
 
     Returns
     -------
@@ -319,7 +303,7 @@ def score(
     opened = dataset if isinstance(dataset, Dataset | FramesSet) else open_scored(dataset)
     if out is not None:
         require_writable(Path(out))
-    chosen = wanted_pairs(opened, preset, draws, pairs, hints, calibration, boxes_px, sensor, frames)
+    chosen = wanted_pairs(opened, PairChoice(preset, **choice))
     if isinstance(method, str):
         with records_kept([None if out is None else Path(out)]):
             (scored,) = run_and_score([method], chosen, workers, console, "pairs", seed, limits)
@@ -409,7 +393,7 @@ def bench(
     require_writable(out / REPORT)
     scores, notes, times = [], [], dict[str, dict[str, float]]()
     for preset in _presets(dataset):
-        taken = wanted_pairs(dataset, preset, pairs=pairs, calibration=calibration)
+        taken = wanted_pairs(dataset, PairChoice(preset, pairs=pairs, calibration=calibration))
         # what a package's method takes is known to nobody: it is asked, and its answers say so
         refusals = {name: refusal(METHODS[name], taken) if name in METHODS else "" for name in chosen}
         notes += [f"{name} is left out on {preset}: {why}" for name, why in refusals.items() if why]
@@ -491,93 +475,6 @@ def ran_with(scored: Scored, ran: Ran) -> Scored:
     """The score with packages and files of its method."""
     card = scored.document.method.model_copy(update=vars(ran))
     return replace(scored, document=scored.document.model_copy(update={"method": card}))
-
-
-def open_scored(folder: str | Path) -> Dataset | ImportedSet | FramesSet:
-    """Finished data set, a frames set, or a set of real pairs."""
-    if is_frames_set(folder):
-        return FramesSet(folder)
-    return open_imported(folder) if is_imported(folder) else open_finished(folder)
-
-
-def wanted_pairs(
-    dataset: Dataset | ImportedSet | FramesSet,
-    preset: str | None,
-    draws: int | None = None,
-    pairs: int | None = None,
-    hints: bool = True,
-    calibration: str | Path | None = None,
-    boxes_px: int | None = None,
-    sensor: str | Path | None = None,
-    frames: tuple[int, int] | None = None,
-) -> PairSet:
-    """Pairs as of `dataset_pairs`; with a calibration file its rig's, with calibrated rig, stroke and covariance.
-
-    `sensor` is a sensor file; `frames` are the frames of each position with the laser on and off.
-
-    Raises
-    ------
-    DatasetError
-        As `dataset_pairs`, or if the calibration cannot be read or is that of another rig.
-    """
-    if isinstance(dataset, FramesSet):
-        if any(one is not None for one in (calibration, boxes_px, sensor, frames)):
-            raise DatasetError(
-                f"{dataset.folder} holds frames that are drawn: leave --calibration, --boxes, --sensor and --frames "
-                "out, or score the data set that it comes from"
-            )
-        return dataset.pairs(preset, draws, pairs=pairs, hints=hints)
-    if isinstance(dataset, ImportedSet):
-        if boxes_px is not None or sensor is not None or frames is not None:
-            raise DatasetError(
-                f"{dataset.folder} holds pictures: their boxes are not known, and sensor and frames are those of the "
-                "import; leave --boxes, --sensor and --frames out"
-            )
-        return _real_pairs(dataset, preset, draws, pairs, calibration)
-    camera = None if sensor is None else read_sensor_file(sensor)
-    counts = None if frames is None else frame_counts(*frames)
-    if calibration is None:
-        return dataset_pairs(dataset, preset, draws, pairs, hints, boxes_px, camera, counts)
-    read = read_calibration(calibration)
-    of_rig = of_calibration(dataset, read)
-    return CalibratedPairs(dataset_pairs(of_rig, preset, draws, pairs, hints, boxes_px, camera, counts), read)
-
-
-MOST_FRAMES = 100
-"""Frames of a position: an image and the single frames are held at a time."""
-
-
-def frame_counts(on: int, off: int) -> FrameCounts:
-    """Frames of each position with the laser on and off.
-
-    Raises
-    ------
-    DatasetError
-        If there are too few or too many.
-    """
-    if not (1 <= on <= MOST_FRAMES and 1 <= off <= MOST_FRAMES):
-        raise DatasetError(
-            f"--frames {on} {off}: give the frames of a position with the laser on and off, 1 to {MOST_FRAMES} each, "
-            "such as --frames 6 6"
-        )
-    return FrameCounts(on, off)
-
-
-def _real_pairs(
-    imported: ImportedSet,
-    preset: str | None,
-    draws: int | None,
-    pairs: int | None,
-    calibration: str | Path | None,
-) -> PairSet:
-    if preset not in (None, imported.preset):
-        raise DatasetError(f"{imported.folder} holds pictures of the kind '{imported.preset}': leave --preset out")
-    found = imported_pairs(imported, TASK_VERSION, draws, pairs)
-    return (
-        found
-        if calibration is None
-        else CalibratedPairs(found, with_shape(read_calibration(calibration, imported.rig)))
-    )
 
 
 def refusal(method: BuiltIn, pairs: PairSet) -> str:

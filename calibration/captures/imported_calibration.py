@@ -24,7 +24,13 @@ from phibench.calibration.outline.limb_image import PoseMeasurement
 from phibench.calibration.outline.outline import find_outline
 from phibench.calibration.outline.outline_result import Outline, mean_measured
 from phibench.calibration.rig.bundle import Bundle, KnownSpot, calibrate
-from phibench.calibration.rig.from_dataset import DatasetCalibration, Photograph, sigmas_of, write_bundle
+from phibench.calibration.rig.from_dataset import (
+    OUTLINES,
+    CalibrationSources,
+    DatasetCalibration,
+    Photograph,
+    write_bundle,
+)
 from phibench.calibration.rig.spots import method_for
 from phibench.calibration.rig.vertical_edges import find_vertical
 from phibench.datasets.common.errors import DatasetError
@@ -48,10 +54,7 @@ def calibrate_imported(
     folder: Path,
     out: Path,
     samples: Sequence[str] = (),
-    spots: bool = False,
-    outline_sigma_factor: float = 1.0,
-    vertical: bool = False,
-    focal_sigma: float | None = None,
+    sources: CalibrationSources = OUTLINES,
 ) -> DatasetCalibration:
     """Calibrate the rig of an imported set and write the file.
 
@@ -60,15 +63,9 @@ def calibrate_imported(
     folder : Path
     out : Path
     samples : ids or numbers; by default the first, with `spots` all that have a measured D
-    spots : bool
-        Also use the spots, at the distances of the tape. A sample is left out where no spot is found, or where what is
-        found contradicts the tape or itself by more than outline and ruler allow.
-    outline_sigma_factor : float
-        As in `calibrate_dataset`.
-    vertical : bool
-        Also use the room's vertical edges, of the pictures that show three or more.
-    focal_sigma : float, optional
-        As in `calibrate_dataset`.
+    sources : CalibrationSources
+        A sample is left out where no spot is found, or where what is found contradicts the tape or itself by more than
+        outline and ruler allow. Vertical edges are those of the pictures that show three or more.
 
     Raises
     ------
@@ -77,17 +74,17 @@ def calibrate_imported(
     """
     require_writable(out)
     imported = open_imported(folder)
-    rows = _rows(imported, samples, spots)
-    images, outlines, names = _outlines(imported, rows, outline_sigma_factor)
-    upright = _vertical(images, outlines, imported.rig) if vertical else None
-    sigmas = sigmas_of(focal_sigma)
+    rows = _rows(imported, samples, sources.spots)
+    images, outlines, names = _outlines(imported, rows, sources.outline_sigma_factor)
+    upright = _vertical(images, outlines, imported.rig) if sources.vertical else None
+    sigmas = sources.sigmas
     aligned = calibrate(imported.rig, outlines_as_one(outlines), (), upright, sigmas)
     # spots are looked for with the mirror where it is: a rig off by some pixels has other epipolar lines
     rig = with_blur_of(aligned.rig, outlines)
     known: dict[str, KnownSpot] = {}
     left_out: dict[str, str] = {}
     shape = SpotShape.prior(rig)
-    if spots:
+    if sources.spots:
         shape = _shape(imported, rows, rig, aligned, outlines)
         for sample_id in dict.fromkeys(row.sample_id for row in rows):
             try:

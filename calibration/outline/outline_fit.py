@@ -268,7 +268,6 @@ def step_from(
     blur_px2: float,
     sectors: int,
     half_px: float,
-    jpeg: bool = False,
     near: bool = False,
 ) -> Step:
     """Linearise the light around (s, blur) and solve, robustly within sectors and over them.

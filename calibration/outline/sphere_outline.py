@@ -7,7 +7,7 @@ left is the centre s: Gauss-Newton with robust weights, sector by sector.
 * Sectors whose light the model does not describe (lamps, edges of the room) are left out, with their neighbours.
 * The covariance comes from the scatter of the sectors' shifts, with the correlation of neighbours: the room and JPEG's
   blocks err over many pixels together.
-* The effect of JPEG on the limb is simulated from the frame itself (`outline_jpeg`).
+* The effect of JPEG on the limb is simulated from the frame itself (`outline_result`).
 * Where the light is not as the model has it, in other mirrors or among lamps, the edge in the picture is the outline
   (`ball_circle`), with its own, larger covariance; so it is where the fit leaves that edge.
 
@@ -250,7 +250,7 @@ def _settle(
     for count in range(1, _STEPS + 1):
         if count <= _CHOOSE:  # later the pixels stay, so that the steps come to rest
             pixels = band(planes, rig.camera, s, rig.sphere.radius_m, half_px)
-        step = step_from(pixels, planes, rig, s, blur, SECTORS, half_px, again is not None, near=True)
+        step = step_from(pixels, planes, rig, s, blur, SECTORS, half_px, near=True)
         # weights that are cut off can take turns for ever: shorter steps end between them
         move = step.move * min(1.0, 6.0 / count)
         sigma = np.sqrt(np.diag(step.covariance)[:3]) if count >= _CHOOSE else np.zeros(3)

@@ -10,7 +10,7 @@ gives it for an upright axis: a tilt of the mirror moves its rim aside.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +34,7 @@ from phibench.calibration.rig.edge_meeting import (
     with_vertical,
 )
 from phibench.calibration.rig.outline_picture import overlay, shown, write_picture
+from phibench.calibration.rig.sphere_options import SphereOptions
 from phibench.calibration.rig.vertical_edges import MIN_EDGES, edges_about, measured_vertical
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.frames.sensor_card import SensorCard
@@ -81,33 +82,6 @@ class Alignment:
     outline: Outline = field(repr=False)
     camera: CameraTilt = field(repr=False)
     meeting: EdgeMeeting | None = field(default=None, repr=False)
-
-
-@dataclass(frozen=True)
-class SphereOptions:
-    """Camera and mirror, a sphere, as options of the command; None where an option is not given.
-
-    `distance_mm` is that of the mirror's centre from the lens, `focus_mm` that of the plane of focus.
-    """
-
-    radius_mm: float | None = None
-    distance_mm: float | None = None
-    focal_px: float | None = None
-    cx_px: float | None = None
-    cy_px: float | None = None
-    focus_mm: float | None = None
-
-    def given(self) -> dict[str, float]:
-        """Values of the options that are given."""
-        values = ((f"--{one.name.replace('_', '-')}", getattr(self, one.name)) for one in fields(self))
-        return {option: value for option, value in values if value is not None}
-
-    def require_sound(self) -> None:
-        """Raise `DatasetError` for a radius or a focal length that none has."""
-        for option in ("--radius-mm", "--focal-px"):
-            value = self.given().get(option, 1.0)
-            if not 0.0 < value < math.inf:
-                raise DatasetError(f"{option} {value:g}: must be above 0")
 
 
 def rig_of_numbers(image: NDArray[Any], card: SensorCard, numbers: SphereOptions) -> Rig | None:

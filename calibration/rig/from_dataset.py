@@ -73,16 +73,59 @@ class DatasetCalibration:
         return write_overlay(path, image.pixels, image.card, self.nominal, self.outlines[worst], title)
 
 
+@dataclass(frozen=True)
+class CalibrationSources:
+    """Sources of a calibration, and how well the rest is known.
+
+    Attributes
+    ----------
+    spots : bool
+        Also use the samples' laser spots, at places that the ruler or a tape measures.
+    vertical : bool
+        Also use the room's vertical edges, see `find_vertical`; the room is to have some.
+    outline_sigma_factor : float
+        Widens the outlines' standard deviations, which were checked in the room `lab` and in rooms like it.
+    focal_sigma : float, optional
+        How well the nominal focal length is known, relative: `sigmas`.
+    """
+
+    spots: bool = False
+    vertical: bool = False
+    outline_sigma_factor: float = 1.0
+    focal_sigma: float | None = None
+
+    @property
+    def sigmas(self) -> Array:
+        """Standard deviations of the nominal numbers, shape (p,); that of the focal length as stated, or 0.003.
+
+        A lens that was turned since its focal length was measured is known to 0.018 only: see docs/capture.md.
+
+        Raises
+        ------
+        DatasetError
+            If it is not above 0, or not below 0.2.
+        """
+        if self.focal_sigma is None:
+            return prior_sigmas()
+        if not 0.0 < self.focal_sigma < MOST_FOCAL_SIGMA:
+            raise DatasetError(
+                f"--focal-sigma {self.focal_sigma:g}: must be above 0 and below {MOST_FOCAL_SIGMA:g}, parts of the "
+                "focal length"
+            )
+        return prior_sigmas({"focal_relative": self.focal_sigma})
+
+
+OUTLINES = CalibrationSources()
+"""Outlines alone."""
+
+
 def calibrate_dataset(
     folder: Path,
     out: Path,
     samples: Sequence[str] = (),
     preset: str = LAYERS,
-    spots: bool = False,
+    sources: CalibrationSources = OUTLINES,
     ruler: Ruler | None = None,
-    vertical: bool = False,
-    outline_sigma_factor: float = 1.0,
-    focal_sigma: float | None = None,
 ) -> DatasetCalibration:
     """Calibrate the rig of some samples and write the file.
 
@@ -94,17 +137,11 @@ def calibrate_dataset(
     samples : ids or numbers; the first of the data set by default
     preset : str
         "layers" for the noise-free layers, or a preset of the sensor whose frames are drawn, with the laser on and off.
-    spots : bool
-        Also use the samples' laser spots, at places that the ruler measures. In frames they are found by the built-in
-        method that comes closest to the bound there, which gives their covariance, too.
+    sources : CalibrationSources
+        Spots in frames are found by the built-in method that comes closest to the bound there, which gives their
+        covariance, too.
     ruler : Ruler, optional
         By default D is measured to 1 mm, height and azimuth not at all.
-    vertical : bool
-        Also use the room's vertical edges, see `find_vertical`; the room is to have some.
-    outline_sigma_factor : float
-        Widens the outlines' standard deviations, which were checked in the room `lab` and in rooms like it.
-    focal_sigma : float, optional
-        How well the nominal focal length is known, relative; see `sigmas_of`.
 
     Raises
     ------
@@ -117,38 +154,19 @@ def calibrate_dataset(
     rig = _one_rig(chosen)
     if preset == LAYERS:
         images = [Photograph(s.ambient(p)) for s, p in one_per_pose(chosen)]
-        known = [_known_in_layers(sample, ruler) for sample in chosen] if spots else []
+        known = [_known_in_layers(sample, ruler) for sample in chosen] if sources.spots else []
     else:
         images = [photograph(dataset, sample, position, preset) for sample, position in one_per_pose(chosen)]
-        known = frame_spots(dataset, chosen, preset, ruler) if spots else []
+        known = frame_spots(dataset, chosen, preset, ruler) if sources.spots else []
     found = [find_outline(image.pixels, rig, image.card) for image in images]
-    outlines = [one.widened(outline_sigma_factor) for one in found]
-    upright = _vertical(images, outlines, rig) if vertical else None
-    sigmas = sigmas_of(focal_sigma)
+    outlines = [one.widened(sources.outline_sigma_factor) for one in found]
+    upright = _vertical(images, outlines, rig) if sources.vertical else None
+    sigmas = sources.sigmas
     bundle = calibrate(rig, mean_outline(outlines), known, upright, sigmas)
     made_from = _made_from(dataset, chosen, preset, outlines, known, upright)
     # in the order of the images, one per pose
     names = [f"{sample.row.sample_id} {position}" for sample, position in one_per_pose(chosen)]
     return write_bundle(out, bundle, rig, images, outlines, names, made_from, sigmas)
-
-
-def sigmas_of(focal_sigma: float | None) -> Array:
-    """Standard deviations of the nominal numbers, shape (p,); that of the focal length as stated, or 0.003.
-
-    A lens that was turned since its focal length was measured is known to 0.018 only: see docs/capture.md.
-
-    Raises
-    ------
-    DatasetError
-        If it is not above 0, or not below 0.2.
-    """
-    if focal_sigma is None:
-        return prior_sigmas()
-    if not 0.0 < focal_sigma < MOST_FOCAL_SIGMA:
-        raise DatasetError(
-            f"--focal-sigma {focal_sigma:g}: must be above 0 and below {MOST_FOCAL_SIGMA:g}, parts of the focal length"
-        )
-    return prior_sigmas({"focal_relative": focal_sigma})
 
 
 def write_bundle(

@@ -26,7 +26,7 @@ from phibench.datasets.recipe.build import (
     rig_fault_of,
     true_stroke_m,
 )
-from phibench.datasets.recipe.faulty_tables import (
+from phibench.datasets.recipe.distributions import (
     Raw,
     boards_of,
     distribution_of,

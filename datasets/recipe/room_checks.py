@@ -7,8 +7,7 @@ from collections.abc import Iterator
 
 from pydantic import ValidationError
 
-from phibench.datasets.recipe.distributions import DistributionTable
-from phibench.datasets.recipe.faulty_tables import Raw, distribution_of, table_of, tables_of
+from phibench.datasets.recipe.distributions import DistributionTable, Raw, distribution_of, table_of, tables_of
 from phibench.datasets.recipe.room_tables import GeometryTable, MeshTable, PanoramaTable, generated_count
 from phibench.datasets.rooms.room_files import RoomError, RoomFiles
 from phibench.scenes.rig import Rig

@@ -76,6 +76,15 @@ class _Group:
     places: list[tuple[int, ...]] = field(default_factory=list)
 
 
+@dataclass(frozen=True)
+class _Vertices:
+    """Places of vertices and texture coordinates, and colours of the vertices, where all have one."""
+
+    points: Array
+    places: Array
+    colours: Array | None
+
+
 class _Reader:
     """State while the lines are read."""
 
@@ -176,13 +185,13 @@ def obj_parts(file: InputFile, companions: Companions) -> list[MeshPart]:
     colours = tints if len(tints) == len(points) else None
     if len(tints) and colours is None:
         raise file.fault(f"has {len(points)} vertices and colours of {len(tints)} of them: give all a colour, or none")
-    parts, cutting = [], Cutting()
+    parts, vertices, cutting = [], _Vertices(points, places, colours), Cutting()
     for (label, name), group in reader.groups.items():
         material = materials.get(name)
         if material is None and name and reader.libraries:
             raise file.fault(f"uses the material '{printable_line(name, 60)}', which none of its libraries has")
         title = "_".join(filter(None, (label, name))) or file.path.stem
-        parts.append(_part(file, companions, title, group, points, places, colours, material, cutting))
+        parts.append(_part(file, companions, title, group, vertices, material, cutting))
     return parts
 
 
@@ -204,12 +213,11 @@ def _part(
     companions: Companions,
     title: str,
     group: _Group,
-    points: Array,
-    places: Array,
-    colours: Array | None,
+    vertices: _Vertices,
     material: _Material | None,
     cutting: Cutting,
 ) -> MeshPart:
+    points, places, colours = vertices.points, vertices.places, vertices.colours
     corners, uv_corners = [], []
     for polygon, place in zip(group.corners, group.places, strict=True):
         if max(polygon) >= len(points) or max(place) >= len(places):

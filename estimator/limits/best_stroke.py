@@ -36,7 +36,7 @@ from phibench.estimator.limits.stroke_curve import (
     stroke_curve,
     stroke_grid,
 )
-from phibench.estimator.spots.spot_prediction import Laser, spot_blur
+from phibench.estimator.spots.spot_prediction import spot_blur
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import Rig
 
@@ -94,7 +94,6 @@ def best_stroke(
     stroke_sigma_m: float = 0.0,
     strokes_m: tuple[float, float] = STROKES_M,
     around: Surroundings | None = None,
-    laser: Laser | None = None,
     card: SensorCard | None = None,
     spot: SpotSigma | None = None,
 ) -> BestStroke:
@@ -114,9 +113,7 @@ def best_stroke(
     strokes_m : tuple of float
         Shortest and longest stroke.
     around : Surroundings
-        Heights and azimuths of the spots, room height, robot, distance from edges.
-    laser : Laser
-        Spot and its light.
+        Heights, azimuths and laser of the spots, room height, robot, distance from edges.
     card : SensorCard
         Sensor and exposure; preset "mjpeg" if not given.
     spot : SpotSigma
@@ -154,7 +151,6 @@ def best_stroke(
         spot=spot or spot_bound(rig, card),
         covariance_rig=covariance,
         around=around or Surroundings(),
-        laser=laser or Laser(),
         exposure_s=card.exposure_s,
         stroke_sigma_m=stroke_sigma_m,
     )

@@ -96,7 +96,6 @@ def processed_on_off_limit(
     background_e: ArrayLike,
     frames: FrameCounts,
     response: tuple[float, float, float] = LASER_RESPONSE,
-    pattern_known: bool = False,
     steps: bool = False,
 ) -> SpotLimit:
     """Bound of (u, v) behind the camera's processing; unknown are the flux and the room of each pixel.
@@ -104,9 +103,9 @@ def processed_on_off_limit(
     Parameters
     ----------
     card : SensorCard
-        Of the output "srgb8", "yuyv" or "mjpeg".
+        Of the output "srgb8", "yuyv" or "mjpeg"; with `prnu` 0 where the pattern is calibrated and taken out.
     frames : FrameCounts
-    uv_px, blur, flux_e, background_e, response, pattern_known
+    uv_px, blur, flux_e, background_e, response
         As for `processed_bound.chain_limit`; `background_e` says how bright the room is, a method does not know it.
     steps : bool
         Of "mjpeg": the steps hide each of the room's coefficients, as of a room with structure everywhere.
@@ -117,11 +116,10 @@ def processed_on_off_limit(
         If the output is none of the three.
     """
     theta = np.array([*np.asarray(uv_px, float), flux_e, *np.asarray(background_e, float)])
-    prnu = 0.0 if pattern_known else card.prnu
     if own_codes(card):
-        return _of_codes(card, theta, blur, response, frames, prnu)
+        return _of_codes(card, theta, blur, response, frames)
     if card.output in PROCESSED:
-        return _of_window(card, theta, blur, response, frames, prnu, steps)
+        return _of_window(card, theta, blur, response, frames, steps)
     raise ValueError(f"output '{card.output}': 'srgb8', 'yuyv' and 'mjpeg' are known; take on_off_limit for raw pixels")
 
 
@@ -131,7 +129,6 @@ def _of_codes(
     blur: SpotBlur,
     response: tuple[float, float, float],
     frames: FrameCounts,
-    prnu: float,
 ) -> SpotLimit:
     corner = np.floor(theta[:2]).astype(np.int64) - _REACH_PX
     filters = bayer_filters(corner[None], (2 * _REACH_PX + 2, 2 * _REACH_PX + 2))
@@ -139,7 +136,7 @@ def _of_codes(
     mean, derivatives = SpotPixels.of(filters, blur, SpotModel(response)).at(theta[None])
     law = code_law(np.zeros(filters.shape, np.uint8), filters, card, unrounded(card, True), code_table(card))
     spot = theta[2] * derivatives[:, 2]
-    J = without_room(law.information(mean), law.information(mean - spot), spot, frames, prnu)
+    J = without_room(law.information(mean), law.information(mean - spot), spot, frames, card.prnu)
     fisher = fisher_matrix(derivatives[0, :3], J[0])
     return SpotLimit(covariance_bound(fisher), fisher)
 
@@ -187,7 +184,6 @@ def _of_window(
     blur: SpotBlur,
     response: tuple[float, float, float],
     frames: FrameCounts,
-    prnu: float,
     steps: bool,
 ) -> SpotLimit:
     model = chain_model(card, unrounded(card, True))
@@ -201,7 +197,7 @@ def _of_window(
     output = quantised(on.mean, on.sigma, model.step)
     noise = (on.factor * output.slope).T @ (on.factor * output.slope)
     np.fill_diagonal(noise, output.variance)
-    extra_e2 = raw_variance_e2(model, mean_e - spot) / frames.off + (prnu * spot) ** 2
+    extra_e2 = raw_variance_e2(model, mean_e - spot) / frames.off + (card.prnu * spot) ** 2
     E = noise_factor(model, on.at, on.slope**2 * extra_e2, model.transform) * output.slope
     room = off.rest / frames.off + (_hidden(off, model.step, frames.off) if steps else 0.0)
     C = noise / frames.on + E.T @ E + np.diag(output.slope**2 * room)

@@ -61,7 +61,7 @@ TOO_BRIGHT, TOO_FAINT, NO_BOUND = (
 
 @dataclass(frozen=True)
 class Surroundings:
-    """Places of the spots, and what bounds the strokes besides the carriage.
+    """Places of the spots, their light, and what bounds the strokes besides the carriage.
 
     Parameters
     ----------
@@ -75,6 +75,8 @@ class Surroundings:
         The robot, its mast and the camera's housing may stand in the way.
     edge_px : float
         Least distance of a spot from the edge of the mirror and of the image: the blur's skirt and the fit's window.
+    laser : Laser
+        Spot and its light.
     """
 
     heights_m: tuple[float, ...] = (0.5,)
@@ -82,6 +84,7 @@ class Surroundings:
     room_height_m: float = 3.0
     robot: bool = True
     edge_px: float = 4.0
+    laser: Laser = Laser()
 
     def points_m(self, rig: Rig, depth_m: float) -> Array:
         """Places of the spots, shape (m, 3), about the vertical line through the sphere centre when down."""
@@ -142,14 +145,13 @@ def stroke_curve(
     spot: SpotSigma,
     covariance_rig: Array,
     around: Surroundings,
-    laser: Laser,
     exposure_s: float,
     stroke_sigma_m: float,
 ) -> StrokeCurve:
     """Predicted error of D for strokes, shape (n,); parameters as for `best_stroke.best_stroke`."""
     h, points = np.asarray(strokes_m, float), around.points_m(rig, depth_m)
     images = [_images(rig, points, offset) for offset in (np.zeros(1), h)]
-    electrons = [spot_electrons_per_s(rig, laser, image, around.wall_normals()) * exposure_s for image in images]
+    electrons = [spot_electrons_per_s(rig, around.laser, image, around.wall_normals()) * exposure_s for image in images]
     C_down, C_up = (_covariance(image, spot, light) for image, light in zip(images, electrons, strict=True))
     down, up = (image.uv_px for image in images)
     found = depth_general(rig, h[:, None], down, up, C_down, C_up, covariance_rig, np.asarray(stroke_sigma_m))

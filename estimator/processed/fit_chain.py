@@ -49,7 +49,6 @@ def fit_srgb(
     card: SensorCard,
     blur: SpotBlur,
     model: SpotModel | None = None,
-    pattern_known: bool = False,
     extra_e2: float = 0.0,
     background: Background | None = None,
     near_px: ArrayLike | None = None,
@@ -67,8 +66,6 @@ def fit_srgb(
     card : SensorCard
     blur, model
         As for `fit_law`.
-    pattern_known : bool
-        PRNU and DSNU were calibrated, or the background holds those of the room; otherwise they count as noise.
     extra_e2 : float
         Variance of the known background's error, electrons squared; frames share it.
     background : Background, optional
@@ -87,8 +84,8 @@ def fit_srgb(
         known, shape = None if model is None else model.background_e, (len(planes), *planes.shape[2:4])
         levels = np.zeros(shape) if known is None else np.broadcast_to(known, shape)
         background = background or Background(levels, np.full(levels.shape, extra_e2))
-        return _fit_windows(planes, origin, card, blur, model, background, pattern_known, near_px=near_px)
-    data = code_data(planes[:, 0], origin, card, blur, model, pattern_known, extra_e2)
+        return _fit_windows(planes, origin, card, blur, model, background, near_px=near_px)
+    data = code_data(planes[:, 0], origin, card, blur, model, extra_e2)
     return fit_law(data.regions, data.law, blur, model, near_px)
 
 
@@ -98,12 +95,11 @@ def code_data(
     card: SensorCard,
     blur: SpotBlur,
     model: SpotModel | None = None,
-    pattern_known: bool = False,
     extra_e2: float = 0.0,
 ) -> SpotData:
     """Likelihood of each pixel's own code, of one frame and for cards of `own_codes`; the rest as `fit_srgb`."""
     filters = bayer_filters(origin + card.mosaic_phase, planes.shape[1:3])
-    noise = unrounded(card, pattern_known)
+    noise = unrounded(card)
     noise = PixelNoise(noise.gaussian_e2 + extra_e2, noise.prnu)
     table = code_table(card)
     codes = np.take_along_axis(planes, filters[..., None], axis=3)[..., 0]
@@ -119,7 +115,6 @@ def fit_yuyv(
     blur: SpotBlur,
     model: SpotModel | None = None,
     background: Background | None = None,
-    pattern_known: bool = False,
     near_px: ArrayLike | None = None,
 ) -> SpotFit:
     """Fit one spot in each region of Y'CbCr 4:2:2 images, to their codes.
@@ -130,7 +125,7 @@ def fit_yuyv(
         13 x 13 pixels or more.
     origin_px : shape (2,) or (n, 2)
         Image pixel (u, v) of the first column and row; it may be odd.
-    card, blur, model, background, pattern_known, near_px
+    card, blur, model, background, near_px
         As for `fit_jpeg`.
 
     Raises
@@ -140,7 +135,7 @@ def fit_yuyv(
     """
     planes = _checked(images, card, 2)
     origin = np.broadcast_to(np.asarray(origin_px, np.int64), (len(planes), 2))
-    return _fit_windows(planes, origin, card, blur, model, background, pattern_known, near_px=near_px)
+    return _fit_windows(planes, origin, card, blur, model, background, near_px=near_px)
 
 
 def fit_jpeg(
@@ -150,7 +145,6 @@ def fit_jpeg(
     blur: SpotBlur,
     model: SpotModel | None = None,
     background: Background | None = None,
-    pattern_known: bool = False,
     size_px: tuple[int, int] = (1280, 720),
     near_px: ArrayLike | None = None,
 ) -> SpotFit:
@@ -168,8 +162,6 @@ def fit_jpeg(
         As for `fit_law`; the model's background is not looked at, `background` is.
     background : Background, optional
         Room behind the spot; flat if it is not given. Levels per filter are fitted on top of it.
-    pattern_known : bool
-        PRNU and DSNU were calibrated; otherwise they count as noise.
     size_px : (width, height) of the image
     near_px
         As for `fit_law`.
@@ -187,7 +179,7 @@ def fit_jpeg(
     planes = _checked(images, card)
     origin = np.broadcast_to(np.asarray(origin_px, np.int64), (len(planes), 2))
     _on_grid(origin, planes.shape[2:4], card)
-    return _fit_windows(planes, origin, card, blur, model, background, pattern_known, size_px, near_px)
+    return _fit_windows(planes, origin, card, blur, model, background, size_px, near_px)
 
 
 def own_codes(card: SensorCard) -> bool:
@@ -203,7 +195,6 @@ def _fit_windows(
     blur: SpotBlur,
     model: SpotModel | None,
     background: Background | None,
-    pattern_known: bool,
     size_px: tuple[int, int] = (0, 0),
     near_px: ArrayLike | None = None,
 ) -> SpotFit:
@@ -211,13 +202,13 @@ def _fit_windows(
     n, model = len(planes), model or SpotModel()
     if n == 0:
         return _collected([], origin, np.zeros(0), model.free_width)
-    chain, blurs = _chain(card, background, pattern_known), blur.each(n)
+    chain, blurs = _chain(card, background), blur.each(n)
     widths = np.asarray(blurs.sigma_px)
     first = first_fit(planes, origin, card, SpotBlur(widths), model.response, background, near_px)
     rows = []
     for i in range(n):
         start = first[i] if not model.free_width else np.append(first[i], widths[i])
-        region, corner = _region(planes[i], origin[i], card, background, i, size_px, pattern_known)
+        region, corner = _region(planes[i], origin[i], card, background, i, size_px)
         start[:2] -= corner
         fit, off = fit_region(region, chain, start[None], blurs.rows(np.array([i])), model)
         fit.theta[:2] += corner
@@ -225,10 +216,9 @@ def _fit_windows(
     return _collected(rows, origin, widths, model.free_width)
 
 
-def _chain(card: SensorCard, background: Background | None, pattern_known: bool) -> ChainModel:
+def _chain(card: SensorCard, background: Background | None) -> ChainModel:
     """Model of the processing; the room's pattern is the background's, where that holds it."""
-    held = background is not None and background.holds_pattern
-    return chain_model(card, unrounded(card, pattern_known or held))
+    return chain_model(card, unrounded(card, background is not None and background.holds_pattern))
 
 
 def _region(
@@ -238,14 +228,13 @@ def _region(
     background: Background | None,
     index: int,
     size_px: tuple[int, int],
-    pattern_known: bool = False,
 ) -> tuple[JpegRegion, Array]:
     """Region of one image's frames, and its first row and column (u, v): the window's grid begins there."""
     (u0, v0), (h, w), zero = origin, frames.shape[1:3], np.zeros(frames.shape[1:3])
     ends = (bool(v0 == 0), bool(v0 + h == size_px[1]), bool(u0 == 0), bool(u0 + w == size_px[0]))
     known = (zero, zero) if background is None else (background.mean_e[index], background.variance_e2[index])
     room = None if background is None or background.image is None else _frames_of(background.image)[index]
-    prnu = card.prnu if background is not None and background.holds_pattern and not pattern_known else 0.0
+    prnu = card.prnu if background is not None and background.holds_pattern else 0.0
     u1, v1 = origin % np.array(grid_px(card)[::-1])
     behind = (known[0][v1:, u1:], known[1][v1:, u1:])
     return JpegRegion(frames[:, v1:, u1:], ends, *behind, room, prnu), np.array([u1, v1])
@@ -270,7 +259,7 @@ def spot_window(
     one = blur.each(1)
     lens = SpotBlur(np.asarray(one.sigma_px))
     start = first_fit(planes, origin, card, lens, model.response, background, uv_px)[0]
-    chain = _chain(card, background, False)
+    chain = _chain(card, background)
     window, first = region_window(region, chain, uv_px - origin[0] - corner, one, model)
     place = first + corner + origin[0]
     start[:2] = uv_px - place

@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
+from phibench.calibration.rig.sphere_options import SphereOptions
 from phibench.cli.options import DEFAULT_PRESET, Preset
+
+if TYPE_CHECKING:
+    from phibench.calibration.rig.from_dataset import CalibrationSources
+    from phibench.calibration.rig.spots import Ruler
 
 _LAB = (
     "sigma of the outline: checked in the room `lab`; in a room with more lamps or edges widen it with "
@@ -16,33 +22,13 @@ _LAB = (
 )
 
 
-def calibrate(
-    directory: Path,
-    *,
-    out: Path,
-    sample: Annotated[tuple[str, ...], Parameter(consume_multiple=True, negative="")] = (),
-    preset: Preset = DEFAULT_PRESET,
-    spots: bool = False,
-    vertical: Annotated[bool, Parameter(negative="")] = False,
-    distance_sigma_m: float = 1e-3,
-    height_sigma_m: float = math.inf,
-    azimuth_sigma_deg: float = math.inf,
-    outline_sigma_factor: float = 1.0,
-    focal_sigma: float | None = None,
-    picture: Path | None = None,
-) -> int:
-    """Calibrate a rig from the images of a data set; write a calibration file and a picture.
+@Parameter(name="*")
+@dataclass(frozen=True)
+class SourceOptions:
+    """Sources of a calibration, and how well its rig is known.
 
     Parameters
     ----------
-    directory
-        Folder of a data set.
-    out
-        JSON file to write.
-    sample
-        Samples: numbers, counted from 0, or ids; the first one by default.
-    preset
-        Preset of the frames to draw: "mjpeg", "srgb8", "bayer-raw" or "mono-raw"; "layers" is noise-free.
     spots
         Also use the laser spots at their known distances.
     vertical
@@ -59,6 +45,64 @@ def calibrate(
     focal_sigma
         How well the nominal focal length is known, relative: 0.003 by default. Give 0.018 for a lens that was turned
         since it was measured.
+    """
+
+    spots: bool = False
+    vertical: Annotated[bool, Parameter(negative="")] = False
+    distance_sigma_m: float = 1e-3
+    height_sigma_m: float = math.inf
+    azimuth_sigma_deg: float = math.inf
+    outline_sigma_factor: float = 1.0
+    focal_sigma: float | None = None
+
+    @property
+    def sources(self) -> CalibrationSources:
+        """The same for the calibration."""
+        from phibench.calibration.rig.from_dataset import CalibrationSources
+
+        return CalibrationSources(self.spots, self.vertical, self.outline_sigma_factor, self.focal_sigma)
+
+    @property
+    def ruler(self) -> Ruler:
+        """Precision of the spots' places.
+
+        Raises
+        ------
+        DatasetError
+            If it is given without spots, or is out of its range.
+        """
+        from phibench.calibration.rig.spots import Ruler
+        from phibench.datasets.common.errors import DatasetError
+
+        if not self.spots and (math.isfinite(self.height_sigma_m) or math.isfinite(self.azimuth_sigma_deg)):
+            raise DatasetError("--height-sigma-m and --azimuth-sigma-deg are about calibration spots: give --spots too")
+        return Ruler(self.distance_sigma_m, self.height_sigma_m, math.radians(self.azimuth_sigma_deg))
+
+
+_OUTLINES = SourceOptions()
+
+
+def calibrate(
+    directory: Path,
+    *,
+    out: Path,
+    sample: Annotated[tuple[str, ...], Parameter(consume_multiple=True, negative="")] = (),
+    preset: Preset = DEFAULT_PRESET,
+    given: SourceOptions = _OUTLINES,
+    picture: Path | None = None,
+) -> int:
+    """Calibrate a rig from the images of a data set; write a calibration file and a picture.
+
+    Parameters
+    ----------
+    directory
+        Folder of a data set.
+    out
+        JSON file to write.
+    sample
+        Samples: numbers, counted from 0, or ids; the first one by default.
+    preset
+        Preset of the frames to draw: "mjpeg", "srgb8", "bayer-raw" or "mono-raw"; "layers" is noise-free.
     picture
         PNG to write: the outline on the frame, with its residuals enlarged; by default beside the calibration.
     """
@@ -71,9 +115,7 @@ def calibrate(
     from phibench.estimator.geometry.rig_parameters import PARAMETERS, has_effect
     from phibench.scenes.misalignment import PARAMETERS as MISALIGNMENT
 
-    if not spots and (math.isfinite(height_sigma_m) or math.isfinite(azimuth_sigma_deg)):
-        raise DatasetError("--height-sigma-m and --azimuth-sigma-deg are about calibration spots: give --spots too")
-    ruler = Ruler(distance_sigma_m, height_sigma_m, math.radians(azimuth_sigma_deg))
+    sources, ruler = given.sources, given.ruler
     require_writable(out)  # a folder such as "." has no name to which an ending could be given
     picture = out.with_suffix(".png") if picture is None else picture
     if is_imported(directory):
@@ -82,10 +124,9 @@ def calibrate(
                 f"{directory} holds pictures: their kind and the tape's standard deviation were imported with them; "
                 "leave --preset and the sigmas out"
             )
-        found = calibrate_imported(directory, out, sample, spots, outline_sigma_factor, vertical, focal_sigma)
+        found = calibrate_imported(directory, out, sample, sources)
     else:
-        more = vertical, outline_sigma_factor, focal_sigma
-        found = calibrate_dataset(directory, out, sample, preset, spots, ruler, *more)
+        found = calibrate_dataset(directory, out, sample, preset, sources, ruler)
     print(f"{found.verdict}.")
     print(f"{found.write_picture(picture)}: the outline on the frame that fits worst, residuals enlarged")
     print(_LAB)
@@ -103,21 +144,45 @@ def calibrate(
     return 0
 
 
+@Parameter(name="*")
+@dataclass(frozen=True)
+class Doubts:
+    """Standard deviations of what is known of the rig.
+
+    Parameters
+    ----------
+    tilt_sigma_deg
+        How well the camera is known to be vertical.
+    principal_point_sigma_px
+        How well the principal point is known.
+    mirror_tilt_sigma_deg
+        How well the axis of a mirror that is no sphere is known to be upright.
+    outline_sigma_factor
+        As in `phibench calibrate`.
+    """
+
+    tilt_sigma_deg: float = 0.1
+    principal_point_sigma_px: float = 5.0
+    mirror_tilt_sigma_deg: float = 0.5
+    outline_sigma_factor: float = 1.0
+
+    @property
+    def numbers(self) -> tuple[float, float, float, float]:
+        """The same for `alignment`, in its order and units."""
+        tilt, mirror_tilt = math.radians(self.tilt_sigma_deg), math.radians(self.mirror_tilt_sigma_deg)
+        return tilt, self.principal_point_sigma_px, self.outline_sigma_factor, mirror_tilt
+
+
+_DEFAULT_RIG, _BY_HAND = SphereOptions(), Doubts()
+
+
 def align(
     image: Path,
     *,
     out: Path | None = None,
     rig: Path | None = None,
-    radius_mm: float | None = None,
-    distance_mm: float | None = None,
-    focal_px: float | None = None,
-    cx_px: float | None = None,
-    cy_px: float | None = None,
-    focus_mm: float | None = None,
-    tilt_sigma_deg: float = 0.1,
-    principal_point_sigma_px: float = 5.0,
-    mirror_tilt_sigma_deg: float = 0.5,
-    outline_sigma_factor: float = 1.0,
+    stated: Annotated[SphereOptions, Parameter(name="*")] = _DEFAULT_RIG,
+    doubts: Doubts = _BY_HAND,
     sensor: Path | None = None,
     vertical: bool = True,
 ) -> int:
@@ -138,27 +203,6 @@ def align(
         the current folder.
     rig
         TOML file with what is known of the rig, as for `phibench measure`; instead of the numbers of camera and mirror.
-    radius_mm
-        Radius of the mirror, a sphere; 60 by default.
-    distance_mm
-        Of the mirror's centre from the lens, roughly. For a frame of 1280 x 720 it is 260 by default; otherwise the
-        outline tells it.
-    focal_px
-        Focal length, pixels. For a whole frame of the C310, 1280 x 720, it is 1430 by default.
-    cx_px
-        Principal point, column, pixels. Left out only for a whole frame of the C310; otherwise it goes with --focal-px.
-    cy_px
-        Principal point, row, pixels. Left out only for a whole frame of the C310; otherwise it goes with --focal-px.
-    focus_mm
-        Distance of the plane of focus; by default on the virtual image, half a radius before the mirror's centre.
-    tilt_sigma_deg
-        How well the camera is known to be vertical.
-    principal_point_sigma_px
-        How well the principal point is known.
-    mirror_tilt_sigma_deg
-        How well the axis of a mirror that is no sphere is known to be upright.
-    outline_sigma_factor
-        As in `phibench calibrate`.
     sensor
         TOML file of the sensor; by default the preset of the kind of file is assumed.
     vertical
@@ -168,7 +212,6 @@ def align(
     from phibench.calibration.captures.rig_file import read_rig_file, require_camera_size
     from phibench.calibration.outline.outline_start import rig_circle
     from phibench.calibration.rig.align import (
-        SphereOptions,
         alignment,
         camera_in_words,
         circle_in_words,
@@ -186,9 +229,8 @@ def align(
     from phibench.datasets.common.errors import DatasetError
     from phibench.datasets.frames.sensor_file import read_sensor_file
 
-    numbers = SphereOptions(radius_mm, distance_mm, focal_px, cx_px, cy_px, focus_mm)
-    numbers.require_sound()
-    given = numbers.given()
+    stated.require_sound()
+    given = stated.given()
     if rig is not None and given:
         raise DatasetError(f"{next(iter(given))}: {rig} says what the rig is; write it there, and leave the option out")
     known = None if rig is None else read_rig_file(rig).rig
@@ -196,7 +238,7 @@ def align(
     pixels, card = photo.pixels, sensor_choice(photo, None if sensor is None else read_sensor_file(sensor)).card
     out = Path(f"{image.stem}-align.png") if out is None else out
     if known is None:
-        known = rig_of_numbers(pixels, card, numbers)
+        known = rig_of_numbers(pixels, card, stated)
     else:
         require_camera_size(known, (pixels.shape[1], pixels.shape[0]), str(image))
     if known is None:
@@ -208,8 +250,7 @@ def align(
             print(edges_in_words(meeting, float(circle.sigma_px[:2].max())))
         print(sharpness_in_words(sharpness(pixels, card, circle.circle_px)))
         return 0
-    doubts = math.radians(tilt_sigma_deg), principal_point_sigma_px, outline_sigma_factor
-    found = alignment(pixels, known, card, *doubts, math.radians(mirror_tilt_sigma_deg), vertical)
+    found = alignment(pixels, known, card, *doubts.numbers, vertical)
     print(verdict(found))
     print(f"{write_alignment_picture(out, pixels, known, found)}: outline, and the move drawn 20 times as long")
     print(in_words(found))

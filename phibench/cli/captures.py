@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -16,28 +17,13 @@ Pictures = Annotated[tuple[Path, ...], Parameter(consume_multiple=True, negative
 Metres = Annotated[float, Parameter(converter=number)]
 
 
-def measure(
-    directory: Path | None = None,
-    *,
-    rig: Path,
-    down: Pictures = (),
-    up: Pictures = (),
-    stroke_m: Metres | None = None,
-    down_off: Pictures = (),
-    up_off: Pictures = (),
-    stroke_sigma_m: Metres = 0.0,
-    calibration: Path | None = None,
-    sensor: Path | None = None,
-    out: Path | None = None,
-) -> int:
-    """Measure D from two pictures of a laser spot in the mirror, down and up; or from a folder of such pairs.
+@Parameter(name="*")
+@dataclass(frozen=True)
+class PairPictures:
+    """Pictures of one pair, and its stroke.
 
     Parameters
     ----------
-    directory
-        Folder with pictures and `pairs.csv`, instead of --down, --up and --stroke-m.
-    rig
-        TOML file with what is known of the rig: `[rig]` of a recipe. docs/measure.md has an example.
     down
         Picture at stroke position 1, laser on: JPEG, PNG, PGM or headerless .raw. Several frames may be given.
     up
@@ -50,6 +36,36 @@ def measure(
         The same at stroke position 2.
     stroke_sigma_m
         How well this stroke is known besides what is common to all strokes, one standard deviation.
+    """
+
+    down: Pictures = ()
+    up: Pictures = ()
+    stroke_m: Metres | None = None
+    down_off: Pictures = ()
+    up_off: Pictures = ()
+    stroke_sigma_m: Metres = 0.0
+
+
+_FOLDER = PairPictures()
+
+
+def measure(
+    directory: Path | None = None,
+    *,
+    rig: Path,
+    pair: PairPictures = _FOLDER,
+    calibration: Path | None = None,
+    sensor: Path | None = None,
+    out: Path | None = None,
+) -> int:
+    """Measure D from two pictures of a laser spot in the mirror, down and up; or from a folder of such pairs.
+
+    Parameters
+    ----------
+    directory
+        Folder with pictures and `pairs.csv`, instead of --down, --up and --stroke-m.
+    rig
+        TOML file with what is known of the rig: `[rig]` of a recipe. docs/measure.md has an example.
     calibration
         File of `phibench calibrate`, made with the same rig file.
     sensor
@@ -61,25 +77,27 @@ def measure(
     from phibench.datasets.common.errors import DatasetError
     from phibench.datasets.store.files import require_writable
 
-    if (directory is None) != bool(down and up and stroke_m is not None) or (directory and (down or up or stroke_m)):
+    whole = bool(pair.down and pair.up and pair.stroke_m is not None)
+    if (directory is None) != whole or (directory and (pair.down or pair.up or pair.stroke_m)):
         raise DatasetError("give --down, --up and --stroke-m, or a folder with pairs.csv instead of them")
     if out is not None:
         require_writable(out)
-    setting = read_setting(rig, calibration, sensor, stroke_sigma_m)
+    setting = read_setting(rig, calibration, sensor, pair.stroke_sigma_m)
     if directory is not None:
         return _measure_folder(directory, setting, out)
-    return _measure_pair((down, up, down_off, up_off), stroke_m or 0.0, setting, out)
+    return _measure_pair(pair, setting, out)
 
 
-def _measure_pair(files: tuple[Pictures, ...], stroke_m: float, setting: KnownNumbers, out: Path | None) -> int:
+def _measure_pair(pair: PairPictures, setting: KnownNumbers, out: Path | None) -> int:
     from phibench.calibration.captures.measure import measure as measured
     from phibench.calibration.captures.measure_picture import write_measure_picture
     from phibench.calibration.captures.pair_photos import PairPhotos, PositionPhotos
     from phibench.calibration.captures.picture_files import read_photo
 
+    files = (pair.down, pair.up, pair.down_off, pair.up_off)
     groups = [tuple(read_photo(path, setting.known.rig, setting.sensor) for path in paths) for paths in files]
     photos = PairPhotos(PositionPhotos(groups[0], groups[2]), PositionPhotos(groups[1], groups[3]))
-    found = measured(photos, stroke_m, setting)
+    found = measured(photos, pair.stroke_m or 0.0, setting)
     print(f"D = {found.depth_m:.4f} m, sigma {found.sigma_m:.4f} m")
     spot_m, rig_m = float(found.depth.sigma_spot_m), float(found.depth.sigma_calibration_m)
     print(f"of which the spots {spot_m:.4f} m, the rig {rig_m:.4f} m, this stroke {found.depth.sigma_stroke_m:.4f} m")

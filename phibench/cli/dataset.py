@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -20,38 +22,46 @@ if TYPE_CHECKING:
 dataset = App(name="dataset", group=START, help="Make, check and show data sets; draw frames and panoramas.")
 
 
-@dataset.command
-def make(
-    recipe: Annotated[str, Parameter(completer=recipes(films=False))],
-    *,
-    out: Path,
-    workers: Whole | None = None,
-    scheduler: str | None = None,
-    wait_for_workers: Whole | None = None,
-    shard: str | None = None,
-    samples: Whole | None = None,
-    seed: Whole | None = None,
-    secret_seed: Path | None = None,
-    replace: Annotated[bool, Parameter(negative="")] = False,
-    room_files: Path | None = None,
-    leave_out_refused: Annotated[bool, Parameter(negative="")] = False,
-    dry_run: bool = False,
-    variant: Variant = None,
-) -> int:
-    """Render a data set; what is finished already is kept. Sensitivities of D come last, sensitivities.parquet.
+@Parameter(name="*")
+@dataclass(frozen=True)
+class ProcessOptions:
+    """Processes that render.
 
     Parameters
     ----------
-    recipe
-        TOML file, or the name of a shipped recipe ("paper", "paper-misaligned", "random", "smoke", ...).
-    out
-        Folder to write; one with finished work that would be lost is refused, and one with more samples keeps them.
     workers
         Number of processes; one for each core by default.
     scheduler
         Address or scheduler file of a running dask scheduler, to use its workers instead.
     wait_for_workers
         With --scheduler: wait so many seconds at most until its file is there and a worker has come.
+    """
+
+    workers: Whole | None = None
+    scheduler: str | None = None
+    wait_for_workers: Whole | None = None
+
+    def wait(self) -> None:
+        """Wait for a scheduler's workers.
+
+        Raises
+        ------
+        DatasetError
+            If none comes in time.
+        """
+        if self.wait_for_workers is not None and self.scheduler is not None:
+            from phibench.datasets.build.workers import wait_for_workers as wait
+
+            wait(self.scheduler, self.wait_for_workers)
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class RecipeOptions:
+    """Part of a recipe that is made.
+
+    Parameters
+    ----------
     shard
         Part of the recipe for job arrays, such as 1/8; put the parts together with `merge`.
     samples
@@ -66,29 +76,62 @@ def make(
         Folder of the panoramas and meshes that the recipe names; the recipe's own by default.
     leave_out_refused
         Finish the data set without the samples that are refused; dataset.json lists them with their causes.
+    """
+
+    shard: str | None = None
+    samples: Whole | None = None
+    seed: Whole | None = None
+    secret_seed: Path | None = None
+    replace: Annotated[bool, Parameter(negative="")] = False
+    room_files: Path | None = None
+    leave_out_refused: Annotated[bool, Parameter(negative="")] = False
+
+    def keywords(self, *, make_seed: bool) -> Any:
+        """Keywords of `make`; the seed of a file, which is made if it is not there and may be."""
+        given = dict(vars(self))
+        if (secret := given.pop("secret_seed")) is not None:
+            given["seed"] = _secret(secret, self.seed, make_seed)
+        return given
+
+
+_PROCESSES, _WHOLE_RECIPE = ProcessOptions(), RecipeOptions()
+
+
+@dataset.command
+def make(
+    recipe: Annotated[str, Parameter(completer=recipes(films=False))],
+    *,
+    out: Path,
+    processes: ProcessOptions = _PROCESSES,
+    wanted: RecipeOptions = _WHOLE_RECIPE,
+    dry_run: bool = False,
+    variant: Variant = None,
+) -> int:
+    """Render a data set; what is finished already is kept. Sensitivities of D come last, sensitivities.parquet.
+
+    Parameters
+    ----------
+    recipe
+        TOML file, or the name of a shipped recipe ("paper", "paper-misaligned", "random", "smoke", ...).
+    out
+        Folder to write; one with finished work that would be lost is refused, and one with more samples keeps them.
     dry_run
         Say what will be seen, where and why not, how many tasks, bytes and seconds it takes; render nothing.
     """
-    given: Any = {"shard": shard, "samples": samples, "seed": seed, "replace": replace, "room_files": room_files}
-    given["leave_out_refused"] = leave_out_refused
-    if secret_seed is not None:
-        given["seed"] = _secret(secret_seed, seed, make_it=not dry_run)
-    if wait_for_workers is not None and scheduler is None:
+    given = wanted.keywords(make_seed=not dry_run)
+    if processes.wait_for_workers is not None and processes.scheduler is None:
         from phibench.datasets.common.errors import DatasetError
 
         raise DatasetError("--wait-for-workers is about workers of a scheduler: give --scheduler too")
     if dry_run:
         from phibench.datasets.make import dry_run as dry_run_text
 
-        print(dry_run_text(recipe, out, workers, **given))
+        print(dry_run_text(recipe, out, processes.workers, **given))
         return 0
     from phibench.studies.paper.sensitivity_table import make as make_dataset
 
-    if wait_for_workers is not None and scheduler is not None:
-        from phibench.datasets.build.workers import wait_for_workers as wait
-
-        wait(scheduler, wait_for_workers)
-    make_dataset(recipe, out, workers, scheduler=scheduler, **given)
+    processes.wait()
+    make_dataset(recipe, out, processes.workers, scheduler=processes.scheduler, **given)
     return 0
 
 
@@ -250,20 +293,57 @@ def show(
     return 0
 
 
+@Parameter(name="*")
+@dataclass(frozen=True)
+class DrawOptions:
+    """Frames that are drawn, and how they are taken.
+
+    Parameters
+    ----------
+    draws
+        Draws of the noise of every image.
+    sample
+        Samples: numbers, counted from 0, or ids; all by default.
+    exposure
+        Seconds, "auto", or "preset" for the preset's time; by default that of the recipe's [frames], else "auto".
+    region
+        Side in pixels of a square around the spot, instead of the whole image.
+    camera_seed
+        Names the camera whose fixed pattern the frames share; by default the recipe's cameras.
+    workers
+        Number of processes; one for each core by default.
+    """
+
+    draws: Whole = 1
+    sample: Annotated[tuple[str, ...], Parameter(consume_multiple=True, negative="")] = ()
+    exposure: str | None = None
+    region: Whole | None = None
+    camera_seed: Whole | None = None
+    workers: Whole | None = None
+
+    def options(self, preset: str, numbers: Mapping[str, Any]) -> FrameOptions:
+        """Options of frames; what is not given is the recipe's."""
+        from phibench.datasets.frames.request import FrameOptions, exposure_of
+
+        asked: dict[str, Any] = {"region": self.region, "camera_seed": self.camera_seed}
+        given = {key: value for key, value in asked.items() if value is not None}
+        if self.exposure is not None:
+            given["exposure"] = exposure_of(self.exposure)
+        return FrameOptions(preset, {**numbers, **given})
+
+
+_ALL_ONCE = DrawOptions()
+
+
 @dataset.command
 def frames(
     directory: Path,
     *,
     preset: OwnOrPreset = None,
     sensor: Path | None = None,
-    draws: Whole = 1,
     out: Path | None = None,
-    sample: Annotated[tuple[str, ...], Parameter(consume_multiple=True, negative="")] = (),
     laser_off: bool = False,
-    exposure: str | None = None,
-    region: Whole | None = None,
-    camera_seed: Whole | None = None,
-    workers: Whole | None = None,
+    drawing: DrawOptions = _ALL_ONCE,
 ) -> int:
     """Draw camera frames with noise, as PNG, JPEG or EXR files with an index; what is there already is kept.
 
@@ -277,48 +357,49 @@ def frames(
         --region). By default that of --sensor, or "mjpeg".
     sensor
         Sensor file of `phibench sensor fit`: its numbers stand for the preset's.
-    draws
-        Draws of every image.
     out
         Folder to write; by default beside the data set, with "-frames" added to its name.
-    sample
-        Samples: numbers, counted from 0, or ids; all by default.
     laser_off
         Also every image without the spot.
-    exposure
-        Seconds, "auto", or "preset" for the preset's time; by default that of the recipe's [frames], else "auto".
-    region
-        Side in pixels of a square around the spot, instead of the whole image.
-    camera_seed
-        Names the camera whose fixed pattern the frames share; by default the recipe's cameras.
-    workers
-        Number of processes; one for each core by default.
     """
     from phibench.datasets.exposures.draw import draw_frames
     from phibench.datasets.frames.sensor_file import read_sensor_file
 
     file = None if sensor is None else read_sensor_file(sensor)
     preset = preset or (DEFAULT_PRESET if file is None else file.preset)
-    numbers = {} if file is None else dict(file.numbers)
-    options = _options(preset, exposure, region, camera_seed, numbers)
-    done = draw_frames(directory, options, draws, out=out, samples=sample or None, laser_off=laser_off, workers=workers)
+    options = drawing.options(preset, {} if file is None else file.numbers)
+    given: Any = {"samples": drawing.sample or None, "laser_off": laser_off, "workers": drawing.workers}
+    done = draw_frames(directory, options, drawing.draws, out=out, **given)
     for note in done.notes:
         print(f"note: {note}")
     print(f"{done.folder}: {done.made} files written, {done.kept} kept, index frames.jsonl and frames.parquet")
     return 0
 
 
-def _options(
-    preset: str, exposure: str | None, region: int | None, camera_seed: int | None, numbers: dict[str, Any]
-) -> FrameOptions:
-    """Options of frames from a command's; what is not given is the recipe's."""
-    from phibench.datasets.frames.request import FrameOptions, exposure_of
+@Parameter(name="*")
+@dataclass(frozen=True)
+class SplitOptions:
+    """Parts of an export.
 
-    asked: dict[str, Any] = {"region": region, "camera_seed": camera_seed}
-    given = {key: value for key, value in asked.items() if value is not None}
-    if exposure is not None:
-        given["exposure"] = exposure_of(exposure)
-    return FrameOptions(preset, {**numbers, **given})
+    Parameters
+    ----------
+    split_by
+        What no two splits share: "both" rig and room, or one of them.
+    validation
+        Share of the pairs, at most; a set of one rig or room is all for training.
+    test
+        Share of the pairs, at most; the rest is for training.
+    pairs_per_shard
+        Pairs in one file of Parquet or tar, or in one folder of image files.
+    """
+
+    split_by: Literal["both", "rig", "room"] = "both"
+    validation: float = 0.1
+    test: float = 0.1
+    pairs_per_shard: Whole = 64
+
+
+_TENTHS = SplitOptions()
 
 
 def export(
@@ -327,21 +408,14 @@ def export(
     to: Literal["parquet", "webdataset", "frames"],
     out: Path,
     preset: Preset = DEFAULT_PRESET,
-    draws: Whole = 1,
-    sample: Annotated[tuple[str, ...], Parameter(consume_multiple=True, negative="")] = (),
     laser_off: bool | None = None,
-    exposure: str | None = None,
-    region: Whole | None = None,
-    camera_seed: Whole | None = None,
-    split_by: Literal["both", "rig", "room"] = "both",
-    validation: float = 0.1,
-    test: float = 0.1,
-    pairs_per_shard: Whole = 64,
-    workers: Whole | None = None,
+    drawing: DrawOptions = _ALL_ONCE,
+    splits: SplitOptions = _TENTHS,
 ) -> int:
     """Write a data set's pairs for other tools, with truth, splits, card, licence and Croissant description.
 
-    What is finished already is kept. `phibench dataset verify` checks an export, too.
+    What is finished already is kept. `phibench dataset verify` checks an export, too. Files with an exposure, a region
+    or a camera of their own are not for `score`.
 
     Parameters
     ----------
@@ -353,39 +427,19 @@ def export(
         Folder to write.
     preset
         Where the camera's chain ends: "mono-raw", "bayer-raw", "srgb8", "yuyv" or "mjpeg" (the camera's own JPEG).
-    draws
-        Draws of the noise of every pair.
-    sample
-        Samples: numbers, counted from 0, or ids; all by default.
     laser_off
         Also every image without the spot; by default for "frames" whose recipe has them.
-    exposure
-        As in `phibench dataset frames`. Files with an exposure, a region or a camera of their own are not for `score`.
-    region
-        Side in pixels of a square around the spot, instead of the whole image.
-    camera_seed
-        Names the camera whose fixed pattern the frames share; by default the recipe's cameras.
-    split_by
-        What no two splits share: "both" rig and room, or one of them.
-    validation
-        Share of the pairs, at most; a set of one rig or room is all for training.
-    test
-        Share of the pairs, at most; the rest is for training.
-    pairs_per_shard
-        Pairs in one file of Parquet or tar, or in one folder of image files.
-    workers
-        Number of processes; one for each core by default.
     """
     from phibench.benchmark.export.export_make import export as export_pairs
     from phibench.benchmark.export.export_make import scored_with_laser_off
     from phibench.benchmark.export.pair_rows import ExportRequest
 
-    options = _options(preset, exposure, region, camera_seed, {})
+    options = drawing.options(preset, {})
     scored = to == "frames" and not options.given
-    shares = (split_by, validation, test, pairs_per_shard)
+    shares = (splits.split_by, splits.validation, splits.test, splits.pairs_per_shard)
     off = scored_with_laser_off(directory) if laser_off is None and scored else bool(laser_off)
-    request = ExportRequest(to, options, draws, off, *shares, samples=sample, scored=scored)
-    done = export_pairs(directory, request, out, workers=workers)
+    request = ExportRequest(to, options, drawing.draws, off, *shares, samples=drawing.sample, scored=scored)
+    done = export_pairs(directory, request, out, workers=drawing.workers)
     for note in done.notes:
         print(f"note: {note}")
     counts = ", ".join(f"{count} {name}" for name, count in done.pairs.items())
@@ -472,18 +526,48 @@ def fetch(
     return 0
 
 
+@Parameter(name="*")
+@dataclass(frozen=True)
+class ViewOptions:
+    """A view of a data set, and the picture of it.
+
+    Parameters
+    ----------
+    sample
+        Sample: its number, counted from 0, or its id; the first one by default.
+    position
+        Which of its two views.
+    preset
+        "layers" (noise-free), or the preset of a frame to draw: "mjpeg" or "srgb8".
+    image
+        PNG or JPEG to unroll in place of the sample's frame, taken with the same rig.
+    """
+
+    sample: str | None = None
+    position: Literal["down", "up"] = "down"
+    preset: Annotated[str, Parameter(completer=pictures)] = DEFAULT_PRESET
+    image: Path | None = None
+
+    def picture(self, sample: Sample) -> NDArray[Any]:
+        """Picture to unroll: a file's, or a frame of the sample."""
+        from phibench.calibration.captures.picture_files import read_picture
+        from phibench.estimator.geometry.panorama import frame
+
+        return frame(sample, self.position, self.preset) if self.image is None else read_picture(self.image).pixels
+
+
+_FIRST_VIEW = ViewOptions()
+
+
 @dataset.command
 def panorama(
     directory: Path,
     *,
     out: Path,
-    sample: str | None = None,
-    position: Literal["down", "up"] = "down",
+    view: ViewOptions = _FIRST_VIEW,
     by: Literal["model", "truth"] = "model",
     width: Whole = 1440,
     elevation_deg: tuple[float, float] = (-60.0, 30.0),
-    preset: Annotated[str, Parameter(completer=pictures)] = DEFAULT_PRESET,
-    image: Path | None = None,
     distance_m: float | None = None,
 ) -> int:
     """Unroll a view of a data set: columns are azimuths, rows elevations of the rays that leave the mirror.
@@ -497,20 +581,12 @@ def panorama(
         Folder of a data set.
     out
         PNG file to write.
-    sample
-        Sample: its number, counted from 0, or its id; the first one by default.
-    position
-        Which of its two views.
     by
         "model": closed form with the nominal rig. "truth": the truth layer of the true rig, no model of the mirror.
     width
         Columns for 360 degrees; rows are as far apart as columns are at the horizon.
     elevation_deg
         Lower and upper edge, degrees above the horizon.
-    preset
-        "layers" (noise-free), or the preset of a frame to draw: "mjpeg" or "srgb8".
-    image
-        PNG or JPEG to unroll in place of the sample's frame, taken with the same rig.
     distance_m
         Of the scene from the mirror's centre; by default far away.
     """
@@ -522,14 +598,14 @@ def panorama(
 
     grid = PanoramaGrid(width, *(math.radians(each) for each in elevation_deg))
     dataset = open_finished(directory)
-    (chosen,) = dataset.chosen(["0" if sample is None else sample])
+    (chosen,) = dataset.chosen(["0" if view.sample is None else view.sample])
     require_writable(out)
     distance = FAR_M if distance_m is None else distance_m
-    result = unroll(chosen, position, grid, by, distance, _picture(chosen, position, preset, image))
+    result = unroll(chosen, view.position, grid, by, distance, view.picture(chosen))
     save_png(out, result.pixels)
     print(
         f"{out}: {grid.width_px} x {grid.height_px} pixels of {360.0 / grid.width_px:g} degrees, "
-        f"{chosen.row.sample_id} {position}, by {by}; {100.0 * result.seen:.1f} % of it is in the image"
+        f"{chosen.row.sample_id} {view.position}, by {by}; {100.0 * result.seen:.1f} % of it is in the image"
     )
     return 0
 
@@ -557,11 +633,3 @@ def sensitivities(directory: Path, *, out: Path | None = None) -> int:
     write_sensitivities(dataset, out)
     print(f"{out}: {len(dataset)} samples x {len(ESTIMATORS)} estimators, {len(columns())} columns")
     return 0
-
-
-def _picture(sample: Sample, position: str, preset: str, file: Path | None) -> NDArray[Any]:
-    """Picture to unroll: a file's, or a frame of the sample."""
-    from phibench.calibration.captures.picture_files import read_picture
-    from phibench.estimator.geometry.panorama import frame
-
-    return frame(sample, position, preset) if file is None else read_picture(file).pixels

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -105,27 +106,13 @@ def show(
     return 0
 
 
-@film.command
-def experiments(
-    directory: Path,
-    *,
-    calibration: Path,
-    preset: Literal["bayer-raw", "mjpeg"] = "bayer-raw",
-    on: Whole = 30,
-    off: Whole = 30,
-    cameras: Whole = 1,
-    jpeg_quality: Whole = 76,
-    stroke: bool = True,
-    out: Path | None = None,
-) -> int:
-    """Depth of every film with rigs that calibrate themselves: bursts at both ends, and the whole stroke.
+@Parameter(name="*")
+@dataclass(frozen=True)
+class FilmOptions:
+    """Frames that the experiments take.
 
     Parameters
     ----------
-    directory
-        Folder of films.
-    calibration
-        Data set of the same rigs with an experiment "calibration", as the recipe paper-misaligned has it.
     preset
         Sensor preset.
     on
@@ -138,6 +125,29 @@ def experiments(
         Of mjpeg.
     stroke
         Fit the whole stroke as well.
+    """
+
+    preset: Literal["bayer-raw", "mjpeg"] = "bayer-raw"
+    on: Whole = 30
+    off: Whole = 30
+    cameras: Whole = 1
+    jpeg_quality: Whole = 76
+    stroke: bool = True
+
+
+_BURSTS = FilmOptions()
+
+
+@film.command
+def experiments(directory: Path, *, calibration: Path, bursts: FilmOptions = _BURSTS, out: Path | None = None) -> int:
+    """Depth of every film with rigs that calibrate themselves: bursts at both ends, and the whole stroke.
+
+    Parameters
+    ----------
+    directory
+        Folder of films.
+    calibration
+        Data set of the same rigs with an experiment "calibration", as the recipe paper-misaligned has it.
     out
         Parquet file for the rows.
     """
@@ -149,8 +159,8 @@ def experiments(
 
     if out is not None:
         require_writable(out)
-    numbers = {"jpeg_quality": jpeg_quality} if preset == "mjpeg" else None
-    procedure = FilmProcedure(preset, on, off, cameras, stroke, numbers)
+    numbers = {"jpeg_quality": bursts.jpeg_quality} if bursts.preset == "mjpeg" else None
+    procedure = FilmProcedure(bursts.preset, bursts.on, bursts.off, bursts.cameras, bursts.stroke, numbers)
     films = open_films(directory)
     with Steps(progress_console(), "films", len(films)) as steps:
         rows = run_film_experiments(films, open_finished(calibration), procedure, told=steps.advance)
@@ -263,7 +273,62 @@ def frames(
 
 loop = App(name="loop", group=SENSOR, help="A robot that finds a target and drives up to it: rooms, episodes, films.")
 
-Fidelity = Literal["exact", "windows", "frames"]
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class RobotOptions:
+    """The robot: its rooms, its sight and its rig.
+
+    Parameters
+    ----------
+    rooms
+        Folder of `phibench loop bake`; without it each episode has a plain room of its own.
+    fidelity
+        Spots by the exact measurement model, or read in pixels: windows around spots, or whole frames, 2 CPU-s each.
+    calibration
+        File of `phibench calibrate`: the robot knows this rig to its covariance, from which each episode's is drawn.
+    as_built
+        The same with a rig as built by hand: its errors are so many times those of `RigParameter.prior_sigma`.
+    """
+
+    rooms: Path | None = None
+    fidelity: Literal["exact", "windows", "frames"] = "exact"
+    calibration: Path | None = None
+    as_built: float | None = None
+
+    def setup(self) -> Setup:
+        """The same for the simulator.
+
+        Raises
+        ------
+        DatasetError
+            If a calibration is given together with `as_built`, or cannot be read.
+        SceneError
+            If `as_built` is not between 0 and 2.
+        """
+        import numpy as np
+
+        from phibench.calibration.rig.file import read_calibration
+        from phibench.datasets.common.errors import DatasetError
+        from phibench.estimator.geometry.rig_parameters import prior_sigmas
+        from phibench.robot.loop.arena import baked_arenas
+        from phibench.robot.loop.simulator import Setup
+        from phibench.scenes.rig import Rig
+        from phibench.scenes.validation import within
+
+        nominal, covariance = Rig(), None
+        if self.calibration is not None:
+            if self.as_built is not None:
+                raise DatasetError("--calibration and --as-built: both say how well the rig is known; give one of them")
+            read = read_calibration(self.calibration)
+            nominal, covariance = read.rig, read.covariance
+        elif self.as_built is not None:
+            covariance = within("loop", "as_built", self.as_built, 0.0, 2.0) ** 2 * np.diag(prior_sigmas() ** 2)
+        arenas = () if self.rooms is None else baked_arenas(self.rooms)
+        return Setup(rig=nominal, arenas=arenas, fidelity=self.fidelity, rig_covariance=covariance)
+
+
+_ROBOT = RobotOptions()
 
 
 @loop.command
@@ -294,10 +359,7 @@ def run(
     policy: Annotated[str, Parameter(completer=policies)] = "paper",
     *,
     episodes: Whole = 10,
-    rooms: Path | None = None,
-    fidelity: Fidelity = "exact",
-    calibration: Path | None = None,
-    as_built: float | None = None,
+    robot: RobotOptions = _ROBOT,
     seed: str = "run",
     seconds: float = 5.0,
     out: Path | None = None,
@@ -310,14 +372,6 @@ def run(
         paper, greedy, drive-only, random or oracle; or FILE.py:NAME, a function from what is known to a policy.
     episodes
         Number of episodes.
-    rooms
-        Folder of `phibench loop bake`; without it each episode has a plain room of its own.
-    fidelity
-        Spots by the exact measurement model, or read in pixels: windows around spots, or whole frames.
-    calibration
-        File of `phibench calibrate`: the robot knows this rig to its covariance, from which each episode's is drawn.
-    as_built
-        The same with a rig as built by hand: its errors are so many times those of `RigParameter.prior_sigma`.
     seed
         Name of the stream that targets, lights and noise are drawn from.
     seconds
@@ -335,10 +389,10 @@ def run(
     whole_number("--episodes", episodes, 1)
     if out is not None:
         require_writable(out)
-    setup = _setup(rooms, fidelity, calibration, as_built)
+    setup = robot.setup()
     known, isolations = setup.rig_covariance is not None, set[str]()
     if ".py" in policy:
-        limits, hidden = RunLimits(seconds=seconds), [rooms] if rooms is not None else []
+        limits, hidden = RunLimits(seconds=seconds), [robot.rooms] if robot.rooms is not None else []
         running = run_foreign(
             setup,
             PolicyFile.of(policy),
@@ -370,10 +424,7 @@ def show_loop(
     policy: Literal["paper", "greedy", "drive-only"] = "paper",
     *,
     out: Path,
-    rooms: Path | None = None,
-    fidelity: Fidelity = "exact",
-    calibration: Path | None = None,
-    as_built: float | None = None,
+    robot: RobotOptions = _ROBOT,
     seed: str = "show",
     episode: Whole = 0,
 ) -> int:
@@ -385,14 +436,6 @@ def show_loop(
         Of the robot.
     out
         MP4 to write.
-    rooms
-        Folder of `phibench loop bake`; without it the episode has a plain room, in which only spots are seen.
-    fidelity
-        With --rooms: windows around spots, or whole frames, which take 2 CPU-s each.
-    calibration
-        File of `phibench calibrate`: the robot knows this rig to its covariance, from which each episode's is drawn.
-    as_built
-        The same with a rig as built by hand: its errors are so many times those of `RigParameter.prior_sigma`.
     seed
         Name of the stream that targets, lights and noise are drawn from.
     episode
@@ -405,41 +448,9 @@ def show_loop(
 
     whole_number("--episode", episode)
     require_writable(out)
-    setup = with_own_rig(_setup(rooms, fidelity, calibration, as_built), seed, episode)
+    setup = with_own_rig(robot.setup(), seed, episode)
     print(f"{out}: {show_episode(setup, out, policy, seed, episode)}")
     return 0
-
-
-def _setup(rooms: Path | None, fidelity: Fidelity, calibration: Path | None, as_built: float | None) -> Setup:
-    """Setup with what is known of the rig.
-
-    Raises
-    ------
-    DatasetError
-        If a calibration is given together with `as_built`, or cannot be read.
-    SceneError
-        If `as_built` is not between 0 and 2.
-    """
-    import numpy as np
-
-    from phibench.calibration.rig.file import read_calibration
-    from phibench.datasets.common.errors import DatasetError
-    from phibench.estimator.geometry.rig_parameters import prior_sigmas
-    from phibench.robot.loop.arena import baked_arenas
-    from phibench.robot.loop.simulator import Setup
-    from phibench.scenes.rig import Rig
-    from phibench.scenes.validation import within
-
-    nominal, covariance = Rig(), None
-    if calibration is not None:
-        if as_built is not None:
-            raise DatasetError("--calibration and --as-built: both say how well the rig is known; give one of them")
-        read = read_calibration(calibration)
-        nominal, covariance = read.rig, read.covariance
-    elif as_built is not None:
-        covariance = within("loop", "as_built", as_built, 0.0, 2.0) ** 2 * np.diag(prior_sigmas() ** 2)
-    arenas = () if rooms is None else baked_arenas(rooms)
-    return Setup(rig=nominal, arenas=arenas, fidelity=fidelity, rig_covariance=covariance)
 
 
 def _print(rows: list[Episode]) -> None:

@@ -2,14 +2,55 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import App, Parameter
 
 from phibench.cli.options import DATA, Whole
 
+if TYPE_CHECKING:
+    from phibench.calibration.outline.mirror_ball import BallPhoto
+
 room = App(name="room", group=DATA, help="Make rooms of photographs, and files of rooms.")
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class BallOptions:
+    """Ball and camera of the photograph.
+
+    Parameters
+    ----------
+    radius_m
+        Radius of the ball.
+    distance_m
+        From the lens to the ball's centre; this or --focal-px is needed.
+    focal_px
+        Focal length, pixels of the photograph.
+    principal_point_px
+        Pixel (u, v) on the camera's axis; the middle of the photograph by default.
+    circle
+        Centre (u, v) and radius of the ball's outline, pixels; looked for by default.
+    camera_elevation_deg
+        Of the camera's axis above the horizon: 0 horizontal, 90 looking up at the ball.
+    """
+
+    radius_m: float
+    distance_m: float | None = None
+    focal_px: float | None = None
+    principal_point_px: Annotated[tuple[float, float] | None, Parameter(negative="")] = None
+    circle: Annotated[tuple[float, float, float] | None, Parameter(negative="")] = None
+    camera_elevation_deg: float = 0.0
+
+    @property
+    def stated(self) -> BallPhoto:
+        """The same for the fit."""
+        from phibench.calibration.outline.mirror_ball import BallPhoto
+
+        centre_px, elevation_deg = self.principal_point_px, self.camera_elevation_deg
+        return BallPhoto(self.radius_m, self.distance_m, self.focal_px, centre_px, self.circle, elevation_deg)
 
 
 @room.command
@@ -17,13 +58,8 @@ def from_mirror_ball(
     photo: Path,
     *,
     out: Path,
-    radius_m: float,
-    distance_m: float | None = None,
-    focal_px: float | None = None,
+    ball_of: BallOptions,
     surroundings_m: float = 2.5,
-    circle: Annotated[tuple[float, float, float] | None, Parameter(negative="")] = None,
-    principal_point_px: Annotated[tuple[float, float] | None, Parameter(negative="")] = None,
-    camera_elevation_deg: float = 0.0,
     width: Whole | None = None,
     point_m: Annotated[tuple[float, float, float] | None, Parameter(negative="")] = None,
     box_m: Annotated[tuple[float, float, float, float, float] | None, Parameter(negative="")] = None,
@@ -41,20 +77,8 @@ def from_mirror_ball(
         JPEG, PNG, TIFF, PPM, PGM, OpenEXR or Radiance HDR file; turned upright as its EXIF data say.
     out
         Panorama to write: .exr (linear light, and what is seen) or .png.
-    radius_m
-        Radius of the ball.
-    distance_m
-        From the lens to the ball's centre; this or --focal-px is needed.
-    focal_px
-        Focal length, pixels of the photograph.
     surroundings_m
         Distance of the surroundings from the ball's centre; a large number for a scene far away.
-    circle
-        Centre (u, v) and radius of the ball's outline, pixels; looked for by default.
-    principal_point_px
-        Pixel (u, v) on the camera's axis; the middle of the photograph by default.
-    camera_elevation_deg
-        Of the camera's axis above the horizon: 0 horizontal, 90 looking up at the ball.
     width
         Columns of the panorama, even; by default as fine as the photograph, up to the 2880 that a recipe reads.
     point_m
@@ -66,7 +90,6 @@ def from_mirror_ball(
     """
     from phibench.calibration.captures.picture_files import read_linear
     from phibench.calibration.outline.mirror_ball import (
-        BallPhoto,
         find_ball,
         panorama_table,
         require_suffix,
@@ -77,7 +100,7 @@ def from_mirror_ball(
     from phibench.datasets.frames.sensor_file import read_sensor_file
     from phibench.datasets.store.files import require_writable
 
-    stated = BallPhoto(radius_m, distance_m, focal_px, principal_point_px, circle, camera_elevation_deg)
+    stated = ball_of.stated
     require_suffix(out)
     require_writable(out)
     table = panorama_table(out, point_m, box_m, surroundings_m)
@@ -86,7 +109,7 @@ def from_mirror_ball(
     u, v, radius = ball.circle_px
     found = (
         "as stated"
-        if circle
+        if ball_of.circle
         else f"each +- {ball.sigma_px:.2g} px, with edges on {100.0 * ball.edges:.0f} % of it; if it is wrong, give "
         "--circle"
     )

@@ -14,6 +14,7 @@ from phibench.cli.options import LIMITS, BuiltIn, Limits, Methods, OwnOrPreset, 
 
 if TYPE_CHECKING:
     from phibench.benchmark.scores.document import MethodCard, ScoreDocument
+    from phibench.estimator.pair_set import PairSet
 
 Rank = Literal["phi", "depth"]
 
@@ -53,31 +54,13 @@ class Output:
 _TABLES = Output()
 
 
-def score(
-    directory: Path,
-    *,
-    method: Methods = None,
-    preset: OwnOrPreset = None,
-    draws: Whole | None = None,
-    pairs: Whole | None = None,
-    hints: bool = True,
-    boxes: Whole | None = None,
-    rank: Rank = "phi",
-    bootstrap_seed: Whole = 0,
-    workers: Whole = 1,
-    calibration: Path | None = None,
-    sensor: Path | None = None,
-    frames: Annotated[tuple[Whole, Whole] | None, Parameter(negative="")] = None,
-    limits: Limits = LIMITS,
-    out: Path | None = None,
-    output: Output = _TABLES,
-) -> int:
-    """Score methods on the pairs of a data set.
+@Parameter(name="*")
+@dataclass(frozen=True)
+class ChoiceOptions:
+    """Pairs that are scored, and what is known of them.
 
     Parameters
     ----------
-    directory
-        Folder of a data set.
     preset
         Preset of the sensor; by default those of the data set's recipe.
     draws
@@ -88,24 +71,71 @@ def score(
         Show the boxes that pairs have; --no-hints leaves the method to search the whole image.
     boxes
         Give every pair boxes of so many pixels a side. The spot is anywhere in them: their centre tells nothing.
-    rank
-        Error that methods are ranked by, missed spots and false detections counted: phi, or depth for D.
-    bootstrap_seed
-        Seed of the bootstrap that makes the intervals.
-    workers
-        Pairs that are worked on at a time. From 2 on, as many further processes draw them, where they are 40 or more.
     calibration
         File of `phibench calibrate`: its rig's samples, with the calibrated rig, stroke and covariance.
     sensor
         Sensor file of `phibench sensor fit`: its numbers stand for the recipe's and the preset's.
     frames
         Frames of each position with the laser on and with it off, such as 6 6; one of each by default.
+    """
+
+    preset: OwnOrPreset = None
+    draws: Whole | None = None
+    pairs: Whole | None = None
+    hints: bool = True
+    boxes: Whole | None = None
+    calibration: Path | None = None
+    sensor: Path | None = None
+    frames: Annotated[tuple[Whole, Whole] | None, Parameter(negative="")] = None
+
+    def of(self, directory: Path) -> PairSet:
+        """Pairs of a data set, of frames or of pictures.
+
+        Raises
+        ------
+        DatasetError
+            If the folder does not hold them.
+        """
+        from phibench.benchmark.pair_sets.wanted_pairs import PairChoice, open_scored, wanted_pairs
+
+        known = self.calibration, self.sensor, self.frames
+        choice = PairChoice(self.preset, self.draws, self.pairs, self.hints, self.boxes, *known)
+        return wanted_pairs(open_scored(directory), choice)
+
+
+_ALL = ChoiceOptions()
+
+
+def score(
+    directory: Path,
+    *,
+    method: Methods = None,
+    choice: ChoiceOptions = _ALL,
+    rank: Rank = "phi",
+    bootstrap_seed: Whole = 0,
+    workers: Whole = 1,
+    limits: Limits = LIMITS,
+    out: Path | None = None,
+    output: Output = _TABLES,
+) -> int:
+    """Score methods on the pairs of a data set.
+
+    Parameters
+    ----------
+    directory
+        Folder of a data set.
+    rank
+        Error that methods are ranked by, missed spots and false detections counted: phi, or depth for D.
+    bootstrap_seed
+        Seed of the bootstrap that makes the intervals.
+    workers
+        Pairs that are worked on at a time. From 2 on, as many further processes draw them, where they are 40 or more.
     out
         JSON file for the score, records beside it as Parquet; with several methods their names are added to it.
     """
     from phibench.benchmark.isolation.resolve import resolve
     from phibench.benchmark.scores.document import MethodCard, records_kept
-    from phibench.benchmark.scores.score import open_scored, run_and_score, saved_each, wanted_pairs
+    from phibench.benchmark.scores.score import run_and_score, saved_each
     from phibench.benchmark.scores.score_tables import print_scores
     from phibench.datasets.common.errors import DatasetError
     from phibench.datasets.common.progress import progress_console
@@ -120,13 +150,12 @@ def score(
     files = _files(out, [MethodCard.of(name, **resolve(name).document()) for name in method])
     for target in filter(None, files):
         require_writable(target)
-    pair_set = wanted_pairs(open_scored(directory), preset, draws, pairs, hints, calibration, boxes, sensor, frames)
-    console, number = progress_console(), _seed(bootstrap_seed)
+    pair_set, console, number = choice.of(directory), progress_console(), _seed(bootstrap_seed)
     with records_kept(files):
         scored = run_and_score(method, pair_set, workers, console, "pairs", number, run_limits)
     if targets := [file for file in files if file is not None]:
         scored = saved_each(scored, targets)
-    print_scores(scored, form, rank, output.wide, calibration is not None)
+    print_scores(scored, form, rank, output.wide, choice.calibration is not None)
     for file in filter(None, files):
         print(f"written: {file}", file=sys.stdout if form == "terminal" else sys.stderr)
     return 0

@@ -18,16 +18,60 @@ if TYPE_CHECKING:
     from phibench.studies.paper.paper_tables import Score
 
 
+@Parameter(name="*")
+@dataclass(frozen=True)
+class MisalignedOptions:
+    """Settings of the misaligned experiments.
+
+    Parameters
+    ----------
+    preset
+        With --misaligned: preset of the sensor, "mjpeg" (default), "bayer-raw", "srgb8" or "mono-raw".
+    draws
+        With --misaligned: draws of the noise per sample; 1 by default.
+    laser_off
+        With --misaligned: also a frame with the laser off beside each (default); --no-laser-off does without.
+    frames
+        With --misaligned: frames of each position, on and off; 1 1 by default.
+    rig
+        With --misaligned: ids of rigs; all by default.
+    """
+
+    preset: OwnOrPreset = None
+    draws: Whole | None = None
+    laser_off: bool | None = None
+    frames: Annotated[tuple[Whole, Whole] | None, Parameter(negative="")] = None
+    rig: Annotated[tuple[str, ...], Parameter(consume_multiple=True, negative="")] = ()
+
+    def refuse(self) -> None:
+        """Raise `DatasetError` if one of the options is given."""
+        from phibench.datasets.common.errors import DatasetError
+
+        for name, value in vars(self).items():
+            if value not in (None, ()):
+                option = name.replace("_", "-")
+                raise DatasetError(f"--{option} is for the misaligned experiments: give --misaligned too")
+
+    @property
+    def procedure(self) -> Procedure:
+        """The same for the experiments."""
+        from phibench.datasets.exposures.pair_draws import FrameCounts
+        from phibench.studies.paper.experiment_tables import Procedure
+
+        counts = FrameCounts() if self.frames is None else FrameCounts(*self.frames)
+        draws, laser_off = 1 if self.draws is None else self.draws, self.laser_off is not False
+        return Procedure(self.preset or DEFAULT_PRESET, draws, laser_off, frames=counts)
+
+
+_BY_DEFAULT = MisalignedOptions()
+
+
 def paper(
     directory: Path,
     *,
     misaligned: Annotated[bool, Parameter(negative="")] = False,
     calibration: Path | None = None,
-    preset: OwnOrPreset = None,
-    draws: Whole | None = None,
-    laser_off: bool | None = None,
-    frames: Annotated[tuple[Whole, Whole] | None, Parameter(negative="")] = None,
-    rig: Annotated[tuple[str, ...], Parameter(consume_multiple=True, negative="")] = (),
+    measured: MisalignedOptions = _BY_DEFAULT,
     wide: Annotated[bool, Parameter(negative="")] = False,
     out: Path | None = None,
 ) -> int:
@@ -44,44 +88,19 @@ def paper(
         The misaligned experiments instead of the tables.
     calibration
         File of `phibench calibrate`: its rig's samples, with the calibrated rig and stroke. Not with --misaligned.
-    preset
-        With --misaligned: preset of the sensor, "mjpeg" (default), "bayer-raw", "srgb8" or "mono-raw".
-    draws
-        With --misaligned: draws of the noise per sample; 1 by default.
-    laser_off
-        With --misaligned: also a frame with the laser off beside each (default); --no-laser-off does without.
-    frames
-        With --misaligned: frames of each position, on and off; 1 1 by default.
-    rig
-        With --misaligned: ids of rigs; all by default.
     wide
         Estimates in metres too, or with --misaligned every interval, in up to 210 columns instead of 80.
     out
         JSON file for the scores; with --misaligned a Parquet file, one row per sample and draw.
     """
     if not misaligned:
-        given = preset, draws, laser_off, frames, rig or None
-        _refuse("is for the misaligned experiments: give --misaligned too", *given)
+        measured.refuse()
         return _tables(directory, calibration, wide, out)
     if calibration is not None:
         from phibench.datasets.common.errors import DatasetError
 
         raise DatasetError("--calibration does not go with --misaligned, which calibrates every rig itself")
-    with_off = True if laser_off is None else laser_off
-    from phibench.datasets.exposures.pair_draws import FrameCounts
-    from phibench.studies.paper.experiment_tables import Procedure
-
-    counts = FrameCounts() if frames is None else FrameCounts(*frames)
-    procedure = Procedure(preset or DEFAULT_PRESET, 1 if draws is None else draws, with_off, frames=counts)
-    return _experiments(directory, procedure, rig, wide, out)
-
-
-def _refuse(why: str, *values: object) -> None:
-    from phibench.datasets.common.errors import DatasetError
-
-    for name, value in zip(("preset", "draws", "laser-off", "frames", "rig"), values, strict=True):
-        if value is not None:
-            raise DatasetError(f"--{name} {why}")
+    return _experiments(directory, measured.procedure, measured.rig, wide, out)
 
 
 def _tables(directory: Path, calibration: Path | None, wide: bool, out: Path | None) -> int:
@@ -184,8 +203,7 @@ class StrokeSetting:
             covariance_rig=None if held is None else held.covariance,
             stroke_sigma_m=self.stroke_sigma_m,
             strokes_m=self.strokes_m,
-            around=Surroundings(heights_m=(self.height_m,)),
-            laser=Laser(power_w=1e-3 * self.power_mw),
+            around=Surroundings(heights_m=(self.height_m,), laser=Laser(power_w=1e-3 * self.power_mw)),
             card=sensor_card(self.preset),
         )
 

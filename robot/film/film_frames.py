@@ -149,7 +149,6 @@ def film_frames(
     camera_seed: int = 0,
     preset: str = "bayer-raw",
     *,
-    vibration_sigma_m: float = 0.0,
     frames: Array | None = None,
     rig: Rig | None = None,
     stroke_scale: float = 1.0,
@@ -161,8 +160,6 @@ def film_frames(
     Parameters
     ----------
     film, draw, camera_seed, preset
-    vibration_sigma_m : float
-        Of the carriage beside its encoder.
     frames : array of int, optional
         Frames to take; all by default.
     rig : Rig, optional
@@ -200,14 +197,13 @@ def film_frames(
         image = film.cut_out(frame, preset, draw, camera_seed, laser=laser, **changes).image[rows, columns]
         return raw_electrons(image, card) if card.output == "raw" else image
 
-    sigma = float(np.hypot(film.plan.encoder.sigma_m, vibration_sigma_m))
     return FilmFrames(
         rig or nominal.rig,
         card,
         nominal.times,
         nominal.carriage,
         film.table["encoder_m"].to_numpy(),
-        sigma,
+        film.plan.encoder.sigma_m,
         on,
         off,
         np.stack([drawn(int(k), True) for k in on]),

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
+from phibench.benchmark.pair_sets.dataset_pairs import SpotInImage
 from phibench.benchmark.pair_sets.dataset_pairs import spot_bounds as bounds_of_spot
 from phibench.benchmark.scores.answer_errors import Rules
 from phibench.benchmark.scores.intervals import Clusters, Estimate, estimates, rate, rms_of, rms_ratio_of
@@ -146,9 +147,9 @@ def _bound_px2(
 ) -> Array:
     """Bound of (u, v), shape (2, 2), pixels squared; NaN where there is none."""
     row = sample.row.position(position)
-    uv_px, rates = (row.u_px, row.v_px), row.electrons_per_s
-    side, beam, depth_m = source.sides[position], Beam(sample.row.spot_diameter_m, 0.0), sample.row.depth_m
-    found = bounds_of_spot(side, sample.rig, uv_px, rates, row.visible, pattern_known, depth_m, beam, frames).bound_px2
+    beam = Beam(sample.row.spot_diameter_m, 0.0)
+    spot = SpotInImage((row.u_px, row.v_px), row.electrons_per_s, row.visible, sample.row.depth_m, beam)
+    found = bounds_of_spot(source.sides[position], sample.rig, spot, pattern_known, frames).bound_px2
     return _NO_MATRIX if found is None else found
 
 

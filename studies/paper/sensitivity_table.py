@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 from rich.console import Console
@@ -105,20 +105,14 @@ def make(
     workers: int | None = None,
     console: Console | None = None,
     scheduler: str | None = None,
-    shard: str | None = None,
-    samples: int | None = None,
-    seed: int | None = None,
-    replace: bool = False,
-    room_files: str | Path | None = None,
-    leave_out_refused: bool = False,
+    **options: Unpack[rendering.MakeKeywords],
 ) -> Path:
     """Make the data set of a recipe; parameters and errors are those of `phibench.datasets.make.make`.
 
     A shard has no table of sensitivities: `merge` writes that of the whole.
     """
-    numbers = (shard, samples, seed, replace, room_files, leave_out_refused)
-    folder = rendering.make(recipe, out, workers, console, scheduler, *numbers)
-    if shard is None:
+    folder = rendering.make(recipe, out, workers, console, scheduler, **options)
+    if options.get("shard") is None:
         keep_sensitivities(folder)
     return folder
 

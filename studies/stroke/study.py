@@ -143,13 +143,13 @@ def planned(settings: StrokeSettings, rig: Rig, rigs: Mapping[str, Array]) -> li
     """Cells of the check that lie within the limits."""
     wanted, card = settings.check, sensor_card(settings.check.preset)
     taken = (wanted.preset, wanted.power_mw, wanted.draws)
-    spot, around = spot_bound(rig, card), Surroundings(heights_m=(settings.spot_height_m,))
+    laser = Laser(power_w=1e-3 * wanted.power_mw)
+    spot, around = spot_bound(rig, card), Surroundings(heights_m=(settings.spot_height_m,), laser=laser)
     checks = []
     for name, C in rigs.items():
         rows = tuple(tuple(row) for row in C.tolist())
         for d in wanted.depths_m:
-            laser = Laser(power_w=1e-3 * wanted.power_mw)
-            options: dict[str, Any] = {"covariance_rig": C, "around": around, "spot": spot, "laser": laser}
+            options: dict[str, Any] = {"covariance_rig": C, "around": around, "spot": spot}
             best = best_stroke(d, rig, strokes_m=wanted.strokes_m, card=card, **options)
             strokes = np.array([f * best.stroke_m for f in wanted.factors])
             curve = stroke_curve(rig, d, strokes, exposure_s=card.exposure_s, stroke_sigma_m=0.0, **options)
@@ -208,7 +208,7 @@ def _free_curves(
     """Curves over strokes that no carriage bounds, at the nearest and the farthest distance."""
     exact, grid = np.zeros((len(PARAMETERS),) * 2), stroke_grid(*_FREE_STROKES_M)
     ends = dict.fromkeys((min(depths_m), max(depths_m)))
-    return {d: stroke_curve(rig, d, grid, spot, exact, around, Laser(), card.exposure_s, 0.0) for d in ends}
+    return {d: stroke_curve(rig, d, grid, spot, exact, around, card.exposure_s, 0.0) for d in ends}
 
 
 def _notes(settings: StrokeSettings, checks: Sequence[RenderedOutcome]) -> tuple[str, ...]:

@@ -18,6 +18,7 @@ from rich.console import Console
 from phibench.cli import main as cli
 from phibench.datasets.common.errors import DatasetError, RecipeError
 from phibench.datasets.common.progress import Steps, StillRunning
+from phibench.datasets.make import MakeOptions
 from phibench.datasets.verify import Report
 from phibench.scenes.validation import SceneError
 from phibench.studies.paper.paper_tables import Score
@@ -198,7 +199,9 @@ def test_make_passes_shard_and_scheduler_on(monkeypatch, tmp_path):
     kept = sensitivities_kept(monkeypatch)
     assert cli.main(tokens) == 0
     assert kept == []  # a shard's are made when it is merged
-    assert calls == [(("smoke", tmp_path, 3, None, "s", "2/5", None, None, False, None, False), {})]
+    ((arguments, options),) = calls
+    assert arguments == ("smoke", tmp_path, 3, None, "s")
+    assert MakeOptions(**options) == MakeOptions(shard="2/5")
 
 
 def lines_of(written: io.StringIO) -> list[str]:

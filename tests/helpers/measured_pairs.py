@@ -31,6 +31,7 @@ from phibench.calibration.captures.imported_calibration import calibrate_importe
 from phibench.calibration.captures.imported_set import import_pairs
 from phibench.calibration.captures.measure import KnownNumbers, measure, read_setting
 from phibench.calibration.captures.pair_list import photos_of, read_pair_list
+from phibench.calibration.rig.from_dataset import CalibrationSources
 from phibench.calibration.sensor_fit.fit import fit_sensor
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.exposures.pair_draws import FrameCounts
@@ -186,7 +187,8 @@ def run(options: argparse.Namespace) -> None:
     sensor_file = write_sensor(pictures) if options.sensor else None
     write_files(dataset, rest, pictures / "measure", preset, options.draws, options.frames)
     import_pairs(pictures / "calibrate", pictures / "set")
-    print(calibrate_imported(pictures / "set", pictures / "rig.json", spots=True).verdict, flush=True)
+    with_spots = CalibrationSources(spots=True)
+    print(calibrate_imported(pictures / "set", pictures / "rig.json", sources=with_spots).verdict, flush=True)
     rig = pictures / "measure" / "rig.toml"
     settings = [("calibrated", read_setting(rig, pictures / "rig.json", sensor_file))]
     settings += [("own outlines", read_setting(rig, sensor=sensor_file))] if options.own else []

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from phibench.calibration.rig.from_dataset import sigmas_of
+from phibench.calibration.rig.from_dataset import CalibrationSources
 from phibench.datasets.common.errors import DatasetError
 from phibench.estimator.geometry.paper_depth import load_published
 from phibench.estimator.geometry.rig_parameters import PARAMETERS, prior_sigmas
@@ -70,10 +70,10 @@ def test_the_errors_are_those_of_the_misalignment() -> None:
 def test_a_calibration_takes_the_statement_about_the_lens() -> None:
     """By default the prior of all calibrations; a stated one changes no other number. Nonsense is one sentence."""
     focal = PARAMETERS.index("focal_relative")
-    assert np.array_equal(sigmas_of(None), prior_sigmas())
-    stated = sigmas_of(0.018)
+    assert np.array_equal(CalibrationSources().sigmas, prior_sigmas())
+    stated = CalibrationSources(focal_sigma=0.018).sigmas
     assert stated[focal] == 0.018
     assert np.array_equal(np.delete(stated, focal), np.delete(prior_sigmas(), focal))
     for value in (0.0, -0.01, 0.2, float("nan")):
         with pytest.raises(DatasetError, match=r"--focal-sigma .*: must be above 0 and below 0\.2"):
-            sigmas_of(value)
+            _ = CalibrationSources(focal_sigma=value).sigmas

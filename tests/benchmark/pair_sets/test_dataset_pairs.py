@@ -15,7 +15,7 @@ import pytest
 from helpers.bench_samples import hidden, with_tables
 from PIL import Image
 
-from phibench.benchmark.pair_sets.dataset_pairs import DatasetPairs, dataset_pairs, spot_bounds
+from phibench.benchmark.pair_sets.dataset_pairs import DatasetPairs, SpotInImage, dataset_pairs, spot_bounds
 from phibench.benchmark.scores.worst_images import worst
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.exposures.expected import expected_of_light, expected_region
@@ -86,9 +86,8 @@ def test_several_frames_are_a_mean_with_their_number_and_have_their_own_bound(da
     source = CachedSample(dataset[draw.sample_id]).source(draw)
     sample, side = dataset[draw.sample_id], source.sides["down"]
     row, bound = sample.row.down, several.truth(0).down.bound_px2
-    expected = spot_bounds(
-        side, sample.rig, (row.u_px, row.v_px), row.electrons_per_s, row.visible, frames=FrameCounts(3, 2)
-    ).bound_px2
+    spot = SpotInImage((row.u_px, row.v_px), row.electrons_per_s, row.visible)
+    expected = spot_bounds(side, sample.rig, spot, frames=FrameCounts(3, 2)).bound_px2
     assert bound is not None
     assert expected is not None
     assert np.allclose(bound, expected)
@@ -274,7 +273,7 @@ def test_snr_squared_is_twice_the_likelihood_ratio_of_the_spot(dataset: Dataset)
         ) / card.dn_per_e
         terms = [(x - mean) ** 2 / variance + np.log(variance) for mean, variance in (without, with_spot)]
         ratios.append(np.sum(terms[0] - terms[1]))
-    snr = spot_bounds(side, sample.rig, (row.u_px, row.v_px), row.electrons_per_s, True).snr
+    snr = spot_bounds(side, sample.rig, SpotInImage((row.u_px, row.v_px), row.electrons_per_s, True)).snr
     assert 4.0 < snr < 12.0
     # the mean of 400 draws is good to 2 snr / 20; the noise that grows with the light makes up to 25 %
     assert np.mean(ratios) == pytest.approx(1.12 * snr**2, rel=0.12, abs=4.0 * 2.0 * snr / 20.0)

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from helpers.camera_files import write_pictures
 
+from phibench.benchmark.pair_sets.wanted_pairs import PairChoice, wanted_pairs
 from phibench.benchmark.scores.document import read_score
-from phibench.benchmark.scores.score import wanted_pairs
 from phibench.calibration.captures.imported_set import import_pairs, imported_pairs, open_imported
 from phibench.calibration.captures.pair_list import read_pair_list
 from phibench.calibration.outline.limb_image import PoseMeasurement
@@ -168,7 +168,8 @@ def test_the_rig_is_calibrated_from_pictures(
     # spots are scored with the blur and filters that the calibration's spots gave
     blur_px, *_ = held.made_from["spot_shape"]["values"]
     assert blur_px != held.rig.camera.blur_sigma_px
-    assert wanted_pairs(open_imported(imported), None, calibration=file).pair(0).rig.camera.blur_sigma_px == blur_px
+    pairs = wanted_pairs(open_imported(imported), PairChoice(calibration=file))
+    assert pairs.pair(0).rig.camera.blur_sigma_px == blur_px
 
 
 def test_vertical_edges_of_pictures_tell_the_tilt(

@@ -12,7 +12,7 @@ import scipy
 
 from phibench.calibration.rig.bundle import vertical_by_principal_point
 from phibench.calibration.rig.file import read_calibration
-from phibench.calibration.rig.from_dataset import calibrate_dataset, frame_spots
+from phibench.calibration.rig.from_dataset import CalibrationSources, calibrate_dataset, frame_spots
 from phibench.calibration.rig.spots import Ruler, known_spot, method_for, one_per_pose
 from phibench.cli.main import main
 from phibench.datasets.common.errors import DatasetError
@@ -48,7 +48,8 @@ def test_frames_of_every_preset_calibrate(smoke: Dataset, tmp_path: Path, preset
     """
     ids = [row.sample_id for row in smoke.rows]
     out = tmp_path / "c.json"
-    bundle = calibrate_dataset(smoke.folder, out, ids, preset, spots=True, ruler=Ruler(height_m=5e-3)).bundle
+    with_spots, ruler = CalibrationSources(spots=True), Ruler(height_m=5e-3)
+    bundle = calibrate_dataset(smoke.folder, out, ids, preset, with_spots, ruler).bundle
     sigma = np.sqrt(np.diag(bundle.covariance))
     assert np.all(np.abs(bundle.values) < 5.0 * sigma)
     assert np.all(sigma <= prior_sigmas() * (1.0 + 1e-9))

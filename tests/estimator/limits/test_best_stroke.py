@@ -170,7 +170,7 @@ def test_processed_pixels_know_less_than_raw_ones() -> None:
 
 def _curve(depth_m: float, strokes: np.ndarray, rig: Rig = RIG, **options: object) -> np.ndarray:
     wanted = {"covariance_rig": EXACT, "around": OPEN, "stroke_sigma_m": 0.0, **options}
-    curve = stroke_curve(rig, depth_m, strokes, SAME, laser=Laser(), exposure_s=1.0 / 60.0, **wanted)  # type: ignore[arg-type]
+    curve = stroke_curve(rig, depth_m, strokes, SAME, exposure_s=1.0 / 60.0, **wanted)  # type: ignore[arg-type]
     return curve.sigma_m
 
 
@@ -229,7 +229,7 @@ def test_a_rig_as_built_errs_beyond_first_order_as_drawn_rigs_do() -> None:
     """At D = 1.4 m, h = 0.4 m the first order of a tilt is nearly 0; what is left is its square."""
     random, n, D, h = generator("test", "drawn rigs"), 125, 1.4, 0.4
     C, one = np.diag(prior_sigmas() ** 2), replace(OPEN, azimuths_rad=(0.0, 1.6, 3.1, 4.7))
-    curve = stroke_curve(RIG, D, np.array([h]), SAME, C, one, Laser(), 1.0 / 60.0, 0.0)
+    curve = stroke_curve(RIG, D, np.array([h]), SAME, C, one, 1.0 / 60.0, 0.0)
     points, root = one.points_m(RIG, D), covariance_root(C)
     down, up, true = [], [], []
     for _ in range(n):
@@ -256,7 +256,7 @@ def test_errors_of_a_rig_as_built_grow_with_the_third_order_at_short_strokes_and
     random, n, D, strokes = generator("test", "third order"), 100, 2.18, np.array([0.45, 1.4])
     C, one = np.diag(prior_sigmas() ** 2), replace(OPEN, azimuths_rad=(0.0, 1.6, 3.1, 4.7))
     exact = SpotSigma((1.0, 1e9), (1e-3, 1e-3))
-    curve = stroke_curve(RIG, D, strokes, exact, C, one, Laser(), 1.0 / 60.0, 0.0)
+    curve = stroke_curve(RIG, D, strokes, exact, C, one, 1.0 / 60.0, 0.0)
     drawn, points = random.standard_normal((n, P)) @ covariance_root(C).T, one.points_m(RIG, D)
     plus, minus = (_errors_m(k * drawn, strokes, points, C) for k in (1.0, -1.0))
     rms = np.sqrt(np.mean(0.5 * (plus**2 + minus**2), axis=(0, 2)))
@@ -280,7 +280,7 @@ def _errors_m(drawn: np.ndarray, strokes_m: np.ndarray, points_m: np.ndarray, C:
 
 
 def test_exact_rigs_have_no_higher_order() -> None:
-    curve = stroke_curve(RIG, 1.4, np.array([0.4, 0.8]), SAME, EXACT, OPEN, Laser(), 1.0 / 60.0, 0.0)
+    curve = stroke_curve(RIG, 1.4, np.array([0.4, 0.8]), SAME, EXACT, OPEN, 1.0 / 60.0, 0.0)
     assert not curve.sigma_higher_order_m.any()
     assert not curve.sigma_calibration_m.any()
 
@@ -325,7 +325,8 @@ def test_strokes_whose_error_is_unknown_have_a_cause() -> None:
     assert math.isnan(near.stroke_m)
     assert TOO_BRIGHT in near.limits
     assert all(near.limits)
-    few = best_stroke(2.0, laser=Laser(power_w=1e-9), spot=SpotSigma((1e3, 1e6), (0.5, 0.01)), covariance_rig=EXACT)
+    faint = Surroundings(laser=Laser(power_w=1e-9))
+    few = best_stroke(2.0, around=faint, spot=SpotSigma((1e3, 1e6), (0.5, 0.01)), covariance_rig=EXACT)
     assert few.limits == (TOO_FAINT,)
     full = best_stroke(2.0, spot=SpotSigma((1.0, 1e9), (math.inf, math.inf)), covariance_rig=EXACT)
     assert full.limits == (NO_BOUND,)
