@@ -155,7 +155,7 @@ dist: $(COMPLETE)
 lint: $(COMPLETE)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/mypy --num-workers 2 -p phibench
+	$(BIN)/mypy --num-workers 2 -p phibench -p tools
 
 clean:
 	rm -rf build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .benchmarks

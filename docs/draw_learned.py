@@ -1,11 +1,11 @@
 """Networks of crops on rooms that they have not seen: by preset, outside the range of training, and a room leak test.
 
-    .venv/bin/python docs/draw_learned.py measure DEV TEST NETWORKS out/learned.json
-    .venv/bin/python docs/draw_learned.py seeds SCORES
-    .venv/bin/python docs/draw_learned.py draw out/learned.json docs/learned.png
-    .venv/bin/python docs/draw_learned.py pairs TEST SCORES NETWORKS
-    .venv/bin/python docs/draw_learned.py found SCORES
-    .venv/bin/python docs/draw_learned.py held DEV NETWORKS
+    .venv/bin/python -m docs.draw_learned measure DEV TEST NETWORKS out/learned.json
+    .venv/bin/python -m docs.draw_learned seeds SCORES
+    .venv/bin/python -m docs.draw_learned draw out/learned.json docs/learned.png
+    .venv/bin/python -m docs.draw_learned pairs TEST SCORES NETWORKS
+    .venv/bin/python -m docs.draw_learned found SCORES
+    .venv/bin/python -m docs.draw_learned held DEV NETWORKS
 
 SCORES is a folder with scores of `detect` and of others on TEST, such as mjpeg-detect.parquet, by `phibench score`.
 `pairs` asks the networks at the places that `detect` answered; bounds and other methods' errors are the scores'.
@@ -38,12 +38,12 @@ from phibench.datasets.frames.sensor_card import card_of
 from phibench.datasets.frames.source import frame_stream
 from phibench.datasets.read import open_finished
 from phibench.datasets.training import CropSettings, SpotCrops
-from phibench.estimator.learned.crop_training import CROP_SETTINGS, Answers, TrainingSettings, crops_of, rooms_of
 from phibench.estimator.learned.network_input import SIDE_PX, crop_input, crop_origin, cut
 from phibench.estimator.learned.networks import CROP, Network, covariances
 from phibench.render.sensor.light import Region
 from phibench.scenes.frames import Array
 from phibench.scenes.random_streams import generator
+from tools.crop_training import CROP_SETTINGS, Answers, TrainingSettings, crops_of, rooms_of
 
 LEAD = "released"
 _LABELS = {

@@ -3,7 +3,7 @@
 One thread: the same bytes every time.
 
 A file ends with the SHA-256 of all that is before it. It is an entry of the model's metadata, so that other programs
-read the file as they read any ONNX model. `learned.crop_training` and `learned.frame_training` make the weights.
+read the file as they read any ONNX model. `tools/crop_training.py` and `tools/frame_training.py` make the weights.
 
 A file may be a stranger's. Its size, its hash, its layers and its numbers are looked at before anything of it runs.
 """

@@ -12,9 +12,7 @@ import pytest
 from phibench.benchmark.isolation.easy_pairs import EasyPairs
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.frames.sensor_card import sensor_card
-from phibench.estimator.learned import crop_training, frame_training, networks
-from phibench.estimator.learned.crop_training import Answers, TrainingSettings, scale_of
-from phibench.estimator.learned.frame_training import FrameSettings
+from phibench.estimator.learned import networks
 from phibench.estimator.learned.network_input import (
     SCALARS,
     SIDE_PX,
@@ -36,6 +34,9 @@ from phibench.estimator.learned.networks import (
 )
 from phibench.estimator.methods.registry import METHODS
 from phibench.scenes.random_streams import generator
+from tools import crop_training, frame_training
+from tools.crop_training import Answers, TrainingSettings, scale_of
+from tools.frame_training import FrameSettings
 
 FOLDER = Path(networks.__file__).parent
 NAMES = [CROP, DETECT]
@@ -292,8 +293,8 @@ def test_training_refuses_data_sets_that_will_not_do(tmp_path: Path, tiny_datase
 @needs_torch
 def test_training_gives_the_same_weights_and_the_file_their_answers(tiny_dataset: Path, tmp_path: Path) -> None:
     from phibench.datasets.read import open_dataset
-    from phibench.estimator.learned.crop_training import answers_of, crops_of, items_of, train_crop
     from phibench.estimator.learned.networks import write_network
+    from tools.crop_training import answers_of, crops_of, items_of, train_crop
 
     settings = TrainingSettings(presets=("srgb8",), epochs=2, crops=64, passes=1)
     samples = [row.sample_id for row in open_dataset(tiny_dataset).rows if row.sample_id.startswith("seen")]

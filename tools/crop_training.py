@@ -1,6 +1,6 @@
 """Training of `learned_crop` by PyTorch, from crops of a data set.
 
-    python -m phibench.estimator.learned.crop_training out/bench-dev --out learned_crop.onnx --seed 0
+    python -m tools.crop_training out/bench-dev --out learned_crop.onnx --seed 0
 
 Needs `pip install 'phibench[learned-training]'`; the CPU wheel is enough. Every random number comes from a named
 stream: first weights, crops, their order and flips, and which rooms are held out. One thread: the same file each time.
@@ -385,9 +385,7 @@ def add_passes(parser: argparse.ArgumentParser, default: int, text: str) -> None
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Train a network from the command line."""
-    parser = argparse.ArgumentParser(
-        "python -m phibench.estimator.learned.crop_training", description=__doc__.split("\n")[0]
-    )
+    parser = argparse.ArgumentParser("python -m tools.crop_training", description=__doc__.split("\n")[0])
     parser.add_argument("folder", type=Path, help="finished data set")
     parser.add_argument("--out", type=Path, required=True, help="file to write, .onnx")
     parser.add_argument("--seed", type=int, default=0)

@@ -1,8 +1,8 @@
 """Training of `learned_detect`, the network of whole frames, by PyTorch.
 
-    python -m phibench.estimator.learned.frame_training out/bench-dev --out learned_detect.onnx --seed 0
+    python -m tools.frame_training out/bench-dev --out learned_detect.onnx --seed 0
 
-Packages and seeds are as in `learned.crop_training`. Hot cells come from tiles of crops, so from spots at all phases
+Packages and seeds are as in `tools/crop_training.py`. Hot cells come from tiles of crops, so from spots at all phases
 and brightnesses; cold ones from whole frames, half of them where the network itself is wrong most. Cells about a
 distractor that goes out with the laser count as neither: it is a spot, only a fainter one.
 
@@ -30,18 +30,6 @@ from phibench.datasets.frames.sensor_card import card_of
 from phibench.datasets.read import Dataset, open_finished
 from phibench.datasets.training import CropSettings, SpotCrops
 from phibench.estimator.interface import Box
-from phibench.estimator.learned.crop_training import (
-    REQUESTS,
-    AdamSteps,
-    Answers,
-    Parameters,
-    TrainingSettings,
-    add_passes,
-    first_layer,
-    rooms_of,
-    scale_of,
-    torch_on_one_thread,
-)
 from phibench.estimator.learned.network_input import frame_input
 from phibench.estimator.learned.networks import (
     CROP,
@@ -59,6 +47,18 @@ from phibench.estimator.spots.image_planes import kind_of
 from phibench.scenes.frames import Array
 from phibench.scenes.random_streams import generator
 from phibench.scenes.rig import POSITIONS
+from tools.crop_training import (
+    REQUESTS,
+    AdamSteps,
+    Answers,
+    Parameters,
+    TrainingSettings,
+    add_passes,
+    first_layer,
+    rooms_of,
+    scale_of,
+    torch_on_one_thread,
+)
 
 TILE_PX = 64
 _SIDE = TILE_PX // 2  # cells
@@ -351,9 +351,7 @@ def _say(text: str) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Train the network from the command line."""
-    parser = argparse.ArgumentParser(
-        "python -m phibench.estimator.learned.frame_training", description=__doc__.split("\n")[0]
-    )
+    parser = argparse.ArgumentParser("python -m tools.frame_training", description=__doc__.split("\n")[0])
     parser.add_argument("folder", type=Path, help="finished data set")
     parser.add_argument("--out", type=Path, required=True, help="file to write, .onnx")
     parser.add_argument("--seed", type=int, default=0)
