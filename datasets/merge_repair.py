@@ -226,7 +226,7 @@ def _header(layer: Path) -> dict[str, Any]:
     """Header of a layer; empty if the file is damaged."""
     try:
         return read_exr(layer).header
-    except DatasetError:
+    except DatasetError:  # that it is damaged is told by its hash
         return {}
 
 

@@ -57,7 +57,7 @@ def show(folder: str | Path, console: Console | None = None, out: str | Path | N
     sheet, fault = contact_sheet(dataset, progress_console()), None
     try:
         save_png(path, sheet)
-    except OSError as error:
+    except OSError as error:  # a disk that is full: the table is printed all the same
         fault = error
     _print_table(dataset, console)
     if fault is not None:
@@ -96,7 +96,7 @@ class _PatientConsole(Console):
 
     def on_broken_pipe(self) -> None:
         """Be quiet from now on; rich's own method ends the program."""
-        with contextlib.suppress(SystemExit):
+        with contextlib.suppress(SystemExit):  # rich ends the program where a pipe is closed
             super().on_broken_pipe()
 
 

@@ -68,7 +68,7 @@ def _converted(value: Any) -> Any:
         array = np.asarray(value)
         with np.errstate(over="ignore"):  # infinity, which is refused later
             kind, listed = array.dtype.kind, np.asarray(array, float).tolist()
-    except (TypeError, ValueError, OverflowError):
+    except (TypeError, ValueError, OverflowError):  # ragged lists and objects of a method: told by their kind
         return {"type": described(value)}
     return listed if kind in "fiu" else {"type": described(value)}
 
@@ -234,7 +234,7 @@ def _number(value: Any) -> float | None:
         return None
     try:
         return float(value)
-    except OverflowError:
+    except OverflowError:  # a whole number of more than 308 digits
         return math.inf if value > 0 else -math.inf
 
 

@@ -163,7 +163,7 @@ def _real(path: Path) -> Path | None:
     """The path without links, if it is there. The kernel says it in a tenth of the time of `Path.resolve`."""
     try:
         handle = os.open(path, os.O_PATH | os.O_CLOEXEC)
-    except OSError:
+    except OSError:  # not there: no rule is needed
         return None
     try:
         return Path(f"/proc/self/fd/{handle}").readlink()
@@ -179,7 +179,7 @@ def _without(path: Path, hidden: Sequence[Path]) -> Iterator[tuple[Path, int]]:
         yield path, _LOOK
         return
     yield path, _LIST  # Python imports nothing from a folder that it cannot list
-    with suppress(OSError):
+    with suppress(OSError):  # not readable: then not for the method either
         for entry in path.iterdir():
             if not entry.is_symlink():
                 yield from _without(entry, hidden)
@@ -197,7 +197,7 @@ def interpreter_paths() -> list[Path]:
     for path in [Path(path) for path in sys.path if path.startswith("/")]:
         if _real(path) not in own:
             found.append(path)
-        with suppress(OSError):
+        with suppress(OSError):  # not readable
             found += [Path(entry.path) for entry in os.scandir(path) if entry.is_symlink()]
     for finder in sys.meta_path:  # packages that setuptools installed as editable
         mapping = getattr(sys.modules.get(getattr(finder, "__module__", "")), "MAPPING", {})
@@ -209,7 +209,7 @@ def _library_folders() -> list[Path]:
     """Folders of shared libraries, by the environment and the linker's settings."""
     lines = os.environ.get("LD_LIBRARY_PATH", "").split(":")
     for file in Path("/etc/ld.so.conf.d").glob("*.conf"):
-        with suppress(OSError, ValueError):
+        with suppress(OSError, ValueError):  # not readable
             lines += file.read_text().splitlines()
     return [Path(line.strip()) for line in lines if line.startswith("/")]
 
@@ -246,7 +246,7 @@ class _Kernel:
         """Allow rights to a file, or to a folder and all in it; no rule for what is not there."""
         try:
             handle = os.open(path, os.O_PATH | os.O_CLOEXEC)
-        except OSError:
+        except OSError:  # gone since it was named
             return
         if not path.is_dir():
             rights &= _ON_FILES
@@ -280,7 +280,7 @@ class _Kernel:
                 Path("/proc/self/setgroups").write_text("deny")
                 Path("/proc/self/uid_map").write_text(f"{user} {user} 1")
                 Path("/proc/self/gid_map").write_text(f"{group} {group} 1")
-            except OSError:
+            except OSError:  # the system gives a process no user namespace
                 return False
         self._mount(b"none", Path("/"), None, _REC_PRIVATE)
         shared = self._mount(b"phibench", _SHARED_MEMORY, b"tmpfs", _NOSUID_NODEV, b"mode=1777")

@@ -136,7 +136,7 @@ def _beside(top: str) -> Iterator[tuple[str, Path]]:
     """Files of a package or module that is found by its name; nothing of it is run."""
     try:
         spec = find_spec(top)
-    except (ImportError, ValueError, AttributeError):
+    except (ImportError, ValueError, AttributeError):  # its parent cannot be imported, or is no package
         return
     if spec is None:
         return

@@ -65,7 +65,7 @@ class OpenedFiles:
 
     def look(self) -> None:
         """Take up what was opened since the last look: the kernel keeps 16 384 events."""
-        with self._lock, suppress(BlockingIOError):
+        with self._lock, suppress(BlockingIOError):  # no more events
             while self._handle >= 0:
                 self._take(os.read(self._handle, _READ_BYTES))
 
@@ -109,7 +109,7 @@ class OpenedFiles:
 def _hash(path: Path) -> str | None:
     try:
         return sha256(path)
-    except (OSError, WriteError):
+    except (OSError, WriteError):  # deleted since, or a pipe
         return None
 
 
@@ -120,6 +120,6 @@ def _folders(path: Path, hidden: Sequence[Path]) -> Iterator[Path]:
         below: list[Path] = []
         for folder in level:
             yield folder
-            with suppress(OSError):
+            with suppress(OSError):  # a folder that cannot be listed
                 below += sorted(Path(one.path) for one in os.scandir(folder) if one.is_dir(follow_symlinks=False))
         level = [one for one in below if one.name != "__pycache__" and one not in hidden]

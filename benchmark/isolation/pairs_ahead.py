@@ -143,7 +143,7 @@ class _Maker:
         """Pair of a number; then the next one is asked for. Raises as `result`."""
         ahead, self._ahead = self._ahead, None
         if ahead not in (number, None):  # nobody wants it any more
-            with contextlib.suppress(Exception):
+            with contextlib.suppress(Exception):  # nobody asked: its error is nobody's
                 self.result(_PAIR, ahead)
         made = self.result(_PAIR, number)
         if following is not None:
@@ -216,7 +216,7 @@ def make_pairs() -> None:
     """Make the pairs that the other side asks for, until it hangs up: all that `_Maker`'s process does."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the other side decides
     maker = _Making(socket.socket(fileno=int(sys.argv[1])))
-    with contextlib.suppress(TransportError):
+    with contextlib.suppress(TransportError):  # the other side has hung up
         maker.answer_all()
 
 
@@ -258,6 +258,6 @@ def _picklable(error: Exception) -> Exception | str:
     """The error, or what it says where it cannot be sent as it is."""
     try:
         pickle.loads(pickle.dumps(error))
-    except Exception:
+    except Exception:  # an error of a library, with a file handle in it
         return f"{type(error).__name__}: {error}"
     return error

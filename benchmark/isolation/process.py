@@ -109,7 +109,7 @@ class OutputTail:
                 return
             try:
                 part = os.read(self._pipe.fileno(), _KEPT_BYTES)
-            except BlockingIOError:
+            except BlockingIOError:  # nothing more was printed
                 return
             self._ended = not part
             self._count += len(part)
@@ -259,7 +259,7 @@ class MethodProcess:
             process = self._process = GuestProcess(max(2 * size, LEAST_BYTES), self._access)
         try:
             self._isolation = process.load(self._references, self._limits)
-        except BaseException:
+        except BaseException:  # Ctrl-C too: no process stays
             self.end()
             raise
         self.loaded |= process.loaded
@@ -373,7 +373,7 @@ class GuestProcess:
             start_new_session=True,  # not hit by Ctrl-C
         )
         assert process.stdin is not None
-        with contextlib.suppress(BrokenPipeError), process.stdin as pipe:
+        with contextlib.suppress(BrokenPipeError), process.stdin as pipe:  # it ended at once: `load` tells why
             pipe.write(access.text().encode())
         return process
 
@@ -453,7 +453,7 @@ class GuestProcess:
             self._process.wait()
         if self._process.returncode == -signal.SIGKILL:  # perhaps before it had killed what was below it
             for pid in processes_in(self._folder):
-                with contextlib.suppress(OSError):
+                with contextlib.suppress(OSError):  # ended in the meantime
                     os.kill(pid, signal.SIGKILL)
         self._output.close()
         self._give_back()
@@ -488,7 +488,7 @@ class GuestProcess:
     def death(self, file: str) -> str:
         """The end of the process in a few words."""
         text = self._output.text(_STACK_SECONDS)
-        with contextlib.suppress(subprocess.TimeoutExpired):
+        with contextlib.suppress(subprocess.TimeoutExpired):  # it still runs
             self._process.wait(_STACK_SECONDS)
         code = self._process.poll()
         if code is None:
@@ -502,7 +502,7 @@ class GuestProcess:
 
     def _place(self, file: str) -> str:
         """The line at which a process is that still runs."""
-        with contextlib.suppress(ProcessLookupError):
+        with contextlib.suppress(ProcessLookupError):  # it has ended
             self._process.send_signal(signal.SIGUSR1)
         place = stack_place(self._output.text(_STACK_SECONDS), file)
         return f", at {place}" if place else ""

@@ -75,7 +75,7 @@ def _search_places() -> list[Path]:
     named = [part for part in os.environ.get("PYTHONPATH", "").split(os.pathsep) if part]
     for folder in map(Path, site.getsitepackages()):
         for file in folder.glob("*.pth"):
-            with suppress(OSError):
+            with suppress(OSError):  # not readable: Python does not read it either
                 named += [line for line in file.read_text(errors="replace").splitlines() if line.startswith("/")]
     places = [Path(name).resolve() for name in dict.fromkeys(named)]
     prefixes = {Path(name).resolve() for name in (sys.prefix, sys.base_prefix)}
@@ -124,7 +124,7 @@ def truth_near(
 def _entries(path: Path) -> list[os.DirEntry[str]]:
     try:
         return [entry for entry in os.scandir(path) if not entry.is_symlink()]
-    except OSError:
+    except OSError:  # not readable: nothing in it is
         return []
 
 
@@ -138,7 +138,7 @@ def _holds_truth(folder: Path, name: str, names: set[str]) -> bool:
     try:
         with (folder / f"{stem}.json").open("rb") as file:
             return b"phibench score" in file.read(_HEAD_BYTES)
-    except OSError:
+    except OSError:  # no file of that name
         return False
 
 

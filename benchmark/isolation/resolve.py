@@ -162,7 +162,7 @@ def code_of_function(function: Any) -> dict[str, Any]:
                 "modules": {name: sha256(path.parent / name) for name in modules_beside(path)},
             }
         return {"sha256": hashlib.sha256(inspect.getsource(code).encode()).hexdigest()}
-    except (OSError, TypeError):
+    except (OSError, TypeError):  # code of a notebook or of a builtin has no file
         return {"sha256": None}
 
 

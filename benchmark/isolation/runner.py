@@ -96,7 +96,7 @@ class Harness:
         try:
             for pool in self._pools:
                 pool.start()  # a method that cannot be imported ends the run before it begins
-        except BaseException:
+        except BaseException:  # Ctrl-C too: no process stays
             self.__exit__(None, None, None)
             raise
         return self

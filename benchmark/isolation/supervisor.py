@@ -92,7 +92,7 @@ def _wait(worker: int, line: int, runner: int) -> int | None:
 
 def _ended() -> Iterator[tuple[int, int]]:
     """Children that have ended, the method's orphans included, with their wait statuses."""
-    with contextlib.suppress(ChildProcessError):
+    with contextlib.suppress(ChildProcessError):  # no children are left
         while True:
             pid, status = os.waitpid(-1, os.WNOHANG)
             if pid == 0:
@@ -114,7 +114,7 @@ def end_descendants(worker: int, seconds: float = KILL_SECONDS) -> None:
             groups.add(group)
             _send(pid, signal.SIGKILL)
         for group in groups - {os.getpgrp()}:  # as a whole: a process that is being forked does not get away
-            with contextlib.suppress(OSError):
+            with contextlib.suppress(OSError):  # the group has ended
                 os.killpg(group, signal.SIGKILL)
         list(_ended())
         if sys.platform != "linux":  # without a subreaper there is no more to be known
@@ -130,7 +130,7 @@ def end_descendants(worker: int, seconds: float = KILL_SECONDS) -> None:
 def _children(parent: int) -> dict[int, int]:
     """Process groups of children, by process, of those that have ended as well; none where the system does not tell."""
     found = {}
-    with contextlib.suppress(OSError, ValueError):
+    with contextlib.suppress(OSError, ValueError):  # the kernel was built without that list
         for pid in map(int, (_PROC / f"{parent}/task/{parent}/children").read_text().split()):
             with contextlib.suppress(OSError):
                 found[pid] = os.getpgid(pid)
@@ -157,14 +157,14 @@ def processes_in(folder: str) -> Iterator[int]:
     """Processes of this user that work in a folder or have it as their TMPDIR; none where there is no /proc."""
     mark = os.fsencode(f"TMPDIR={folder}") + b"\0"
     for entry in _PROC.glob("[0-9]*"):
-        with contextlib.suppress(OSError):
+        with contextlib.suppress(OSError):  # a process that ended, or of another user
             place = (entry / "cwd").readlink()
             if f"{place}/".startswith(f"{folder}/") or mark in (entry / "environ").read_bytes():
                 yield int(entry.name)
 
 
 def _send(pid: int, number: int) -> None:
-    with contextlib.suppress(OSError):
+    with contextlib.suppress(OSError):  # it has ended
         os.kill(pid, number)
 
 
@@ -182,7 +182,7 @@ def _leave_as(status: int | None) -> None:
 def _prctl(option: int, value: int) -> None:
     """Linux alone has it; elsewhere the process group and the hang-up are what there is."""
     if sys.platform == "linux":
-        with contextlib.suppress(OSError, AttributeError):
+        with contextlib.suppress(OSError, AttributeError):  # a system without prctl
             ctypes.CDLL(None).prctl(option, value, 0, 0, 0)
 
 

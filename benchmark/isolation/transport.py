@@ -174,7 +174,7 @@ def _memory_handles(size: int) -> tuple[int, int]:
 def _seal(handle: int) -> None:
     try:
         fcntl.fcntl(handle, fcntl.F_ADD_SEALS, _SEALS)
-    except OSError:
+    except OSError:  # Linux before 5.1
         fcntl.fcntl(handle, fcntl.F_ADD_SEALS, _OLD_SEALS)
 
 

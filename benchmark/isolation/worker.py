@@ -157,7 +157,7 @@ def function_of_file(reference: Reference) -> Any:
     sys.modules[_MODULE] = module  # dataclasses and pickle look their module up
     try:
         spec.loader.exec_module(module)
-    except BaseException as error:
+    except BaseException as error:  # SystemExit of a script counts as well
         raise MethodError(f"{path.name} cannot be imported: {sentence_of(error, str(path))}") from error
     if not hasattr(module, reference.function):
         raise MethodError(f"{path.name} has no function '{reference.function}': {_advice(reference.function, module)}")
@@ -180,7 +180,7 @@ def _from_package(reference: Reference) -> Any:
         found: Any = importlib.import_module(module)
         for name in filter(None, attribute.split(".")):
             found = getattr(found, name)
-    except BaseException as error:
+    except BaseException as error:  # SystemExit of a script counts as well
         raise MethodError(f"method '{reference.name}' cannot be imported: {sentence_of(error)}") from error
     return found
 
@@ -245,7 +245,7 @@ def main(line: int, reader: int, isolation: dict[str, Any]) -> None:
     folder = str(Path(file).parent) if file else ""
     connection.send(to_bytes({"nonce": nonce, "fault": "", "loaded": loaded_names(folder)}))
     held = None
-    with suppress(TransportError):
+    with suppress(TransportError):  # the run has hung up
         while True:
             received = unpack(connection.receive(), pages, held)
             if len(methods) > 1:  # one method's pair is not kept: it would count against its limit
@@ -291,7 +291,7 @@ def _reply(method: Method, received: ReceivedPair, limits: RunLimits, limit_byte
     work = getattr(received.pair, "work", None)
     reply = reply_of(ask, file, BaseException, limits) if work is None else _reply_with_stages(ask, work, limits)
     for stream in (sys.stdout, sys.stderr):  # what belongs to this pair must be in the pipe before the reply
-        with suppress(Exception):
+        with suppress(Exception):  # the method has closed or replaced it
             stream.flush()
     if not received.unchanged():
         return {**reply, "failure": "mutated", "message": "the method wrote into the pair's images: work on a copy"}

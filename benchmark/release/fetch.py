@@ -191,14 +191,14 @@ def _remove_own(stage: Path) -> None:
     remove_leftovers(stage)
     (stage / _STATE).unlink(missing_ok=True)
     for folder in (stage / _ARCHIVES, stage):
-        with contextlib.suppress(OSError):
+        with contextlib.suppress(OSError):  # files of the user lie there
             folder.rmdir()
 
 
 def _remove_rest(stage: Path) -> None:
     """Remove what a fetch has left that was killed after it had given the set its name."""
     if stage.is_dir() and not (stage / _SET).exists() and not _foreign(stage):
-        with contextlib.suppress(OSError, DatasetError):
+        with contextlib.suppress(OSError, DatasetError):  # another fetch has it
             with only_run(stage):
                 pass
             _remove_own(stage)

@@ -165,7 +165,7 @@ def _unfinished(
     rules: Rules,
 ) -> DatasetError:
     """The error with the records of the pairs before; of a pair whose truth cannot be read there are none."""
-    with suppress(DatasetError):
+    with suppress(DatasetError):  # another pair's truth cannot be read either: these records are not written
         if answers:
             _examine_each(parts, held, answers, rules)
     if not all(parts):
@@ -334,7 +334,7 @@ def saved_each(scores: Sequence[Scored], files: Sequence[Path]) -> list[Scored]:
     for one, file in zip(scores, files, strict=True):
         try:
             written.append(saved(one, file))
-        except (DatasetError, OSError) as error:
+        except (DatasetError, OSError) as error:  # the others are written all the same
             faults.append(f"{file} could not be written: {error}")
     if faults:
         told = f"{len(written)} of {len(files)} scores are written" if written else "no score is written"

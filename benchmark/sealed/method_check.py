@@ -84,7 +84,7 @@ def _known(card: MethodCard) -> Reference | None:
         return None
     try:
         found = resolve(card.reference)
-    except MethodError:
+    except MethodError:  # not here: nothing to compare with
         return None
     return found if (found.kind, found.version) == (card.kind, card.version) else None
 

@@ -73,7 +73,7 @@ def alike(given: EncodedPicture | None, right: EncodedPicture | None) -> bool:
         return False
     try:
         first, second = (_pixels(one) for one in (given, right))
-    except (DatasetError, ValueError):
+    except (DatasetError, ValueError):  # no picture: not the same
         return False
     return first.shape == second.shape and float(np.abs(first - second).mean()) <= _CODES
 

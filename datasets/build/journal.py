@@ -178,7 +178,7 @@ def _documents(path: Path) -> Iterator[FolderHead | Entry | Refusal | None]:
         check, _, text = line.partition(b" ")
         try:
             yield _LINES.validate_json(text, strict=True) if check == b"%08x" % zlib.crc32(text) else None
-        except ValidationError:
+        except ValidationError:  # a line that a kill cut, or that somebody changed
             yield None
 
 

@@ -53,6 +53,7 @@ def read_draws(out: Path, recipe: Recipe, files: RoomFiles) -> Kept:
         document = _FILE.validate_json(text, strict=True)
         if document[0] != _key(recipe, files):
             return {}
+    # a file of kept draws is a saving alone: without it samples are drawn anew
     except (DatasetError, ValidationError, RoomError):
         return {}
     return {number: one for number, one in document[1].items() if isinstance(one, str) or _is_draw(one)}

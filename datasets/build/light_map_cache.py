@@ -167,7 +167,7 @@ def cache_entries(folder: Path | None = None) -> list[CacheEntry]:
 
 def cache_limit_mb(folder: Path | None = None) -> float:
     """Limit of the cache, 1e6 bytes."""
-    with contextlib.suppress(OSError, ValueError):
+    with contextlib.suppress(OSError, ValueError):  # no file, or a damaged one: the default holds
         text = InputFile((folder or cache_folder()) / _LIMIT, "set it anew", limit_bytes=100).text()
         if math.isfinite(limit := float(text)) and limit >= 0.0:
             return limit

@@ -208,7 +208,7 @@ def _run(tasks: list[BuildTask], pace: Pace, journal: Journal, pool: WorkerPool,
 def _info_text(info: DatasetInfo, journal: Journal, out: Path) -> str:
     """Text of `dataset.json`: the journal's, or the one that is there, if it means the same."""
     held = [] if journal.head is None else [journal.head.info]
-    with contextlib.suppress(DatasetError):
+    with contextlib.suppress(DatasetError):  # none yet, or damaged: the journal's counts
         held.append(InputFile(out / schema.INFO, "run `phibench dataset repair`").text())
     for text in held:
         with contextlib.suppress(ValueError):  # of another version, or damaged

@@ -128,7 +128,7 @@ def perform(task: BuildTask, out: Path, code: str | None = None) -> Done | Faile
         with working(out):
             made = task.function(out, *task.arguments)
             files = {name: sha256(out / name) for name in made.files}
-    except Exception as error:
+    except Exception as error:  # whatever a task does, the others go on
         return Failed(fault_text(error), refused=_is_refusal(error))
     seconds, cpu_s = time.perf_counter() - began, time.process_time() - began_cpu
     return Done(files, made.result, round(seconds, 3), _peak_mb(), worker_name(), round(cpu_s, 3))
@@ -163,7 +163,7 @@ def _peak_mb() -> float:
 
     Linux' ru_maxrss starts at what the parent had before exec, so that /proc is asked first.
     """
-    with contextlib.suppress(OSError, StopIteration):
+    with contextlib.suppress(OSError, StopIteration):  # not Linux
         lines = Path("/proc/self/status").read_text().splitlines()
         return round(int(next(line for line in lines if line.startswith("VmHWM")).split()[1]) * 1024.0 / 1e6, 1)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss

@@ -176,14 +176,14 @@ class _Worker:
             with _signals_kept_from_children(), environment_of_children({**_MEMORY, **ONE_THREAD}):
                 self._process.start()
                 self._far.close()  # ours: the pipe then ends with the worker
-        with contextlib.suppress(OSError):
+        with contextlib.suppress(OSError):  # a worker that died at once: `result` tells
             self.line.send(task)
 
     def outcome(self) -> Done | Failed | None:
         """Outcome of the task; None if the worker has died."""
         try:
             outcome: Done | Failed = self.line.recv()
-        except (EOFError, OSError):
+        except (EOFError, OSError):  # the pipe ended in the middle
             return None
         return outcome
 
@@ -210,7 +210,7 @@ def _serve(line: Connection, do: Do, out: Path, code: str) -> None:
     """Do tasks until the pipe ends."""
     end_with_the_parent()
     signal.pthread_sigmask(signal.SIG_UNBLOCK, _STOPS)
-    with contextlib.suppress(EOFError):
+    with contextlib.suppress(EOFError):  # the run has hung up: nothing is left to do
         while True:
             line.send(do(line.recv(), out, code))
 
@@ -311,7 +311,7 @@ def _wants_key(file: Path | None, address: str) -> bool:
     from dask import config
 
     if file is not None:
-        with contextlib.suppress(OSError, ValueError, AttributeError):
+        with contextlib.suppress(OSError, ValueError, AttributeError):  # a file that is being written, or not yet there
             address = str(json.loads(file.read_text(encoding="utf-8")).get("address"))
     settings = ("distributed.comm.tls.client.cert", "distributed.client.security-loader")
     return address.startswith("tls:") and not any(config.get(name, None) for name in settings)
@@ -381,7 +381,7 @@ def describe(probe: Path | None = None) -> Environment:
         return {"fault": f"it does not see the folder {probe.parent}: use one that all machines share"}
     try:
         rendering = start_renderer()
-    except Exception as error:
+    except Exception as error:  # told as a fault of this worker
         return {"fault": fault_text(error)}
     return {
         **{key: value for key, value in provenance().items() if key not in _UNLIKE},

@@ -287,5 +287,5 @@ def _directory(data: bytes) -> Image.Exif:
     try:
         directory.load(b"Exif\0\0" + data)
         return directory if len(directory) else Image.Exif()
-    except Exception:
+    except Exception:  # damaged EXIF data: as a picture without
         return Image.Exif()

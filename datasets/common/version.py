@@ -19,7 +19,7 @@ def own_version() -> str:
         return str(tomllib.loads(project.read_text(encoding="utf-8"))["project"]["version"])
     try:
         return metadata.version("phibench")
-    except metadata.PackageNotFoundError:
+    except metadata.PackageNotFoundError:  # a copy that was never installed
         return "0+unknown"
 
 
@@ -50,6 +50,6 @@ def _git(*arguments: str) -> str:
     try:
         command = ["git", "-C", str(_root()), *arguments]
         result = subprocess.run(command, capture_output=True, text=True, timeout=10, check=False)
-    except (OSError, subprocess.TimeoutExpired):
+    except (OSError, subprocess.TimeoutExpired):  # no git, or a drive that hangs
         return ""
     return result.stdout.strip()

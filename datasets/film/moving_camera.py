@@ -152,7 +152,7 @@ def _drawn_room(*stream: Name) -> tuple[GeneratedRoom, Room]:
         source = GeneratedRoom(drawn_properties(*names), names)
         try:
             return source, replace(source.build(), robot=False)
-        except SceneError:
+        except SceneError:  # the lamps have no place: the next room of the stream
             continue
     raise DatasetError(f"no room of the stream {stream} has a place for its lamps; take another stream")
 

@@ -66,7 +66,7 @@ def rebuilt(
             assert isinstance(one, KeptSample)
             try:
                 rigs, spot = drawn_rigs(recipe, dict(drawn)), _spot(recipe, one)
-            except SceneError:
+            except SceneError:  # of an older draw: it is drawn anew
                 continue
             place = (rooms[number % len(rooms)], rigs.rig, one.surface, spot)
             numbers_of = (rigs.stroke_m, rigs.nominal_rig, rigs.nominal_stroke_m)

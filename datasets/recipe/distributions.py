@@ -160,7 +160,7 @@ def values_of(kind: Any, whole: bool = False) -> ValuesOf:
     def is_sound(value: float) -> bool:
         try:
             adapter.validate_python(value)
-        except ValidationError:
+        except ValidationError:  # its sentence speaks of the value; ours tells the whole distribution
             return False
         return True
 

@@ -65,7 +65,7 @@ def _file_rooms(raw: Raw) -> Iterator[tuple[str, PanoramaTable | MeshTable]]:
         for i, entry in tables_of(table_of(raw, "rooms"), key):
             try:
                 yield f"rooms.{key}[{i}]", model.model_validate(entry)
-            except ValidationError:
+            except ValidationError:  # told by the table
                 continue
 
 

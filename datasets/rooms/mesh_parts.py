@@ -190,7 +190,7 @@ def three_numbers(words: Any) -> Vector:
     """Three finite numbers from 0 up; none where they are others."""
     try:
         values = tuple(float(word) for word in words)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError):  # the caller knows the material's name
         return ()
     return values if len(values) == 3 and all(math.isfinite(value) and value >= 0.0 for value in values) else ()
 

@@ -362,6 +362,6 @@ def _leading_numbers(words: list[str]) -> list[float]:
     for word in words:
         try:
             found.append(float(word))
-        except ValueError:
+        except ValueError:  # the picture's name begins
             break
     return found

@@ -125,7 +125,7 @@ def _header(file: InputFile, data: bytes) -> tuple[str, list[_Element], list[str
     order, elements, pictures = None, list[_Element](), list[str]()
     try:
         shown = text.decode("utf-8")
-    except UnicodeDecodeError:
+    except UnicodeDecodeError:  # comments of older programs; keywords are ASCII
         shown = text.decode("latin-1")
     for line in shown.replace("\r", "\n").split("\n")[1:]:
         words = line.split()

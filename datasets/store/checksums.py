@@ -77,7 +77,7 @@ def _exported_files(folder: Path, info: DatasetInfo) -> Iterable[str]:
 def held_room_files(folder: Path) -> RoomFiles:
     """Files of rooms that a data set holds, with the SHA-256 that its list says; none are known without the list."""
     listed: dict[str, str] = {}
-    with contextlib.suppress(DatasetError):
+    with contextlib.suppress(DatasetError):  # a set that was cut off has no list yet
         listed = read_checksums(folder)
     head = schema.room_file("")
     known = {name.removeprefix(head): digest for name, digest in listed.items() if name.startswith(head)}

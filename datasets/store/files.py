@@ -135,7 +135,7 @@ def _write_and_rename(path: Path, write: Callable[[Path], None], secret: bool) -
             write(temporary)
             _flush(temporary)
             temporary.replace(path)
-    except BaseException:
+    except BaseException:  # Ctrl-C too: no temporary file stays
         temporary.unlink(missing_ok=True)
         raise
 

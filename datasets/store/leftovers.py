@@ -104,10 +104,10 @@ def remove_leftovers(folder: Path) -> None:
     """Remove temporary folders and files of this user whose owner is gone, in a folder but not below; never raises."""
     if os.name == "nt":  # no such locks
         return
-    with contextlib.suppress(OSError), os.scandir(folder) as entries:
+    with contextlib.suppress(OSError), os.scandir(folder) as entries:  # the folder may not be readable
         names = [entry.path for entry in entries if _NAME.fullmatch(entry.name)]
         for path in map(Path, names):
-            with contextlib.suppress(OSError):
+            with contextlib.suppress(OSError):  # another run may have removed it
                 _remove_if_free(path)
 
 
@@ -119,7 +119,7 @@ def _locked(handle: int, wait: bool = False) -> bool:
 
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
-    except OSError:
+    except OSError:  # somebody holds it
         return False
     return True
 
@@ -175,7 +175,7 @@ def _without_files(folder: int) -> Iterator[str]:
             if entry.is_dir(follow_symlinks=False):
                 yield entry.name
             else:
-                with contextlib.suppress(OSError):
+                with contextlib.suppress(OSError):  # another user's, or gone
                     os.unlink(entry.name, dir_fd=folder)
 
 
@@ -194,7 +194,7 @@ def _held(path: Path) -> int | None:
     """Handle of a file or folder that is locked; None where it cannot be opened or locked."""
     try:
         handle = os.open(path, os.O_RDONLY)
-    except OSError:
+    except OSError:  # gone since it was listed
         return None
     if _locked(handle, wait=True):
         return handle
@@ -205,7 +205,7 @@ def _held(path: Path) -> int | None:
 def _is_at(handle: int, path: Path) -> bool:
     try:
         return os.path.samestat(os.fstat(handle), path.lstat())
-    except OSError:
+    except OSError:  # removed in the meantime
         return False
 
 

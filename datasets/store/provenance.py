@@ -56,7 +56,7 @@ def _commit() -> str | None:
     try:
         command = ["git", "-C", str(folder), "rev-parse", "--verify", "--quiet", "HEAD"]
         result = subprocess.run(command, capture_output=True, text=True, timeout=10, check=False)
-    except (OSError, subprocess.TimeoutExpired):
+    except (OSError, subprocess.TimeoutExpired):  # no git
         return None
     return result.stdout.strip() or None
 
