@@ -126,9 +126,9 @@ def _all_there(folders: list[Path], infos: list[DatasetInfo]) -> None:
     if len(counts) > 1:
         raise DatasetError(f"these are shards of different divisions: {', '.join(f'{i}/{n}' for i, n in parts)}")
     for i in range(1, max(counts) + 1):
-        found = [folder for folder, (j, _) in zip(folders, parts, strict=True) if i == j]
-        if len(found) != 1:
-            what = "is missing" if not found else "is given more than once"
+        of_shard = [folder for folder, (j, _) in zip(folders, parts, strict=True) if i == j]
+        if len(of_shard) != 1:
+            what = "is missing" if not of_shard else "is given more than once"
             raise DatasetError(f"shard {i}/{max(counts)} {what}")
 
 

@@ -139,10 +139,10 @@ def epipolar_line(sample: Sample, position: str) -> dict[str, Any] | None:
     other = sample.view(next(p for p in POSITIONS if p != position))
     light = np.array([sample.truth_row(position).centre.place_world_m])
     spot = light if np.isfinite(light).all() else np.array([sample.row.spot_world_m])
-    found = mirror_points(view, spot, view.camera_centre_m[None])
-    if not np.isfinite(found.points_m).all():
+    points = mirror_points(view, spot, view.camera_centre_m[None])
+    if not np.isfinite(points.points_m).all():
         return None
-    start, end = (leg[0] for leg in onward(view, found, spot).legs[-1])
+    start, end = (leg[0] for leg in onward(view, points, spot).legs[-1])
     reach = float(np.linalg.norm(end - start))
     along = np.sort(np.append(np.geomspace(_NEAREST_M, _FARTHEST_M, _LINE_POINTS), reach))
     direction = (end - start) / reach
@@ -168,8 +168,8 @@ def _length_at(start: Array, direction: Array, centre: Array, depth_m: float) ->
 
 def _seen_at(view: View, points_m: Array) -> Array:
     """Images of world points through the mirror, shape (N, 2); NaN where there is none."""
-    found = mirror_points(view, points_m, np.broadcast_to(view.camera_centre_m, points_m.shape))
-    mirror = np.where(found.lit[:, None], found.points_m, np.nan)
+    points = mirror_points(view, points_m, np.broadcast_to(view.camera_centre_m, points_m.shape))
+    mirror = np.where(points.lit[:, None], points.points_m, np.nan)
     return np.asarray(view.rig.camera.project(view.T_world_camera.inverse().points(mirror)))
 
 
@@ -256,8 +256,8 @@ def _rig_lines(sample: Sample, position: str) -> dict[str, Any]:
     way = []
     if np.isfinite(row.reflection_point_world_m).all():
         spot = np.array([sample.row.spot_world_m])
-        found = mirror_points(view, spot, view.camera_centre_m[None])
-        way = [view.camera_centre_m, *(leg[0][0] for leg in onward(view, found, spot).legs), spot[0]]
+        points = mirror_points(view, spot, view.camera_centre_m[None])
+        way = [view.camera_centre_m, *(leg[0][0] for leg in onward(view, points, spot).legs), spot[0]]
     mirror = view.rig.mirror
     return {
         "position": position,

@@ -139,10 +139,10 @@ def _files_of(folder: Path, options: FrameOptions) -> PairFiles[FramesRow]:
 
 def _held_item(files: PairFiles[FramesRow], sample_id: str, draw: int, laser_off: bool) -> Item:
     """Item of a frames set."""
-    found = [row for row in files.rows if (row.truth.sample_id, row.truth.draw) == (sample_id, draw)]
-    if not found:
+    rows = [row for row in files.rows if (row.truth.sample_id, row.truth.draw) == (sample_id, draw)]
+    if not rows:
         raise DatasetError(f"{files.folder} has no draw {draw} of '{sample_id}': its draws are its epochs")
-    row, truth = found[0], found[0].truth
+    row, truth = rows[0], rows[0].truth
     if laser_off and not IMAGES_OFF <= set(row.files):
         raise DatasetError(f"{files.folder} has no frames with the laser off: leave laser_off out")
     camera = from_json(Rig, row.rig).camera

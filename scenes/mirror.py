@@ -188,11 +188,11 @@ def directions(count: int) -> Array:
 @cache
 def _basis() -> tuple[Array, Array]:
     """Tensors of the harmonics of degree 2, shape (5, 3, 3), and 3, shape (7, 3, 3, 3)."""
-    found: dict[int, list[Array]] = {2: [], 3: []}
+    matrices: dict[int, list[Array]] = {2: [], 3: []}
     for name in HARMONICS:
         degree = len(next(iter(_POLYNOMIALS[name])))
-        found[degree].append(sum((_symmetric(m, c) for m, c in _POLYNOMIALS[name].items()), np.zeros((3,) * degree)))
-    return np.array(found[2]), np.array(found[3])
+        matrices[degree].append(sum((_symmetric(m, c) for m, c in _POLYNOMIALS[name].items()), np.zeros((3,) * degree)))
+    return np.array(matrices[2]), np.array(matrices[3])
 
 
 def _symmetric(monomial: str, coefficient: float) -> Array:
@@ -458,7 +458,7 @@ def _check_convex(radius_m: float, form: Form) -> None:
         least = float(curvatures(level(radius_m * directions(_PLACES), radius_m, form))[0].min()) * radius_m
         if least >= _LEAST_CURVATURE:
             return
-        found = f"its curvature falls to {least:.2f} of the sphere's; at least {_LEAST_CURVATURE} is needed"
+        told = f"its curvature falls to {least:.2f} of the sphere's; at least {_LEAST_CURVATURE} is needed"
     else:
-        found = f"its peaks add up to {form.bound_m:g} m; less than half the radius is needed"
-    raise SceneError(f"SphereMirror.form is too far from round for radius_m = {radius_m:g}: {found}; make it smaller")
+        told = f"its peaks add up to {form.bound_m:g} m; less than half the radius is needed"
+    raise SceneError(f"SphereMirror.form is too far from round for radius_m = {radius_m:g}: {told}; make it smaller")

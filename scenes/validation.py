@@ -140,8 +140,8 @@ def structural_faults(model: type[BaseModel], raw: object) -> list[Fault]:
         model.model_validate(raw)
     except ValidationError as error:
         schema = model.model_json_schema()
-        found = [_untagged(details) for details in error.errors() if not _follows(details)]
-        return [_fault(schema, details) for details in _merged(schema, found)]
+        faults = [_untagged(details) for details in error.errors() if not _follows(details)]
+        return [_fault(schema, details) for details in _merged(schema, faults)]
     return []
 
 
@@ -248,8 +248,8 @@ def _plain(node: Schema) -> bool:
 def _entry(node: Schema, index: int = 0) -> Schema:
     """Schema of a list's entry; a list of so many entries has one for each."""
     each = node.get("prefixItems", ())
-    found: Schema = each[min(index, len(each) - 1)] if each else node.get("items") or {}
-    return found
+    entry: Schema = each[min(index, len(each) - 1)] if each else node.get("items") or {}
+    return entry
 
 
 def _value(node: Schema, key: str) -> Schema:

@@ -92,9 +92,9 @@ def errors(nominal: Rig, misalignment: Misalignment, places: Places, names: tupl
 def calibrated_errors(nominal: Rig, misalignment: Misalignment, places: Places, calibrate: Calibrate) -> Array:
     """The same of the exact estimator with a rig calibrated for this misalignment, shape (d, a)."""
     down, up = pixels(nominal, misalignment, places)
-    found = calibrate(misalignment)
-    h = found.stroke(np.asarray(places.stroke_m))
-    return depth_exact(found.rig, h, down, up).depth_m / true_depth_m(nominal, misalignment, places) - 1.0
+    calibration = calibrate(misalignment)
+    h = calibration.stroke(np.asarray(places.stroke_m))
+    return depth_exact(calibration.rig, h, down, up).depth_m / true_depth_m(nominal, misalignment, places) - 1.0
 
 
 def true_depth_m(nominal: Rig, misalignment: Misalignment, places: Places) -> Array:
@@ -113,12 +113,12 @@ def slopes(
 
     Analytic where `sensitivities` has them, else differences of the whole change.
     """
-    found = np.array([[_gradients(name, nominal, places, p) for p in _flat(places)] for name in names])
+    gradients = np.array([[_gradients(name, nominal, places, p) for p in _flat(places)] for name in names])
     shape = (len(names), *places.points_m.shape[:-1])
     result = {}
     for name in parameters:
         if name in ANALYTIC:
-            result[name] = found[..., ANALYTIC.index(name)].reshape(shape)
+            result[name] = gradients[..., ANALYTIC.index(name)].reshape(shape)
         else:
             step = _SMALL * PARAMETERS[name].study
             both = [errors(nominal, Misalignment(**{name: s * step}), places, names) for s in (1.0, -1.0)]
@@ -135,10 +135,10 @@ def spot_of(point_m: Array) -> LaserSpot:
 
 
 def _gradients(name: str, nominal: Rig, places: Places, point_m: Array) -> Array:
-    found = sensitivity(name, nominal, places.stroke_m, nominal, places.stroke_m, point_m)
+    gradient = sensitivity(name, nominal, places.stroke_m, nominal, places.stroke_m, point_m)
     D = float(np.hypot(point_m[0], point_m[1]))
     # d(estimate / D - 1) = d estimate / D - estimate dD / D^2
-    return (found.estimate_gradient - found.estimate_m / D * found.truth_gradient) / D
+    return (gradient.estimate_gradient - gradient.estimate_m / D * gradient.truth_gradient) / D
 
 
 def _flat(places: Places) -> Array:
@@ -252,11 +252,11 @@ def rendered(nominal: Rig, places: Places, parameters: Sequence[str] = ALL) -> I
     per_px = np.abs(exact_gradient(nominal, places.stroke_m, down, up)).sum(axis=-1) / places.depths_m[:, None]
     for name in parameters:
         m = Misalignment(**{name: PARAMETERS[name].study})
-        found = _errors(nominal, m, places)
-        moved = [np.abs(a - b).max() for a, b in zip(found.beside_px, aligned.beside_px, strict=True)]
+        seen = _errors(nominal, m, places)
+        moved = [np.abs(a - b).max() for a, b in zip(seen.beside_px, aligned.beside_px, strict=True)]
         predicted = errors(nominal, m, places) - before
         yield Rendered(
-            name, PARAMETERS[name].study, found.errors - aligned.errors, predicted, max(map(float, moved)), per_px
+            name, PARAMETERS[name].study, seen.errors - aligned.errors, predicted, max(map(float, moved)), per_px
         )
 
 
@@ -269,11 +269,11 @@ class _Seen:
 def _errors(nominal: Rig, misalignment: Misalignment, places: Places) -> _Seen:
     """Relative errors (estimators, d, a) from rendered centroids, and centroids less chief rays in both images."""
     true, h = nominal.perturbed(misalignment), misalignment.stroke_m(places.stroke_m)
-    found = [centroids_px(true.at(offset), places.points_m) for offset in (0.0, h)]
+    centroids = [centroids_px(true.at(offset), places.points_m) for offset in (0.0, h)]
     D = true_depth_m(nominal, misalignment, places)
-    estimates = [ESTIMATORS[name](nominal, places.stroke_m, *found).depth_m / D - 1.0 for name in NOMINAL]
+    estimates = [ESTIMATORS[name](nominal, places.stroke_m, *centroids).depth_m / D - 1.0 for name in NOMINAL]
     chief = pixels(nominal, misalignment, places)
-    return _Seen(np.stack(estimates), (found[0] - chief[0], found[1] - chief[1]))
+    return _Seen(np.stack(estimates), (centroids[0] - chief[0], centroids[1] - chief[1]))
 
 
 def centroids_px(view: View, points_m: Array) -> Array:

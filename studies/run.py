@@ -192,9 +192,9 @@ def find_study(name: str) -> Study[Any]:
     """
     if name not in NAMES:
         raise DatasetError(f"no study '{name}'; {nearest(name, NAMES)}")
-    found = importlib.import_module(f"phibench.studies.{name}.study").STUDY
-    assert isinstance(found, Study)
-    return found
+    study = importlib.import_module(f"phibench.studies.{name}.study").STUDY
+    assert isinstance(study, Study)
+    return study
 
 
 def run_study(

@@ -170,8 +170,8 @@ def items_of(crops: SpotCrops, settings: TrainingSettings, side_px: int = SIDE_P
     """Inputs of all crops of an epoch; some of them without laser-off image."""
     draw = generator("learned", "without off", crops.seed, crops.epoch)
     blind = draw.random(len(crops)) < settings.without_off
-    found = [_item(crops.crop(k), bool(blind[k]), side_px) for k in range(len(crops))]
-    planes, scalars, uv, turned = (np.array(column) for column in zip(*found, strict=True))
+    rows = [_item(crops.crop(k), bool(blind[k]), side_px) for k in range(len(crops))]
+    planes, scalars, uv, turned = (np.array(column) for column in zip(*rows, strict=True))
     return Items(planes, scalars, uv.astype(np.float32), turned)
 
 
@@ -191,14 +191,14 @@ _FIRST_LN = math.log(1.0 / 0.3)  # of the precision's factor: 0.3 px
 def first_crop_weights(seed: int) -> Weights:
     """Weights before training (He's law), by name: "<layer>.w" and "<layer>.b"."""
     draw = generator("learned", "crop weights", seed)
-    found: Weights = {}
+    weights: Weights = {}
     for name, of, to, _ in CONVOLUTIONS:
-        found |= first_layer(draw, name, (to, of, 3, 3))
-    found |= first_layer(draw, "cells", (3, 32, 1, 1), 0.3)
+        weights |= first_layer(draw, name, (to, of, 3, 3))
+    weights |= first_layer(draw, "cells", (3, 32, 1, 1), 0.3)
     for name, of, to in DENSE:
-        found |= first_layer(draw, name, (of, to), 0.1 if name == "d2" else 1.0, axis=0)
-    found["d2.b"][[2, 4]] = _FIRST_LN
-    return found
+        weights |= first_layer(draw, name, (of, to), 0.1 if name == "d2" else 1.0, axis=0)
+    weights["d2.b"][[2, 4]] = _FIRST_LN
+    return weights
 
 
 def first_layer(
@@ -342,10 +342,10 @@ def train(folder: Path, out: Path, settings: TrainingSettings) -> Path:
     held = rooms_of(folder, settings.seed)[1]
     items = items_of(crops_of(folder, settings, held, settings.checked, settings.seed + 1_000_000), settings)
     scale = scale_of(answers_of(weights, items))
-    found = answers_of(weights, items, scale)
+    answers = answers_of(weights, items, scale)
     minutes = (time.process_time() - began) / 60.0
-    _say(f"held-out rooms: rms pull {np.sqrt(found.squared_pull[found.sure].mean()):.2f}, scale {scale:.2f}")
-    _say(f"rms error {np.sqrt((found.error_px[found.sure] ** 2).mean()):.4f} px, {minutes:.1f} CPU-min")
+    _say(f"held-out rooms: rms pull {np.sqrt(answers.squared_pull[answers.sure].mean()):.2f}, scale {scale:.2f}")
+    _say(f"rms error {np.sqrt((answers.error_px[answers.sure] ** 2).mean()):.4f} px, {minutes:.1f} CPU-min")
     entries = {"covariance_scale": scale, "settings": json.dumps(asdict(settings), sort_keys=True)}
     return write_network(out, CROP, weights, entries)
 

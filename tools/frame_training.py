@@ -163,17 +163,17 @@ def _cut(crops: SpotCrops) -> Iterator[tuple[Any, ...]]:
 
 def spot_tiles(crops: SpotCrops) -> Tiles:
     """Tiles with a spot, at all phases."""
-    found = []
+    tiles = []
     for on, off, card, uv in _cut(crops):
         planes, _ = frame_input(on, off, card)
-        found.append((planes, *targets(planes, [uv], [])))
-    return Tiles(*(np.stack(column) for column in zip(*found, strict=True)))
+        tiles.append((planes, *targets(planes, [uv], [])))
+    return Tiles(*(np.stack(column) for column in zip(*tiles, strict=True)))
 
 
 def frame_maps(folder: Path, samples: Sequence[str], turn: int = 0) -> list[FrameMap]:
     """Frames of samples: of each one in half of the requests, which of them takes turns."""
     dataset = open_finished(folder)
-    found: list[FrameMap] = []
+    maps: list[FrameMap] = []
     draws = {one: {draw.sample_id: draw for draw in pair_draws(dataset, one, 1)} for one in REQUESTS}
     for number, name in enumerate(samples):
         cached = CachedSample(dataset[name])
@@ -181,8 +181,8 @@ def frame_maps(folder: Path, samples: Sequence[str], turn: int = 0) -> list[Fram
             for overrides in requests[(number + turn) % 2 :: 2]:
                 draw = draws[preset][name]
                 draw = replace(draw, draw=turn, request=replace(draw.request, overrides=dict(overrides)))
-                found += _maps_of(cached, draw, dataset)
-    return found
+                maps += _maps_of(cached, draw, dataset)
+    return maps
 
 
 def _maps_of(cached: CachedSample, draw: PairDraw, dataset: Dataset) -> Iterator[FrameMap]:
@@ -203,7 +203,7 @@ def _maps_of(cached: CachedSample, draw: PairDraw, dataset: Dataset) -> Iterator
 
 def _cold_tiles(maps: Sequence[FrameMap], heats: Sequence[Array], draw: np.random.Generator) -> Tiles:
     """Tiles of frames, half of them about the hottest cells that are to be cold, half by chance."""
-    found = []
+    tiles = []
     for one, heat in zip(maps, heats, strict=True):
         cold = (one.counted > 0.0) & (one.heat == 0.0)
         peaks = heat_peaks(heat, one.red_e, cold, -np.inf)
@@ -213,8 +213,8 @@ def _cold_tiles(maps: Sequence[FrameMap], heats: Sequence[Array], draw: np.rando
             shift = draw.integers(-_SIDE // 4, _SIDE // 4 + 1, 2)
             v, u = np.clip(at - _SIDE // 2 + shift, 0, np.array(cold.shape) - _SIDE)
             part = (slice(v, v + _SIDE), slice(u, u + _SIDE))
-            found.append((one.planes[:, *part].astype(np.float32), one.heat[part], one.counted[part]))
-    return Tiles(*(np.stack(column) for column in zip(*found, strict=True)))
+            tiles.append((one.planes[:, *part].astype(np.float32), one.heat[part], one.counted[part]))
+    return Tiles(*(np.stack(column) for column in zip(*tiles, strict=True)))
 
 
 # -- the network of frames -------------------------------------------------------------------------------------------
@@ -223,10 +223,10 @@ def _cold_tiles(maps: Sequence[FrameMap], heats: Sequence[Array], draw: np.rando
 def first_detector_weights(seed: int) -> Weights:
     """Weights before training."""
     draw = generator("learned", "detector weights", seed)
-    found: Weights = {}
+    weights: Weights = {}
     for name, of, to in DETECTOR:
-        found |= first_layer(draw, name, (to, of, 3, 3))
-    return found | first_layer(draw, "heat", (1, DETECTOR[-1][2], 1, 1))
+        weights |= first_layer(draw, name, (to, of, 3, 3))
+    return weights | first_layer(draw, "heat", (1, DETECTOR[-1][2], 1, 1))
 
 
 def detector_forward(torch: Any, p: Parameters, planes: Any) -> Any:
@@ -289,7 +289,7 @@ def thresholds_of(weights: Weights, maps: Sequence[FrameMap]) -> dict[str, tuple
     one false peak in a frame.
     """
     p = {name: torch_on_one_thread().from_numpy(value) for name, value in weights.items()}
-    found: dict[str, tuple[float, float]] = {}
+    thresholds: dict[str, tuple[float, float]] = {}
     for preset in REQUESTS:
         chosen, peaks = [one for one in maps if one.preset == preset], []
         for one, heat in zip(chosen, heats_of(p, chosen), strict=True):
@@ -297,8 +297,8 @@ def thresholds_of(weights: Weights, maps: Sequence[FrameMap]) -> dict[str, tuple
             peaks.append(heat_peaks(heat, one.red_e, cold, -20.0).heat)
         every = np.sort(np.concatenate(peaks))[::-1]
         alone, each = (max(float(every[int(share * len(chosen))]), 0.0) for share in (_FALSE_ALONE, _FALSE_EACH))
-        found[preset] = (alone + _MARGIN, each)
-    return found
+        thresholds[preset] = (alone + _MARGIN, each)
+    return thresholds
 
 
 def answers_at_found(detector: Path, crops: SpotCrops, thresholds: Mapping[str, tuple[float, float]]) -> Answers:

@@ -116,9 +116,9 @@ def _dtype(dtype: DataType) -> str:
 
 def hugging_face_features(request: ExportRequest, table: DataFrame) -> Mapping[str, Any]:
     """Features of an export's rows as the library `datasets` writes them down."""
-    found: dict[str, Any] = {}
+    features: dict[str, Any] = {}
     for name, dtype in table.schema.items():
         is_list = "List" in str(dtype)
         value = {"dtype": "float64" if is_list else _dtype(dtype), "_type": "Value"}
-        found[name] = {"feature": value, "_type": "Sequence"} if is_list else value
-    return found | {column: {"_type": "Image"} for column, _, _ in request.images}
+        features[name] = {"feature": value, "_type": "Sequence"} if is_list else value
+    return features | {column: {"_type": "Image"} for column, _, _ in request.images}

@@ -83,13 +83,13 @@ def _images(request: ExportRequest) -> list[dict[str, Any]]:
 
 def column_texts(request: ExportRequest) -> dict[str, str]:
     """Meaning of every column of an export that is not drawn by the recipe, with its unit."""
-    found = manifest_texts()
+    texts = manifest_texts()
     frame = {name: described_field(field) for name, field in columns(FrameRow)}
-    found |= {f"{p}.{name}": frame[name] for p in ("down", "up") for name in POSITION_FIELDS}
-    found |= {name: frame[name] for name in ("draw", "preset", "jpeg_quality", "laser_level", "lamp_level")}
-    found |= {"key": "name of the pair in this draw", "split": "train, validation or test"}
+    texts |= {f"{p}.{name}": frame[name] for p in ("down", "up") for name in POSITION_FIELDS}
+    texts |= {name: frame[name] for name in ("draw", "preset", "jpeg_quality", "laser_level", "lamp_level")}
+    texts |= {"key": "name of the pair in this draw", "split": "train, validation or test"}
     places = {"parquet": "shard and name", "webdataset": "shard and member", "frames": "file"}
-    return found | {column: f"{places[request.form]} of the image" for column, _, _ in request.images}
+    return texts | {column: f"{places[request.form]} of the image" for column, _, _ in request.images}
 
 
 # The card.
@@ -122,7 +122,7 @@ def _header(dataset: Dataset, request: ExportRequest, table: DataFrame) -> list[
     ends = {"parquet": "-*.parquet", "webdataset": "-*.tar", "frames": "/**"}
     there = [name for name in SPLITS if (table["split"] == name).any()]
     files = [{"split": name, "path": f"{FOLDER[request.form]}/{name}{ends[request.form]}"} for name in there]
-    found = [
+    lines = [
         "license: cc-by-4.0",
         f"pretty_name: {json.dumps(f'{dataset.info.name} ({request.frames.preset})')}",
         'tags: ["omnidirectional", "catadioptric", "synthetic", "metrology"]',
@@ -135,8 +135,8 @@ def _header(dataset: Dataset, request: ExportRequest, table: DataFrame) -> list[
         features = [
             {"name": name, **_card_feature(kind)} for name, kind in hugging_face_features(request, plain).items()
         ]
-        found.append(f"dataset_info: {json.dumps({'features': features})}")
-    return found
+        lines.append(f"dataset_info: {json.dumps({'features': features})}")
+    return lines
 
 
 def _card_feature(kind: Any) -> dict[str, Any]:

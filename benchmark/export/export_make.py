@@ -175,8 +175,8 @@ def verify_export(folder: str | Path) -> list[str]:
     if not (folder / schema.CHECKSUMS).is_file():
         raise DatasetError(f"{folder} has no {schema.CHECKSUMS}: it was not finished; {_AGAIN}")
     listed = read_checksums(folder)
-    found = (path for path in folder.rglob("*") if path.is_symlink() or not path.is_dir())  # pipes and sockets, too
-    there = {path.relative_to(folder).as_posix() for path in found}
+    paths = (path for path in folder.rglob("*") if path.is_symlink() or not path.is_dir())  # pipes and sockets, too
+    there = {path.relative_to(folder).as_posix() for path in paths}
     state = {schema.CHECKSUMS, schema.JOURNAL, schema.LOCK, schema.TruthFile.SHARDS.value}
     strange = sorted(there - set(listed) - state)
     return differing_files(folder, listed) + [f"{name} is not of the export" for name in strange]

@@ -185,7 +185,7 @@ def splits(dataset: Dataset, request: ExportRequest) -> dict[str, str]:
     seed = dataset.recipe.dataset.seed
     order = generator(dataset.info.name, seed, "export", request.split_by).permutation(len(groups))
     total = len(dataset.rows)
-    found: dict[str, str] = {}
+    split_of: dict[str, str] = {}
     room = {"test": request.test * total, "validation": request.validation * total}
     for number in order:
         group = groups[number]
@@ -193,8 +193,8 @@ def splits(dataset: Dataset, request: ExportRequest) -> dict[str, str]:
         fits = next((name for name in room if len(group) <= room[name] + 1e-9), "train")
         if fits in room:
             room[fits] -= len(group)
-        found |= dict.fromkeys(group, fits)
-    return {row.sample_id: found[row.sample_id] for row in dataset.rows}
+        split_of |= dict.fromkeys(group, fits)
+    return {row.sample_id: split_of[row.sample_id] for row in dataset.rows}
 
 
 def _groups(rows: Sequence[ManifestRow], split_by: SplitBy) -> list[list[str]]:

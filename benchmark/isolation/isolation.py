@@ -189,20 +189,20 @@ def interpreter_paths() -> list[Path]:
     """Folders of this interpreter, its packages and its libraries."""
     package, python = sys.modules["phibench"], Path(sys.executable)
     own = {path for path in map(_real, map(Path, package.__path__)) if path}
-    found = [Path(path) for path in (sys.prefix, sys.exec_prefix, sys.base_prefix, sys.base_exec_prefix)]
-    found += [python.parent, (_real(python) or python).parent, *_library_folders()]
+    paths = [Path(path) for path in (sys.prefix, sys.exec_prefix, sys.base_prefix, sys.base_exec_prefix)]
+    paths += [python.parent, (_real(python) or python).parent, *_library_folders()]
     # a checkout holds links to folders beside it
-    found += [entry.resolve() for path in own for entry in (path, *path.iterdir()) if entry.is_dir()]
-    found.append((_real(Path(package.__file__ or python)) or python).parent)
+    paths += [entry.resolve() for path in own for entry in (path, *path.iterdir()) if entry.is_dir()]
+    paths.append((_real(Path(package.__file__ or python)) or python).parent)
     for path in [Path(path) for path in sys.path if path.startswith("/")]:
         if _real(path) not in own:
-            found.append(path)
+            paths.append(path)
         with suppress(OSError):  # not readable
-            found += [Path(entry.path) for entry in os.scandir(path) if entry.is_symlink()]
+            paths += [Path(entry.path) for entry in os.scandir(path) if entry.is_symlink()]
     for finder in sys.meta_path:  # packages that setuptools installed as editable
         mapping = getattr(sys.modules.get(getattr(finder, "__module__", "")), "MAPPING", {})
-        found += [Path(place) for place in dict(mapping).values()]
-    return found
+        paths += [Path(place) for place in dict(mapping).values()]
+    return paths
 
 
 def _library_folders() -> list[Path]:

@@ -28,12 +28,12 @@ def loaded_names(folder: str = "") -> list[str]:
 
     A part of a namespace package stands with its own name, "google.protobuf".
     """
-    found = set[str]()
+    names = set[str]()
     with suppress(Exception):  # a method may put anything into sys.modules
         for name, module in list(sys.modules.items()):
             if isinstance(name, str) and len(name) <= _LONGEST_NAME and _is_of_others(name, module, folder):
-                found.add(_unit(name))
-    return sorted(found)[:MOST_NAMES]
+                names.add(_unit(name))
+    return sorted(names)[:MOST_NAMES]
 
 
 def _is_of_others(name: str, module: Any, folder: str) -> bool:
@@ -58,14 +58,14 @@ def packages_of(names: Iterable[str]) -> dict[str, str | None]:
 
     Modules of no package whose names begin with an underscore are left out: they are parts of an installation.
     """
-    owners, found = _owners(_places()), dict[str, str | None]()
+    owners, versions = _owners(_places()), dict[str, str | None]()
     for name in names:
         candidates = owners.get(name.partition(".")[0], ())
         packages = [one for one in dict.fromkeys(candidates) if len(candidates) == 1 or _has(one, name)] or candidates
-        found |= {printable_line(one): _version(one) for one in packages}
+        versions |= {printable_line(one): _version(one) for one in packages}
         if not packages and not name.startswith("_"):
-            found[printable_line(name)] = None
-    return dict(sorted(found.items()))
+            versions[printable_line(name)] = None
+    return dict(sorted(versions.items()))
 
 
 def _places() -> tuple[tuple[str, int], ...]:

@@ -168,8 +168,8 @@ class _Maker:
             self.ask(*wanted)
             with self._receiving:
                 while wanted not in self._results:
-                    found = self._received()
-                    self._results[self._asked[0]] = found
+                    reply = self._received()
+                    self._results[self._asked[0]] = reply
                     self._asked.popleft()
                 made = self._results.pop(wanted)
         except TransportError as error:

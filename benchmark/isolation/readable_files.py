@@ -98,7 +98,7 @@ def truth_near(
     MethodError
         If there is more in it than can be looked through.
     """
-    found: list[Path] = []
+    truths: list[Path] = []
     linked: dict[tuple[int, int], Path] = {}
     passed = {*secret, *(Path(name).resolve() for name in (sys.prefix, sys.base_prefix))}
     level, left = [folder], _MOST_ENTRIES
@@ -109,16 +109,16 @@ def truth_near(
             left -= len(entries)
             names = {entry.name for entry in entries}
             if names & _FOLDERS:
-                found.append(path)
+                truths.append(path)
                 continue
-            found += [path / entry.name for entry in entries if _holds_truth(path, entry.name, names)]
+            truths += [path / entry.name for entry in entries if _holds_truth(path, entry.name, names)]
             linked.update(_linked(entries))
             below += [path / entry.name for entry in entries if entry.is_dir(follow_symlinks=False)]
         if left < 0:
             most = f"more than {_MOST_ENTRIES} files, too many to look for the truth in"
             raise MethodError(f"{title or f'the folder of the method, {folder},'} holds {most}: {advice}")
         level = [path for path in below if path not in passed]
-    return [*found, *(_same_files(linked, secret) if linked else ())]
+    return [*truths, *(_same_files(linked, secret) if linked else ())]
 
 
 def _entries(path: Path) -> list[os.DirEntry[str]]:

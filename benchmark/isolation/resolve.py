@@ -103,17 +103,17 @@ def resolve(reference: str) -> Reference:
         return _of_file(reference)
     from phibench.estimator.methods.registry import KNOWN  # a second of imports that a method in a file does not need
 
-    found = [point for point in installed() if point.name == reference]
+    points = [point for point in installed() if point.name == reference]
     if reference in KNOWN:
-        if found:
-            raise MethodError(f"method '{reference}' is built in, and {_owner(found[0])} registers another")
+        if points:
+            raise MethodError(f"method '{reference}' is built in, and {_owner(points[0])} registers another")
         return _built_in(KNOWN[reference])
-    if len(found) > 1:
-        raise MethodError(f"method '{reference}' is registered by {' and by '.join(map(_owner, found))}: remove one")
-    if not found:
+    if len(points) > 1:
+        raise MethodError(f"method '{reference}' is registered by {' and by '.join(map(_owner, points))}: remove one")
+    if not points:
         raise MethodError(_unknown(reference, list(KNOWN)))
-    hashed = package_sha256(found[0].dist, found[0].module)
-    return Reference(reference, "package", found[0].value, sha256=hashed, version=_owner(found[0]))
+    hashed = package_sha256(points[0].dist, points[0].module)
+    return Reference(reference, "package", points[0].value, sha256=hashed, version=_owner(points[0]))
 
 
 def installed() -> tuple[EntryPoint, ...]:
@@ -168,13 +168,13 @@ def code_of_function(function: Any) -> dict[str, Any]:
 
 def modules_beside(path: Path) -> list[str]:
     """Files in the folder of a Python file that it imports, and that these import: paths from there, sorted."""
-    folder, found, waiting = path.parent, set[Path](), [path]
+    folder, modules, waiting = path.parent, set[Path](), [path]
     while waiting:
         for file in _imported(waiting.pop(), folder):
-            if file != path and file not in found:
-                found.add(file)
+            if file != path and file not in modules:
+                modules.add(file)
                 waiting.append(file)
-    return sorted(file.relative_to(folder).as_posix() for file in found)
+    return sorted(file.relative_to(folder).as_posix() for file in modules)
 
 
 def _imported(file: Path, folder: Path) -> Iterator[Path]:

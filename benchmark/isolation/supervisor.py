@@ -129,12 +129,12 @@ def end_descendants(worker: int, seconds: float = KILL_SECONDS) -> None:
 
 def _children(parent: int) -> dict[int, int]:
     """Process groups of children, by process, of those that have ended as well; none where the system does not tell."""
-    found = {}
+    groups = {}
     with contextlib.suppress(OSError, ValueError):  # the kernel was built without that list
         for pid in map(int, (_PROC / f"{parent}/task/{parent}/children").read_text().split()):
             with contextlib.suppress(OSError):
-                found[pid] = os.getpgid(pid)
-    return found
+                groups[pid] = os.getpgid(pid)
+    return groups
 
 
 def _descendants(ancestor: int) -> dict[int, int]:
@@ -146,11 +146,11 @@ def _descendants(ancestor: int) -> dict[int, int]:
             if state not in "ZX":
                 pid = int(entry.parent.name)
                 parents[pid], groups[pid] = int(parent), int(group)
-    found, added = set[int](), {ancestor}
+    descendants, added = set[int](), {ancestor}
     while added:
-        added = {pid for pid, parent in parents.items() if parent in added} - found
-        found |= added
-    return {pid: groups[pid] for pid in found}
+        added = {pid for pid, parent in parents.items() if parent in added} - descendants
+        descendants |= added
+    return {pid: groups[pid] for pid in descendants}
 
 
 def processes_in(folder: str) -> Iterator[int]:

@@ -177,12 +177,12 @@ def _advice(name: str, module: ModuleType) -> str:
 def _from_package(reference: Reference) -> Any:
     module, _, attribute = reference.place.partition(":")
     try:
-        found: Any = importlib.import_module(module)
+        item: Any = importlib.import_module(module)
         for name in filter(None, attribute.split(".")):
-            found = getattr(found, name)
+            item = getattr(item, name)
     except BaseException as error:  # SystemExit of a script counts as well
         raise MethodError(f"method '{reference.name}' cannot be imported: {sentence_of(error)}") from error
-    return found
+    return item
 
 
 def require_method(function: Any, title: str) -> None:

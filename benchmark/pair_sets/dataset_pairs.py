@@ -134,13 +134,13 @@ class DatasetPairs(DrawnPairs, ShortForm):
         DatasetError
             If there is none, or several for want of a preset.
         """
-        found = [one for one in self.pair_draws if (one.sample_id, one.draw) == (sample_id, draw)]
-        found = [one for one in found if preset in (None, one.preset)]
-        if len(found) != 1:
-            presets = sorted({one.preset for one in found})
-            say = f"it is there in {', '.join(presets)}: give one" if found else "there is no such pair"
+        numbers = [one for one in self.pair_draws if (one.sample_id, one.draw) == (sample_id, draw)]
+        numbers = [one for one in numbers if preset in (None, one.preset)]
+        if len(numbers) != 1:
+            presets = sorted({one.preset for one in numbers})
+            say = f"it is there in {', '.join(presets)}: give one" if numbers else "there is no such pair"
             raise DatasetError(f"sample '{sample_id}', draw {draw}, preset {preset or 'any'}: {say}")
-        return found[0].number
+        return numbers[0].number
 
     def __iter__(self) -> Iterator[tuple[Pair, PairTruth]]:
         """Pairs with their truths, by number."""
@@ -172,13 +172,13 @@ class DatasetPairs(DrawnPairs, ShortForm):
 
     def _otherwise(self) -> dict[str, Any]:
         """Frames and numbers of the sensor that are not the recipe's: scores of others are not comparable."""
-        found: dict[str, Any] = {}
+        changed: dict[str, Any] = {}
         if (counts := sorted({draw.frames for draw in self.pair_draws})) != [(1, 1)]:
-            found["frames"] = [list(one) for one in counts]
+            changed["frames"] = [list(one) for one in counts]
         if self._sensor is not None:
             text = json.dumps([self._sensor.preset, dict(self._sensor.numbers)], sort_keys=True)
-            found["sensor_sha256"] = hashlib.sha256(text.encode()).hexdigest()
-        return found
+            changed["sensor_sha256"] = hashlib.sha256(text.encode()).hexdigest()
+        return changed
 
 
 def _box_px2(pair_draw: PairDraw) -> float:

@@ -113,8 +113,8 @@ class FramesSet(ShortForm):
 
     def pair(self, number: int) -> Pair:
         """Images of a pair, with what a user knows of the rig."""
-        found = replace(pair_of_files(self._files, self._place(number)), number=number)
-        return found if self._hints else replace(found, box_down=None, box_up=None)
+        read = replace(pair_of_files(self._files, self._place(number)), number=number)
+        return read if self._hints else replace(read, box_down=None, box_up=None)
 
     def truth(self, number: int) -> PairTruth:
         """Exact answer for a pair, with its bounds.
@@ -126,10 +126,10 @@ class FramesSet(ShortForm):
         """
         place = self._place(number)
         try:
-            found = truth_of(self._files.row(place).truth)
+            read = truth_of(self._files.row(place).truth)
         except DatasetError as error:
             raise DatasetError(f"{self.folder / PAIRS} line {place + 1}: {error}; download the set again") from error
-        return replace(found, number=number, hinted=found.hinted and self._hints)
+        return replace(read, number=number, hinted=read.hinted and self._hints)
 
     def number_of(self, sample_id: str, draw: int = 0, preset: str | None = None) -> int:
         """Number of the pair of a sample in a draw of the noise, as scores name it.
@@ -141,10 +141,10 @@ class FramesSet(ShortForm):
         """
         wanted = (sample_id, draw, preset or self.preset)
         rows = (self._files.row(place).truth for place in self._numbers)
-        found = [k for k, row in enumerate(rows) if (row.sample_id, row.draw, row.preset) == wanted]
-        if not found:
+        numbers = [k for k, row in enumerate(rows) if (row.sample_id, row.draw, row.preset) == wanted]
+        if not numbers:
             raise DatasetError(f"sample '{sample_id}', draw {draw}, preset {wanted[2]}: there is no such pair")
-        return found[0]
+        return numbers[0]
 
     def pairs(
         self, preset: str | None = None, draws: int | None = None, *, pairs: int | None = None, hints: bool = True

@@ -66,10 +66,10 @@ def read_truth_file(path: Path, sha256: str) -> list[PairTruth]:
     """
     file = InputFile(path, "give the truth's file")
     data = file.read()
-    found = hashlib.sha256(data).hexdigest()
-    if found != sha256:
+    digest = hashlib.sha256(data).hexdigest()
+    if digest != sha256:
         raise DatasetError(
-            f"{path} is not the truth that was sealed: its SHA-256 begins with {found[:12]}, the seal says "
+            f"{path} is not the truth that was sealed: its SHA-256 begins with {digest[:12]}, the seal says "
             f"{sha256[:12]}; give the file that `phibench seal make` wrote for this set"
         )
     truths = []

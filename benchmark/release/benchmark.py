@@ -122,11 +122,11 @@ def _sha256(values: dict[str, Any]) -> str:
 
 
 def _without_numbers(values: dict[str, Any]) -> dict[str, Any]:
-    found = dict(values)
+    rest = dict(values)
     for name, left_out in (("dataset", "seed"), ("random", "samples")):
         if isinstance(table := values.get(name), dict):
-            found[name] = {key: value for key, value in table.items() if key != left_out}
-    return found
+            rest[name] = {key: value for key, value in table.items() if key != left_out}
+    return rest
 
 
 # Documents of a release.

@@ -325,8 +325,8 @@ def _write_member(file: IO[bytes], path: Path, size: int) -> None:
 
 def _files(folder: Path) -> list[str]:
     """Names of all that lies in a folder and below, but folders."""
-    found = (path for path in folder.rglob("*") if path.is_symlink() or not path.is_dir())
-    return sorted(path.relative_to(folder).as_posix() for path in found)
+    paths = (path for path in folder.rglob("*") if path.is_symlink() or not path.is_dir())
+    return sorted(path.relative_to(folder).as_posix() for path in paths)
 
 
 def _check(stage: Path, title: str, part: ReleasedPart, place: Source, is_fresh: bool) -> None:

@@ -211,15 +211,15 @@ def _seed(request: ReleaseRequest, part: ReleasePart, make_it: bool = True) -> i
 
 def _assigned(request: ReleaseRequest) -> dict[str, Path]:
     """Folder by title of the part that it fits."""
-    found: dict[str, Path] = {}
+    folders: dict[str, Path] = {}
     for folder in request.use:
         reasons = {part.title: _misfit(request, part, folder) for part in request.parts}
         fitting = [title for title, reason in reasons.items() if not reason]
         if not fitting:
             told = [reason for reason in reasons.values() if reason != _OTHER] or [_OTHER]
             raise DatasetError(f"--use {folder}: {told[0]}; leave it out, and it is rendered")
-        found[fitting[0]] = folder
-    return found
+        folders[fitting[0]] = folder
+    return folders
 
 
 _OTHER = "it is no data set of a recipe that is to be released"
@@ -328,8 +328,8 @@ def _members(part: ReleasePart, folder: Path) -> dict[str, str]:
     """Files to be packed with their SHA-256, sorted by name: what SHA256SUMS lists, itself, and the journal."""
     listed = read_checksums(folder)
     extra = [schema.CHECKSUMS, *([schema.JOURNAL] if part.kind == "pairs" else [])]
-    found = listed | {name: sha256(folder / name) for name in extra if (folder / name).is_file()}
-    return dict(sorted(found.items()))
+    hashes = listed | {name: sha256(folder / name) for name in extra if (folder / name).is_file()}
+    return dict(sorted(hashes.items()))
 
 
 def _shares(folder: Path, members: Mapping[str, str], most: int) -> Iterator[list[str]]:

@@ -155,11 +155,11 @@ class _Transfer:
 
         handle = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))
         with os.fdopen(handle, "rb") as source, Path(target).open("wb") as copy:
-            found = os.fstat(handle)
-            if not stat.S_ISREG(found.st_mode):
+            status = os.fstat(handle)
+            if not stat.S_ISREG(status.st_mode):
                 raise HopelessError(f"holds {self._name}, which is no ordinary file")
-            if found.st_size > self._most:
-                raise ValueError(f"has {found.st_size} bytes: at most {self._most} are read")
+            if status.st_size > self._most:
+                raise ValueError(f"has {status.st_size} bytes: at most {self._most} are read")
             left = self._most
             while left and (data := source.read(min(_CHUNK, left))):
                 left -= len(data)

@@ -114,10 +114,11 @@ def compare_records(first: pl.DataFrame, second: pl.DataFrame, rules: Rules, *st
         If they share no pair, or a pair's truth differs.
     """
     a, b = _common(first, second, rules)
-    found = [_difference(name, a, b, rules, *stream) for name in COMPARED]
-    shown = holm([item.chance for item in found], 1.0 - rules.confidence)
+    differences = [_difference(name, a, b, rules, *stream) for name in COMPARED]
+    shown = holm([item.chance for item in differences], 1.0 - rules.confidence)
     return [
-        replace(item, better=_verdict(item)) if is_shown else item for item, is_shown in zip(found, shown, strict=True)
+        replace(item, better=_verdict(item)) if is_shown else item
+        for item, is_shown in zip(differences, shown, strict=True)
     ]
 
 

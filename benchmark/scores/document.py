@@ -422,8 +422,8 @@ def read_score(path: Path) -> ScoreDocument:
     if raw.get("kind") != KIND:
         raise DatasetError(f"{path} is no score: give a JSON file that `phibench score --method ... --out` wrote")
     if raw.get("version") != VERSION:
-        found = printable_line(str(raw.get("version")), 60)
-        raise DatasetError(f"{path} has version {found}, this program reads {VERSION}: score again")
+        version = printable_line(str(raw.get("version")), 60)
+        raise DatasetError(f"{path} has version {version}, this program reads {VERSION}: score again")
     return file.validated(ScoreDocument, raw)
 
 

@@ -328,18 +328,18 @@ def measure(
     *stream : names of the random stream of the resamples
     """
     wanted = {name: METRICS[name] for name in names or METRICS}
-    found: dict[str, MetricEstimate] = {}
+    estimates_by_name: dict[str, MetricEstimate] = {}
     groups: dict[bytes, dict[str, _Ready]] = {}
     for family in dict.fromkeys(metric.family for metric in wanted.values()):
         part = {name: metric for name, metric in wanted.items() if metric.family == family}
         chosen = records.filter(FAMILIES[family])
         clusters = Clusters.of(chosen["sample_code"].to_numpy())
-        found |= _rates(part, chosen, clusters, rules)
+        estimates_by_name |= _rates(part, chosen, clusters, rules)
         # families of the same samples are resampled together: one set of resamples for nearly everything
         groups.setdefault(clusters.key, {}).update(_statistics(part, chosen, clusters))
     for number, ready in enumerate(groups.values()):
-        found |= _resampled(ready, rules, generator(*stream, number))
-    return {name: _with_share(metric, found[name], records) for name, metric in wanted.items()}
+        estimates_by_name |= _resampled(ready, rules, generator(*stream, number))
+    return {name: _with_share(metric, estimates_by_name[name], records) for name, metric in wanted.items()}
 
 
 def _with_share(metric: Metric, measured: MetricEstimate, records: pl.DataFrame) -> MetricEstimate:

@@ -279,7 +279,7 @@ def verdict(scores: Mapping[str, ScoreDocument], by: str) -> str:
     if not any(_rate(score, "detection_rate") for score in scores.values()):
         return "No method finds a spot on these pairs."
     number, interval = shown_parts(metric, first.metrics[metric])
-    found = _rate(first, "detection_rate")
+    rate = _rate(first, "detection_rate")
     missing = {name: kind["missed"] + kind["false"] for name, kind in first.causes.items()}
     cause = max(missing, key=lambda name: missing[name])
     placed = first.metrics["rms_counted_px"].value is not None  # of real pairs no cause can be told
@@ -288,7 +288,7 @@ def verdict(scores: Mapping[str, ScoreDocument], by: str) -> str:
     parts = [f"{best}: {flag.text}." for flag in first.flags]
     parts += [
         f"{best} {alone} {quantity}: {number} {METRICS[metric].shown[1]} {interval}; "
-        f"it finds {100 * found:.3g} % of the spots{why}."
+        f"it finds {100 * rate:.3g} % of the spots{why}."
     ]
     blind = [name for name, score in scores.items() if _rate(score, "detection_rate") < _LEAST_FOUND]
     wrong = [name for name, score in scores.items() if _rate(score, "false_rate") >= FULL_OF_FALSE]

@@ -220,11 +220,11 @@ def _strata(part: ScoreGroup) -> TextTable:
 def _in_stratum(one: ScoreDocument, wanted: StratumScore) -> str:
     for stratum in one.strata:
         if (stratum.by, stratum.label) == (wanted.by, wanted.label):
-            found, _ = shown_parts("detection_rate", stratum.metrics["detection_rate"])
+            shown, _ = shown_parts("detection_rate", stratum.metrics["detection_rate"])
             median = cell_parts(
                 stratum.metrics["median_px"].estimate, METRICS["median_px"].shown[0], 2, significant=True
             )
-            return f"{found}; {_cut(' '.join(median))}"
+            return f"{shown}; {_cut(' '.join(median))}"
     return ""
 
 

@@ -429,15 +429,15 @@ def run_and_score(
     MethodError
         If a method cannot be found or imported.
     """
-    found, limits = [resolve(reference) for reference in references], limits or RunLimits()
-    cards = [MethodCard.of(name, **method.document()) for name, method in zip(references, found, strict=True)]
+    resolved, limits = [resolve(reference) for reference in references], limits or RunLimits()
+    cards = [MethodCard.of(name, **method.document()) for name, method in zip(references, resolved, strict=True)]
     if not cards:
         return []
     # the steps first: they tell of time that goes by while methods start
     with (
         Steps(console, title, len(pairs)) as steps,
         _ahead(pairs, workers) as (made, making),
-        Harness(found, limits, workers, truth_folders(pairs)) as harness,
+        Harness(resolved, limits, workers, truth_folders(pairs)) as harness,
     ):
         scored = score_methods(cards, made, harness.outcomes, None, seed, limits.document(), steps.reach, stages)
     if stages is not None:

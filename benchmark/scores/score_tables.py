@@ -483,8 +483,8 @@ def differences_csv(differences: Sequence[Difference]) -> str:
 
 def differences_json(differences: Sequence[Difference]) -> str:
     """One JSON object: metric to values and difference."""
-    found = {d.name: {key: x for key, x in _difference_fields(d).items() if key != "metric"} for d in differences}
-    return json.dumps(found, indent=1, allow_nan=False) + "\n"
+    fields = {d.name: {key: x for key, x in _difference_fields(d).items() if key != "metric"} for d in differences}
+    return json.dumps(fields, indent=1, allow_nan=False) + "\n"
 
 
 def _difference_fields(d: Difference) -> dict[str, str | float | int | None]:

@@ -83,10 +83,10 @@ def _known(card: MethodCard) -> Reference | None:
     if card.kind not in ("built-in", "package"):
         return None
     try:
-        found = resolve(card.reference)
+        reference = resolve(card.reference)
     except MethodError:  # not here: nothing to compare with
         return None
-    return found if (found.kind, found.version) == (card.kind, card.version) else None
+    return reference if (reference.kind, reference.version) == (card.kind, card.version) else None
 
 
 def _of_reference(card: MethodCard, reference: Reference) -> Iterator[str]:

@@ -152,14 +152,14 @@ def _of_release(document: ScoreDocument, release: Path | None) -> Iterator[str]:
 
 def _of_pairs(document: ScoreDocument, table: pl.DataFrame) -> Iterator[str]:
     wanted = [(number, image) for number in range(document.pairs) for image in ("down", "up")]
-    found = list(table.select("number", "image").rows())
-    if found != wanted:
-        missing = sorted({number for number, _ in set(wanted) - set(found)})
+    given = list(table.select("number", "image").rows())
+    if given != wanted:
+        missing = sorted({number for number, _ in set(wanted) - set(given)})
         if missing:
             text = ", ".join(map(str, missing[:5])) + (" and more" if len(missing) > 5 else "")
             yield f"records: no answer for pair {text}; each of {document.pairs} pairs has two rows, down and up"
         else:
-            yield f"records: {len(found)} rows for {document.pairs} pairs: each has two, down and up, in order"
+            yield f"records: {len(given)} rows for {document.pairs} pairs: each has two, down and up, in order"
     stated = document.pair_set.get("pairs")
     if stated != document.pairs:
         yield f"pairs is {document.pairs} and pair_set.pairs {stated}: the method was not scored on the whole set"
@@ -306,11 +306,11 @@ _FROM_RECORDS = (*("missed_relative", "draws", "frames", "light", "metrics", "st
 
 def _unequal(given: Any, right: Any, place: str, source: str = "the records give") -> Iterator[str]:
     """Leaves that differ; the first ones of a place, because one number in the records changes many."""
-    found = list(_leaves(given, right, place))
-    for where, a, b in found[:_MOST]:
+    leaves = list(_leaves(given, right, place))
+    for where, a, b in leaves[:_MOST]:
         yield f"{where} is {short(a)}, and {source} {short(b)}"
-    if len(found) > _MOST:
-        yield f"{place}: {len(found) - _MOST} more are not what {source}"
+    if len(leaves) > _MOST:
+        yield f"{place}: {len(leaves) - _MOST} more are not what {source}"
 
 
 _MOST = 3  # differences of a file that are told: the first ones show the cause

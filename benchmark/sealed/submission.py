@@ -199,10 +199,10 @@ def submit(
     if out.is_dir():
         raise DatasetError(f"{out} is a folder; give a file such as submission.json, --out")
     pairs.check()
-    found = resolve(method)
-    with Harness([found], limits, workers, truth_folders(pairs)) as harness:
+    reference = resolve(method)
+    with Harness([reference], limits, workers, truth_folders(pairs)) as harness:
         outcomes = [outcome for (outcome,) in harness.outcomes(pairs, range(len(pairs)))]
-        document = submission(pairs.seal, found, outcomes, harness.isolations[0], harness.ran[0])
+        document = submission(pairs.seal, reference, outcomes, harness.isolations[0], harness.ran[0])
     check_complete(document, pairs.seal, "the run")
     write_text(out, json.dumps(document.model_dump(mode="json"), indent=1, allow_nan=False) + "\n")
     spots = [spot for o in outcomes if o.answer is not None for spot in (o.answer.down, o.answer.up)]

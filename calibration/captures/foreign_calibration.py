@@ -61,17 +61,18 @@ class _Found:
 
 def foreign_calibration(text: str) -> str:
     """Fault of a rig file that is a calibration of another program: what to do with it; "" if it is none."""
-    found = next((found for known in _PROGRAMS if (found := known(text)) is not None), None)
-    if found is None:
+    calibration = next((calibration for known in _PROGRAMS if (calibration := known(text)) is not None), None)
+    if calibration is None:
         return ""
-    start = f"is a calibration of {found.program}, not a rig file"
-    if found.in_one:
-        return f"{start}, and holds mirror and camera in one ({found.in_one}), which cannot be split; {_WITHOUT_MIRROR}"
-    if not found.focal:
+    start = f"is a calibration of {calibration.program}, not a rig file"
+    if calibration.in_one:
+        both = f"holds mirror and camera in one ({calibration.in_one}), which cannot be split"
+        return f"{start}, and {both}; {_WITHOUT_MIRROR}"
+    if not calibration.focal:
         return f"{start}, and has no focal length; write fx_px, fy_px, cx_px and cy_px into [rig] of a TOML file"
-    keys = _rig_keys(found)
-    several = f" (of its first camera of {found.cameras})" if found.cameras > 1 else ""
-    beyond = _beyond(found)
+    keys = _rig_keys(calibration)
+    several = f" (of its first camera of {calibration.cameras})" if calibration.cameras > 1 else ""
+    beyond = _beyond(calibration)
     return (
         f"{start}; write a TOML file with [rig]{several} and {', '.join(keys)}, one key a line, and add radius_m and "
         f"z_c_m of the mirror, which no calibration of a camera knows{beyond}"
@@ -132,9 +133,9 @@ def _key(text: str, names: tuple[str, ...]) -> int | None:
     """Place after the first of some keys, of YAML, JSON or XML, as they are written or in other cases."""
     for name in names:
         flags = "" if len(name) <= 2 else "(?i)"
-        found = re.search(rf"{flags}(?:^|[\s{{,\"'<]){re.escape(name)}[\"']?\s*(?::|=|>|\stype_id=[^>]*>)", text)
-        if found is not None:
-            return found.end()
+        match = re.search(rf"{flags}(?:^|[\s{{,\"'<]){re.escape(name)}[\"']?\s*(?::|=|>|\stype_id=[^>]*>)", text)
+        if match is not None:
+            return match.end()
     return None
 
 
@@ -145,8 +146,8 @@ def _values(text: str, names: tuple[str, ...], count: int) -> tuple[float, ...]:
 
 def _word(text: str, names: tuple[str, ...]) -> str:
     at = _key(text, names)
-    found = None if at is None else re.match(r"[\s\"']*([A-Za-z_][\w -]*)", text[at:])
-    return "" if found is None else found[1].strip()
+    match = None if at is None else re.match(r"[\s\"']*([A-Za-z_][\w -]*)", text[at:])
+    return "" if match is None else match[1].strip()
 
 
 def _size(text: str) -> tuple[float, ...]:
@@ -156,8 +157,8 @@ def _size(text: str) -> tuple[float, ...]:
 
 def _scalars(text: str, names: tuple[tuple[str, ...], ...]) -> tuple[float, ...]:
     """One number for each of some keys, each under any of its names; none if one is missing."""
-    found = tuple(x for keys in names for x in _values(text, keys, 1))
-    return found if len(found) == len(names) else ()
+    numbers = tuple(x for keys in names for x in _values(text, keys, 1))
+    return numbers if len(numbers) == len(names) else ()
 
 
 def _ocamcalib(text: str) -> _Found | None:

@@ -161,17 +161,17 @@ def _vertical(images: Sequence[Photograph], outlines: Sequence[Outline], nominal
     ImageError
         If no picture shows one.
     """
-    found: list[PoseMeasurement] = []
+    verticals: list[PoseMeasurement] = []
     fault: ImageError | None = None
     for image, outline in zip(images, outlines, strict=True):
         try:
-            found.append(find_vertical(image.pixels, outline.rig(nominal), image.card, outline.covariance_m2))
+            verticals.append(find_vertical(image.pixels, outline.rig(nominal), image.card, outline.covariance_m2))
         except ImageError as error:
             fault = error
-    if fault is not None and not found:
+    if fault is not None and not verticals:
         raise fault
-    mean = mean_measured(found)
-    return replace(mean, covariance=mean.covariance * len(found))
+    mean = mean_measured(verticals)
+    return replace(mean, covariance=mean.covariance * len(verticals))
 
 
 def _shape(
@@ -199,12 +199,12 @@ def _known(imported: ImportedSet, rows: Sequence[ImportedRow], rig: Rig, shape: 
         if spot.uv_px is None or spot.covariance_px2 is None:
             why = spot.status if spot.uv_px is None else "a light is there, but no fit of it stays at its place"
             raise DatasetError(f"no spot {position}: {why}")
-    found = seen_spots(kept(pair, answer, with_posteriors(pair, answer)))
+    spots = seen_spots(kept(pair, answer, with_posteriors(pair, answer)))
     row = rows[0]
     if row.depth_m is None or row.depth_sigma_m is None:
         raise DatasetError("no measured D")
     images = seen_images(pair)
-    down, up = (widened_by_shape(found[name], images.get(name), shape) for name in POSITIONS)
+    down, up = (widened_by_shape(spots[name], images.get(name), shape) for name in POSITIONS)
     if max(down.unlike, up.unlike) >= UNLIKE:
         raise DatasetError("the light has not the shape of a spot: the beam meets an edge or grazes a surface")
     return KnownSpot(
@@ -234,10 +234,10 @@ def _require_sound(spot: KnownSpot, aligned: Bundle) -> None:
     """Refuse a spot that another light was taken for."""
     stroke_m = float(stroke_of(np.array(spot.stroke_m), aligned.values))
     places = spot.uv_down_px, spot.uv_up_px, spot.covariance_down_px2, spot.covariance_up_px2
-    found = depth_general(aligned.rig, stroke_m, *places, aligned.covariance)
-    off = abs(float(found.depth_m) - spot.depth_m) / math.hypot(float(found.sigma_m), spot.depth_sigma_m)
-    if not (off < _FAR_SIGMAS and float(found.chi2) < _FAR_SIGMAS**2):
+    depth = depth_general(aligned.rig, stroke_m, *places, aligned.covariance)
+    off = abs(float(depth.depth_m) - spot.depth_m) / math.hypot(float(depth.sigma_m), spot.depth_sigma_m)
+    if not (off < _FAR_SIGMAS and float(depth.chi2) < _FAR_SIGMAS**2):
         raise DatasetError(
-            f"what was found is {float(found.depth_m):.3f} m away, the tape says {spot.depth_m:.3f} m; gap of the rays "
-            f"{math.sqrt(float(found.chi2)):.1f} sigma"
+            f"what was found is {float(depth.depth_m):.3f} m away, the tape says {spot.depth_m:.3f} m; gap of the rays "
+            f"{math.sqrt(float(depth.chi2)):.1f} sigma"
         )

@@ -201,9 +201,9 @@ def _chosen(test: ChainTest, setting: KnownNumbers) -> SensorChoice:
             f"{phase[1]} rows off at the left and top of all pictures, and as many at the other side, and change "
             "width_px, height_px, cx_px and cy_px of the rig file"
         )
-    found = sensor_choice(first, setting.sensor)
-    note = "; ".join(text for text in (found.note, test.note, test.doubt) if text)
-    return replace(found, card=replace(found.card, mosaic_phase=phase), note=note)
+    choice = sensor_choice(first, setting.sensor)
+    note = "; ".join(text for text in (choice.note, test.note, test.doubt) if text)
+    return replace(choice, card=replace(choice.card, mosaic_phase=phase), note=note)
 
 
 def _require_like(first: Photo, photo: Photo) -> None:

@@ -348,13 +348,13 @@ def _outlines(pair: Pair, calibrated: bool) -> tuple[tuple[Outline, ...], str]:
 
     With a calibration one is enough: it only tells whether the mirror is still there.
     """
-    found, why = [], ""
+    outlines, why = [], ""
     for position in POSITIONS[: 1 if calibrated else 2]:
         try:
-            found.append(find_outline(_picture(pair, position), pair.rig, pair.card))
+            outlines.append(find_outline(_picture(pair, position), pair.rig, pair.card))
         except ImageError as error:
             why = str(error)
-    return tuple(found), why
+    return tuple(outlines), why
 
 
 def _picture(pair: Pair, position: str) -> Image:
@@ -426,8 +426,8 @@ def with_blur_of(rig: Rig, outlines: Sequence[Outline]) -> Rig:
 
 def seen_images(pair: Pair) -> dict[str, SpotPicture]:
     """Pictures of a pair, by position, in which `detect` sees the spot."""
-    found = detect(pair)
-    return spot_images(pair, *(Spot(None if one is None else one.uv_px) for one in (found.down, found.up)))
+    detection = detect(pair)
+    return spot_images(pair, *(Spot(None if one is None else one.uv_px) for one in (detection.down, detection.up)))
 
 
 def _shape(setting: KnownNumbers, pair: Pair, images: dict[str, SpotPicture], outlines: Sequence[Outline]) -> SpotShape:

@@ -91,11 +91,11 @@ def read_pair_list(folder: Path) -> list[ListedPair]:
         raise file.fault(f"has no column '{lacking[0]}'")
     if not 0 < len(lines) <= _MOST_ROWS:
         raise file.fault(f"has {len(lines)} pairs: 1 to {_MOST_ROWS} are read")
-    found = [_row(line, partial(_fault_of_line, file, number)) for number, line in lines]
-    counts = Counter(row.name for row in found)
-    if len(counts) != len(found):
+    pairs = [_row(line, partial(_fault_of_line, file, number)) for number, line in lines]
+    counts = Counter(row.name for row in pairs)
+    if len(counts) != len(pairs):
         raise file.fault(f"has the name {counts.most_common(1)[0][0]} twice")
-    return found
+    return pairs
 
 
 def _fault_of_line(file: InputFile, number: int, text: str) -> DatasetError:
@@ -226,18 +226,23 @@ def write_results(path: Path, results: Sequence[PairOutcome]) -> Path:
 
 
 def _values(result: PairOutcome) -> Iterable[float | str | None]:
-    row, found = result.row, result.found
+    row, measurement = result.row, result.found
     yield from (row.name, row.stroke_m)
-    if found is None:
+    if measurement is None:
         yield from [None] * 13
     else:
-        depth = found.depth
-        yield from (found.depth_m, found.sigma_m, float(depth.sigma_spot_m), float(depth.sigma_calibration_m))
+        depth = measurement.depth
+        yield from (
+            measurement.depth_m,
+            measurement.sigma_m,
+            float(depth.sigma_spot_m),
+            float(depth.sigma_calibration_m),
+        )
         yield from (float(depth.sigma_stroke_m), float(depth.chi2), float(depth.p_value))
-        for spot in (found.down, found.up):
+        for spot in (measurement.down, measurement.up):
             yield from (float(spot.uv_px[0]), float(spot.uv_px[1]), spot.sigma_px)
     yield from (row.depth_m, row.depth_sigma_m)
-    yield None if found is None or row.depth_m is None else found.depth_m - row.depth_m
+    yield None if measurement is None or row.depth_m is None else measurement.depth_m - row.depth_m
     yield from (result.tape_sigmas, result.status)
 
 

@@ -221,10 +221,10 @@ def _strokes_faults(pair: Pair) -> Iterator[DatasetError]:
     for stroke in (factor * pair.stroke_m for factor in _FACTORS):
         if not LEAST_STROKE_M <= stroke <= MOST_STROKE_M:
             continue
-        found = detect(replace(pair, stroke_m=stroke))
-        if found.down is None or found.up is None or not _both(found):
+        detection = detect(replace(pair, stroke_m=stroke))
+        if detection.down is None or detection.up is None or not _both(detection):
             continue
-        uv = np.array(found.down.uv_px), np.array(found.up.uv_px)
+        uv = np.array(detection.down.uv_px), np.array(detection.up.uv_px)
         per_m = float(depth_exact(pair.rig, stroke, *uv).depth_m) / stroke  # D grows with the stroke
         if not per_m > 0.0 or NEAREST_M <= per_m * pair.stroke_m <= FARTHEST_M:
             continue  # the stroke is possible: something else is wrong
@@ -280,9 +280,9 @@ def moved_between(pair: Pair) -> Iterator[tuple[str, float]]:
     for position in POSITIONS:
         if f"{position}_off" not in pair.images:
             continue
-        found = shift_px(pair.images[f"{position}_off"], pair.images[position])
-        if found is not None and math.hypot(*found) >= MOVED_PX:
-            yield position, math.hypot(*found)
+        shift = shift_px(pair.images[f"{position}_off"], pair.images[position])
+        if shift is not None and math.hypot(*shift) >= MOVED_PX:
+            yield position, math.hypot(*shift)
 
 
 def relit_between(pair: Pair) -> Iterator[tuple[str, float]]:

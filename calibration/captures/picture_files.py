@@ -77,9 +77,16 @@ def read_picture(path: Path) -> Photo:
     ImageError
         If the file is no picture of the formats that are read (`camera_pictures`); in one sentence.
     """
-    found = read_camera_picture(InputFile(path, _REMEDY, ImageError))
+    picture = read_camera_picture(InputFile(path, _REMEDY, ImageError))
     return Photo(
-        path, found.pixels, found.kind, found.camera, found.tables, found.subsampling, found.orientation, found.grey
+        path,
+        picture.pixels,
+        picture.kind,
+        picture.camera,
+        picture.tables,
+        picture.subsampling,
+        picture.orientation,
+        picture.grey,
     )
 
 

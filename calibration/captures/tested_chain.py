@@ -190,10 +190,10 @@ def phase_weights(pair: Pair) -> tuple[dict[Phase, float], float]:
     Phases below 0.005 are left out. The surprise is how many standard deviations the outputs are less likely than those
     of the model itself.
     """
-    found = detect(pair)
+    detection = detect(pair)
     logs = {phase: math.log(_PRIOR[phase == (0, 0)]) for phase in PATTERNS}
     surprises = dict.fromkeys(PATTERNS, 0.0)
-    for position, spot in (("down", found.down), ("up", found.up)):
+    for position, spot in (("down", detection.down), ("up", detection.up)):
         if spot is None:
             continue
         told = {phase: _spot_chances(pair, position, spot.uv_px, phase) for phase in PATTERNS}
@@ -363,19 +363,19 @@ def _as_jpeg(photos: PairPhotos, quality: int, sampling: Subsampling) -> PairPho
 
 
 def _of_raw(photos: PairPhotos, card: SensorCard, pair_of: PairOf) -> ChainTest:
-    found = raw_phase(pair_of(photos, card).images)
+    told = raw_phase(pair_of(photos, card).images)
     path = photos.down.on[0].path
-    if found == "mono" and card.mosaic != "mono":
+    if told == "mono" and card.mosaic != "mono":
         raise ImageError(
             f"{path} has no colour filters: the spot is as bright on all four places of a mosaic; give a sensor file "
             'with preset = "mono-raw", --sensor'
         )
-    if isinstance(found, tuple) and card.mosaic == "mono":
+    if isinstance(told, tuple) and card.mosaic == "mono":
         raise ImageError(
-            f"{path} has colour filters, {PATTERNS[found]}: the spot is bright on one of four places; the sensor file "
+            f"{path} has colour filters, {PATTERNS[told]}: the spot is bright on one of four places; the sensor file "
             "says mono-raw"
         )
-    phase = found if isinstance(found, tuple) else (0, 0)
+    phase = told if isinstance(told, tuple) else (0, 0)
     return ChainTest(photos, {phase: 1.0}, note=_phase_note({phase: 1.0}))
 
 

@@ -139,9 +139,9 @@ def find_circle(light: NDArray[Any], radii_px: tuple[float, float] | None = None
     if best is None:
         raise ImageError("no outline of a ball was found: the picture has no edges on a circle")
     best.require_clear()
-    found = beside_limb(light, refined(light, best))
-    found.require_clear()
-    return found
+    circle = beside_limb(light, refined(light, best))
+    circle.require_clear()
+    return circle
 
 
 def beside_limb(light: NDArray[Any], found: BallCircle) -> BallCircle:
@@ -207,9 +207,9 @@ def circles(
     """Outlines that a ball may have, the clearest first, clear or not; `count` circles are tried."""
     block = max(1, math.ceil(max(light.shape[:2]) / LONGEST_PX))
     radii = None if radii_px is None else _over(radii_px, block)
-    found = _settled(log_colours(shrunk(light, block)), radii, count)
-    for one in found:
-        others = [other[0] for other in found if other is not one]
+    curves = _settled(log_colours(shrunk(light, block)), radii, count)
+    for one in curves:
+        others = [other[0] for other in curves if other is not one]
         yield _measured(_clearer(one), max(others, default=0.0), block)
 
 
@@ -254,13 +254,15 @@ def candidates(channels: Array, radii_px: tuple[float, float] | None = None, cou
     space = ndimage.gaussian_filter1d(space, 0.7, axis=0)
     # by chance every place gets a share of the votes with a deviation as 1 / sqrt(r)
     space = (space - space.mean(axis=(1, 2), keepdims=True)) * np.sqrt(radii)[:, None, None]
-    found: list[Circle] = []
+    circles_seen: list[Circle] = []
     for _ in range(count):
         k, i, j = (int(x) for x in np.unravel_index(int(np.argmax(space)), space.shape))
-        found.append(((2 * j - beyond + 0.5) * block - 0.5, (2 * i - beyond + 0.5) * block - 0.5, radii[k] * block))
+        circles_seen.append(
+            ((2 * j - beyond + 0.5) * block - 0.5, (2 * i - beyond + 0.5) * block - 0.5, radii[k] * block)
+        )
         # the next one is another circle
         space[max(0, k - 3) : k + 4, max(0, i - 4) : i + 5, max(0, j - 4) : j + 5] = -np.inf
-    return found
+    return circles_seen
 
 
 def _edge_elements(small: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any], Array, Array]:
@@ -295,15 +297,19 @@ def _settled(channels: Array, radii_px: tuple[float, float] | None, count: int) 
         if len(rough) >= _SETTLED and max(one[0] for one in rough) > _OVERWHELMING * LEAST_CONTRAST:
             break
     rough.sort(key=lambda one: -one[0])
-    found: list[_Curve] = []
+    settled_curves: list[_Curve] = []
     for one in rough[:_SETTLED]:
         # settling makes a curve clearer, but not by that much
-        hopeless = found and one[0] < found[0][0] / _OVERWHELMING
+        hopeless = settled_curves and one[0] < settled_curves[0][0] / _OVERWHELMING
         settled = one if hopeless else _joined(one[1])
         if settled:
-            found.append(settled)
-    found.sort(key=lambda one: -one[0])
-    return [one for i, one in enumerate(found) if not any(_same(one[1].circle, other[1].circle) for other in found[:i])]
+            settled_curves.append(settled)
+    settled_curves.sort(key=lambda one: -one[0])
+    return [
+        one
+        for i, one in enumerate(settled_curves)
+        if not any(_same(one[1].circle, other[1].circle) for other in settled_curves[:i])
+    ]
 
 
 def _same(a: Circle, b: Circle) -> bool:
@@ -471,10 +477,10 @@ def on_limb(light: NDArray[Any], near: Circle, blur_px: float) -> BallCircle | N
     ring, curve = LimbRing(channels, start, blur_px=blur_px), np.zeros(5)
     for seed, (reach, px) in enumerate(_LIMB_ROUNDS):
         ring = LimbRing(channels, ring.circle, reach, blur_px=blur_px)
-        found = _consensus(ring, px, seed)
-        if found is None:
+        consensus = _consensus(ring, px, seed)
+        if consensus is None:
             return None
-        ring, curve = ring.moved(found, blur_px=blur_px)
+        ring, curve = ring.moved(consensus, blur_px=blur_px)
     last = LimbRing(channels, ring.circle, reach, blur_px=blur_px)
     scales = (2.0 * px, px, px)
     limb = _with_covariance(ring.contrast(curve), last, curve, scales, _LIMB_FLOOR_PX, block, math.inf)

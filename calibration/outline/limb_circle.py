@@ -174,8 +174,8 @@ def _fit(polar: _Polar, radius_px: float, start: tuple[float, float]) -> _Fit:
         def weighted(p: Array, weight: Array = weight, left: Callable[[Array], Array] = left) -> Array:
             return np.asarray((left(p) * weight[:, None]).ravel())
 
-        found = optimize.least_squares(
+        solution = optimize.least_squares(
             weighted, theta, loss="soft_l1", f_scale=_ROBUST, x_scale=[1.0, 1.0, 1.0, 0.3], max_nfev=_STEPS
         )
-        theta = found.x
-    return _Fit(theta, left(theta), found.jac, found.fun)
+        theta = solution.x
+    return _Fit(theta, left(theta), solution.jac, solution.fun)

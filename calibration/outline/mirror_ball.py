@@ -139,8 +139,13 @@ def find_ball(light: NDArray[np.float32], photo: BallPhoto) -> Ball:
     if photo.circle_px is not None:
         circle, points, edges, sigma = photo.circle_px, None, 1.0, 0.0
     else:
-        found = _outline(light)
-        circle, points, edges, sigma = found.circle_px, found.points_px, found.edges, float(found.sigma_px.max())
+        seen_circle = _outline(light)
+        circle, points, edges, sigma = (
+            seen_circle.circle_px,
+            seen_circle.points_px,
+            seen_circle.edges,
+            float(seen_circle.sigma_px.max()),
+        )
     u, v, radius = circle
     if not (radius >= 10.0 and -radius < u < columns + radius and -radius < v < rows + radius):
         raise DatasetError(

@@ -56,13 +56,13 @@ def rough_outlines(picture: Array, rig: Rig) -> Iterator[tuple[Array, BallCircle
     ImageError
         If no circle of about the expected size is found.
     """
-    found, (low, high) = 0, radii_px(rig)
+    yielded, (low, high) = 0, radii_px(rig)
     near = (low * _NEAR[0] / _RADII[0], high * _NEAR[1] / _RADII[1])  # a holder's plates are clear circles, too
     for radii, count in ((near, _FEW), ((low, high), _CANDIDATES)):
         for circle in circles(picture, radii, count):
-            found += 1
+            yielded += 1
             yield sphere_from_rays(rig.camera.rays(circle.points_px), rig.sphere.radius_m), circle
-    if not found:
+    if not yielded:
         raise ImageError(
             "an image without a mirror: no circle of the outline's size has edges all around; check the picture"
         )

@@ -90,12 +90,12 @@ def find_rim_outline(image: NDArray[Any], rig: Rig, card: SensorCard | None = No
     picture = grey(planes)
     for place, circle in _clearest(picture, rig):
         try:
-            found = fit_rim(*small, place, again=again if block == 1 else None)
+            outline = fit_rim(*small, place, again=again if block == 1 else None)
             if block > 1:  # the last refinement alone sees all pixels
-                start = np.concatenate([found.sphere_in_camera_m, block * np.array(found.ellipse_px)])
-                found = fit_rim(planes, rig, start, again=again, near=True)
-            require_near(found.rig(rig), circle)
-            return found
+                start = np.concatenate([outline.sphere_in_camera_m, block * np.array(outline.ellipse_px)])
+                outline = fit_rim(planes, rig, start, again=again, near=True)
+            require_near(outline.rig(rig), circle)
+            return outline
         except ImageError as error:
             fault = error if "without a mirror" in str(fault) else fault
         if by_edge := _by_edge(rig, picture, circle):
@@ -134,7 +134,7 @@ def _clearest(picture: Array, rig: Rig) -> list[tuple[Array, BallCircle]]:
     """Places and circles that a picture may show, at most `_MOST_TRIED`: those at about the rig's distance first."""
     low, high = radii_px(rig)
     near = (low * _NEAR_RADII[0] / _RADII[0], high * _NEAR_RADII[1] / _RADII[1])
-    found: list[tuple[bool, float, Array, BallCircle]] = []
+    starts: list[tuple[bool, float, Array, BallCircle]] = []
     for radii, count in ((near, _FEW), ((low, high), _CANDIDATES)):
         for circle in circles(picture, radii, count):
             if circle.contrast < _LEAST_CONTRAST:
@@ -143,10 +143,10 @@ def _clearest(picture: Array, rig: Rig) -> list[tuple[Array, BallCircle]]:
                 place = place_of_outline(rig, circle.points_px, _start(rig, circle), ellipse=False)
             except SceneError:  # no rig has such a contour
                 continue
-            found.append((not _as_far(rig, place), -circle.contrast, place, circle))
-        if any(not far for far, *_ in found):
+            starts.append((not _as_far(rig, place), -circle.contrast, place, circle))
+        if any(not far for far, *_ in starts):
             break
-    return [one[2:] for one in sorted(found, key=lambda one: one[:2])[:_MOST_TRIED]]
+    return [one[2:] for one in sorted(starts, key=lambda one: one[:2])[:_MOST_TRIED]]
 
 
 def _start(rig: Rig, circle: BallCircle) -> Array:

@@ -105,10 +105,10 @@ def find_sphere_outline(image: NDArray[Any], rig: Rig, card: SensorCard | None =
     full = full_pixels(planes)
     for start, circle, edge in _clearest(grey(planes), full, rig):
         try:
-            found = fit_outline(*small, start, again=again if block == 1 else None)
-            require_near(found.rig(rig), circle)
-            require_unlit(full, found.rig(rig).outline_px(), 1.0 - MIN_USED)
-            return replace(found, blur_px=block * found.blur_px, shifts_px=block * found.shifts_px)
+            outline = fit_outline(*small, start, again=again if block == 1 else None)
+            require_near(outline.rig(rig), circle)
+            require_unlit(full, outline.rig(rig).outline_px(), 1.0 - MIN_USED)
+            return replace(outline, blur_px=block * outline.blur_px, shifts_px=block * outline.shifts_px)
         except ImageError as error:
             # that it is cut, or lit badly, says more than that the last circle tried was none
             fault = error if "without a mirror" in str(fault) else fault
@@ -137,16 +137,16 @@ def _clearest(picture: Array, full: BoolArray, rig: Rig) -> list[tuple[Array, Ba
     blur_px = math.sqrt(rig.camera.blur_sigma_px**2 + PICTURE_BLUR_PX2)
     # the mosaic's mean takes its neighbours in
     unknown = np.where(ndimage.binary_dilation(full), np.nan, picture) if full.any() else picture
-    found: list[tuple[bool, bool, float, Array, BallCircle, BallCircle]] = []
+    starts: list[tuple[bool, bool, float, Array, BallCircle, BallCircle]] = []
     for _, edge in rough_outlines(picture, rig):
         if edge.contrast < _LEAST_CONTRAST:
             continue
         circle = on_limb(unknown, edge.circle_px, blur_px) or edge
         s = _sphere(rig, circle)
-        found.append((not _as_far(rig, s), not _at_edge(circle, edge), -circle.contrast, s, circle, edge))
-        if len(found) == _MOST_TRIED or (_as_far(rig, s) and circle.contrast > _CLEAR_LIMB):
+        starts.append((not _as_far(rig, s), not _at_edge(circle, edge), -circle.contrast, s, circle, edge))
+        if len(starts) == _MOST_TRIED or (_as_far(rig, s) and circle.contrast > _CLEAR_LIMB):
             break
-    return [one[3:] for one in sorted(found, key=lambda one: one[:3])]
+    return [one[3:] for one in sorted(starts, key=lambda one: one[:3])]
 
 
 def _at_edge(limb: BallCircle, edge: BallCircle) -> bool:
@@ -211,13 +211,13 @@ def fit_outline(
             f"a mirror cut by the frame: {100.0 * arc:.0f} % of its outline lie in the image, {100.0 * MIN_ARC:.0f} % "
             "are needed; move the camera away from the mirror or centre it"
         )
-    found = _settle(planes, rig, s, blur, half_px, again)
-    if found.arc < MIN_USED * arc:
+    settled = _settle(planes, rig, s, blur, half_px, again)
+    if settled.arc < MIN_USED * arc:
         raise ImageError(
-            f"lamps or edges of the room along the mirror's outline: {100.0 * found.arc / arc:.0f} % of it are usable, "
-            f"{100.0 * MIN_USED:.0f} % are needed; switch lamps off, or move the robot"
+            f"lamps or edges of the room along the mirror's outline: {100.0 * settled.arc / arc:.0f} % of it are "
+            f"usable, {100.0 * MIN_USED:.0f} % are needed; switch lamps off, or move the robot"
         )
-    return found
+    return settled
 
 
 def visible_arc(rig: Rig, s: Array, margin_px: float = 0.0) -> float:

@@ -184,21 +184,21 @@ def alignment(
     """
     if not (tilt_sigma_rad >= 0.0 and principal_point_sigma_px >= 0.0 and mirror_tilt_sigma_rad >= 0.0):
         raise ImageError("the standard deviations of tilts and principal point must be 0 or above")
-    found = find_outline(image, rig, card).widened(outline_sigma_factor)
-    s, R, camera = found.sphere_in_camera_m, rig.T_world_camera.R, rig.camera
+    outline = find_outline(image, rig, card).widened(outline_sigma_factor)
+    s, R, camera = outline.sphere_in_camera_m, rig.T_world_camera.R, rig.camera
     known, meeting = stated_tilt(rig, tilt_sigma_rad, principal_point_sigma_px), None
     if vertical:
-        known, meeting = _by_edges(known, image, found, rig, card)
+        known, meeting = _by_edges(known, image, outline, rig, card)
     beside, doubt_m2 = known.beside_m(s, np.array([camera.fx_px, camera.fy_px]))
     move = -(R @ beside) * (1.0, 1.0, 0.0)
     in_camera = R.T @ move
-    own = R @ found.covariance_m2 @ R.T
+    own = R @ outline.covariance_m2 @ R.T
     sigma_outline = float(np.sqrt(0.5 * (own[0, 0] + own[1, 1])))
     doubt = float(np.sqrt(0.5 * np.trace(doubt_m2)))
     if isinstance(rig.mirror, RevolvedMirror):
         doubt = math.hypot(doubt, mirror_tilt_sigma_rad * aside_by_tilt_m(rig))
     move_px = camera.project(s + in_camera) - camera.project(s)
-    return Alignment(move, in_camera, move_px, sigma_outline, math.hypot(sigma_outline, doubt), found, known, meeting)
+    return Alignment(move, in_camera, move_px, sigma_outline, math.hypot(sigma_outline, doubt), outline, known, meeting)
 
 
 def _by_edges(

@@ -163,16 +163,16 @@ def calibrate(
     problem = _Problem(nominal, outline, tuple(spots), vertical, prior, free, turned)
     start = np.concatenate([np.zeros(free.size), *(_start(nominal, spot) for spot in spots)])
     try:
-        found = optimize.least_squares(problem.residuals, start, x_scale="jac", xtol=1e-12, ftol=1e-12)
+        solution = optimize.least_squares(problem.residuals, start, x_scale="jac", xtol=1e-12, ftol=1e-12)
     except SceneError as error:  # a step led to a rig that cannot be
         raise DatasetError(f"the calibration does not come to rest: {error}") from error
-    if not found.success or not np.isfinite(found.cost):
-        raise DatasetError(f"the calibration does not come to rest: {found.message}")
-    normal = found.jac.T @ found.jac  # residuals are over their sigmas: the inverse is the covariance
-    fit = _Fit(found.x[: free.size], np.linalg.inv(normal)[: free.size, : free.size], 2.0 * float(found.cost))
-    degrees = found.fun.size - found.x.size
+    if not solution.success or not np.isfinite(solution.cost):
+        raise DatasetError(f"the calibration does not come to rest: {solution.message}")
+    normal = solution.jac.T @ solution.jac  # residuals are over their sigmas: the inverse is the covariance
+    fit = _Fit(solution.x[: free.size], np.linalg.inv(normal)[: free.size, : free.size], 2.0 * float(solution.cost))
+    degrees = solution.fun.size - solution.x.size
     if problem.has_ellipse:
-        fit, degrees = _with_ellipse(problem, fit, found.jac[free.size : free.size + 3, : free.size]), degrees + 2
+        fit, degrees = _with_ellipse(problem, fit, solution.jac[free.size : free.size + 3, : free.size]), degrees + 2
     values, covariance = problem.values(fit.x), np.zeros((len(PARAMETERS),) * 2)
     covariance[np.ix_(free, free)] = fit.covariance * np.outer(prior[free], prior[free])
     weak = _undetermined(fit.covariance, [PARAMETERS[i] for i in free])
@@ -324,9 +324,9 @@ def _spot_residuals(rig: Rig, values: Array, spots: Sequence[KnownSpot], points:
     up_points = points - strokes[:, None] * np.array(rig.stroke_axis_world)
     view, seen = rig.at(0.0), []
     for where, name in ((points, "down"), (up_points, "up")):
-        found = np.array([getattr(spot, f"uv_{name}_px") for spot in spots], float)
+        seen_px = np.array([getattr(spot, f"uv_{name}_px") for spot in spots], float)
         covariance = np.array([getattr(spot, f"covariance_{name}_px2") for spot in spots], float)
-        off = (seen_at(view, where, found) - found)[..., None]
+        off = (seen_at(view, where, seen_px) - seen_px)[..., None]
         seen.append(np.linalg.solve(np.linalg.cholesky(covariance), off).ravel())
     flat = points[:, :2] - view.sphere_centre_m[:2]
     turn = np.arctan2(flat[:, 1], flat[:, 0]) - [spot.azimuth_rad for spot in spots]

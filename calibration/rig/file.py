@@ -119,9 +119,9 @@ def read_calibration(path: str | Path, nominal: Rig | None = None) -> Calibratio
     if raw.get("kind") != "phibench calibration":
         raise CalibrationError(f"{path} is not a calibration: make one with `phibench calibrate`")
     if raw.get("version") not in (1, VERSION):
-        found = printable_line(str(raw.get("version")), 60)
+        version = printable_line(str(raw.get("version")), 60)
         raise CalibrationError(
-            f"{path} is a calibration of version {found}; this program reads versions 1 and {VERSION}: "
+            f"{path} is a calibration of version {version}; this program reads versions 1 and {VERSION}: "
             "make it again with `phibench calibrate`"
         )
     # of what the file says, before any translation of names, and before any of it is looked at

@@ -158,8 +158,8 @@ def calibrate_dataset(
     else:
         images = [photograph(dataset, sample, position, preset) for sample, position in one_per_pose(chosen)]
         known = frame_spots(dataset, chosen, preset, ruler) if sources.spots else []
-    found = [find_outline(image.pixels, rig, image.card) for image in images]
-    outlines = [one.widened(sources.outline_sigma_factor) for one in found]
+    measured = [find_outline(image.pixels, rig, image.card) for image in images]
+    outlines = [one.widened(sources.outline_sigma_factor) for one in measured]
     upright = _vertical(images, outlines, rig) if sources.vertical else None
     sigmas = sources.sigmas
     bundle = calibrate(rig, mean_outline(outlines), known, upright, sigmas)
@@ -218,17 +218,17 @@ def frame_spots(
     DatasetError
         If too few spots were found; what it says is about the last one that was not.
     """
-    pairs, found = pairs_of(dataset, samples, preset, laser_off=laser_off), []
+    pairs, spots = pairs_of(dataset, samples, preset, laser_off=laser_off), []
     fault: DatasetError | None = None  # the last one; raised if too few spots remain
     for number, sample in enumerate(samples):
         pair = pairs.pair(number)
         try:
-            found.append(known_spot(sample, pair, method_for(pair.card)(pair), ruler))
+            spots.append(known_spot(sample, pair, method_for(pair.card)(pair), ruler))
         except DatasetError as error:
             fault = error
-    if fault is not None and len(found) < (len(samples) if least is None else least):
+    if fault is not None and len(spots) < (len(samples) if least is None else least):
         raise fault
-    return found
+    return spots
 
 
 def _vertical(images: Sequence[Photograph], outlines: Sequence[Outline], nominal: Rig) -> PoseMeasurement:
@@ -246,13 +246,13 @@ def _one_rig(samples: Sequence[Sample]) -> Rig:
 
 
 def _known_in_layers(sample: Sample, ruler: Ruler) -> KnownSpot:
-    found = {
+    centroids = {
         p: find_spot(sample.expected_image(p, laser=True), sample.expected_image(p, laser=False)) for p in POSITIONS
     }
-    for position, spot in found.items():
+    for position, spot in centroids.items():
         if spot.status is not Status.OK:
             raise DatasetError(f"{sample.row.sample_id} {position}: no spot to calibrate with: {describe(spot.status)}")
-    places = {position: spot.uv_px for position, spot in found.items()}
+    places = {position: spot.uv_px for position, spot in centroids.items()}
     C = dict.fromkeys(POSITIONS, SPOT_SIGMA_PX**2 * np.eye(2))
     return measured_spot(sample, places, C, sample.row.nominal_stroke_m, ruler)
 

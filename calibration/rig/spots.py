@@ -130,8 +130,8 @@ def _read(sample: Sample, what: str, value: float, sigma: float) -> float:
 
 def one_per_pose(samples: Sequence[Sample]) -> list[tuple[Sample, str]]:
     """Sample and position of every mirror pose, once each, in the order of their appearance."""
-    found: dict[str, tuple[Sample, str]] = {}
+    poses: dict[str, tuple[Sample, str]] = {}
     for sample in samples:
         for position in POSITIONS:
-            found.setdefault(sample.row.position(position).pose, (sample, position))
-    return list(found.values())
+            poses.setdefault(sample.row.position(position).pose, (sample, position))
+    return list(poses.values())

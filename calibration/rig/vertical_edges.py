@@ -89,7 +89,7 @@ def edges_about(picture: Array, circle: Circle) -> list[Array]:
     """The same about the circle of an outline, for a picture of an unknown camera."""
     polar = unwrapped(picture, circle)
     across = _gradient(polar.light)
-    found, taken = [], np.zeros(across.shape, bool)
+    edges, taken = [], np.zeros(across.shape, bool)
     noise = 1.4826 * float(np.median(np.abs(across)))  # that of a normal law: edges are few
     least = max(_MIN_STEP, _MIN_OVER_NOISE * noise)
     for (c0, r0), (c1, r1) in _segments(polar, least):
@@ -104,8 +104,8 @@ def edges_about(picture: Array, circle: Circle) -> list[Array]:
             continue
         for k in range(-int(_NEAR_PX / _STEP_PX), int(_NEAR_PX / _STEP_PX) + 1):
             taken[row, (cell + k) % across.shape[1]] = True
-        found.append(polar.pixels(row.astype(float), column))
-    return found
+        edges.append(polar.pixels(row.astype(float), column))
+    return edges
 
 
 def _gradient(light: Array) -> Array:
@@ -238,12 +238,12 @@ def find_vertical(
 
 def measured_vertical(edges: Sequence[Array], rig: Rig, sphere_covariance_m2: Array | None = None) -> PoseMeasurement:
     """The same from the pixels of edges, each of shape (k, 2)."""
-    found = vertical_of(edges, rig)
-    covariance = found.covariance
+    vertical = vertical_of(edges, rig)
+    covariance = vertical.covariance
     if sphere_covariance_m2 is not None:
-        slope = _by_sphere(edges, rig, found)
+        slope = _by_sphere(edges, rig, vertical)
         covariance = covariance + slope @ sphere_covariance_m2 @ slope.T
-    return PoseMeasurement(found.up[:2], covariance)
+    return PoseMeasurement(vertical.up[:2], covariance)
 
 
 def vertical_of(edges: Sequence[Array], rig: Rig) -> Vertical:

@@ -210,15 +210,18 @@ def before_rounding(sums: BlockSums, frame_dn2: float = 0.0) -> Array:
 
     # a pattern that sampling noise takes below 0 has no solution: the nearest one is taken
     low = [-np.inf, 1e-6, 0.0]
-    found = least_squares(
+    moments = least_squares(
         lambda x: model(x) - seen[0], start, bounds=(low, np.inf), x_scale=[1.0, 0.1, 0.1], xtol=1e-12
     ).x
-    steps = np.diag([1e-3, 1e-3 * max(found[1], 1e-3), 1e-3 * max(found[2], 1e-3)])
-    lower = np.maximum(found - steps, low)
+    steps = np.diag([1e-3, 1e-3 * max(moments[1], 1e-3), 1e-3 * max(moments[2], 1e-3)])
+    lower = np.maximum(moments - steps, low)
     jacobian = np.stack(
-        [(model(found + d) - model(least)) / (found + d - least).sum() for d, least in zip(steps, lower, strict=True)],
+        [
+            (model(moments + d) - model(least)) / (moments + d - least).sum()
+            for d, least in zip(steps, lower, strict=True)
+        ],
         axis=1,
     )
-    replicates = found + (seen - seen[0]) @ np.linalg.pinv(jacobian).T
+    replicates = moments + (seen - seen[0]) @ np.linalg.pinv(jacobian).T
     replicates[:, 1] -= frame_dn2 / jacobian[0, 0] ** 2  # rounding passes on less, or more, of a small shift
     return np.asarray(replicates)

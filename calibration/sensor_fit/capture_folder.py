@@ -269,8 +269,8 @@ def _series(folder: Path, name: str, timed: bool) -> Iterator[FrameGroup]:
     place = folder / name
     for level in sorted(place.iterdir()) if place.is_dir() else []:
         seconds = _seconds(level) if timed and level.is_dir() else None
-        if level.is_dir() and (found := _group(folder, f"{name}/{level.name}", seconds)):
-            yield found
+        if level.is_dir() and (group := _group(folder, f"{name}/{level.name}", seconds)):
+            yield group
 
 
 def _seconds(level: Path) -> float:
@@ -333,8 +333,8 @@ def read_header(data: bytes, name: str) -> JpegHeader:
     factors = (layers[0][1] // layers[1][1], layers[0][2] // layers[1][2])
     if factors not in _SUBSAMPLING:
         raise CaptureError(f"{name} has chroma of {factors[0]} x {factors[1]} pixels: 4:4:4, 4:2:2 and 4:2:0 are known")
-    found = (of_luma, of_chroma)
-    return JpegHeader(found, _quality(found), _SUBSAMPLING[factors], _restart_interval(data))
+    qtables = (of_luma, of_chroma)
+    return JpegHeader(qtables, _quality(qtables), _SUBSAMPLING[factors], _restart_interval(data))
 
 
 def _quality(tables: tuple[tuple[int, ...], tuple[int, ...]]) -> int | None:

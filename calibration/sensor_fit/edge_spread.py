@@ -342,13 +342,13 @@ def fit_edges(edges: list[Edge], model: EdgeModel, sharpness: float | None = Non
         return f"{len(edges)} straight slanted edges found, 5 are needed: turn a printed edge by 5 to 10 degrees"
     # evenly out of all, so that every frame has its share
     chosen = [edges[k] for k in np.unique(np.linspace(0, len(edges) - 1, _MOST_EDGES).astype(int))]
-    found = np.array([_fit_one(edge, model, sharpness) for edge in chosen])
-    good = np.isfinite(found).all(axis=1)
-    found = found[good]
-    if len(found) < 5:
+    fits = np.array([_fit_one(edge, model, sharpness) for edge in chosen])
+    good = np.isfinite(fits).all(axis=1)
+    fits = fits[good]
+    if len(fits) < 5:
         return "the edges found do not follow the model of a blurred step"
     measures = np.array([tuple(vars(measure(edge)).values()) for edge in edges])
-    centre, error = _robust(found)
+    centre, error = _robust(fits)
     mean, spread = _robust(measures)
     return EdgeFit(
         float(centre[0]),
@@ -357,9 +357,9 @@ def fit_edges(edges: list[Edge], model: EdgeModel, sharpness: float | None = Non
         float(np.hypot(error[1], _MODEL[1])),
         EdgeMeasure(*map(float, mean)),
         EdgeMeasure(*map(float, spread)),
-        len(found),
+        len(fits),
         _mean_profile(edges),
-        _threshold(found[:, 2:], centre, error),
+        _threshold(fits[:, 2:], centre, error),
     )
 
 
@@ -391,12 +391,12 @@ def _fit_one(edge: Edge, model: EdgeModel, sharpness: float | None) -> tuple[flo
             scale.append(unit)
     first = np.clip(np.array(start, float), low, high)
     done = least_squares(residuals, first, bounds=(low, high), x_scale=scale, max_nfev=25, loss="soft_l1")
-    found = numbers(done.x)
-    wanted = [found.sigma_px, found.sharpness]
-    at_end = not 0.16 < found.sigma_px < 3.9 or abs(found.shift_px) > 1.4  # a fit at a bound says nothing
+    fitted = numbers(done.x)
+    wanted = [fitted.sigma_px, fitted.sharpness]
+    at_end = not 0.16 < fitted.sigma_px < 3.9 or abs(fitted.shift_px) > 1.4  # a fit at a bound says nothing
     if model.smoothing is not None:
-        wanted.append(found.threshold_codes)
-        at_end = at_end or found.threshold_codes < 1.01 * _THRESHOLD[0]
+        wanted.append(fitted.threshold_codes)
+        at_end = at_end or fitted.threshold_codes < 1.01 * _THRESHOLD[0]
     return (np.nan,) * len(wanted) if at_end else tuple(map(float, wanted))
 
 

@@ -179,15 +179,15 @@ def _take_end(draft: _Draft, codes: float, capture: Capture) -> None:
 
 
 def _take_tone(draft: _Draft, capture: Capture) -> ToneFit | None:
-    found = fit_tone(capture)
-    if isinstance(found, str):
-        draft.missing["transfer_function"] = found
+    tone = fit_tone(capture)
+    if isinstance(tone, str):
+        draft.missing["transfer_function"] = tone
         return None
-    draft.take("transfer_function", found.curve)
-    if found.points is not None:
-        draft.take("transfer_points", [list(point) for point in found.points])
-    draft.measure("tone_residual", found.rms_codes["srgb"], 0.0, "codes rms, against sRGB")
-    return found
+    draft.take("transfer_function", tone.curve)
+    if tone.points is not None:
+        draft.take("transfer_points", [list(point) for point in tone.points])
+    draft.measure("tone_residual", tone.rms_codes["srgb"], 0.0, "codes rms, against sRGB")
+    return tone
 
 
 def _fit_noise(draft: _Draft, capture: Capture, tone: ToneFit | None) -> ProcessedNoise | None:
@@ -253,15 +253,15 @@ def _take_jpeg(draft: _Draft, capture: Capture) -> JpegHeader | None:
     if capture.kind != "mjpeg":
         return None
     first = next(g for g in _every_group(capture) if g.files).files[0]
-    found = read_header(InputFile(first, "give the camera's own picture", CaptureError).read(), str(first))
-    if found.quality is not None:
-        draft.take("jpeg_quality", found.quality)
+    header = read_header(InputFile(first, "give the camera's own picture", CaptureError).read(), str(first))
+    if header.quality is not None:
+        draft.take("jpeg_quality", header.quality)
     else:
-        draft.take("jpeg_qtables", [list(table) for table in found.tables])
-    draft.take("jpeg_subsampling", found.subsampling)
-    if found.restart_interval:
-        draft.take("jpeg_restart_interval", found.restart_interval)
-    return found
+        draft.take("jpeg_qtables", [list(table) for table in header.tables])
+    draft.take("jpeg_subsampling", header.subsampling)
+    if header.restart_interval:
+        draft.take("jpeg_restart_interval", header.restart_interval)
+    return header
 
 
 def _every_group(capture: Capture) -> list[FrameGroup]:
@@ -284,14 +284,14 @@ def _fit_edges(draft: _Draft, capture: Capture, tone: ToneFit | None, noise: Pro
     curve, points = (tone.curve, tone.points) if tone is not None else ("srgb", None)
     model = EdgeModel(curve, points, "mean" if capture.notes.scaled else "placed")
     if noise is not None and noise.smoothing is not None and noise.numbers is not None:
-        found = fit_edges(edges, replace(model, smoothing=noise.smoothing), max(noise.numbers.sharpen, 0.0))
-        if not isinstance(found, str) and found.threshold_codes is not None:
-            return found
-    found = fit_edges(edges, model)
-    if isinstance(found, str):
-        draft.missing["edge_sigma_px"] = found
+        fit = fit_edges(edges, replace(model, smoothing=noise.smoothing), max(noise.numbers.sharpen, 0.0))
+        if not isinstance(fit, str) and fit.threshold_codes is not None:
+            return fit
+    fit = fit_edges(edges, model)
+    if isinstance(fit, str):
+        draft.missing["edge_sigma_px"] = fit
         return None
-    return found
+    return fit
 
 
 def _take_edges(draft: _Draft, found: EdgeFit) -> None:
@@ -311,11 +311,11 @@ def _edges(capture: Capture, path: Path) -> list[Edge]:
 
 
 def _take_lens(draft: _Draft, capture: Capture) -> LensFit | None:
-    found = fit_lens(capture)
-    if isinstance(found, str):
-        draft.missing["lens"] = found
+    lens = fit_lens(capture)
+    if isinstance(lens, str):
+        draft.missing["lens"] = lens
         return None
-    for name, value in found.values.items():
-        draft.measure(name, value, found.sigmas[name], "px" if name.endswith("_px") else "1")
-    draft.measure("corner_residual_px", found.rms_px, found.rms_px / np.sqrt(2.0 * found.views), "px")
-    return found
+    for name, value in lens.values.items():
+        draft.measure(name, value, lens.sigmas[name], "px" if name.endswith("_px") else "1")
+    draft.measure("corner_residual_px", lens.rms_px, lens.rms_px / np.sqrt(2.0 * lens.views), "px")
+    return lens

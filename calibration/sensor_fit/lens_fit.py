@@ -55,14 +55,14 @@ def fit_lens(capture: Capture) -> LensFit | str:
         )
     size = (board[0], board[1])
     images = [_grey(capture.read(path), capture) for path in capture.chessboards.files]
-    found = [corners for image in images if (corners := find_corners(image, size)) is not None]
-    if len(found) < _LEAST_VIEWS:
-        return f"{len(found)} of {len(images)} views show all {size[0]} x {size[1]} corners: {_LEAST_VIEWS} are needed"
+    views = [corners for image in images if (corners := find_corners(image, size)) is not None]
+    if len(views) < _LEAST_VIEWS:
+        return f"{len(views)} of {len(images)} views show all {size[0]} x {size[1]} corners: {_LEAST_VIEWS} are needed"
     square = capture.notes.board_square_m or 1.0
     grid = np.zeros((size[0] * size[1], 3), np.float32)
     grid[:, :2] = square * np.mgrid[0 : size[0], 0 : size[1]].T.reshape(-1, 2)
     height, width = capture.size
-    kept = found
+    kept = views
     for _ in range(2):  # the second time without views that were found wrongly
         rms, matrix, distortion, _, _, deviations, _, per_view = cv2.calibrateCameraExtended(
             [grid] * len(kept), [c.astype(np.float32)[:, None] for c in kept], (width, height), None, None

@@ -256,27 +256,27 @@ class _Fit:
         no_dark = self._is_cut or self.is_hidden  # the dark frames' own variance says nothing
         dark_dn2 = _intercept(levels) if no_dark and len({one.name for one in used}) > 1 else self.dark_dn2
         try:
-            found = fit_response(levels, dark_dn2, self._range)
+            response = fit_response(levels, dark_dn2, self._range)
         except ValueError:
             raise self._no_growth() from None
         signal = np.array([float(one.signal_dn[0]) for one in levels])
-        unknown = float(found.gain[0]) * self._unknown_black() * float(signal.sum() / np.sum(signal**2))
-        if no_dark and found.is_bent:  # a line through levels that bend has another intercept
+        unknown = float(response.gain[0]) * self._unknown_black() * float(signal.sum() / np.sum(signal**2))
+        if no_dark and response.is_bent:  # a line through levels that bend has another intercept
             other = fit_response(levels, self.dark_dn2, self._range)
-            unknown = float(np.hypot(unknown, other.gain[0] - found.gain[0]))
+            unknown = float(np.hypot(unknown, other.gain[0] - response.gain[0]))
         self.extra["gain_dn_per_e"] = unknown / self.notes.analogue_gain
-        if (said := found.finding()) is not None:
+        if (said := response.finding()) is not None:
             self.findings["photon_transfer"] = said
-        if found.is_bent:
+        if response.is_bent:
             unit = f"x = y (1 + a1 u + a2 u^2 + a3 u^3), u = y / {self._range:.6g} DN"
-            a, sigma = found.coefficients[0].tolist(), found.coefficient_sigmas.tolist()
+            a, sigma = response.coefficients[0].tolist(), response.coefficient_sigmas.tolist()
             self.measured["response_coefficients"] = (a, sigma, unit)
             self.measured["straight_gain_dn_per_e"] = (
-                found.straight_gain / self.notes.analogue_gain,
-                found.straight_sigma / self.notes.analogue_gain,
+                response.straight_gain / self.notes.analogue_gain,
+                response.straight_sigma / self.notes.analogue_gain,
                 "DN per electron, of a straight line",
             )
-        return found
+        return response
 
     def _no_growth(self) -> CaptureError:
         return CaptureError(
@@ -420,11 +420,11 @@ class _Fit:
             signal = float(np.mean([self._signal(one)[0] for one in sites])) - dark
             flicker = float(np.mean([s.sums.flicker_dn2 for s in sites])) + self.common.level_dn2 / self.dark.frames
             lights.append(LightLevel(light, signal, float(np.sqrt(flicker))))
-        found = fit_linearity(lights, unit)
-        if found is None:
+        linearity = fit_linearity(lights, unit)
+        if linearity is None:
             return
-        self.measured["linearity_error"] = (found.mean_percent, found.sigma_percent, f"percent, against {unit}")
-        if (said := found.finding()) is not None:
+        self.measured["linearity_error"] = (linearity.mean_percent, linearity.sigma_percent, f"percent, against {unit}")
+        if (said := linearity.finding()) is not None:
             self.findings["linearity"] = said
 
     def _ratios(self, used: list[_Level]) -> tuple[float, ...]:

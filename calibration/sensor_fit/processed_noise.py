@@ -99,9 +99,9 @@ def fit_noise(
     lattice = [first.model.lattice_errors(one, first.numbers()) for one in used]
     best = _solved(used, first.model, (), first.numbers(), lattice)
     for reach, extra in _CHAINS:
-        found = _solved(used, PlaneModel(card, reach, threshold_codes), extra, best.numbers(), lattice)
-        if found.misfit < best.misfit - _BETTER:
-            best = found
+        solution = _solved(used, PlaneModel(card, reach, threshold_codes), extra, best.numbers(), lattice)
+        if solution.misfit < best.misfit - _BETTER:
+            best = solution
     return _told(best, used, levels, card, analogue_gain)
 
 
@@ -194,18 +194,18 @@ def _told(
         values["prnu"] = np.sqrt(np.maximum(pattern, 0.0))
     else:
         reasons["prnu"] = "lost in temporal noise: take more frames of the brighter levels"
-    found: dict[str, float | tuple[float, ...]] = {n: float(x[0]) for n, x in values.items()}
+    values_by_name: dict[str, float | tuple[float, ...]] = {n: float(x[0]) for n, x in values.items()}
     sigmas: dict[str, float | tuple[float, ...]] = {n: own_error.get(n, jackknife_sigma(x)) for n, x in values.items()}
-    found["white_balance"] = (numbers.red, 1.0, numbers.blue)
+    values_by_name["white_balance"] = (numbers.red, 1.0, numbers.blue)
     sigmas["white_balance"] = (error["red"], 0.0, error["blue"])
     if best.model.halved:
         middle = 1.0 - column["left"] - column["right"]
         left, right = max(numbers.left, 0.0), max(numbers.right, 0.0)  # noise takes absent taps below 0
-        found["chroma_taps"] = (left, 1.0 - left - right, right)
+        values_by_name["chroma_taps"] = (left, 1.0 - left - right, right)
         sigmas["chroma_taps"] = (error["left"], jackknife_sigma(middle), error["right"])
     share = numbers.denoise if "denoise" in column else max(-numbers.sharpen, 0.0)
     smoothing = Smoothing(share, best.model.reach_px, numbers.vertical) if share > 0.0 else None
-    return ProcessedNoise(found, sigmas, reasons, best.chi2, tuple(levels), card, numbers, smoothing)
+    return ProcessedNoise(values_by_name, sigmas, reasons, best.chi2, tuple(levels), card, numbers, smoothing)
 
 
 def _prnu(used: list[NoiseLevel], model: PlaneModel, numbers: PlaneParameters) -> Array | None:

@@ -101,9 +101,9 @@ def _fitted(curve: Curve, times: Array, codes: Array) -> tuple[float, float]:
     def residuals(log_rate: Array) -> Array:
         return encoded_by(curve, times * np.exp(log_rate[0])) - codes
 
-    found = least_squares(residuals, [start])
+    solution = least_squares(residuals, [start])
     freedom = max(len(codes) - 1, 1)
-    return float(np.exp(-found.x[0])), float(np.sqrt(np.sum(found.fun**2) / freedom))
+    return float(np.exp(-solution.x[0])), float(np.sqrt(np.sum(solution.fun**2) / freedom))
 
 
 def _table(times: Array, codes: Array) -> tuple[float, tuple[tuple[float, float], ...]]:

@@ -181,12 +181,12 @@ def refused_samples(plan: Plan, tasks: Mapping[str, BuildTask], journal: Journal
 
     Of several refused tasks of a sample the first one counts, by the order of `needs` from its last task on.
     """
-    found = dict(plan.refused)
+    refused = dict(plan.refused)
     if journal.refusals:
         for pair in plan.pairs:
             if (culprit := _culprit(sample_task_name(pair), tasks, journal)) is not None:
-                found[pair.sample_id] = journal.refusals[culprit].refused
-    return {name: found[name] for name in plan.sample_ids if name in found}
+                refused[pair.sample_id] = journal.refusals[culprit].refused
+    return {name: refused[name] for name in plan.sample_ids if name in refused}
 
 
 def settled_samples(plan: Plan, tasks: Mapping[str, BuildTask], journal: Journal) -> dict[str, str]:
@@ -206,8 +206,8 @@ def possible(names: Sequence[str], tasks: Mapping[str, BuildTask], journal: Jour
 def _culprit(name: str, tasks: Mapping[str, BuildTask], journal: Journal) -> str | None:
     """First refused task among a task and what it needs."""
     for need in tasks[name].needs:
-        if (found := _culprit(need, tasks, journal)) is not None:
-            return found
+        if (culprit := _culprit(need, tasks, journal)) is not None:
+            return culprit
     return name if name in journal.refusals else None
 
 

@@ -131,8 +131,8 @@ def _light(plan: Plan) -> Light:
         return "none"
     settings = bake_settings(plan.recipe.ambient)
     is_all = round(sum(part for part, _ in lit) * len(plan.rooms)) == len(lit)
-    found = is_all and all(is_cached(plan.rig.at(0.0), room, settings) for _, room in lit)
-    return "cached" if found else "baked"
+    cached = is_all and all(is_cached(plan.rig.at(0.0), room, settings) for _, room in lit)
+    return "cached" if cached else "baked"
 
 
 def _seconds(plan: Plan, megapixels: float, bakes: bool) -> dict[str, float]:
@@ -372,8 +372,8 @@ class PairForecast:
 def pair_forecasts(plan: Plan, pairs: Sequence[PairPlan] | None = None) -> Iterator[PairForecast]:
     """Trace the chief rays of all pairs of a plan, or of some, room by room; nothing is rendered."""
     rooms, pairs = {name: number for number, name in enumerate(plan.rooms)}, plan.pairs if pairs is None else pairs
-    found = {one.pair.sample_id: one for one in _traced(plan, sorted(pairs, key=lambda pair: rooms[pair.room]))}
-    return (found[pair.sample_id] for pair in pairs)
+    forecasts = {one.pair.sample_id: one for one in _traced(plan, sorted(pairs, key=lambda pair: rooms[pair.room]))}
+    return (forecasts[pair.sample_id] for pair in pairs)
 
 
 def rim_lines(plan: Plan, pairs: Iterable[PairForecast]) -> list[str]:

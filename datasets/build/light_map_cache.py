@@ -157,12 +157,12 @@ class CacheEntry:
 
 def cache_entries(folder: Path | None = None) -> list[CacheEntry]:
     """Light maps of the cache, those last used first."""
-    found = []
+    entries = []
     for path in (folder or cache_folder()).glob(f"*{_SUFFIX}"):
         with contextlib.suppress(OSError):  # gone meanwhile
             status = path.stat()
-            found.append(CacheEntry(path, status.st_size, status.st_mtime))
-    return sorted(found, key=lambda entry: (-entry.used_s, entry.path.name))
+            entries.append(CacheEntry(path, status.st_size, status.st_mtime))
+    return sorted(entries, key=lambda entry: (-entry.used_s, entry.path.name))
 
 
 def cache_limit_mb(folder: Path | None = None) -> float:

@@ -181,8 +181,10 @@ def own_files(recipe: Recipe, files: RoomFiles) -> RoomFiles:
     RoomError
         If one is not known and cannot be read.
     """
-    found = room_files(recipe, files)
-    return RoomFiles(found.folder, {n: d for n, d in found.digests.items() if not n.startswith(f"{EXPORTED}/")})
+    files_of_rooms = room_files(recipe, files)
+    return RoomFiles(
+        files_of_rooms.folder, {n: d for n, d in files_of_rooms.digests.items() if not n.startswith(f"{EXPORTED}/")}
+    )
 
 
 def held(files: RoomFiles, out: Path) -> RoomFiles:

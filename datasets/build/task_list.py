@@ -45,10 +45,10 @@ def plan_tasks(plan: Plan, versions: Mapping[str, Any]) -> Tasks:
 
 def _by_room(entries: Iterable[P]) -> dict[str, list[P]]:
     """Pairs or poses by the id of their room."""
-    found: dict[str, list[P]] = defaultdict(list)
+    by_room: dict[str, list[P]] = defaultdict(list)
     for entry in entries:
-        found[entry.room].append(entry)
-    return found
+        by_room[entry.room].append(entry)
+    return by_room
 
 
 def task_names(plan: Plan) -> list[str]:

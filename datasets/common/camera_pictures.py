@@ -90,11 +90,11 @@ def read_camera_picture(file: InputFile, data: bytes | None = None) -> CameraPic
         warnings.catch_warnings(),
     ):  # what a decoder has not looked at yet: texts, tags and tables
         warnings.simplefilter("ignore", UserWarning)  # of damaged tags, without the name of the file
-        found = _of_decoded(file, picture)
+        decoded = _of_decoded(file, picture)
         # Pillow turns a TIFF as it decodes it, and forgets so
-        told = _directory(data).get(_ORIENTATION, 1) if found.kind == "raw" and picture.format == "TIFF" else 1
-        _orientation(file, told, found.kind)
-    return found
+        told = _directory(data).get(_ORIENTATION, 1) if decoded.kind == "raw" and picture.format == "TIFF" else 1
+        _orientation(file, told, decoded.kind)
+    return decoded
 
 
 def _of_decoded(file: InputFile, picture: Image.Image) -> CameraPicture:
@@ -106,8 +106,8 @@ def _of_decoded(file: InputFile, picture: Image.Image) -> CameraPicture:
     kind, pixels = _pixels(file, picture)
     orientation = _orientation(file, exif.get(_ORIENTATION, 1), kind)
     grey = picture.mode in ("L", "LA", "1") or (kind in ("jpeg", "rgb") and _is_grey(pixels))
-    found = CameraPicture(_sealed(upright(pixels, orientation)), kind, grey, camera, orientation)
-    return _with_tables(file, picture, found) if kind == "jpeg" else found
+    upright_picture = CameraPicture(_sealed(upright(pixels, orientation)), kind, grey, camera, orientation)
+    return _with_tables(file, picture, upright_picture) if kind == "jpeg" else upright_picture
 
 
 def _is_grey(pixels: NDArray[Any]) -> bool:

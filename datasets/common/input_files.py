@@ -155,14 +155,14 @@ class InputFile:
             raise self.fault(f"is not readable: {getattr(error, 'strerror', None) or error}") from error
 
     def _bounded(self, handle: int) -> bytes:
-        found = os.fstat(handle)
-        if stat.S_ISDIR(found.st_mode):
+        status = os.fstat(handle)
+        if stat.S_ISDIR(status.st_mode):
             raise self.fault("is not readable: it is a folder")
-        if not stat.S_ISREG(found.st_mode):
+        if not stat.S_ISREG(status.st_mode):
             raise self.fault("is not readable: it is no ordinary file")
         with os.fdopen(handle, "rb", closefd=False) as file:
-            data = b"" if found.st_size > self.limit_bytes else file.read(self.limit_bytes + 1)
-        if max(found.st_size, len(data)) > self.limit_bytes:
+            data = b"" if status.st_size > self.limit_bytes else file.read(self.limit_bytes + 1)
+        if max(status.st_size, len(data)) > self.limit_bytes:
             raise self.fault(f"is larger than {self.limit_bytes / MIB:.0f} MiB, the most that is read of its kind")
         return data
 
@@ -207,8 +207,8 @@ class InputFile:
             raise self.fault(f"is damaged: it is not JSON ({printable_line(str(error), 200)})") from error
         if not isinstance(document, dict):
             raise self.fault("is damaged: it does not hold a JSON object")
-        if found := bounds_fault(document):
-            raise self.fault(f"is damaged: {found}")
+        if fault := bounds_fault(document):
+            raise self.fault(f"is damaged: {fault}")
         return document
 
     def toml(self, data: bytes | None = None) -> dict[str, Any]:
@@ -227,8 +227,8 @@ class InputFile:
             raise self.fault(f"is not valid TOML: it is nested deeper than {DEPTH} levels") from error
         except ValueError as error:  # tomllib lets a number of 5000 digits end in Python's own words
             raise self.fault(f"is not valid TOML: {printable_line(str(error), 200)}") from error
-        if found := bounds_fault(document, finite=False):
-            raise self.fault(f"is not valid here: {found}")
+        if fault := bounds_fault(document, finite=False):
+            raise self.fault(f"is not valid here: {fault}")
         return document
 
     def document(self, model: type[M], data: bytes | None = None) -> M:
@@ -259,14 +259,16 @@ class InputFile:
 
         data = self.read() if data is None else data
         try:
-            found = polars.read_parquet_schema(io.BytesIO(data))
-            if columns is not None and (fault := _columns_fault(found, dict(columns))):
+            columns_found = polars.read_parquet_schema(io.BytesIO(data))
+            if columns is not None and (fault := _columns_fault(columns_found, dict(columns))):
                 raise self.fault(f"has {fault}")
             rows = polars.scan_parquet(io.BytesIO(data)).select(polars.len()).collect().item()
             if rows > TABLE_ROWS:
                 raise self.fault(f"has {rows} rows: at most {TABLE_ROWS} are read")
-            if rows * len(found) > TABLE_VALUES:
-                raise self.fault(f"has {rows} rows of {len(found)} columns: at most {TABLE_VALUES} values are read")
+            if rows * len(columns_found) > TABLE_VALUES:
+                raise self.fault(
+                    f"has {rows} rows of {len(columns_found)} columns: at most {TABLE_VALUES} values are read"
+                )
             return polars.read_parquet(io.BytesIO(data))
         except (DatasetError, MemoryError):
             raise

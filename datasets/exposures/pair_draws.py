@@ -119,10 +119,10 @@ def pair_draws(
     frames = frames or FramesTable()
     presets = frames.presets if preset is None else (preset,)
     count = frames.draws if draws is None else whole_number("draws", draws, 1)
-    found = [pair_draw for sample in dataset for pair_draw in _of_sample(sample, frames, presets, count, sensor)]
+    ordered = [pair_draw for sample in dataset for pair_draw in _of_sample(sample, frames, presets, count, sensor)]
     name, seed = dataset.info.name, dataset.recipe.dataset.seed
-    order = generator(name, seed, _ORDER_STREAM, "order", *presets, count).permutation(len(found))
-    return tuple(replace(found[k], number=number) for number, k in enumerate(order))
+    order = generator(name, seed, _ORDER_STREAM, "order", *presets, count).permutation(len(ordered))
+    return tuple(replace(ordered[k], number=number) for number, k in enumerate(order))
 
 
 def _of_sample(

@@ -117,8 +117,8 @@ def distractors(sample: _Sample) -> tuple[Distractor, ...]:
     kept = vars(sample)
     if _KEPT not in kept:
         kept[_KEPT] = _found(sample)
-    found: tuple[Distractor, ...] = kept[_KEPT]
-    return found
+    placed: tuple[Distractor, ...] = kept[_KEPT]
+    return placed
 
 
 _KEPT = "_distractors"
@@ -181,12 +181,12 @@ def _scaled(layer: SpotLayer, factor: float) -> SpotLayer:
 def _drawn_spot(sample: _Sample, room: Room, number: int, table: DistractorTable, attempt: int) -> LaserSpot | None:
     """Disc at one drawn place; None where there can be none."""
     place = _ray_place if table.azimuth_deg is not None else _board_place
-    found = place(sample, room, number, table, attempt)
-    if found is None:
+    spot = place(sample, room, number, table, attempt)
+    if spot is None:
         return None
     recipe = sample.dataset.recipe
     return LaserSpot(
-        *found,
+        *spot,
         diameter_m=_value(sample.stream_names, number, "diameter_m", table.diameter_m),
         albedo=max(spot_albedo(recipe.laser.albedo, None) or 0.0, 0.01),  # its power is scaled to the flux ratio anyway
         power_w=recipe.laser.power_w,
@@ -209,8 +209,8 @@ def _ray_place(
         )
     )
     if table.distance_m is None:
-        [found] = by_ray(sample.dataset.recipe.laser, room, np.array([azimuth_deg]), np.array([height_m]))
-        return None if isinstance(found, str) else (found[1].position_world_m, found[1].normal_world)
+        [spot] = by_ray(sample.dataset.recipe.laser, room, np.array([azimuth_deg]), np.array([height_m]))
+        return None if isinstance(spot, str) else (spot[1].position_world_m, spot[1].normal_world)
     x, y = math.cos(math.radians(azimuth_deg)), math.sin(math.radians(azimuth_deg))
     position = (distance_m * x, distance_m * y, height_m)
     return None if room.solid_around(position) is not None else (position, (-x, -y, 0.0))

@@ -124,11 +124,11 @@ def read_sensor_file(path: str | Path) -> SensorFile:
     if wrong := [key for key in _OF_ONE_CAPTURE if key in document]:
         raise file.fault(f"has the key {wrong[0]}, which belongs to a frame and not to a camera; leave it out")
     try:
-        found = SensorFile(preset, document, tables)
-        found.sensor()
+        content = SensorFile(preset, document, tables)
+        content.sensor()
     except SensorError as error:
         raise file.fault(f"is no sensor: {error}") from error
-    return found
+    return content
 
 
 def write_sensor_file(path: Path, content: SensorFile) -> Path:

@@ -57,7 +57,7 @@ def rebuilt(
     for number in wanted:
         if isinstance(one := kept.get(number), KeptSample):
             by_draw[one.tries].append(number)
-    targets, found = [target.name for target in recipe.targets], dict[int, RandomSample]()
+    targets, samples = [target.name for target in recipe.targets], dict[int, RandomSample]()
     for tries, numbers in by_draw.items():
         points = points_of(recipe, table, first, numbers, tries - 1)
         rows = rows_of(draw_values(table, targets, points), len(numbers))
@@ -70,8 +70,8 @@ def rebuilt(
                 continue
             place = (rooms[number % len(rooms)], rigs.rig, one.surface, spot)
             numbers_of = (rigs.stroke_m, rigs.nominal_rig, rigs.nominal_stroke_m)
-            found[number] = RandomSample(number, tries, drawn, *place, *numbers_of, one.causes)
-    return found
+            samples[number] = RandomSample(number, tries, drawn, *place, *numbers_of, one.causes)
+    return samples
 
 
 def _spot(recipe: Recipe, one: KeptSample) -> LaserSpot:

@@ -185,7 +185,7 @@ def draw_samples(
     dataset, held = recipe.dataset, held or {}
     first = first_points(table.sequence, dataset.name, dataset.seed, table.samples, drawn_parameters(table))
     wanted = range(table.samples) if wanted is None else wanted
-    found = {number: one for number in wanted if isinstance(one := held.get(number), RandomSample)}
+    samples = {number: one for number in wanted if isinstance(one := held.get(number), RandomSample)}
     refused = {number: one for number in wanted if isinstance(one := held.get(number), str)}
     for k, room_id in enumerate(rooms):  # a room is built once, and let go before the next
         every = range(wanted.start + (k - wanted.start) % len(rooms), wanted.stop, len(rooms))
@@ -198,18 +198,18 @@ def draw_samples(
                 if stated or room_id == ONLY_ROOM:
                     raise RecipeError(f"rooms: {fault}") from error
                 refused |= dict.fromkeys(numbers, fault)
-                _require_some(refused, found, table.samples)
+                _require_some(refused, samples, table.samples)
                 continue
             makers = _Makers(recipe, table, room_id, room, first)
             for part in (numbers[:_PILOT], numbers[_PILOT:]):  # whether it is possible at all is known after a few
                 drawn, lost = makers.draw(part)
-                found |= {sample.number: sample for sample in drawn}
+                samples |= {sample.number: sample for sample in drawn}
                 refused |= lost
-                _require_some(refused, found, table.samples)
+                _require_some(refused, samples, table.samples)
                 if stated:  # it is the recipe that names it
                     of_room = len(range(k, table.samples, len(rooms)))
-                    _require_some(lost, [number for number in every if number in found], of_room)
-    return tuple(found[number] for number in sorted(found)), dict(sorted(refused.items()))
+                    _require_some(lost, [number for number in every if number in samples], of_room)
+    return tuple(samples[number] for number in sorted(samples)), dict(sorted(refused.items()))
 
 
 def _require_some(refused: Mapping[int, str], found: Collection[int], count: int) -> None:
@@ -277,18 +277,18 @@ class _Makers:
 
     def draw(self, numbers: Sequence_[int]) -> tuple[list[RandomSample], dict[int, str]]:
         """Draw some samples, those that are impossible again until they are not; the reason where they stay so."""
-        found: dict[int, RandomSample] = {}
+        samples: dict[int, RandomSample] = {}
         refused: dict[int, str] = {}
         left = list(numbers)
         for attempt in range(HIDDEN_TRIES):
             outcomes = self._once(left, attempt)
-            found |= {number: sample for number, sample in outcomes.items() if isinstance(sample, RandomSample)}
-            left = [number for number in left if number not in found]
+            samples |= {number: sample for number, sample in outcomes.items() if isinstance(sample, RandomSample)}
+            left = [number for number in left if number not in samples]
             lost = [number for number in left if attempt + 1 == self._tries(number)]
             refused |= {number: self._reason(attempt + 1, str(outcomes[number])) for number in lost}
             left = [number for number in left if number not in refused]
             if not left:
-                return [found[number] for number in numbers if number in found], refused
+                return [samples[number] for number in numbers if number in samples], refused
         raise AssertionError("every sample is found or lost")
 
     def _reason(self, tries: int, last: str) -> str:

@@ -73,8 +73,8 @@ def by_keys(text: str) -> str:
 
 def rig_fault_of(error: SceneError) -> Fault:
     """Fault at the key of `[rig]` that an error of `build_rig` begins with, or else of the whole table."""
-    found = re.match(r"(rig(?:\.\w+)+) = (.+)", str(error), re.DOTALL)
-    return Fault("rig", str(error)) if found is None else Fault(found[1], found[2])
+    match = re.match(r"(rig(?:\.\w+)+) = (.+)", str(error), re.DOTALL)
+    return Fault("rig", str(error)) if match is None else Fault(match[1], match[2])
 
 
 def idle_holder_keys(path: str, given: Iterable[str], kinds: Iterable[str]) -> list[Fault]:

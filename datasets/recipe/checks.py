@@ -130,8 +130,8 @@ class _Draft:
     def of(cls, raw: Raw) -> _Draft:
         single = (("rig", RigTable), ("misalignment", MisalignmentTable), ("room", RoomTable), ("laser", LaserTable))
         targets = [(i, sound_of(entry, TargetTable)) for i, entry in tables_of(raw, "targets")]
-        found: Any = [sound_of(raw.get(key, {}), model) for key, model in single]
-        rig, misalignment, room, laser = found
+        sound: Any = [sound_of(raw.get(key, {}), model) for key, model in single]
+        rig, misalignment, room, laser = sound
         room = None if "rooms" in raw else room  # drawn ones have heights of their own
         return cls(raw, rig, misalignment, room, laser, [(i, table) for i, table in targets if table is not None])
 

@@ -66,9 +66,9 @@ def parse_recipe(text: str, source: str = "recipe", files: RoomFiles | None = No
 
 def check_recipe(raw: dict[str, Any], source: str = "recipe", files: RoomFiles | None = None) -> Recipe:
     """Check a recipe that is a dict already."""
-    found = [*semantic_faults(raw), *([] if files is None else file_faults(raw, files))]
-    explained = {fault.path for fault in found}  # better than that the key is unknown
-    faults = [*(f for f in structural_faults(Recipe, raw) if not (f.unknown and f.path in explained)), *found]
+    semantic = [*semantic_faults(raw), *([] if files is None else file_faults(raw, files))]
+    explained = {fault.path for fault in semantic}  # better than that the key is unknown
+    faults = [*(f for f in structural_faults(Recipe, raw) if not (f.unknown and f.path in explained)), *semantic]
     if faults:
         count = f"{len(faults)} fault" + "s" * (len(faults) > 1)
         raise RecipeError("\n".join([f"{source} has {count}:", *(f"  {fault}" for fault in faults)]))

@@ -76,10 +76,10 @@ def _settings_fault(path: str, one: PanoramaTable | MeshTable, raw: Raw) -> Faul
     except SceneError as error:
         within_it = ".mesh" if isinstance(one, PanoramaTable) else ""
         text = str(error).replace("MeshSettings", f"PanoramaSettings{within_it}", 1)
-        found = re.match(r"PanoramaSettings((?:\.\w+|\[\d+\])*)(?: = (.*?): |: | )(.*)", text, re.DOTALL)
-        if found is None:
+        match = re.match(r"PanoramaSettings((?:\.\w+|\[\d+\])*)(?: = (.*?): |: | )(.*)", text, re.DOTALL)
+        if match is None:
             return Fault(path, text)
-        key, given, rest = found.groups()
+        key, given, rest = match.groups()
         return Fault(path + key, rest if given is None else f"{given}: {rest}")
     return None
 
@@ -141,11 +141,11 @@ def file_faults(raw: Raw, files: RoomFiles) -> Iterator[Fault]:
 
 def _file_fault(path: str, one: PanoramaTable | GeometryTable, files: RoomFiles) -> Iterator[Fault]:
     try:
-        found = RoomFiles(files.folder).sha256(one.file)
+        digest = RoomFiles(files.folder).sha256(one.file)
     except RoomError as error:
         yield Fault(f"{path}.file", str(error))
         return
-    wanted = one.sha256 or files.digests.get(one.file, found)
-    if found != wanted:
-        text = f"is not that of {one.file}, which has {found}"
+    wanted = one.sha256 or files.digests.get(one.file, digest)
+    if digest != wanted:
+        text = f"is not that of {one.file}, which has {digest}"
         yield Fault(f"{path}.sha256", f"{text}; put the right file there, or correct the number")

@@ -246,10 +246,10 @@ class RoomsTable(Table):
     @property
     def pinned(self) -> Mapping[str, str | None]:
         """SHA-256 of the files of all rooms by name, None where the recipe does not state it; in their order."""
-        found: dict[str, str | None] = {}
+        digests: dict[str, str | None] = {}
         for one in self.file_tables:
-            found[one.file] = found.get(one.file) or one.sha256
-        return found
+            digests[one.file] = digests.get(one.file) or one.sha256
+        return digests
 
     @property
     def file_tables(self) -> tuple[PanoramaTable | GeometryTable, ...]:

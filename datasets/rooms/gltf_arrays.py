@@ -56,27 +56,27 @@ class GltfDocument:
 
     def _chunks(self, data: bytes) -> tuple[bytes, bytes]:
         """Text and binary chunk of a .glb file."""
-        found: dict[bytes, bytes] = {}
+        chunks: dict[bytes, bytes] = {}
         at = 12  # after magic, version and length
         while at + 8 <= len(data):
             length, kind = int.from_bytes(data[at : at + 4], "little"), data[at + 4 : at + 8]
             if at + 8 + length > len(data):
                 raise self.file.fault("is damaged: it ends within a chunk")
-            found.setdefault(kind, data[at + 8 : at + 8 + length])
+            chunks.setdefault(kind, data[at + 8 : at + 8 + length])
             at += 8 + length
-        if b"JSON" not in found:
+        if b"JSON" not in chunks:
             raise self.file.fault("is damaged: it has no JSON chunk")
-        return found[b"JSON"], found.get(b"BIN\0", b"")
+        return chunks[b"JSON"], chunks.get(b"BIN\0", b"")
 
     # Values of the document.
 
     def rows(self, key: str) -> list[dict[str, Any]]:
         """List of tables at the root."""
         if key not in self._rows:  # looked at once: a thousand nodes ask for it a thousand times
-            found = self.tree.get(key, [])
-            if not isinstance(found, list) or not all(isinstance(one, dict) for one in found):
+            entries = self.tree.get(key, [])
+            if not isinstance(entries, list) or not all(isinstance(one, dict) for one in entries):
                 raise self.file.fault(f"is damaged: '{key}' is not a list of tables")
-            self._rows[key] = found
+            self._rows[key] = entries
         return self._rows[key]
 
     def row(self, key: str, number: Any) -> dict[str, Any]:
@@ -90,25 +90,25 @@ class GltfDocument:
 
     def table(self, owner: dict[str, Any], key: str) -> dict[str, Any]:
         """Table within a table; an empty one where there is none."""
-        found = owner.get(key, {})
-        if not isinstance(found, dict):
+        value = owner.get(key, {})
+        if not isinstance(value, dict):
             raise self.file.fault(f"is damaged: '{key}' is not a table")
-        return found
+        return value
 
     def numbers(self, owner: dict[str, Any], key: str, default: tuple[float, ...]) -> tuple[float, ...]:
         """Numbers of a list of fixed length."""
-        found = owner.get(key, list(default))
-        is_plain = isinstance(found, list) and len(found) == len(default)
-        if not is_plain or not all(isinstance(x, (int, float)) and not isinstance(x, bool) for x in found):
+        values = owner.get(key, list(default))
+        is_plain = isinstance(values, list) and len(values) == len(default)
+        if not is_plain or not all(isinstance(x, (int, float)) and not isinstance(x, bool) for x in values):
             raise self.file.fault(f"is damaged: '{key}' is not {len(default)} numbers")
-        return tuple(float(x) for x in found)
+        return tuple(float(x) for x in values)
 
     def whole(self, owner: dict[str, Any], key: str, default: int | None = None, most: int = 2**40) -> int:
         """Whole number from 0 up."""
-        found = owner.get(key, default)
-        if isinstance(found, bool) or not isinstance(found, int) or not 0 <= found <= most:
-            raise self.file.fault(f"is damaged: '{key}' is {found!s:.20}, not a whole number from 0 to {most}")
-        return found
+        number = owner.get(key, default)
+        if isinstance(number, bool) or not isinstance(number, int) or not 0 <= number <= most:
+            raise self.file.fault(f"is damaged: '{key}' is {number!s:.20}, not a whole number from 0 to {most}")
+        return number
 
     # Bytes and arrays.
 
@@ -153,10 +153,10 @@ class GltfDocument:
 
     def array(self, number: Any, width: int | tuple[int, ...]) -> Array:
         """Entries of an accessor, shape (count, width), as floats; normalised whole numbers span 0 or -1 to 1."""
-        found, accessor = self.raw_array(number, width), self.row("accessors", number)
-        values = found.astype(float)
-        if accessor.get("normalized") and found.dtype.kind in "iu":
-            values = np.maximum(values / np.iinfo(found.dtype).max, -1.0)
+        raw, accessor = self.raw_array(number, width), self.row("accessors", number)
+        values = raw.astype(float)
+        if accessor.get("normalized") and raw.dtype.kind in "iu":
+            values = np.maximum(values / np.iinfo(raw.dtype).max, -1.0)
         return values
 
     def raw_array(self, number: Any, width: int | tuple[int, ...]) -> NDArray[Any]:

@@ -104,7 +104,7 @@ class _Reader:
 
     def parts(self) -> list[MeshPart]:
         """All triangles of the scene."""
-        found: list[MeshPart] = []
+        mesh_parts: list[MeshPart] = []
         waiting = [(number, np.eye(4), 1) for number in self._roots()]
         while waiting:
             number, outer, depth = waiting.pop(0)
@@ -116,11 +116,11 @@ class _Reader:
                 continue
             transform = outer @ self._transform(node)
             if "mesh" in node:
-                found += self._of_node(number, node, transform)
-                check_parts(self.file, len(found))
+                mesh_parts += self._of_node(number, node, transform)
+                check_parts(self.file, len(mesh_parts))
             waiting += [(child, transform, depth + 1) for child in node.get("children", [])]
         check_count(self.file, self._count)
-        return found
+        return mesh_parts
 
     def _roots(self) -> list[Any]:
         """Nodes of the scene that is shown; of a file without scenes all that are no node's children."""
@@ -450,8 +450,8 @@ class _Reader:
         image, companions = self.document.row("images", number), self.document.companions
         uri = image.get("uri")
         if "bufferView" not in image and isinstance(uri, str) and not uri.startswith("data:"):
-            found = companions.named(uri)
-            return found, found.read()
+            file = companions.named(uri)
+            return file, file.read()
         inside = "bufferView" in image
         return self.file, self.document.view(image["bufferView"])[0] if inside else self.document.of_uri(uri)
 

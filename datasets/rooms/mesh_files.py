@@ -57,9 +57,9 @@ def read_mesh(path: Path, one_file: bool = False) -> tuple[MeshPart, ...]:
         raise file.fault(f"has {error}: export triangles") from error
     except Exception as error:  # documents and arrays can contradict each other in any way
         raise damaged(file) from error
-    found = named_parts(part for part in parts if len(part.triangles))
-    check_count(file, sum(len(part.triangles) for part in found))
-    check_parts(file, len(found))
-    for part in found:
+    named = named_parts(part for part in parts if len(part.triangles))
+    check_count(file, sum(len(part.triangles) for part in named))
+    check_parts(file, len(named))
+    for part in named:
         check_part(file, part)
-    return found
+    return named

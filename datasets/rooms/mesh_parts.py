@@ -134,8 +134,8 @@ class Companions:
 
     def picture(self, name: str) -> Picture:
         """Pixels of a picture that has a file of its own."""
-        found = self.named(name)
-        return self.pixels(found, found.read())
+        file = self.named(name)
+        return self.pixels(file, file.read())
 
     def pixels(self, owner: InputFile, data: bytes) -> Picture:
         """Pixels of an encoded picture, 8 bits, sRGB; 16 bits of grey are scaled.
@@ -230,16 +230,16 @@ def opacities(triangles: int, uniform: float, corners: Array | None, uv: Array |
     uv : shape (M, 3, 2), places of the corners on the picture, v upwards, or None
     alpha : picture's alpha, or None for 1
     """
-    found = np.full((triangles, 1), uniform)
+    values = np.full((triangles, 1), uniform)
     if corners is not None:
-        found = found * (corners @ _WEIGHTS.T)
+        values = values * (corners @ _WEIGHTS.T)
     if uv is not None and alpha is not None:
         places = np.einsum("sk,mkd->msd", _WEIGHTS, uv)
         height, width = alpha.shape
         column = np.floor(places[..., 0] * width).astype(int) % width
         row = height - 1 - np.floor(places[..., 1] * height).astype(int) % height
-        found = found * (alpha[row, column] / 255.0)
-    return np.stack([found.min(axis=1), found.max(axis=1)], axis=1)
+        values = values * (alpha[row, column] / 255.0)
+    return np.stack([values.min(axis=1), values.max(axis=1)], axis=1)
 
 
 def check_count(file: InputFile, count: int) -> None:

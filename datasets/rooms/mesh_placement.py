@@ -206,7 +206,7 @@ def _check_extent(settings: MeshSettings, parts: list[MeshPart]) -> None:
 
 def heights_on_vertical(parts: Sequence[MeshPart], xy_m: Vector = (0.0, 0.0)) -> list[Array]:
     """Heights, metres, rising, at which a vertical crosses each part."""
-    found, foot = [], np.array([*xy_m, 0.0])
+    heights, foot = [], np.array([*xy_m, 0.0])
     for part in parts:
         a, b, c = np.moveaxis(corners_of(part) - foot, 1, 0)
         area = _cross(b - a, c - a)
@@ -214,8 +214,8 @@ def heights_on_vertical(parts: Sequence[MeshPart], xy_m: Vector = (0.0, 0.0)) ->
             u, v = -_cross(a, c - a) / area, -_cross(b - a, a) / area
             inside = (area != 0.0) & (u >= 0.0) & (v >= 0.0) & (u + v <= 1.0)
         z = a[inside, 2] + u[inside] * (b - a)[inside, 2] + v[inside] * (c - a)[inside, 2]
-        found.append(np.sort(z))
-    return found
+        heights.append(np.sort(z))
+    return heights
 
 
 def _cross(a: Array, b: Array) -> Array:

@@ -96,7 +96,7 @@ def _lamps(settings: MeshSettings, parts: list[MeshPart]) -> tuple[tuple[Rectang
         )
         for k, one in enumerate(settings.lamps, 1)
     ]
-    found: list[tuple[float, Rectangle, int, NDArray[np.bool_]]] = []
+    rectangles: list[tuple[float, Rectangle, int, NDArray[np.bool_]]] = []
     for number, part in enumerate(parts):
         if part.light is None or part.light.picture is not None:
             continue
@@ -104,10 +104,10 @@ def _lamps(settings: MeshSettings, parts: list[MeshPart]) -> tuple[tuple[Rectang
         for count, (chosen, pose, size) in enumerate(_rectangles(part), 1):
             name = f"{part.name} (lamp {count})"
             panel = Rectangle(name, pose, size, _BLACK, radiance)
-            found.append((max(radiance) * size[0] * size[1], panel, number, chosen))
-    found.sort(key=lambda each: (-each[0], each[1].name))
+            rectangles.append((max(radiance) * size[0] * size[1], panel, number, chosen))
+    rectangles.sort(key=lambda each: (-each[0], each[1].name))
     rest = {number: np.ones(len(part.triangles), dtype=bool) for number, part in enumerate(parts)}
-    for _, panel, number, chosen in found[: max(MOST_LAMPS - len(lamps), 0)]:
+    for _, panel, number, chosen in rectangles[: max(MOST_LAMPS - len(lamps), 0)]:
         lamps.append(panel)
         rest[number] &= ~chosen
     left = [(part, rest[number]) for number, part in enumerate(parts) if rest[number].any()]

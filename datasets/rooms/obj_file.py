@@ -281,29 +281,29 @@ def _pictured(
 
 
 def _materials(file: InputFile, companions: Companions, libraries: list[str]) -> dict[str, _Material]:
-    found: dict[str, _Material] = {}
+    materials: dict[str, _Material] = {}
     for line in libraries:
         # one name with blanks, or several names
         names = [line] if companions.is_there(line) or " " not in line else line.split()
         for name in names:
             library = companions.named(name)
             for material in _library(library):
-                found.setdefault(material.name, material)
-    return found
+                materials.setdefault(material.name, material)
+    return materials
 
 
 def _library(file: InputFile) -> list[_Material]:
-    found: list[_Material] = []
+    materials: list[_Material] = []
     for line in _lines(file):
         words = line.split()
         if not words:
             continue
         key, values = words[0], words[1:]
         if key == "newmtl":
-            found.append(_Material(" ".join(values)))
-        elif found:
-            found[-1] = _with_line(file, found[-1], key.lower(), values)
-    return found
+            materials.append(_Material(" ".join(values)))
+        elif materials:
+            materials[-1] = _with_line(file, materials[-1], key.lower(), values)
+    return materials
 
 
 def _with_line(file: InputFile, material: _Material, key: str, values: list[str]) -> _Material:
@@ -311,8 +311,8 @@ def _with_line(file: InputFile, material: _Material, key: str, values: list[str]
         colour = _colour(file, material.name, key, values)
         return replace(material, diffuse=colour) if key == "kd" else replace(material, emission=colour)
     if key in ("map_kd", "map_ke"):
-        found = _map(file, material.name, key, values)
-        return replace(material, picture=found) if key == "map_kd" else replace(material, light_picture=found)
+        picture = _map(file, material.name, key, values)
+        return replace(material, picture=picture) if key == "map_kd" else replace(material, light_picture=picture)
     if key == "map_d":
         return replace(material, mask=_map(file, material.name, key, values))
     return material  # gloss and relief are not kept, nor is a half transparency
@@ -331,7 +331,7 @@ def _colour(file: InputFile, name: str, key: str, values: list[str]) -> Vector:
 def _map(file: InputFile, name: str, key: str, values: list[str]) -> _Map:
     """Picture with its options, which stand before its name."""
     where = f"{key} of '{printable_line(name, 60)}'"
-    found, k = _Map(""), 0
+    picture, k = _Map(""), 0
     while k < len(values) and values[k].startswith("-"):
         option = values[k]
         if option in ("-s", "-o", "-t"):
@@ -341,8 +341,8 @@ def _map(file: InputFile, name: str, key: str, values: list[str]) -> _Map:
                 raise file.fault(f"has turbulence in {where}, which is not read")
             default = 1.0 if option == "-s" else 0.0
             u, v, *_ = (*numbers, default, default)
-            found = replace(found, scale=(u, v)) if option == "-s" else found
-            found = replace(found, offset=(u, v)) if option == "-o" else found
+            picture = replace(picture, scale=(u, v)) if option == "-s" else picture
+            picture = replace(picture, offset=(u, v)) if option == "-o" else picture
             continue
         if option not in _OPTIONS:
             raise file.fault(f"has the option {printable_line(option, 20)} in {where}, which is not read")
@@ -350,18 +350,18 @@ def _map(file: InputFile, name: str, key: str, values: list[str]) -> _Map:
         if option == "-mm" and [float(word) for word in words] != [0.0, 1.0]:
             raise file.fault(f"changes the values of a picture (-mm) in {where}: put it into the picture")
         if option == "-clamp":
-            found = replace(found, clamped=words == ["on"])
+            picture = replace(picture, clamped=words == ["on"])
         k += 1 + _OPTIONS[option]
     if k >= len(values):
         raise damaged(file)
-    return replace(found, name=" ".join(values[k:]))
+    return replace(picture, name=" ".join(values[k:]))
 
 
 def _leading_numbers(words: list[str]) -> list[float]:
-    found: list[float] = []
+    numbers: list[float] = []
     for word in words:
         try:
-            found.append(float(word))
+            numbers.append(float(word))
         except ValueError:  # the picture's name begins
             break
-    return found
+    return numbers

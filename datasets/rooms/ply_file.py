@@ -273,7 +273,7 @@ def _triangles(file: InputFile, points: Array, polygons: Any) -> tuple[NDArray[n
     if isinstance(polygons, np.ndarray) and polygons.shape[1] == 3:
         count = len(polygons)
         return polygons.astype(np.int64), np.arange(count), np.tile(np.arange(3), (count, 1))
-    found: list[Any] = []
+    triangles: list[Any] = []
     owner: list[int] = []
     corner: list[Any] = []
     total, cutting = 0, Cutting()
@@ -289,17 +289,17 @@ def _triangles(file: InputFile, points: Array, polygons: Any) -> tuple[NDArray[n
         total += len(pieces)
         if total > MOST_TRIANGLES:
             check_count(file, total)
-        found.append(index[pieces])
+        triangles.append(index[pieces])
         owner += [number] * len(pieces)
         corner.append(pieces)
-    if not found:
+    if not triangles:
         return np.zeros((0, 3), np.int64), np.zeros(0, int), np.zeros((0, 3), int)
-    return np.concatenate(found), np.array(owner), np.concatenate(corner)
+    return np.concatenate(triangles), np.array(owner), np.concatenate(corner)
 
 
 def _strips(strips: Any) -> NDArray[np.int64]:
     """Triangles of strips; -1 begins a new one. Every other triangle turns around."""
-    found = []
+    triangles = []
     for strip in strips:
         index = np.asarray(strip).astype(np.int64)
         for run in np.split(index, np.flatnonzero(index == -1)):
@@ -307,8 +307,8 @@ def _strips(strips: Any) -> NDArray[np.int64]:
             if len(part) > 2:
                 three = np.stack([part[:-2], part[1:-1], part[2:]], axis=1)
                 three[1::2] = three[1::2, ::-1]
-                found.append(three)
-    return np.concatenate(found) if found else np.zeros((0, 3), np.int64)
+                triangles.append(three)
+    return np.concatenate(triangles) if triangles else np.zeros((0, 3), np.int64)
 
 
 # Colours.
@@ -373,11 +373,11 @@ def _colours(file: InputFile, table: Table, kinds: dict[str, str]) -> Array | No
     names = next((names for names in _COLOURS if all(name in table for name in names)), None)
     if names is None or not len(table[names[0]]):
         return None
-    found = []
+    columns = []
     for name in names:
         values, kind = np.asarray(table[name], float), kinds[name]
         scale = 1.0 if kind in ("f4", "f8") else 65535.0 if kind == "u2" else 255.0  # largest value of the type
         if not (np.isfinite(values).all() and values.min() >= 0.0 and values.max() <= scale):
             raise file.fault(f"has colours outside 0 to {scale:g}, which are the ends of their type")
-        found.append(values / scale)
-    return np.asarray(srgb_decoded(np.stack(found, axis=1)))
+        columns.append(values / scale)
+    return np.asarray(srgb_decoded(np.stack(columns, axis=1)))

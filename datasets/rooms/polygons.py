@@ -100,15 +100,15 @@ def _is_convex(flat: Array, size: float) -> bool:
 
 
 def _by_ears(flat: Array, size: float, cutting: Cutting) -> NDArray[np.int64]:
-    left, found = list(range(len(flat))), []
+    left, triangles = list(range(len(flat))), []
     while len(left) > 3:
         ear = next((k for k in range(len(left)) if _is_ear(flat, left, k, size, cutting)), None)
         if ear is None:  # it crosses itself
             break
-        found.append((left[ear - 1], left[ear], left[(ear + 1) % len(left)]))
+        triangles.append((left[ear - 1], left[ear], left[(ear + 1) % len(left)]))
         del left[ear]
-    found += [(left[0], left[k], left[k + 1]) for k in range(1, len(left) - 1)]
-    return np.array(found, np.int64)
+    triangles += [(left[0], left[k], left[k + 1]) for k in range(1, len(left) - 1)]
+    return np.array(triangles, np.int64)
 
 
 def _is_ear(flat: Array, left: list[int], k: int, size: float, cutting: Cutting) -> bool:

@@ -65,9 +65,9 @@ def checked_data(folder: Path | None, name: str, sha256: str) -> bytes:
         If it is missing, larger than 64 MiB, or not the file with that SHA-256.
     """
     data = _data(folder, name)
-    if (found := hashlib.sha256(data).hexdigest()) != sha256:
+    if (digest := hashlib.sha256(data).hexdigest()) != sha256:
         raise RoomError(
-            f"{folder}/{name} is another file than the room was made from: its SHA-256 begins with {found[:12]}, not "
+            f"{folder}/{name} is another file than the room was made from: its SHA-256 begins with {digest[:12]}, not "
             f"{sha256[:12]}; put the right file back"
         )
     return data

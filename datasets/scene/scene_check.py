@@ -112,7 +112,7 @@ def check_sample(sample: Sample) -> Iterator[ViewComparison]:
 
 def check_view(sample: Sample, position: str) -> ViewComparison:
     """Compare one view of a sample."""
-    found: dict[str, RendererDifference] = {}
+    differences: dict[str, RendererDifference] = {}
     left_out: list[str] = []
     view, room = sample.view(position), sample.room
     try:
@@ -121,15 +121,15 @@ def check_view(sample: Sample, position: str) -> ViewComparison:
                 left_out.append("not compared: our layers leave out reflections in the tube's glass")
             else:
                 scene = LoadedScene(sample, position, Path(folder))
-                found["outline"] = _outline(scene)
+                differences["outline"] = _outline(scene)
                 if room.sun is not None:
                     left_out.append("ambient light not compared: standard plugins have no sun behind panes")
                 else:
-                    found |= _ambient(scene)
-                found |= _spot(scene)
+                    differences |= _ambient(scene)
+                differences |= _spot(scene)
     except SceneError as error:
         left_out.append(f"not compared: {error}")
-    return ViewComparison(sample.row.sample_id, position, found, tuple(left_out))
+    return ViewComparison(sample.row.sample_id, position, differences, tuple(left_out))
 
 
 class LoadedScene:
@@ -179,14 +179,14 @@ def _ambient(scene: LoadedScene) -> dict[str, RendererDifference]:
     theirs = ndimage.gaussian_filter(
         scene.rendered("ambient", (0, 0, width, height), _SAMPLES, seed), (sigma, sigma, 0.0)
     )
-    found = {}
+    differences = {}
     for name, free in _free(scene, ours).items():
         wide = ndimage.minimum_filter(free, 2 * int(np.ceil(4.0 * sigma)) + 1, mode="constant", cval=False)
         ratios = np.array(list(_ratios(theirs, ours, wide, round(height / _SIDES[name])))) - 1.0
         if len(ratios) > 1:
             error = ratios.std(ddof=1) / np.sqrt(len(ratios))
-            found[f"light {name}"] = RendererDifference(float(ratios.mean()), float(error), LIGHT_TOLERANCE, "1")
-    return found
+            differences[f"light {name}"] = RendererDifference(float(ratios.mean()), float(error), LIGHT_TOLERANCE, "1")
+    return differences
 
 
 def light_layer(sample: Sample, position: str) -> Array:

@@ -131,15 +131,15 @@ _LINE = re.compile(r"[0-9a-f]{64}  " + FILE_NAME)
 
 def misplaced(folder: Path) -> list[str]:
     """One sentence per FIFO, socket, device or circular link in a folder, and per folder in place of a file of ours."""
-    found = []
+    faults = []
     for path in sorted(folder.rglob("*")):
         name = path.relative_to(folder).as_posix()
         try:
             if not path.is_dir() or name in _FILES or schema.is_task_file(name):
                 require_file(path)
         except OSError as error:
-            found.append(f"{name} is not readable: {error.strerror or error}")
-    return found
+            faults.append(f"{name} is not readable: {error.strerror or error}")
+    return faults
 
 
 def damaged(folder: Path) -> list[str]:

@@ -94,8 +94,8 @@ def croissant_text(
 
 def file_object(name: str, media: str, digest: str, contained_in: str = "") -> dict[str, Any]:
     """Description of one file with its SHA-256."""
-    found = {"@type": "cr:FileObject", "@id": name, "name": name, "contentUrl": name, "encodingFormat": media}
-    return found | {"sha256": digest} | ({"containedIn": {"@id": contained_in}} if contained_in else {})
+    entry = {"@type": "cr:FileObject", "@id": name, "name": name, "contentUrl": name, "encodingFormat": media}
+    return entry | {"sha256": digest} | ({"containedIn": {"@id": contained_in}} if contained_in else {})
 
 
 def file_set(name: str, media: str, includes: str) -> dict[str, Any]:
@@ -116,13 +116,13 @@ def record_set(
     key : column that names a row, if one does
     """
     fields = [_field(name, column, kind, texts, source) for column, kind in types.items()]
-    found: dict[str, Any] = {"@type": "cr:RecordSet", "@id": name, "name": name, "description": about}
-    return found | ({"key": {"@id": f"{name}/{key}"}} if key else {}) | {"field": fields}
+    entry: dict[str, Any] = {"@type": "cr:RecordSet", "@id": name, "name": name, "description": about}
+    return entry | ({"key": {"@id": f"{name}/{key}"}} if key else {}) | {"field": fields}
 
 
 def _field(table: str, column: str, kind: str, texts: Mapping[str, str], source: Mapping[str, Any]) -> dict[str, Any]:
     is_list = "List" in kind
-    found: dict[str, Any] = {
+    entry: dict[str, Any] = {
         "@type": "cr:Field",
         "@id": f"{table}/{column}",
         "name": column,
@@ -130,7 +130,7 @@ def _field(table: str, column: str, kind: str, texts: Mapping[str, str], source:
         "dataType": "sc:Float" if is_list else _TYPES[kind],
         "source": {**source, "extract": {"column": column}},
     }
-    return found | ({"isArray": True, "arrayShape": "-1"} if is_list else {})
+    return entry | ({"isArray": True, "arrayShape": "-1"} if is_list else {})
 
 
 def manifest_texts() -> dict[str, str]:
@@ -152,8 +152,8 @@ def counted(*counts: tuple[int, str]) -> str:
 def made_by(info: DatasetInfo) -> str:
     """Version of phibench that made a data set, as its `dataset.json` says."""
     packages = info.provenance.get("packages")
-    found = packages.get("phibench") if isinstance(packages, dict) else None
-    return found if isinstance(found, str) else "0.0.0"
+    version = packages.get("phibench") if isinstance(packages, dict) else None
+    return version if isinstance(version, str) else "0.0.0"
 
 
 _SMALL = {

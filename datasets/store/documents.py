@@ -229,8 +229,8 @@ def read_info(folder: Path) -> DatasetInfo:
     document = file.json()
     version = document.get("schema_version")
     if version not in READABLE_VERSIONS:
-        known, found = " and ".join(map(str, READABLE_VERSIONS)), printable_line(str(version), 60)
-        raise DatasetError(f"{path} has schema version {found}; this phibench reads versions {known}")
+        known, shown = " and ".join(map(str, READABLE_VERSIONS)), printable_line(str(version), 60)
+        raise DatasetError(f"{path} has schema version {shown}; this phibench reads versions {known}")
     return file.validated(DatasetInfo, document)
 
 

@@ -249,6 +249,6 @@ class PairFiles(Generic[Row]):
         """
         for name in self._listed:
             self.read(name)
-        found = [path for path in (self.folder / FRAMES).rglob("*") if path.is_symlink() or not path.is_dir()]
-        if strays := sorted({path.relative_to(self.folder).as_posix() for path in found} - set(self._listed)):
+        paths = [path for path in (self.folder / FRAMES).rglob("*") if path.is_symlink() or not path.is_dir()]
+        if strays := sorted({path.relative_to(self.folder).as_posix() for path in paths} - set(self._listed)):
             raise DatasetError(f"{self.folder / strays[0]} is not of the set; remove it")

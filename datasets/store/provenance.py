@@ -80,13 +80,13 @@ def code_behind(module: str) -> str:
 
 def closure(module: str) -> frozenset[str]:
     """Full names of a module and of all that it imports from phibench, at its top or inside its functions."""
-    found, waiting = set[str](), [module]
+    modules, waiting = set[str](), [module]
     while waiting:
         name = waiting.pop()
-        if name not in found:
-            found.add(name)
+        if name not in modules:
+            modules.add(name)
             waiting += _imported(name)
-    return frozenset(found)
+    return frozenset(modules)
 
 
 @cache

@@ -68,11 +68,11 @@ def image_of(view: View, points_world_m: Array) -> MirrorImage:
             if not np.any(np.abs(step) > _TOLERANCE_PX):
                 break
         step, px_per_m = _newton(view, uv, X)
-        found = np.all(np.abs(step) < 1e3 * _TOLERANCE_PX, axis=-1)
+        at_rest = np.all(np.abs(step) < 1e3 * _TOLERANCE_PX, axis=-1)
         ray = room_rays(view, uv)
         ahead = np.sum((X - ray.origin_world_m) * ray.direction_world, axis=-1) > 0.0
     status = first_fault(
-        flag((~np.isfinite(X).all(axis=-1), Status.NOT_FINITE)), flag((~(found & ahead), Status.NOT_CONVERGED))
+        flag((~np.isfinite(X).all(axis=-1), Status.NOT_FINITE)), flag((~(at_rest & ahead), Status.NOT_CONVERGED))
     )
     return MirrorImage(keep(uv, status), keep(px_per_m, status), status)
 

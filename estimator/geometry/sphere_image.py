@@ -125,12 +125,12 @@ class SphereImager:
             return None
         sin_b, cos_b, t = math.sin(b), math.cos(b), 2.0 * p + b
         sin_t, cos_t = math.sin(t), math.cos(t)
-        found = self._pixel((sin_b * ax - cos_b * ex, sin_b * ay - cos_b * ey, sin_b * az - cos_b * ez))
-        if found is None:
+        pixel = self._pixel((sin_b * ax - cos_b * ex, sin_b * ay - cos_b * ey, sin_b * az - cos_b * ez))
+        if pixel is None:
             return None
         ray = (sin_t * ax + cos_t * ex, sin_t * ay + cos_t * ey, sin_t * az + cos_t * ez)
-        etendue = self._camera.aperture_m2 * found[2] * b1 / slope * sin_b / w
-        return SphereImage(found[0], found[1], cosine, ray, etendue)
+        etendue = self._camera.aperture_m2 * pixel[2] * b1 / slope * sin_b / w
+        return SphereImage(pixel[0], pixel[1], cosine, ray, etendue)
 
     def reflectance(self, cos_incidence: float) -> float:
         """Part of the light that the mirror keeps."""

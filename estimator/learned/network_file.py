@@ -84,8 +84,8 @@ def require_layers(model: OnnxModel, nodes: list[Node], shapes: Mapping[str, tup
     if model.opsets != [("", opset)]:
         raise NetworkFileError(f"uses other operators than ONNX's of version {opset}")
     if model.nodes != nodes:
-        found = {node.kind for node in model.nodes} - {node.kind for node in nodes}
-        more = f": it has {', '.join(sorted(found)[:3])}" if found else ""
+        strange = {node.kind for node in model.nodes} - {node.kind for node in nodes}
+        more = f": it has {', '.join(sorted(strange)[:3])}" if strange else ""
         raise NetworkFileError(f"has other layers than this network{more}")
     for name, shape in shapes.items():
         tensor = model.tensors.get(name)
@@ -225,11 +225,11 @@ def _numbers(value: Value) -> list[int]:
     """Whole numbers of a repeated field, packed or one by one."""
     if isinstance(value, int):
         return [_signed(value)]
-    found, place = list[int](), 0
+    numbers, place = list[int](), 0
     while place < len(value):
         number, place = _varint(value, place)
-        found.append(_signed(number))
-    return found
+        numbers.append(_signed(number))
+    return numbers
 
 
 def _signed(value: int) -> int:

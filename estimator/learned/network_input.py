@@ -82,8 +82,8 @@ def filter_planes(image: Image, card: SensorCard) -> tuple[Array, BoolArray]:
         signal = raw_electrons(image, card)
         return demosaiced(signal), np.asarray(signal >= card.saturation_e)
     height, width = image.shape[:2]
-    found = colour_planes(image, card, Box(0, 0, width, height))
-    return np.asarray(found.values_e, float), np.asarray(found.full.any(axis=0))
+    colours = colour_planes(image, card, Box(0, 0, width, height))
+    return np.asarray(colours.values_e, float), np.asarray(colours.full.any(axis=0))
 
 
 def crop_input(on: Image, off: Image | None, card: SensorCard) -> CropInput:

@@ -200,31 +200,31 @@ def _checked(model: bytes, name: str) -> dict[str, str]:
     NetworkFileError
         If it is not.
     """
-    found = read_model(model)
-    if found.metadata.get("name") != name:
-        raise NetworkFileError(f"holds '{printable_line(str(found.metadata.get('name')), 40)}', not '{name}'")
-    if found.metadata.get("version") != VERSION:
-        stated = printable_line(str(found.metadata.get("version")), 20)
+    network = read_model(model)
+    if network.metadata.get("name") != name:
+        raise NetworkFileError(f"holds '{printable_line(str(network.metadata.get('name')), 40)}', not '{name}'")
+    if network.metadata.get("version") != VERSION:
+        stated = printable_line(str(network.metadata.get("version")), 20)
         raise NetworkFileError(f"is of version {stated}, this phibench needs version {VERSION}")
     graph = _GRAPHS[name](_Recorder())
-    for kind, given, right in (("inputs", found.inputs, graph.inputs), ("outputs", found.outputs, graph.outputs)):
+    for kind, given, right in (("inputs", network.inputs, graph.inputs), ("outputs", network.outputs, graph.outputs)):
         if given != list(right):
             raise NetworkFileError(
                 f"has the {kind} {printable_line(', '.join(given), 60) or '-'}: {', '.join(right)} are needed"
             )
-    require_layers(found, graph.nodes, weight_shapes(name), _OPSET)
+    require_layers(network, graph.nodes, weight_shapes(name), _OPSET)
     for key, value in graph.constants.items():
-        if key not in found.tensors or not np.array_equal(found.tensors[key], value):
+        if key not in network.tensors or not np.array_equal(network.tensors[key], value):
             raise NetworkFileError(f"has another constant '{key}' than this network")
-    if strange := sorted(set(found.tensors) - set(graph.constants) - set(weight_shapes(name))):
+    if strange := sorted(set(network.tensors) - set(graph.constants) - set(weight_shapes(name))):
         raise NetworkFileError(f"has the weights '{printable_line(strange[0], 40)}', which this network does not know")
     try:
-        scale = float(found.metadata[_SCALE])
+        scale = float(network.metadata[_SCALE])
     except (KeyError, ValueError) as error:
         raise NetworkFileError(f"states no number {_SCALE}") from error
     if not 0.0 < scale < math.inf:
         raise NetworkFileError(f"states {_SCALE} = {scale:g}: a finite number above 0 is needed")
-    return found.metadata
+    return network.metadata
 
 
 class _Recorder:

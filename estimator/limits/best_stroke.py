@@ -205,16 +205,16 @@ def _limits(curve: StrokeCurve, index: int) -> tuple[str, ...]:
     """Causes beside the best element of a curve on the side where the error would fall further."""
     # "not a >= b" holds for NaN too: a stroke without any error, such as one behind the rim, limits as well
     last, sigma = len(curve.strokes_m) - 1, curve.sigma_m
-    found = []
+    limits = []
     if index == 0 and sigma[0] < sigma[1]:
-        found.append(LEAST)
+        limits.append(LEAST)
     elif index > 0 and curve.causes[index - 1] != FREE and not sigma[index - 1] >= sigma[index]:
-        found.append(curve.causes[index - 1])
+        limits.append(curve.causes[index - 1])
     if index == last and sigma[last] < sigma[last - 1]:
-        found.append(LARGEST)
+        limits.append(LARGEST)
     elif index < last and curve.causes[index + 1] != FREE and not sigma[index + 1] >= sigma[index]:
-        found.append(curve.causes[index + 1])
-    return tuple(dict.fromkeys(found))
+        limits.append(curve.causes[index + 1])
+    return tuple(dict.fromkeys(limits))
 
 
 def _check(depth_m: float, strokes_m: tuple[float, float], stroke_sigma_m: float) -> None:

@@ -159,8 +159,8 @@ def excesses(records: pl.DataFrame) -> list[Excess]:
     ----------
     records : `metrics.prepared`
     """
-    found = [one for one in _tried(records) if one.pairs and one.ratio > 1.0 and one.chance < FALSE_ALARM]
-    named = ([one for one in found if one.quantity == quantity] for quantity in QUANTITIES)
+    suspicious = [one for one in _tried(records) if one.pairs and one.ratio > 1.0 and one.chance < FALSE_ALARM]
+    named = ([one for one in suspicious if one.quantity == quantity] for quantity in QUANTITIES)
     return [min(some, key=lambda one: one.chance) for some in named if some]
 
 

@@ -154,8 +154,8 @@ def stroke_curve(
     electrons = [spot_electrons_per_s(rig, around.laser, image, around.wall_normals()) * exposure_s for image in images]
     C_down, C_up = (_covariance(image, spot, light) for image, light in zip(images, electrons, strict=True))
     down, up = (image.uv_px for image in images)
-    found = depth_general(rig, h[:, None], down, up, C_down, C_up, covariance_rig, np.asarray(stroke_sigma_m))
-    parts = (found.sigma_spot_m, found.sigma_calibration_m, found.sigma_stroke_m)
+    depth = depth_general(rig, h[:, None], down, up, C_down, C_up, covariance_rig, np.asarray(stroke_sigma_m))
+    parts = (depth.sigma_spot_m, depth.sigma_calibration_m, depth.sigma_stroke_m)
     of_spot, of_rig, of_stroke = (np.sqrt(np.mean(part**2, axis=-1)) for part in parts)
     even = beyond_first_order_m(rig, h, points, C_down, C_up, covariance_rig, stroke_sigma_m)
     curve = StrokeCurve(h, of_spot, of_rig, of_stroke, even, causes(rig, points, images[0], images[1], h, around))
@@ -287,8 +287,8 @@ def beyond_first_order_m(
     seen = [_seen(rig, v, h, points_m) for v in (*deviations, *-deviations)]
     down, up, true = (np.stack(column) for column in zip(*seen, strict=True))
     C_down, C_up = covariance_down_px2, up_px2[chosen]
-    found = depth_general(rig, h[:, None], down, up, C_down, C_up, covariance_rig, np.asarray(stroke_sigma_m))
-    square_m2 = _between(strokes_m, h, _beyond_m2(found.depth_m - true, normals))
+    depth = depth_general(rig, h[:, None], down, up, C_down, C_up, covariance_rig, np.asarray(stroke_sigma_m))
+    square_m2 = _between(strokes_m, h, _beyond_m2(depth.depth_m - true, normals))
     return np.asarray(np.sqrt(np.maximum(square_m2, 0.0)))
 
 

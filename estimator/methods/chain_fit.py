@@ -65,18 +65,18 @@ def chain_fit(pair: Pair) -> Answer:
 
 
 def _fitted(pair: Pair) -> Answer:
-    found = detected(pair)
-    hint_down, hint_up = trusted_hints(pair, found)
+    detections = detected(pair)
+    hint_down, hint_up = trusted_hints(pair, detections)
 
     def measure(depth_m: float | None) -> Answer:
         return Answer(
-            _spot_or_place(pair, "down", found.down, hint_down, depth_m),
-            _spot_or_place(pair, "up", found.up, hint_up, depth_m),
+            _spot_or_place(pair, "down", detections.down, hint_down, depth_m),
+            _spot_or_place(pair, "up", detections.up, hint_up, depth_m),
         )
 
     depth_m = None
-    if found.down is not None and found.up is not None:  # to 0.2 px, enough for the beam's size
-        depth_m = seen_depth_m(pair, Answer(Spot(found.down.uv_px), Spot(found.up.uv_px)))
+    if detections.down is not None and detections.up is not None:  # to 0.2 px, enough for the beam's size
+        depth_m = seen_depth_m(pair, Answer(Spot(detections.down.uv_px), Spot(detections.up.uv_px)))
     return measured_twice(measure, pair) if depth_m is None else measure(depth_m)
 
 
@@ -172,8 +172,8 @@ def _background(
     variance = unrounded(card, not own).variance_e2(x) + 1.0 / (12.0 * card.dn_per_e**2)
     everywhere = np.ones(x.shape) if known is None else known
     pattern = None if own else PatternNoise.of(card)
-    found = background_of(x, variance / frames.shape[1] + rounding, everywhere, pattern)
-    return replace(found, image=frames) if known is None else found
+    background = background_of(x, variance / frames.shape[1] + rounding, everywhere, pattern)
+    return replace(background, image=frames) if known is None else background
 
 
 def _response(pair: Pair) -> tuple[float, float, float]:

@@ -54,11 +54,11 @@ def reaches_bound(answer: Answer | None, position: str, spot: ImageTruth, match_
     Where the bound itself is so wide that four of its deviations exceed `match_px`, nothing is reached: an answer in
     the box would be near by chance.
     """
-    found, bound = getattr(answer, position, None), spot.bound_px2
-    if found is None or found.uv_px is None or bound is None or not spot.visible:
+    answered, bound = getattr(answer, position, None), spot.bound_px2
+    if answered is None or answered.uv_px is None or bound is None or not spot.visible:
         return False
     reach = _SIGMAS * float(np.sqrt(np.trace(bound) / 2.0))
-    return reach <= match_px and float(np.linalg.norm(np.subtract(found.uv_px, spot.uv_px))) <= reach
+    return reach <= match_px and float(np.linalg.norm(np.subtract(answered.uv_px, spot.uv_px))) <= reach
 
 
 def _box_about(spot: ImageTruth, image: Image) -> Box | None:

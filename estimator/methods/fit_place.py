@@ -43,9 +43,9 @@ def at_detection(found: Detection | None, spot: Spot) -> Spot:
 
 def kept(pair: Pair, separate: Answer, together: Answer) -> Answer:
     """The answer for both images together; the separate one where a spot of it left its detection."""
-    found = detected(pair)
+    detections = detected(pair)
     for position in POSITIONS:
-        one, spot = getattr(found, position), getattr(together, position)
+        one, spot = getattr(detections, position), getattr(together, position)
         if one is not None and left_px(one, spot) is not None:
             return separate
     return together

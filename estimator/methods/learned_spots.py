@@ -82,11 +82,11 @@ def _candidates(finder: Network, pair: Pair, position: str, least: float) -> Can
     on, off = (pair.images[name][box.slices] for name in (position, f"{position}_off"))
     planes, red = frame_input(on, off, pair.card)
     heat = np.asarray(finder.run(planes=planes[None])[0][0, 0], float)
-    found = heat_peaks(heat, red, _searched(pair, position, box)[::2, ::2], least)
-    order = np.argsort(-found.red_e, kind="stable")
-    uv = 2.0 * found.cells[order] + 0.5 + [box.u0_px, box.v0_px]
+    peaks = heat_peaks(heat, red, _searched(pair, position, box)[::2, ::2], least)
+    order = np.argsort(-peaks.red_e, kind="stable")
+    uv = 2.0 * peaks.cells[order] + 0.5 + [box.u0_px, box.v0_px]
     nothing = np.zeros(len(order))
-    return Candidates(uv, found.heat[order], found.red_e[order], nothing, nothing, np.ones(len(order), bool))
+    return Candidates(uv, peaks.heat[order], peaks.red_e[order], nothing, nothing, np.ones(len(order), bool))
 
 
 def _searched(pair: Pair, position: str, box: Box) -> BoolArray:

@@ -134,10 +134,10 @@ def claimed_px2(uv_px: Array, covariance_px2: Array, likelihood: Callable[[], Sp
     """
     if np.trace(covariance_px2) < 2.0 * FAINT_PX**2 or (one := likelihood()) is None:
         return covariance_px2
-    found = None if (places := likelihood_map(one)) is None else single_posterior(places)
-    if found is None:
+    posterior = None if (places := likelihood_map(one)) is None else single_posterior(places)
+    if posterior is None:
         return None
-    mean, covariance = found
+    mean, covariance = posterior
     return covariance + np.outer(mean - uv_px, mean - uv_px)
 
 

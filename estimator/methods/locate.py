@@ -332,8 +332,8 @@ def each_spot_twice(find: Callable[[SearchRegion], Spot]) -> Method:
     """Method as of `each_spot`, then once more with the distance found, for methods that use the beam's size."""
 
     def method(pair: Pair) -> Answer:
-        found = detected(pair)
-        return measured_twice(lambda depth_m: _both(find, pair, found, False, depth_m), pair)
+        detections = detected(pair)
+        return measured_twice(lambda depth_m: _both(find, pair, detections, False, depth_m), pair)
 
     return method
 
@@ -395,9 +395,9 @@ def seen_depth_m(pair: Pair, answer: Answer) -> float | None:
     """Distance at which the rays through two positions meet; None if they do not, or the beam is not known."""
     if pair.beam is None or answer.down.uv_px is None or answer.up.uv_px is None:
         return None
-    found = depth_exact(pair.rig, pair.stroke_m, np.array(answer.down.uv_px), np.array(answer.up.uv_px))
-    depth_m = float(found.depth_m)
-    return depth_m if found.status == Status.OK and _BEAM_RANGE_M[0] <= depth_m <= _BEAM_RANGE_M[1] else None
+    estimate = depth_exact(pair.rig, pair.stroke_m, np.array(answer.down.uv_px), np.array(answer.up.uv_px))
+    depth_m = float(estimate.depth_m)
+    return depth_m if estimate.status == Status.OK and _BEAM_RANGE_M[0] <= depth_m <= _BEAM_RANGE_M[1] else None
 
 
 def pair_blur(pair: Pair, uv_px: ArrayLike, depth_m: float | None) -> SpotBlur:

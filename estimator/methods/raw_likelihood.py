@@ -195,8 +195,8 @@ def _with_posterior(pair: Pair, position: str, spot: Spot, depth_m: float | None
         return spot
     one = _likelihood(pair, position, spot, depth_m)
     places = None if one is None else likelihood_map(one)
-    found = None if places is None else single_posterior(places)
-    return spot if found is None else _joint_spot(*found)
+    posterior = None if places is None else single_posterior(places)
+    return spot if posterior is None else _joint_spot(*posterior)
 
 
 def _likelihood(pair: Pair, position: str, spot: Spot, depth_m: float | None) -> SpotLikelihood | None:
@@ -230,17 +230,17 @@ def _raw(pair: Pair, separate: Answer) -> Answer:
     likelihoods = [of_pixels(one, start[0]) for one, start in zip((down, up), starts, strict=True)]
     if any(_of_other_shape(getattr(separate, p), one) for p, one in zip(POSITIONS, likelihoods, strict=True)):
         return _combined(pair, separate)
-    found = _posterior(pair, likelihoods)
-    if found is not None and found.status == Status.OK:
-        return separate if not found.misfit < _MOST_CHI2 else _posterior_answer(found)
+    posterior = _posterior(pair, likelihoods)
+    if posterior is not None and posterior.status == Status.OK:
+        return separate if not posterior.misfit < _MOST_CHI2 else _posterior_answer(posterior)
     return _answer(fit_joint(pair.rig, pair.stroke_m, down, up, *starts), separate)
 
 
 def _processed(pair: Pair, separate: Answer) -> Answer:
     depth_m = seen_depth_m(pair, separate)
-    found = _posterior(pair, [spot_likelihood(pair, p, getattr(separate, p), depth_m) for p in POSITIONS])
-    if found is not None and found.status == Status.OK:
-        return separate if not found.misfit < _MOST_CHI2 else _posterior_answer(found)
+    posterior = _posterior(pair, [spot_likelihood(pair, p, getattr(separate, p), depth_m) for p in POSITIONS])
+    if posterior is not None and posterior.status == Status.OK:
+        return separate if not posterior.misfit < _MOST_CHI2 else _posterior_answer(posterior)
     return _combined(pair, separate)
 
 

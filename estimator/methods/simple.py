@@ -125,8 +125,8 @@ def _spot_in_window(near: SearchRegion, u: float, v: float) -> Spot:
 
 def detected_spots(pair: Pair) -> Answer:
     """Position of the matched filter's peak, refined by a parabola, in both images."""
-    found = detected(pair)
-    return Answer(_detected_spot(found.down), _detected_spot(found.up))
+    detections = detected(pair)
+    return Answer(_detected_spot(detections.down), _detected_spot(detections.up))
 
 
 def _detected_spot(found: Detection | None) -> Spot:

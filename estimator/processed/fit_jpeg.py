@@ -185,9 +185,9 @@ def coefficients_at(region: JpegRegion, chain: ChainModel, row: int, column: int
         region.ends[2] and left == 0,
         region.ends[3] and right == width,
     )
-    found = recovered(region.image[:, top:bottom, left:right], qtables_of(card), card.jpeg_subsampling, ends)
+    decoded = recovered(region.image[:, top:bottom, left:right], qtables_of(card), card.jpeg_subsampling, ends)
     v, u = row - top, column - left
-    luma = found.luma[:, v // 8 : (v + h) // 8, u // 8 : (u + w) // 8]
-    chroma = found.chroma[:, :, v // down : (v + h) // down, u // across : (u + w) // across]
+    luma = decoded.luma[:, v // 8 : (v + h) // 8, u // 8 : (u + w) // 8]
+    chroma = decoded.chroma[:, :, v // down : (v + h) // down, u // across : (u + w) // across]
     count = len(region.image)
     return np.concatenate([luma.reshape(count, -1), chroma.reshape(count, -1)], axis=1)

@@ -155,15 +155,15 @@ def fit_intervals(window: CoefficientWindow, start: Array) -> WindowFit:
     WindowFit
         The posterior's mean, and its inverse covariance. The misfit is that of the quasi-score there.
     """
-    found = interval_posterior(window, start)
-    if found is None:
+    posterior = interval_posterior(window, start)
+    if posterior is None:
         return _nothing(start)
-    noise = window.noise(found.theta)
+    noise = window.noise(posterior.theta)
     if noise.dead:
         return _nothing(start)
-    r, _ = window.residual(noise, found.theta[None])
+    r, _ = window.residual(noise, posterior.theta[None])
     chi2 = float(r[0] @ r[0]) / max(len(noise.sigma) - len(start), 1)
-    return WindowFit(found.theta, np.asarray(np.linalg.inv(found.covariance), float), chi2, found.settled)
+    return WindowFit(posterior.theta, np.asarray(np.linalg.inv(posterior.covariance), float), chi2, posterior.settled)
 
 
 def interval_posterior(

@@ -81,14 +81,14 @@ def recovered(
         for size, step, end in zip(rgb.shape[2:], CHROMA_STEP[subsampling], (ends[:2], ends[2:]), strict=True)
     )
     decoder = _Decoder(tables, down, across)
-    found = decoder.quantised(rgb)
+    recovery = decoder.quantised(rgb)
     for _ in range(_MOST_ROUNDS):
-        again = decoder.uncut(*found)
+        again = decoder.uncut(*recovery)
         cut = ((rgb <= 0.0) & (again < 0.0)) | ((rgb >= 255.0) & (again > 255.0))
-        before, found = found, decoder.quantised(np.where(cut, again, rgb))
-        if all(np.array_equal(a, b) for a, b in zip(found, before, strict=True)):
+        before, recovery = recovery, decoder.quantised(np.where(cut, again, rgb))
+        if all(np.array_equal(a, b) for a, b in zip(recovery, before, strict=True)):
             break
-    luma, chroma = _searched(*found, rgb, decoder) if ((rgb <= 0.0) | (rgb >= 255.0)).any() else found
+    luma, chroma = _searched(*recovery, rgb, decoder) if ((rgb <= 0.0) | (rgb >= 255.0)).any() else recovery
     again = decoder.image(luma, chroma)
     return Recovered(luma * tables[0], chroma * tables[1], (np.abs(again - rgb) > _SAME_CODES).any(axis=1))
 
@@ -277,7 +277,7 @@ def _best_chroma(
     sizes = [axis.up.shape[1] for axis in ups]
     window = padded[:, rows : rows + sizes[0], columns : columns + sizes[1]]
     inside = tuple(slice(axis.before, axis.before + BLOCK_PX) for axis in ups)
-    found = []
+    candidates = []
     for plane in (0, 1):
         tried = np.repeat(window[None], 128, axis=0)
         tried[(slice(None), plane, *inside)] += np.tile(decoder.tables[1].ravel(), 2)[:, None, None] * _waves()
@@ -285,8 +285,8 @@ def _best_chroma(
         added = np.floor(np.einsum("ij,njhw->nihw", RGB_FROM_YCC[:, 1:], _halved(up, decoder.step)) + 0.5)
         misfit = np.square(np.clip(y + added, 0.0, 255.0) - there).sum(axis=(1, 2, 3))
         k = int(np.argmin(misfit))
-        found.append((float(misfit[k]), plane, k))
-    return min(found)
+        candidates.append((float(misfit[k]), plane, k))
+    return min(candidates)
 
 
 def _chosen(index: tuple[NDArray[np.int64], ...], which: BoolArray) -> tuple[NDArray[np.int64], ...]:

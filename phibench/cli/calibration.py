@@ -124,20 +124,20 @@ def calibrate(
                 f"{directory} holds pictures: their kind and the tape's standard deviation were imported with them; "
                 "leave --preset and the sigmas out"
             )
-        found = calibrate_imported(directory, out, sample, sources)
+        result = calibrate_imported(directory, out, sample, sources)
     else:
-        found = calibrate_dataset(directory, out, sample, preset, sources, ruler)
-    print(f"{found.verdict}.")
-    print(f"{found.write_picture(picture)}: the outline on the frame that fits worst, residuals enlarged")
+        result = calibrate_dataset(directory, out, sample, preset, sources, ruler)
+    print(f"{result.verdict}.")
+    print(f"{result.write_picture(picture)}: the outline on the frame that fits worst, residuals enlarged")
     print(_LAB)
     print(f"\n{'parameter':18s} {'unit':4s} {'correction':>11s} {'sigma':>8s} {'prior sigma':>11s}")
-    every = zip(PARAMETERS, found.bundle.values, found.prior_sigmas, has_effect(found.nominal), strict=True)
+    every = zip(PARAMETERS, result.bundle.values, result.prior_sigmas, has_effect(result.nominal), strict=True)
     for name, value, prior in (row[:3] for row in every if row[3]):
         unit = MISALIGNMENT[name].unit
-        print(f"{name:18s} {unit:4s} {value:+11.3e} {found.bundle.sigmas[name]:8.1e} {prior:11.1e}")
-    if found.bundle.undetermined:
+        print(f"{name:18s} {unit:4s} {value:+11.3e} {result.bundle.sigmas[name]:8.1e} {prior:11.1e}")
+    if result.bundle.undetermined:
         print("\ncombinations that the data say little about (shares in prior sigmas):")
-        for weak in found.bundle.undetermined:
+        for weak in result.bundle.undetermined:
             parts = ", ".join(f"{name} {share:+.2f}" for name, share in weak.parts.items())
             print(f"  {parts} ({100.0 * weak.remaining:.0f} % of the prior sigma is left)")
     print(f"\n{out}: calibration; use it with `phibench score --calibration {out}`")
@@ -250,13 +250,13 @@ def align(
             print(edges_in_words(meeting, float(circle.sigma_px[:2].max())))
         print(sharpness_in_words(sharpness(pixels, card, circle.circle_px)))
         return 0
-    found = alignment(pixels, known, card, *doubts.numbers, vertical)
-    print(verdict(found))
-    print(f"{write_alignment_picture(out, pixels, known, found)}: outline, and the move drawn 20 times as long")
-    print(in_words(found))
+    result = alignment(pixels, known, card, *doubts.numbers, vertical)
+    print(verdict(result))
+    print(f"{write_alignment_picture(out, pixels, known, result)}: outline, and the move drawn 20 times as long")
+    print(in_words(result))
     if vertical:
-        print(edges_in_words(found.meeting))
-    print(camera_in_words(found))
-    print(sharpness_in_words(sharpness(pixels, card, rig_circle(found.outline.rig(known)))))
+        print(edges_in_words(result.meeting))
+    print(camera_in_words(result))
+    print(sharpness_in_words(sharpness(pixels, card, rig_circle(result.outline.rig(known)))))
     print(_LAB)
     return 0

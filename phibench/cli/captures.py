@@ -97,16 +97,18 @@ def _measure_pair(pair: PairPictures, setting: KnownNumbers, out: Path | None) -
     files = (pair.down, pair.up, pair.down_off, pair.up_off)
     groups = [tuple(read_photo(path, setting.known.rig, setting.sensor) for path in paths) for paths in files]
     photos = PairPhotos(PositionPhotos(groups[0], groups[2]), PositionPhotos(groups[1], groups[3]))
-    found = measured(photos, pair.stroke_m or 0.0, setting)
-    print(f"D = {found.depth_m:.4f} m, sigma {found.sigma_m:.4f} m")
-    spot_m, rig_m = float(found.depth.sigma_spot_m), float(found.depth.sigma_calibration_m)
-    print(f"of which the spots {spot_m:.4f} m, the rig {rig_m:.4f} m, this stroke {found.depth.sigma_stroke_m:.4f} m")
-    for position, spot in (("down", found.down), ("up", found.up)):
+    measurement = measured(photos, pair.stroke_m or 0.0, setting)
+    print(f"D = {measurement.depth_m:.4f} m, sigma {measurement.sigma_m:.4f} m")
+    spot_m, rig_m = float(measurement.depth.sigma_spot_m), float(measurement.depth.sigma_calibration_m)
+    print(
+        f"of which the spots {spot_m:.4f} m, the rig {rig_m:.4f} m, this stroke {measurement.depth.sigma_stroke_m:.4f} m"
+    )
+    for position, spot in (("down", measurement.down), ("up", measurement.up)):
         print(f"{position}: spot at ({spot.uv_px[0]:.3f}, {spot.uv_px[1]:.3f}) px, sigma {spot.sigma_px:.3f} px")
-    for note in found.notes:
+    for note in measurement.notes:
         print(note)
     if out is not None:
-        print(f"{write_measure_picture(out, found)}: spots, epipolar line and outline")
+        print(f"{write_measure_picture(out, measurement)}: spots, epipolar line and outline")
     return 0
 
 
@@ -120,8 +122,8 @@ def _measure_folder(directory: Path, setting: KnownNumbers, out: Path | None) ->
         raise DatasetError(f"{given}: the results of a folder are a CSV file; give --out with a name that ends in .csv")
 
     def told(result: PairOutcome) -> None:
-        found = result.found
-        text = "" if found is None else f"D = {found.depth_m:.4f} m, sigma {found.sigma_m:.4f} m; "
+        measurement = result.found
+        text = "" if measurement is None else f"D = {measurement.depth_m:.4f} m, sigma {measurement.sigma_m:.4f} m; "
         print(f"{result.row.name}: {text}{result.status}", flush=True)
 
     results = measured_pairs(directory, setting, told)
@@ -180,14 +182,14 @@ def fit(frames: Path, *, out: Path, page: Path | None = None) -> int:
         require_writable(target)
     if page is not None:
         require_page(page)
-    found = fit_sensor(frames)
-    write_sensor_file(out, found.file)
+    fitted = fit_sensor(frames)
+    write_sensor_file(out, fitted.file)
     print(f"{'number':32s} {'value':>14s} {'sigma':>10s}")
-    for name, value, sigma in numbers_of(found):
+    for name, value, sigma in numbers_of(fitted):
         print(f"{name:32s} {value:>14s} {sigma:>10s}".rstrip())
-    for said in remarks_of(found):
+    for said in remarks_of(fitted):
         print(said)
     if page is not None:
-        print(f"{write_page(page, found)}: numbers and plots")
-    print(f"{out}: sensor file of {found.capture.frames} frames; use it with `phibench dataset frames --sensor {out}`")
+        print(f"{write_page(page, fitted)}: numbers and plots")
+    print(f"{out}: sensor file of {fitted.capture.frames} frames; use it with `phibench dataset frames --sensor {out}`")
     return 0

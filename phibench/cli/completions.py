@@ -95,6 +95,6 @@ def _files(begun: str, suffix: str) -> Iterator[str]:
     typed = begun[: begun.rfind("/") + 1]
     folder, word = Path(typed or "."), begun[len(typed) :]
     patterns = (f"*{suffix}", f"*/*{suffix}") if word else (f"*{suffix}",)
-    found = {path.relative_to(folder).as_posix() for pattern in patterns for path in folder.glob(pattern)}
-    shown = sorted(name for name in found if name.startswith(word) and not name.startswith("."))
+    names = {path.relative_to(folder).as_posix() for pattern in patterns for path in folder.glob(pattern)}
+    shown = sorted(name for name in names if name.startswith(word) and not name.startswith("."))
     yield from (typed + name for name in shown[:_MOST_FILES])

@@ -173,9 +173,9 @@ def _compare_variants() -> int:
     with tempfile.TemporaryDirectory(prefix="phibench-variants-") as folder:
         # CUDA first: where there is none, it says so at once
         cuda, llvm = (make_with_variant(name, "smoke", Path(folder) / name) for name in ("cuda", "llvm"))
-        found = variant_difference(llvm, cuda)
-    print(table_of("llvm", "cuda", found))
-    return 0 if found.agrees else 1
+        differences = variant_difference(llvm, cuda)
+    print(table_of("llvm", "cuda", differences))
+    return 0 if differences.agrees else 1
 
 
 def main(tokens: Sequence[str] | None = None) -> int:

@@ -145,9 +145,9 @@ def evidence(electrons: Array, sigma_e: Array, exposures: Sequence[Exposures], b
     """
     best = Evidence(-math.inf)
     for phase, one in enumerate(exposures):
-        found = _of_phase(electrons, sigma_e, one, bits)
-        if found.log_odds > best.log_odds:
-            best = replace(found, phase=phase)
+        of_phase = _of_phase(electrons, sigma_e, one, bits)
+        if of_phase.log_odds > best.log_odds:
+            best = replace(of_phase, phase=phase)
     return replace(best, log_odds=best.log_odds - math.log(len(exposures)))
 
 
@@ -397,18 +397,18 @@ class TargetTracker:
     def _try_lock(self, state: _Search) -> None:
         """Lock on the brightest light that has the code, once no brighter one may have it: a reflection is fainter."""
         taken = {id(other.hold.track) for other in self._states.values() if other.hold is not None}
-        found = [
+        candidates = [
             (one, track)
             for track in self.tracker.live
             if id(track) not in taken
             and (track.dark <= state.dark_frames if track is state.past else self._may_lock(state, track))
             and (one := self.evidence(state, track)).log_odds > 0.0
         ]
-        sure = [pair for pair in found if pair[0].log_odds >= (REGAIN if pair[1] is state.past else LOCK)]
+        sure = [pair for pair in candidates if pair[0].log_odds >= (REGAIN if pair[1] is state.past else LOCK)]
         if not sure:
             return
         best, track = max(sure, key=lambda pair: pair[0].electrons)
-        if any(one.electrons > best.electrons for one, _ in found):
+        if any(one.electrons > best.electrons for one, _ in candidates):
             return
         state.hold = Hold(state.code.name, track, self.frame, log_odds=best.log_odds)
         self.holds.append(state.hold)

@@ -334,17 +334,17 @@ def driving_film_depth(
         # tracks are read with every frame, and run evenly from one to the next
         tracks = np.stack([np.interp(times, frames.times.frame_s, one) for one in read.T], axis=1)
         way = RobotWay(drive.vehicle, tracks, drive.state(times)[:, 3])
-        found = driving_depth(frames.rig, way, _spread(positions, on, len(numbers)), covariance_rig)
-        if abs(found.depth_m[0] - before_m) < _SAME * found.sigma_m[0]:
+        depth = driving_depth(frames.rig, way, _spread(positions, on, len(numbers)), covariance_rig)
+        if abs(depth.depth_m[0] - before_m) < _SAME * depth.sigma_m[0]:
             break
-        places, before_m = found.uv_px, float(found.depth_m[0])
+        places, before_m = depth.uv_px, float(depth.depth_m[0])
         speeds = np.gradient(places, times, axis=0)
-        blur = frames.moving_blur(found.depth_m[on], places[on], speeds[on])
+        blur = frames.moving_blur(depth.depth_m[on], places[on], speeds[on])
         positions = stepped_positions(frames, blur, np.vstack([places[on], places[off]]))
         # between frames with the laser off that are farther apart, edges of the room are interpolated wrongly
         nearest = np.linalg.norm(places[on][:, None] - places[off], axis=2).min(axis=1)
         positions.uv_px[nearest > LENGTH_PX] = np.nan
-    return found
+    return depth
 
 
 def _in_time(frames: FilmFrames) -> RoomWeights:

@@ -224,10 +224,10 @@ def _start(rig: Rig, positions: FilmPositions, readings: Array) -> Array:
     count = max(1, len(order) // 4)
     ends = [order[:count], order[-count:]]
     uv, offset = ([values[end].mean(axis=0) for end in ends] for values in (positions.uv_px, readings))
-    found = depth_exact(rig, offset[1] - offset[0], *uv)
-    if not np.isfinite(found.point_world_m).all():
+    estimates = depth_exact(rig, offset[1] - offset[0], *uv)
+    if not np.isfinite(estimates.point_world_m).all():
         raise DatasetError("the rays of the film's ends do not meet before the rig: its positions are no spot's")
-    return np.asarray(found.point_world_m + offset[0] * np.array(rig.stroke_axis_world))
+    return np.asarray(estimates.point_world_m + offset[0] * np.array(rig.stroke_axis_world))
 
 
 def _result(

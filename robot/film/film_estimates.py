@@ -82,11 +82,11 @@ def seen_film(frames: FilmFrames) -> SeenFilm:
         positions.uv_px[~room_known(here, off)] = np.nan
         offsets = frames.offsets_m(frames.on, np.where(positions.good, positions.uv_px[:, 1], here[:, 1]))
         positions.uv_px[~most_agree(frames.rig, positions, offsets)] = np.nan
-        found = film_depth(frames.rig, positions, offsets, frames.encoder_sigma_m)
+        depth = film_depth(frames.rig, positions, offsets, frames.encoder_sigma_m)
         if number + 1 < _ROUNDS:
-            places = predicted_px(frames, found.point_world_m)[0]
-            blur = frames.blur(found.point_world_m, places[:count])
-    return SeenFilm(frames, positions, offsets, found)
+            places = predicted_px(frames, depth.point_world_m)[0]
+            blur = frames.blur(depth.point_world_m, places[:count])
+    return SeenFilm(frames, positions, offsets, depth)
 
 
 def _near_px(frames: FilmFrames) -> Array:
@@ -112,15 +112,15 @@ def bundle_depth(seen: SeenFilm, covariance_rig: Array | None = None) -> FilmDep
     DatasetError
         If the spot is too faint, more than half of the frames disagree, or what is left is no one place at rest.
     """
-    frames, found, places = seen.frames, seen.depth, None
+    frames, depth, places = seen.frames, seen.depth, None
     for _ in range(_STEPS):
-        positions, offsets = joint_positions(frames, found.point_world_m, places)
-        before, found = found, _agreed(frames, positions, offsets, covariance_rig)
-        if abs(found.depth_m - before.depth_m) < _SETTLED * found.sigma_m:
+        positions, offsets = joint_positions(frames, depth.point_world_m, places)
+        before, depth = depth, _agreed(frames, positions, offsets, covariance_rig)
+        if abs(depth.depth_m - before.depth_m) < _SETTLED * depth.sigma_m:
             break
-        places = found.places_px
+        places = depth.places_px
     _check_light(positions)
-    return _of_one_place(found, _NO_ONE_PLACE_CHI2)
+    return _of_one_place(depth, _NO_ONE_PLACE_CHI2)
 
 
 def _agreed(
@@ -129,10 +129,10 @@ def _agreed(
     """Depth of the frames that agree: the worst are left out and the others fitted again while any is beyond chance."""
     known, told = positions.good, (frames.encoder_sigma_m, covariance_rig)
     while positions.good.sum() >= (1.0 - _LEFT_OUT) * known.sum():
-        found = film_depth(frames.rig, positions, offsets_m, *told)
-        apart2 = np.nan_to_num(deviations2(frames.rig, found.point_world_m, positions, offsets_m, *told))
+        depth = film_depth(frames.rig, positions, offsets_m, *told)
+        apart2 = np.nan_to_num(deviations2(frames.rig, depth.point_world_m, positions, offsets_m, *told))
         if apart2.max() < _BEYOND_CHANCE:
-            return found
+            return depth
         positions.uv_px[apart2 >= max(_BEYOND_CHANCE, _AMONG_WORST * apart2.max())] = np.nan
     raise _disagreement(int((known & ~positions.good).sum()), int(known.sum()))
 
@@ -308,11 +308,11 @@ def tracked_positions(
         If its code is on in fewer than two frames or off in none, or the positions give no depth, or do not agree.
     """
     frames = agreeing(tracked_frames(tracker, name, carriage, encoder_m, encoder_sigma_m))
-    found = _of_one_place(bundle_depth(seen_film(frames)), _MOST_CHI2)
-    positions, offsets = joint_positions(frames, found.point_world_m)
-    positions.uv_px[np.isnan(found.places_px)] = np.nan  # frames that the bundle left out
-    rows = predicted_px(frames, found.point_world_m)[0][: len(frames.on), 1]
-    return TrackedPositions(positions, frames.times.row_s(frames.on.astype(float), rows), offsets, found)
+    depth = _of_one_place(bundle_depth(seen_film(frames)), _MOST_CHI2)
+    positions, offsets = joint_positions(frames, depth.point_world_m)
+    positions.uv_px[np.isnan(depth.places_px)] = np.nan  # frames that the bundle left out
+    rows = predicted_px(frames, depth.point_world_m)[0][: len(frames.on), 1]
+    return TrackedPositions(positions, frames.times.row_s(frames.on.astype(float), rows), offsets, depth)
 
 
 def tracked_frames(
@@ -347,9 +347,9 @@ def agreeing(frames: FilmFrames) -> FilmFrames:
     On edges of the room, or behind something, a fit in one frame may find anything.
     """
     seen = seen_film(frames)
-    found = _agreed(frames, seen.positions, seen.offsets_m)
-    if found.frames < (1.0 - _LEFT_OUT) * len(frames.on):
-        raise _disagreement(len(frames.on) - found.frames, len(frames.on))
+    depth = _agreed(frames, seen.positions, seen.offsets_m)
+    if depth.frames < (1.0 - _LEFT_OUT) * len(frames.on):
+        raise _disagreement(len(frames.on) - depth.frames, len(frames.on))
     return frames.some(np.flatnonzero(seen.positions.good), np.arange(len(frames.off)))
 
 

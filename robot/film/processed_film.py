@@ -75,17 +75,17 @@ def processed_positions(frames: FilmFrames, point_world_m: Array, which: Index) 
 
 def _of_intervals(window: CoefficientWindow, start: Array) -> tuple[Array, Array]:
     """Unknowns and Fisher matrix by the likelihood alone; NaN where the posterior is none."""
-    found = interval_posterior(window, start, _PREDICTED_PX)
-    if found is None or not found.settled:
+    posterior = interval_posterior(window, start, _PREDICTED_PX)
+    if posterior is None or not posterior.settled:
         return np.full(len(start), np.nan), np.eye(len(start))
-    (r,), (J,) = found.likelihood()(found.theta[None], 0)
+    (r,), (J,) = posterior.likelihood()(posterior.theta[None], 0)
     fisher = J @ J.T
-    return found.theta + scoring_step(fisher[None], (J @ r)[None])[0], fisher
+    return posterior.theta + scoring_step(fisher[None], (J @ r)[None])[0], fisher
 
 
 def _of_score(window: CoefficientWindow, start: Array) -> tuple[Array, Array]:
-    found = fit_window(window, start[None])
-    return (found.theta if found.converged else np.full(len(start), np.nan)), found.fisher
+    fit = fit_window(window, start[None])
+    return (fit.theta if fit.converged else np.full(len(start), np.nan)), fit.fisher
 
 
 def _units(frames: FilmFrames, uv_px: Array) -> tuple[NDArray[np.int64], tuple[slice, slice]]:
@@ -106,5 +106,5 @@ def _room(frames: FilmFrames, weights: Array, corner: NDArray[np.int64], part: t
     mean = regained(np.tensordot(w, x, 1)[None], corner[None], frames.card)[0]
     noise = unrounded(frames.card, True).variance_e2(mean)
     variance = w @ w * noise + np.tensordot(w**2, rounding, 1)
-    found = background_of(mean[None], variance[None], np.ones((1, *mean.shape)), PatternNoise.of(frames.card))
-    return Background(found.mean_e, found.variance_e2, images[np.argmax(w)][None], holds_pattern=True)
+    background = background_of(mean[None], variance[None], np.ones((1, *mean.shape)), PatternNoise.of(frames.card))
+    return Background(background.mean_e, background.variance_e2, images[np.argmax(w)][None], holds_pattern=True)

@@ -167,8 +167,8 @@ class FrameSearch:
         scale = math.sqrt(0.5 * float(np.median(((x / lit) ** 2 + ((1.0 - x) / dark) ** 2).sum(axis=0))))
         first = frames[0]
         mean_on, mean_off = (replace(first, values_e=np.stack([red, red, red])) for red in (on, off))
-        found = self._brighter(mean_on, mean_off, self.inside, scale, _LEAST_FOLLOWING)
-        return self._refined(mean_on, mean_off, found) + self._origin
+        brighter = self._brighter(mean_on, mean_off, self.inside, scale, _LEAST_FOLLOWING)
+        return self._refined(mean_on, mean_off, brighter) + self._origin
 
     def _brighter(
         self,

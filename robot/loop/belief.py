@@ -408,5 +408,5 @@ class PairTracker:
         (low_m, low), (high_m, high) = sorted([apart[-1], (stroke_m, reading)], key=lambda frame: frame[0])
         pixels = [np.array([one.u_px, one.v_px]) for one in (low, high)]
         noise = [one.sigma_px**2 * np.eye(2) for one in (low, high)]
-        found = depth_exact(self.rig, high_m - low_m, *pixels, *noise)
-        self.distance_m, self.distance_sigma_m = float(found.depth_m), float(found.sigma_m)
+        depth = depth_exact(self.rig, high_m - low_m, *pixels, *noise)
+        self.distance_m, self.distance_sigma_m = float(depth.depth_m), float(depth.sigma_m)

@@ -138,11 +138,11 @@ class SearchingPolicy(abc.ABC):
                 yield from itertools.repeat(Action(turn_rad_per_s=_SEARCH_RAD_PER_S), _SEARCH_STEPS)
             if attempt % 2:
                 yield from self.stroke(0.0 if self.observation.stroke_m > 0.5 * PAPER_STROKE_M else PAPER_STROKE_M)
-            found = Identifier()
+            identifier = Identifier()
             for _ in range(2 * len(CODES[CODED])):
                 yield Action(exposure=self.exposure, code=CODED)
-                found.add(self.observation)
-                if (spot := found.target()) is not None and self._lock(spot):
+                identifier.add(self.observation)
+                if (spot := identifier.target()) is not None and self._lock(spot):
                     return
 
     def _lock(self, spot: SpotReading) -> bool:

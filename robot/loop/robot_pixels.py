@@ -178,10 +178,10 @@ class SpotReader:
     def read(self, windows: Sequence[Window], exposure: int) -> tuple[SpotReading, ...]:
         """Spots by rising u; of a whole frame the strongest ones."""
         card = self._cards[exposure]
-        found = [reading for window in windows for reading in self._in_window(window, card)]
-        found.sort(key=lambda reading: -reading.electrons)
+        readings = [reading for window in windows for reading in self._in_window(window, card)]
+        readings.sort(key=lambda reading: -reading.electrons)
         apart: list[SpotReading] = []
-        for one in found:
+        for one in readings:
             if all(math.hypot(one.u_px - other.u_px, one.v_px - other.v_px) > _APART_PX for other in apart):
                 apart.append(one)
         return tuple(sorted(apart[:_MOST_SPOTS]))

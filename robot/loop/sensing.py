@@ -295,8 +295,8 @@ def direction_of(rig: Rig, u_px: float, v_px: float, sigma_px: float) -> Directi
 
 def direction_read(rig: Rig, reading: SpotReading) -> Direction | None:
     """Direction of a reading, with what its error shares with that of other frames."""
-    found = direction_of(rig, reading.u_px, reading.v_px, reading.sigma_px)
-    return None if found is None else replace(found, shared_px=(reading.pattern_px, reading.texture_px))
+    direction = direction_of(rig, reading.u_px, reading.v_px, reading.sigma_px)
+    return None if direction is None else replace(direction, shared_px=(reading.pattern_px, reading.texture_px))
 
 
 def direction_with(rig: Rig, u_px: float, v_px: float, covariance_px2: Array) -> Direction | None:

@@ -52,9 +52,9 @@ class _DeviatedView(NamedTuple):
 
     def rays(self, uv_px: Array, stroke_m: Array) -> tuple[Array, Array, Array]:
         """Origins and directions of rays, shapes (..., N, 3), and how far the mirror was raised, shape (N, 3)."""
-        found = reflect(self.view, uv_px)
+        ray = reflect(self.view, uv_px)
         raised = stroke_of(stroke_m, self.values)[:, None] * self.axis
-        return found.origin_world_m, found.direction_world, raised
+        return ray.origin_world_m, ray.direction_world, raised
 
     def rays_beside(self, uv_px: Array, stroke_m: Array) -> Array:
         """Origin, direction and rise for each pixel as it is and a step aside in u and v, shape (3, 3, N, 3)."""

@@ -68,12 +68,12 @@ def run(settings: BaselineSettings, datasets: StudyDatasets) -> StudyResult:
         published_curve(name, *_published(table, name), settings.resamples) for name in TABLES if _long(table, name)
     ]
     rendered = pl.concat([_rendered(name, datasets) for name in settings.rendered] or [_NONE])
-    found = findings(table, bands, laws, curves, rendered)
+    all_findings = findings(table, bands, laws, curves, rendered)
     return StudyResult(
         {"table": table, "misaligned": bands, "laws": _law_table(laws), "rendered": rendered},
-        found,
+        all_findings,
         (
-            curves_drawing(table, bands, METHODS[1], _curves_alt(found)),
+            curves_drawing(table, bands, METHODS[1], _curves_alt(all_findings)),
             laws_drawing(table, laws, _laws_alt(laws)),
         ),
         {"Errors over the published experiments": senses_shown(table, bands), "Exponents": laws_shown(laws)},
@@ -112,7 +112,7 @@ def _rendered(recipe: str, datasets: StudyDatasets) -> pl.DataFrame:
     wrong = Misalignment(**dataset.info.recipe["misalignment"])
     points, strokes = np.array([row.spot_world_m for row in rows]), np.array([row.nominal_stroke_m for row in rows])
     down, up, true = seen(rig, wrong, points, strokes)
-    found = [
+    tables = [
         np.array(
             [
                 find_spot(sample.expected_image(p, laser=True), sample.expected_image(p, laser=False)).uv_px
@@ -127,7 +127,7 @@ def _rendered(recipe: str, datasets: StudyDatasets) -> pl.DataFrame:
                 "recipe": recipe,
                 "sample_id": row.sample_id,
                 "sense": sense,
-                "rendered_error_m": float(estimates(sense, rig, strokes, *found)[i] - row.depth_m),
+                "rendered_error_m": float(estimates(sense, rig, strokes, *tables)[i] - row.depth_m),
                 "closed_form_error_m": float(estimates(sense, rig, strokes, down, up)[i] - true[i]),
             }
             for sense in SENSES
@@ -323,7 +323,7 @@ def rms_interval(values: Array, *names: str) -> tuple[float, float]:
     """
     if len(values) < 3:
         return float("nan"), float("nan")
-    found = scipy.stats.bootstrap(
+    interval = scipy.stats.bootstrap(
         (np.square(values),),
         lambda squares, axis: np.sqrt(np.mean(squares, axis=axis)),
         n_resamples=RESAMPLES,
@@ -332,7 +332,7 @@ def rms_interval(values: Array, *names: str) -> tuple[float, float]:
         vectorized=True,
         rng=generator("study", "spread", *names),
     )
-    return float(found.confidence_interval.low), float(found.confidence_interval.high)
+    return float(interval.confidence_interval.low), float(interval.confidence_interval.high)
 
 
 def rms_finding(label: str, values: Array, *names: str) -> Finding:

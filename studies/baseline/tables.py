@@ -74,7 +74,7 @@ def fit_power_law(
     """
     good = np.isfinite(y) & (y > 0.0)
     logs = [np.log(x[good]) for x in (*bases, y)]
-    found = scipy.stats.bootstrap(
+    bootstrap = scipy.stats.bootstrap(
         logs,
         lambda *rows: _exponents(rows),
         paired=True,
@@ -87,7 +87,7 @@ def fit_power_law(
     design = np.stack([np.ones(good.sum()), *logs[:-1]], axis=-1)
     fitted = np.linalg.lstsq(design, logs[-1], rcond=None)[0]
     rms = float(np.sqrt(np.mean((logs[-1] - design @ fitted) ** 2)))
-    interval = found.confidence_interval
+    interval = bootstrap.confidence_interval
     return PowerLaw(fitted[1:], np.atleast_1d(interval.low), np.atleast_1d(interval.high), rms)
 
 
@@ -288,16 +288,16 @@ def _found(folder: Path, preset: str, draws: dict[str, int], sample_id: str) -> 
         if pair_draw.sample_id == sample_id
     ]
     pairs = DatasetPairs(dataset, tuple(replace(pair_draw, number=i) for i, pair_draw in enumerate(chosen)))
-    found: dict[str, list[Array]] = {name: [] for name in draws}
+    spots: dict[str, list[Array]] = {name: [] for name in draws}
     for number in range(len(pairs)):
         pair = pairs.pair(number)
         for name, count in draws.items():
             if number < count:
                 answer = METHODS[name](pair)
-                found[name].append(np.array([_place(answer.down), _place(answer.up)]))
+                spots[name].append(np.array([_place(answer.down), _place(answer.up)]))
     truth = pairs.truth(0)
     bounds = [np.full((2, 2), np.nan) if s.bound_px2 is None else s.bound_px2 for s in (truth.down, truth.up)]
-    return FoundSpots(sample_id, {name: np.stack(places) for name, places in found.items()}, np.stack(bounds))
+    return FoundSpots(sample_id, {name: np.stack(places) for name, places in spots.items()}, np.stack(bounds))
 
 
 def _place(spot: Spot) -> tuple[float, float]:
@@ -333,16 +333,16 @@ def experiments_of(dataset: Dataset) -> list[Experiment]:
     DatasetError
         If there is none.
     """
-    found = []
+    experiments = []
     for sample in dataset:
         row = sample.row
         published = find_published(row.experiment, row.depth_m, row.nominal_stroke_m)
         if published is not None:
             pixels = np.array([[row.down.u_px, row.down.v_px], [row.up.u_px, row.up.v_px]])
-            found.append(Experiment(row.sample_id, published, np.array(row.spot_world_m), pixels))
-    if not found:
+            experiments.append(Experiment(row.sample_id, published, np.array(row.spot_world_m), pixels))
+    if not experiments:
         raise DatasetError(f"{dataset.folder} has none of the paper's experiments: take the recipe paper")
-    return found
+    return experiments
 
 
 def experiment_table(experiments: list[Experiment], rig: Rig, spots: Mapping[str, FoundSpots]) -> pl.DataFrame:

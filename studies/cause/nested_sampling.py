@@ -113,12 +113,12 @@ def sample(model: DepthModel, live_points: int, stop: float, *names: Name) -> Po
         rstate=random,
     )
     sampler.run_nested(dlogz=stop, print_progress=False)
-    found = sampler.results
+    results = sampler.results
     return Posterior(
-        np.asarray(found.samples_equal(rstate=random)),
-        float(found.logz[-1]),
-        float(found.logzerr[-1]),
-        int(np.sum(found.ncall)),
+        np.asarray(results.samples_equal(rstate=random)),
+        float(results.logz[-1]),
+        float(results.logzerr[-1]),
+        int(np.sum(results.ncall)),
     )
 
 

@@ -175,12 +175,18 @@ def gain(both: Binocular, light: Array, sensor: Sensor, draws: int) -> Gain | No
                 return None
             uv = fitted_px(pair, sensor, each, "study", "isotropy", "binocular", f"{D:g}", f"{b:g}", f"{du:g} {dv:g}")
             depth = depth_exact(pair.rig, b, uv[0], uv[1]).depth_m
-            found = np.isfinite(depth)
-            if found.sum() < _LEAST_FITS:
+            measured_pairs = np.isfinite(depth)
+            if measured_pairs.sum() < _LEAST_FITS:
                 continue
             by_rays = depth_exact(pair.rig, b, pair.uv_px[0], pair.uv_px[1], np.eye(2), np.eye(2)).sigma_m
-            squares.append([np.var(depth[found], ddof=1), np.mean(np.var(uv[:, found], axis=1, ddof=1)), by_rays**2])
-            degrees += int(found.sum()) - 1
+            squares.append(
+                [
+                    np.var(depth[measured_pairs], ddof=1),
+                    np.mean(np.var(uv[:, measured_pairs], axis=1, ddof=1)),
+                    by_rays**2,
+                ]
+            )
+            degrees += int(measured_pairs.sum()) - 1
     if not squares:
         return None
     scatter_m, scatter_px, rays = (float(value) for value in np.sqrt(np.mean(squares, axis=0)))

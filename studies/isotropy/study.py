@@ -222,11 +222,11 @@ def _lines(settings: IsotropySettings, scene: _Scene, true: Misalignment) -> tup
     grid = PanoramaGrid(settings.panorama_width_px, _LOW_RAD, _HIGH_RAD)
     points = circle(scene.depth_m, scene.height_m, settings.line_azimuths)
     depths = np.array(settings.line_depths_m)
-    found = []
+    lines = []
     for m in (Misalignment(), true):
         rig, h = scene.rig.perturbed(m), m.stroke_m(scene.baseline_m)
-        found.append(tuple(epipolar_line(scene.rig, rig, h, point, depths, grid, True) for point in points))
-    return found[0], found[1]
+        lines.append(tuple(epipolar_line(scene.rig, rig, h, point, depths, grid, True) for point in points))
+    return lines[0], lines[1]
 
 
 def _edges(settings: IsotropySettings, dataset: Dataset) -> tuple[SeenEdge, ...]:
@@ -236,8 +236,8 @@ def _edges(settings: IsotropySettings, dataset: Dataset) -> tuple[SeenEdge, ...]
     nominal = sample.nominal_rig.at(0.0)
     image = unrolled(np.asarray(sample.ambient("down"), float).sum(axis=0), pixels_by_model(nominal, grid))
     edges = vertical_edges(dataset.room, settings.edges)
-    found = (seen_edge(image, grid, e.name, track(sample.rig.at(0.0), nominal, grid, e)) for e in edges)
-    return tuple(edge for edge in found if edge is not None)
+    edges_seen = (seen_edge(image, grid, e.name, track(sample.rig.at(0.0), nominal, grid, e)) for e in edges)
+    return tuple(edge for edge in edges_seen if edge is not None)
 
 
 def _noise_table(noise: dict[str, tuple[AzimuthNoise, ...]]) -> pl.DataFrame:

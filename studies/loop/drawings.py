@@ -143,16 +143,16 @@ def phases(track: Track) -> list[tuple[float, str]]:
     time, known = np.array(track.time_s), np.isfinite(track.sigma_m)
     # moves in a step
     stroke, way = np.abs(np.diff(track.stroke_m)) > 1e-9, np.hypot(*np.diff(track.place_m, axis=0).T) > 0.01
-    found = [(0.0, "identify")]
+    begins = [(0.0, "identify")]
     if known.any():
         first = int(np.argmax(known))
-        found.append((float(time[first]), "orient"))
+        begins.append((float(time[first]), "orient"))
         if stroke[first:].any():
             begin = first + int(np.argmax(stroke[first:]))
-            found.append((float(time[begin]), "stroke"))
+            begins.append((float(time[begin]), "stroke"))
             if way[begin:].any():
-                found.append((float(time[begin + int(np.argmax(way[begin:]))]), "servo"))
-    return found
+                begins.append((float(time[begin + int(np.argmax(way[begin:]))]), "servo"))
+    return begins
 
 
 def top_view(ax: Axes, simulator: Simulator, track: Track) -> None:

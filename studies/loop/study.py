@@ -121,11 +121,11 @@ def pixel_conditions(settings: LoopSettings, datasets: StudyDatasets) -> list[Co
     if not (folder / INFO).is_file():
         bake_rooms(folder, settings.rooms, STREAM, workers=datasets.workers, console=datasets.console)
     setup = Setup(arenas=baked_arenas(folder))
-    found = [Condition("fidelity", "exact", (setup,), max(wanted.values()))]
+    conditions = [Condition("fidelity", "exact", (setup,), max(wanted.values()))]
     for fidelity, count in wanted.items():
         if count:
-            found.append(Condition("fidelity", fidelity, (replace(setup, fidelity=fidelity),), count))  # type: ignore[arg-type]
-    return found
+            conditions.append(Condition("fidelity", fidelity, (replace(setup, fidelity=fidelity),), count))  # type: ignore[arg-type]
+    return conditions
 
 
 def _with_task(**numbers: Any) -> Setup:

@@ -144,8 +144,8 @@ class BlurBounds:
         """Bounds along and across the radius, pixels, for a spot on the image's u axis."""
         radial, tangential = float(blur.sigma_px), float(blur.sigma_px * blur.ratio)
         middle = float(np.sqrt(radial * tangential))
-        found = self.round_at(flux_e, middle)
-        return found * radial / middle, found * tangential / middle
+        at_middle = self.round_at(flux_e, middle)
+        return at_middle * radial / middle, at_middle * tangential / middle
 
 
 def blur_bounds(card: SensorCard, response: tuple[float, float, float], blurs_px: Sequence[float]) -> BlurBounds:
@@ -153,8 +153,8 @@ def blur_bounds(card: SensorCard, response: tuple[float, float, float], blurs_px
     room = [rate * card.exposure_s for rate in ROOM_E_PER_S]
     # a processed bound costs a covariance of the codes at every flux
     fluxes = tuple(np.geomspace(100.0, 1e6, 25 if card.output == "raw" else 9).tolist())
-    found = tuple(spot_sigma(card, blur, room, response, flux_e=fluxes) for blur in blurs_px)
-    return BlurBounds(tuple(blurs_px), found, card.exposure_s)
+    bounds = tuple(spot_sigma(card, blur, room, response, flux_e=fluxes) for blur in blurs_px)
+    return BlurBounds(tuple(blurs_px), bounds, card.exposure_s)
 
 
 @dataclass(frozen=True)
@@ -194,8 +194,8 @@ def place_bound(rig: Rig, table: BlurBounds, depth_m: float, height_m: float, st
         covariances.append(np.diag(np.square(table.at(light, blur))))
         thetas.append(float(np.arctan2(ray[0], -ray[2])))
         blurs.append(float(blur.sigma_px))
-    found = depth_exact(rig, stroke_m, *pixels, *covariances)
-    return PlaceBound(float(found.sigma_m) / depth_m, (thetas[0], thetas[1]), max(blurs))
+    depth = depth_exact(rig, stroke_m, *pixels, *covariances)
+    return PlaceBound(float(depth.sigma_m) / depth_m, (thetas[0], thetas[1]), max(blurs))
 
 
 # -- misalignments -----------------------------------------------------------------------------------------------------

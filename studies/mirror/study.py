@@ -135,26 +135,31 @@ def run(settings: MirrorSettings, datasets: StudyDatasets) -> StudyResult:
         for preset in settings.presets:
             tables[preset] = _bounds_of_spots(settings, preset, next(iter(rigs.values())))
             steps.advance()
-        found = {}
+        compared = {}
         for name, rig in rigs.items():
-            found[name] = compare(settings, rig, tables)
+            compared[name] = compare(settings, rig, tables)
             steps.advance()
     heights = list(dict.fromkeys((*settings.heights_m, settings.spot_height_m)))
     percent, spot = f"{100.0 * settings.cost:g} %", f"spots at {settings.spot_height_m:g} m"
     shown = {
-        "Pick a mirror": pick_table(found, settings),
-        "Field of view and use of the image": field_table(found),
-        "Resolution, pixels per degree of theta": resolution_table(found, settings.angles_deg),
-        "Places that both images show": reach_table(found, settings),
-        **{f"Bound of D, %, {preset}": bound_table(found, preset, heights, settings.depths_m) for preset in tables},
-        f"Error of D, %, by deviations of usual size, {spot}": cost_table(found, settings),
-        f"Deviation that costs {percent} of D at the costliest distance, {spot}": tolerance_table(found),
-        f"Error of D, %, by one deviation of usual size, {spot}": single_table(found, settings),
+        "Pick a mirror": pick_table(compared, settings),
+        "Field of view and use of the image": field_table(compared),
+        "Resolution, pixels per degree of theta": resolution_table(compared, settings.angles_deg),
+        "Places that both images show": reach_table(compared, settings),
+        **{f"Bound of D, %, {preset}": bound_table(compared, preset, heights, settings.depths_m) for preset in tables},
+        f"Error of D, %, by deviations of usual size, {spot}": cost_table(compared, settings),
+        f"Deviation that costs {percent} of D at the costliest distance, {spot}": tolerance_table(compared),
+        f"Error of D, %, by one deviation of usual size, {spot}": single_table(compared, settings),
     }
     return StudyResult(
-        {"table": bound_frame(found), "rays": ray_frame(found), "costs": cost_frame(found), "map": map_frame(found)},
-        tuple(row for part in _FINDINGS for row in part(found, settings)),
-        (comparison_drawing(found, settings),),
+        {
+            "table": bound_frame(compared),
+            "rays": ray_frame(compared),
+            "costs": cost_frame(compared),
+            "map": map_frame(compared),
+        },
+        tuple(row for part in _FINDINGS for row in part(compared, settings)),
+        (comparison_drawing(compared, settings),),
         shown,
         _notes(settings),
     )
@@ -209,7 +214,7 @@ def compare(settings: MirrorSettings, rig: Rig, tables: Mapping[str, BlurBounds]
     at, h = settings.spot_height_m, settings.stroke_m
     wrong = [d for d in settings.misaligned_m if seen[d, at]]
     spots = np.array([(d, 0.0, at) for d in wrong])
-    found = {kind: errors(rig, kind, usual(kind), spots, h) for kind in DIRECTIONS} if wrong else {}
+    costs = {kind: errors(rig, kind, usual(kind), spots, h) for kind in DIRECTIONS} if wrong else {}
     sides = (0.0, 0.5 * math.pi, math.pi)
     return Compared(
         rays=rays,
@@ -223,7 +228,7 @@ def compare(settings: MirrorSettings, rig: Rig, tables: Mapping[str, BlurBounds]
         bounds=bounds,
         floor_m=tuple(floor_from_m(rig, h, settings.edge_px, a, settings.curve_m[1]) for a in sides),
         costs=dict.fromkeys(settings.misaligned_m, nothing)
-        | {d: {kind: float(column[i]) for kind, column in found.items()} for i, d in enumerate(wrong)},
+        | {d: {kind: float(column[i]) for kind, column in costs.items()} for i, d in enumerate(wrong)},
         tolerances={k: tolerance(rig, k, spots, h, settings.cost) if wrong else math.nan for k in DIRECTIONS},
     )
 

@@ -310,8 +310,8 @@ def _together(depth_m: float, kinds: Sequence[str]) -> Callable[[Compared], floa
 
 
 def _largest_blur(compared: Compared, preset: str, height_m: float) -> float:
-    found = [one.radial_blur_px for (p, h, _), one in compared.bounds.items() if (p, h) == (preset, height_m)]
-    known = [value for value in found if math.isfinite(value)]
+    blurs = [one.radial_blur_px for (p, h, _), one in compared.bounds.items() if (p, h) == (preset, height_m)]
+    known = [value for value in blurs if math.isfinite(value)]
     return max(known) if known else math.nan
 
 

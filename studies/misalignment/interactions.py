@@ -125,8 +125,8 @@ def interactions(
     values = evaluated(model, len(names), n, rng)
     labels = [(kind, power, float(D)) for kind, power in OUTPUTS for D in places.depths_m]
     powers = np.array([power for _, power, _ in labels])
-    found, low, high = with_intervals(values, powers, resamples, rng)
-    return tuple(Interactions(kind, D, names, found[i], low[i], high[i]) for i, (kind, _, D) in enumerate(labels))
+    indices, low, high = with_intervals(values, powers, resamples, rng)
+    return tuple(Interactions(kind, D, names, indices[i], low[i], high[i]) for i, (kind, _, D) in enumerate(labels))
 
 
 @dataclass(frozen=True)
@@ -165,8 +165,8 @@ def with_intervals(
 
 def indices_of(values: Values, powers: Array) -> Array:
     """First-order, total, sum of first-order, root of the mean of output^power, shape (s, 2 p + 2)."""
-    found = scipy.stats.sobol_indices(func={"f_A": values.A, "f_B": values.B, "f_AB": values.AB}, n=values.A.shape[1])
-    first, total = np.atleast_2d(found.first_order), np.atleast_2d(found.total_order)
+    sobol = scipy.stats.sobol_indices(func={"f_A": values.A, "f_B": values.B, "f_AB": values.AB}, n=values.A.shape[1])
+    first, total = np.atleast_2d(sobol.first_order), np.atleast_2d(sobol.total_order)
     both = np.concatenate([values.A, values.B], axis=1)
     rms = np.sqrt(np.mean(both ** powers[:, None], axis=1))
     return np.column_stack([first, total, first.sum(axis=1), rms])

@@ -73,13 +73,13 @@ def refocus(nominal: Rig, focus_m: float, places: Sequence[tuple[float, float]],
     pose = replace(nominal.T_camera_sphere, translation_m=as_vector(apparent_outline(nominal, true)[:3]))
     known = {OLD: nominal, OUTLINE: replace(nominal, T_camera_sphere=pose)}
     D, h = np.array(places, float).T
-    found: dict[str, list[float]] = {name: [] for name in known}
+    errors_by_name: dict[str, list[float]] = {name: [] for name in known}
     for depth_m, stroke_m in zip(D, h, strict=True):
         point = np.array([depth_m, 0.0, height_m])
         down, up = (seen_px(true.at(offset), point) for offset in (0.0, float(stroke_m)))
         for name, rig in known.items():
-            found[name].append(float(depth_exact(rig, float(stroke_m), down, up).depth_m) / depth_m - 1.0)
-    errors = {name: np.array(values) for name, values in found.items()}
+            errors_by_name[name].append(float(depth_exact(rig, float(stroke_m), down, up).depth_m) / depth_m - 1.0)
+    errors = {name: np.array(values) for name, values in errors_by_name.items()}
     return Refocus(focus_m, camera.fx_px, camera.fx_px / nominal.camera.fx_px - 1.0, errors)
 
 

@@ -230,8 +230,8 @@ def _noise(settings: MisalignmentSettings, nominal: Rig, places: Places) -> Arra
     errors = []
     for draw in range(settings.noise_draws):
         rng = generator("study", "misalignment", "calibration", draw)
-        found = setup.calibrated(nominal, places.stroke_m, Misalignment(), rng)
-        errors.append(depth_exact(found.rig, found.stroke(np.asarray(places.stroke_m)), down, up).depth_m / D - 1.0)
+        bundle = setup.calibrated(nominal, places.stroke_m, Misalignment(), rng)
+        errors.append(depth_exact(bundle.rig, bundle.stroke(np.asarray(places.stroke_m)), down, up).depth_m / D - 1.0)
     return np.stack(errors)
 
 

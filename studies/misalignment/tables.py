@@ -137,14 +137,14 @@ def first_crossing(cost: Cost, target: float, start: float, limit: float, factor
     """
     before, low = start, np.asarray(cost(start), float)
     with np.errstate(divide="ignore", invalid="ignore"):
-        found = np.where(low >= target, start * target / low, np.nan)
-    while np.isnan(found).any() and before < limit:
+        crossing = np.where(low >= target, start * target / low, np.nan)
+    while np.isnan(crossing).any() and before < limit:
         value = min(before * factor, limit)
         high = np.asarray(cost(value), float)
-        new = np.isnan(found) & (high >= target)
-        found = np.where(new, _between(before, value, low, high, target), found)
+        new = np.isnan(crossing) & (high >= target)
+        crossing = np.where(new, _between(before, value, low, high, target), crossing)
         before, low = value, high
-    return found
+    return crossing
 
 
 def _between(a: float, b: float, low: Array, high: Array, target: float) -> Array:
@@ -227,11 +227,11 @@ def _nominal(nominal: Rig, places: Places, values: Values) -> pl.DataFrame:
     slope, aligned = slopes(nominal, places, parameters=names), errors(nominal, Misalignment(), places)
     frames = []
     for parameter, value in values:
-        found = errors(nominal, Misalignment(**{parameter: value}), places)
+        changes = errors(nominal, Misalignment(**{parameter: value}), places)
         for i, name in enumerate(NOMINAL):
             columns = {
-                "error_relative": found[i],
-                "whole_relative": found[i] - aligned[i],
+                "error_relative": changes[i],
+                "whole_relative": changes[i] - aligned[i],
                 "first_order_relative": slope[parameter][i] * value,
             }
             frames.append(_frame(parameter, value, name, places, columns))
@@ -242,11 +242,11 @@ def _calibrated(nominal: Rig, places: Places, calibrate: Calibrate, values: Valu
     aligned = calibrated_or_lost(nominal, Misalignment(), places, calibrate)
     frames = []
     for parameter, value in values:
-        found = calibrated_or_lost(nominal, Misalignment(**{parameter: value}), places, calibrate)
+        changes = calibrated_or_lost(nominal, Misalignment(**{parameter: value}), places, calibrate)
         columns = {
-            "error_relative": found,
-            "whole_relative": found - aligned,
-            "first_order_relative": np.full(found.shape, np.nan),
+            "error_relative": changes,
+            "whole_relative": changes - aligned,
+            "first_order_relative": np.full(changes.shape, np.nan),
         }
         frames.append(_frame(parameter, value, CALIBRATED, places, columns))
     return pl.concat(frames)

@@ -189,18 +189,18 @@ def cell_records(cell: Cell) -> pl.DataFrame:
 def answered(pair: Pair, methods: Sequence[str]) -> dict[str, tuple[Answer, float]]:
     """Answers and seconds of the methods that take such a pair; laser-off frames go to those that cannot do without."""
     alone = without_off(pair)
-    found: dict[str, tuple[Answer, float]] = {}
+    answers: dict[str, tuple[Answer, float]] = {}
     for name in methods:
         method = METHODS[name]
         seen = pair if method.needs_off else alone
         if method.refusal(seen):
             continue
         start = time.perf_counter()
-        separate = found.get("raw_maximum_likelihood") or found.get("chain_fit")
+        separate = answers.get("raw_maximum_likelihood") or answers.get("chain_fit")
         # the joint fit begins with the separate one, which is the costly part
         answer = joint_of(seen, separate[0]) if name == "joint_fit" and separate else method(seen)
-        found[name] = (answer, time.perf_counter() - start)
-    return found
+        answers[name] = (answer, time.perf_counter() - start)
+    return answers
 
 
 def all_records(cells: Sequence[Cell], datasets: StudyDatasets) -> pl.DataFrame:

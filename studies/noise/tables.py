@@ -81,7 +81,7 @@ def table_of(records: pl.DataFrame, rules: Rules) -> pl.DataFrame:
 
 def elasticities(records: pl.DataFrame, rules: Rules) -> list[Elasticity]:
     """Elasticities of every method on every factor that has levels on one side of the base, or on both."""
-    found = []
+    rows = []
     for key, part in sorted(records.group_by("sample", "preset", "factor", "method"), key=lambda item: item[0]):
         sample, preset, factor, method = (str(x) for x in key)
         if factor == BASE:
@@ -90,8 +90,8 @@ def elasticities(records: pl.DataFrame, rules: Rules) -> list[Elasticity]:
         if span is None:
             continue
         estimate, bound = _slope(part, span, rules, (sample, preset, factor))
-        found.append(Elasticity(sample, preset, factor, method, *span, estimate, bound))
-    return found
+        rows.append(Elasticity(sample, preset, factor, method, *span, estimate, bound))
+    return rows
 
 
 def around_base(levels: Sequence[float], base: float) -> tuple[float, float] | None:
@@ -299,8 +299,8 @@ def _levels(table: pl.DataFrame, sample: str, preset: str) -> list[dict[str, Any
 
 
 def _one(table: pl.DataFrame, sample: str, preset: str, factor: str, method: str) -> dict[str, Any] | None:
-    found = table.filter(_case(sample, preset), pl.col("factor") == factor, pl.col("method") == method)
-    return None if found.is_empty() else found.row(0, named=True)
+    rows = table.filter(_case(sample, preset), pl.col("factor") == factor, pl.col("method") == method)
+    return None if rows.is_empty() else rows.row(0, named=True)
 
 
 def _case(sample: str, preset: str) -> pl.Expr:

@@ -200,21 +200,23 @@ def budget(rows: pl.DataFrame, rules: Rules | None = None, seed: int = 0) -> Bud
     DatasetError
         If no row has an estimate.
     """
-    rules, found = rules or Rules(), rows.filter(pl.col("status") == "ok")
-    if found.is_empty():
+    rules, measured_rows = rules or Rules(), rows.filter(pl.col("status") == "ok")
+    if measured_rows.is_empty():
         raise DatasetError(f"none of {len(rows)} experiments has an estimate; the first says: {_first_status(rows)}")
-    clusters = Clusters.of(found["sample_id"].to_numpy())
-    error2, sigma2, bound2 = (_squares(found[name] / found["depth_m"]) for name in ("error_m", "sigma_m", "bound_m"))
+    clusters = Clusters.of(measured_rows["sample_id"].to_numpy())
+    error2, sigma2, bound2 = (
+        _squares(measured_rows[name] / measured_rows["depth_m"]) for name in ("error_m", "sigma_m", "bound_m")
+    )
     statistics = (
         rms_of(clusters, error2),
         rms_ratio_of(clusters, sigma2, error2),
         rms_ratio_of(clusters, error2, bound2),
     )
     measured, closure, over = estimates(statistics, clusters.n, rules, generator("budget", seed))
-    nominal2 = _squares(found["nominal_error"])
+    nominal2 = _squares(measured_rows["nominal_error"])
     predicted, bound, nominal = (float(np.sqrt(np.mean(x))) for x in (sigma2, bound2, nominal2))
-    within = rate(clusters, found["within_95"].cast(pl.Float64).to_numpy(), rules)
-    numbers = len(found), clusters.n, len(rows) - len(found)
+    within = rate(clusters, measured_rows["within_95"].cast(pl.Float64).to_numpy(), rules)
+    numbers = len(measured_rows), clusters.n, len(rows) - len(measured_rows)
     return Budget(*numbers, measured, predicted, bound, closure, over, within, nominal)
 
 

@@ -191,10 +191,10 @@ def measure(dataset: Dataset, samples: Sequence[Sample], bundle: Bundle, procedu
 
 
 def _estimate(pair: Pair, separate: Answer, bundle: Bundle, depth_m: float) -> dict[str, Any]:
-    found, joint = _depth_of(pair, separate, bundle), joint_of(pair, separate)
+    depth, joint = _depth_of(pair, separate, bundle), joint_of(pair, separate)
     fault = _answer_fault(separate)
-    calibration_m = float(np.hypot(found.sigma_calibration_m, found.sigma_stroke_m))
-    here_m, spot_m, interval_m = float(found.depth_m), float(found.sigma_spot_m), joint.interval_depth_m
+    calibration_m = float(np.hypot(depth.sigma_calibration_m, depth.sigma_stroke_m))
+    here_m, spot_m, interval_m = float(depth.depth_m), float(depth.sigma_spot_m), joint.interval_depth_m
     if joint.depth_m is not None and joint.sigma_depth_m is not None:
         here_m, spot_m = joint.depth_m, joint.sigma_depth_m
     low_m, high_m = interval_m or (here_m - WITHIN * spot_m, here_m + WITHIN * spot_m)
@@ -208,10 +208,10 @@ def _estimate(pair: Pair, separate: Answer, bundle: Bundle, depth_m: float) -> d
         "sigma_m": float(np.hypot(spot_m, calibration_m)),
         "sigma_spot_m": spot_m,
         "sigma_calibration_m": calibration_m,
-        "chi2": float(found.chi2),
-        "p_value": float(found.p_value),
+        "chi2": float(depth.chi2),
+        "p_value": float(depth.p_value),
         "within_95": bool(-above <= error <= below),
-        "status": fault or describe(int(found.status)),
+        "status": fault or describe(int(depth.status)),
     }
 
 

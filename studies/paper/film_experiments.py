@@ -120,17 +120,17 @@ _TYPES: dict[str, Any] = {
 
 def _rows(film: Film, bundle: Bundle, procedure: FilmProcedure, camera: int) -> list[dict[str, Any]]:
     seen, nan = bursts(film, bundle, procedure, camera), float("nan")
-    found: list[tuple[str, FilmDepth | None, int, EqualLight | None]] = [("burst", seen.depth, seen.frames, None)]
+    estimates: list[tuple[str, FilmDepth | None, int, EqualLight | None]] = [("burst", seen.depth, seen.frames, None)]
     if procedure.stroke and procedure.preset == "bayer-raw":
         at, light = whole_stroke(film, bundle, procedure, camera)
-        found.append(("stroke", at, len(film), light))
+        estimates.append(("stroke", at, len(film), light))
     elif procedure.stroke:
         whole = processed_stroke(film, bundle, procedure, camera, seen)
         frames = seen.frames if whole is None else seen.frames + whole.frames - 2
-        found.append(("stroke", whole, frames, None))
+        estimates.append(("stroke", whole, frames, None))
     pair, depth_m, parts = film.plan.pair, film.light_depth_m, _independent(bundle.covariance)
     rows = []
-    for way, one, frames, at_light in found:
+    for way, one, frames, at_light in estimates:
         estimate, sigma = (nan, nan) if one is None else (one.depth_m, one.sigma_m)
         two_ends_m = at_light.two_ends_m if at_light else nan
         calibration = np.full(len(parts), nan) if one is None else one.by_rig_m @ parts
@@ -283,8 +283,8 @@ def whole_stroke(film: Film, bundle: Bundle, procedure: FilmProcedure, camera: i
     nominal = film.plan.pair.nominal_stroke_m
     scale = float(bundle.stroke(np.array(nominal))) / nominal
     seen = seen_film(film_frames(film, camera, camera, procedure.preset, rig=bundle.rig, stroke_scale=scale))
-    found = bundle_depth(seen, bundle.covariance)
-    return found, equal_light(seen, found.point_world_m)
+    depth = bundle_depth(seen, bundle.covariance)
+    return depth, equal_light(seen, depth.point_world_m)
 
 
 def processed_stroke(

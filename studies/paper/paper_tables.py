@@ -218,9 +218,9 @@ def _narrow_table(rows: list[list[Score]], names: list[str], source: str) -> Tex
 def _without(rows: list[list[Score]], most: int = 3) -> str:
     """Sentence on the samples that have no estimate; "" if there are none."""
     causes = [(items[0], next((x.status for x in items if x.status != "ok"), "")) for items in rows]
-    found = [f"{x.experiment}, h {x.stroke_m:.3f}, D {x.depth_m:.3f} ({cause})" for x, cause in causes if cause]
-    more = f"; and {len(found) - most} more" if len(found) > most else ""
-    return f"Without an estimate: {'; '.join(found[:most])}{more}. " if found else ""
+    left_out = [f"{x.experiment}, h {x.stroke_m:.3f}, D {x.depth_m:.3f} ({cause})" for x, cause in causes if cause]
+    more = f"; and {len(left_out) - most} more" if len(left_out) > most else ""
+    return f"Without an estimate: {'; '.join(left_out[:most])}{more}. " if left_out else ""
 
 
 def bias_table(scores: Sequence[Score]) -> TextTable:

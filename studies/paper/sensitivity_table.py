@@ -81,13 +81,13 @@ def _row(sample: Sample, estimator: str) -> Row:
     if hidden:
         return {**dict.fromkeys(columns()), **words, "depth_m": row.depth_m}
     spot = np.array(row.spot_world_m)
-    found = sensitivity(estimator, sample.nominal_rig, row.nominal_stroke_m, sample.rig, row.stroke_m, spot)
-    truth = dict(zip(PARAMETERS, found.truth_gradient, strict=True))
+    change = sensitivity(estimator, sample.nominal_rig, row.nominal_stroke_m, sample.rig, row.stroke_m, spot)
+    truth = dict(zip(PARAMETERS, change.truth_gradient, strict=True))
     return {
         **words,
         "depth_m": row.depth_m,
-        "estimate_m": _number(found.estimate_m),
-        **{f"estimate_m_per_{p}": _number(x) for p, x in zip(PARAMETERS, found.estimate_gradient, strict=True)},
+        "estimate_m": _number(change.estimate_m),
+        **{f"estimate_m_per_{p}": _number(x) for p, x in zip(PARAMETERS, change.estimate_gradient, strict=True)},
         **{f"truth_m_per_{p}": _number(truth[p]) for p in TRUTH},
     }
 

@@ -114,8 +114,8 @@ def _loss(best: BestStroke, stroke_m: float) -> Loss:
     if causes:
         return Loss(stroke_m, math.nan, math.nan, causes[0])
     free = np.isfinite(sigma)
-    found = math.exp(np.interp(math.log(stroke_m), np.log(known[free]), np.log(sigma[free])))
-    return Loss(stroke_m, found, found / best.sigma_m, FREE)
+    sigma_m = math.exp(np.interp(math.log(stroke_m), np.log(known[free]), np.log(sigma[free])))
+    return Loss(stroke_m, sigma_m, sigma_m / best.sigma_m, FREE)
 
 
 def loss_table(best: BestStroke, strokes_m: Sequence[float] | None = None) -> TextTable:

@@ -117,21 +117,21 @@ class RenderedOutcome:
 def run_checks(checks: Sequence[RenderedCheck], datasets: StudyDatasets) -> list[RenderedOutcome]:
     """Measure, with the workers of the data sets."""
     with Steps(datasets.console, "stroke, frames", len(checks)) as steps:
-        found = []
+        outcomes = []
         for one in parallel_map(measured, checks, datasets.workers):
-            found.append(one)
+            outcomes.append(one)
             steps.advance()
-    return found
+    return outcomes
 
 
 def measured(check: RenderedCheck) -> RenderedOutcome:
     """Draw and evaluate all frames of a check."""
     nominal = Rig()
     answers = [_answer(check, nominal, k) for k in range(check.draws)]
-    found = [a for a in answers if a is not None]
-    if not found:
+    given = [a for a in answers if a is not None]
+    if not given:
         return RenderedOutcome(check, ())
-    true, down, up, C_down, C_up = (np.array(column) for column in zip(*found, strict=True))
+    true, down, up, C_down, C_up = (np.array(column) for column in zip(*given, strict=True))
     depth = depth_general(nominal, check.stroke_m, down, up, C_down, C_up, np.array(check.covariance)).depth_m
     errors = depth - true
     return RenderedOutcome(check, tuple(errors[np.isfinite(errors)].tolist()))

@@ -78,33 +78,33 @@ def run(settings: StrokeSettings, datasets: StudyDatasets) -> StudyResult:
     rigs, spot = tolerances(rig, settings.outline_sigma_um), spot_bound(rig, card)
     longest = _paper(settings)
     depths = sorted({*settings.depths_m, *longest})
-    found = {}
+    best_by_case = {}
     with Steps(datasets.console, "stroke, curves", len(rigs) * len(depths)) as steps:
         for name, C in rigs.items():
             for d in depths:
-                found[name, d] = best_stroke(
+                best_by_case[name, d] = best_stroke(
                     d, rig, covariance_rig=C, strokes_m=settings.strokes_m, around=around, card=card, spot=spot
                 )
                 steps.advance()
     checks = run_checks(planned(settings, rig, {k: rigs[k] for k in (AS_BUILT, EXACT)}), datasets)
     names, top = tuple(rigs), settings.strokes_m[1]
-    findings = [row for name in names for row in best_findings(found, name, tuple(longest))]
-    findings += [row for d in longest for row in growth_findings(found, d, names, top)]
-    built = found[AS_BUILT, next(iter(longest))]
+    findings = [row for name in names for row in best_findings(best_by_case, name, tuple(longest))]
+    findings += [row for d in longest for row in growth_findings(best_by_case, d, names, top)]
+    built = best_by_case[AS_BUILT, next(iter(longest))]
     if math.isfinite(built.stroke_m):
         findings += reason_findings(rig, built.depth_m, settings.spot_height_m, (built.stroke_m, top))
     findings += limit_findings(_free_curves(rig, settings.depths_m, spot, card, around))
     findings += check_findings(checks)
     return StudyResult(
-        {"table": best_frame(found), "curves": curve_frame(found), "checks": check_frame(checks)},
+        {"table": best_frame(best_by_case), "curves": curve_frame(best_by_case), "checks": check_frame(checks)},
         tuple(findings),
         (
-            best_drawing(found, names, settings.depths_m),
-            curves_drawing(found, names, longest),
+            best_drawing(best_by_case, names, settings.depths_m),
+            curves_drawing(best_by_case, names, longest),
             check_drawing(checks),
         ),
         {
-            f"Best strokes, {settings.preset}": best_table(found, names, depths),
+            f"Best strokes, {settings.preset}": best_table(best_by_case, names, depths),
             f"Frames, {settings.check.preset}: rms error of D with 95 % interval": check_table(checks),
         },
         _notes(settings, checks),
