@@ -101,7 +101,8 @@ def _measure_pair(pair: PairPictures, setting: KnownNumbers, out: Path | None) -
     print(f"D = {measurement.depth_m:.4f} m, sigma {measurement.sigma_m:.4f} m")
     spot_m, rig_m = float(measurement.depth.sigma_spot_m), float(measurement.depth.sigma_calibration_m)
     print(
-        f"of which the spots {spot_m:.4f} m, the rig {rig_m:.4f} m, this stroke {measurement.depth.sigma_stroke_m:.4f} m"
+        f"of which the spots {spot_m:.4f} m, the rig {rig_m:.4f} m, this stroke "
+        f"{measurement.depth.sigma_stroke_m:.4f} m"
     )
     for position, spot in (("down", measurement.down), ("up", measurement.up)):
         print(f"{position}: spot at ({spot.uv_px[0]:.3f}, {spot.uv_px[1]:.3f}) px, sigma {spot.sigma_px:.3f} px")
