@@ -82,7 +82,7 @@ def summary(folder: str | Path) -> dict[str, Any]:
         "schema_version": info.schema_version,
         "recipe_sha256": info.recipe_sha256,
         "samples": len(dataset),
-        "left_out": [one.model_dump(mode="json") for one in info.left_out],
+        "left_out": [sample.model_dump(mode="json") for sample in info.left_out],
         "poses": len(info.poses),
         "rigs": len(dataset.rigs),
         "rooms": len(dataset.rooms),

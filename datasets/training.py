@@ -275,7 +275,7 @@ class SpotCrops:
         self.length, self.seed, self.epoch = whole_number("length", length, 1), whole_number("seed", seed), 0
         if not self.options:
             raise DatasetError("options is empty: give at least one FrameOptions")
-        if any(one.region is not None for one in self.options):
+        if any(option.region is not None for option in self.options):
             raise DatasetError("region: the crops have a side of their own, CropSettings.side_px")
         self._sides = tuple(_sides([open_finished(folder) for folder in folders], self.settings, samples))
         if not self._sides:

@@ -249,7 +249,7 @@ def _spot_faults(
 def _depth_faults(sample: Sample) -> Iterator[str]:
     """D of the light is that of its places, by Pythagoras."""
     row = sample.row
-    places = [one.light.place_world_m for one in (row.down, row.up) if one.visible and one.light is not None]
+    places = [image.light.place_world_m for image in (row.down, row.up) if image.visible and image.light is not None]
     if not places:
         return
     x, y, _ = (math.fsum(values) / len(places) for values in zip(*places, strict=True))

@@ -120,12 +120,14 @@ def joined(tables: Sequence[FaceTable], shapes: Sequence[int]) -> FaceTable:
     if not tables:
         return _empty()
     # by identity: comparing contents would take longer than it saves
-    kept = {id(one): one for table in tables for one in table.textures}
+    kept = {id(texture): texture for table in tables for texture in table.textures}
     places = {key: number for number, key in enumerate(kept)}
     counts = [len(table.shape) for table in tables]
     columns = {name: np.concatenate([getattr(table, name) for table in tables]) for name in _COLUMNS}
     columns["shape"] = columns["shape"] + np.repeat(_firsts(shapes), counts)
-    own = [np.array([places[id(one)] for one in table.textures], dtype=np.int64)[table.texture] for table in tables]
+    own = [
+        np.array([places[id(texture)] for texture in table.textures], dtype=np.int64)[table.texture] for table in tables
+    ]
     firsts = np.repeat(_firsts(counts), [len(table.patch) for table in tables])
     columns |= {"texture": np.concatenate(own), "patch": columns["patch"] + firsts}
     return FaceTable(**columns, textures=tuple(kept.values()))

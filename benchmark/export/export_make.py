@@ -157,7 +157,7 @@ def scored_with_laser_off(folder: Path) -> bool:
 def scored_pairs(dataset: Dataset, request: ExportRequest) -> DatasetPairs:
     """Pairs of a data set as `score` numbers them, with or without frames with the laser off."""
     taken = dataset_pairs(dataset, request.frames.preset, request.draws)
-    draws = (replace(one, laser_off=request.laser_off) for one in taken.pair_draws)
+    draws = (replace(draw, laser_off=request.laser_off) for draw in taken.pair_draws)
     return DatasetPairs(dataset, tuple(draws))
 
 

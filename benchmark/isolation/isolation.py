@@ -450,7 +450,7 @@ def _of_other_processes(numbers: dict[str, int]) -> list[_Line]:
         # of the system and the caller's own; 3 in the lowest bits is that of a device
         body = [(_LOAD, 0, 0, _ARGUMENT), (_AT_LEAST, 1, 0, 1 << 31), allow, (_AND, 0, 0, 4), (_EQUAL, 0, 1, 4), allow]
         mine = [(_LOAD, 0, 0, _ARGUMENT), (_AND, 0, 0, 0xFFFFFFF8)]
-        mine += [line for one in own for line in ((_EQUAL, 0, 1, ~one << 3 & 0xFFFFFFFF), allow)]
+        mine += [line for pid in own for line in ((_EQUAL, 0, 1, ~pid << 3 & 0xFFFFFFFF), allow)]
         lines += [(_EQUAL, 0, len(body) + len(mine) + 1, numbers[name]), *body, *mine, deny]
     return lines
 

@@ -61,8 +61,10 @@ def packages_of(names: Iterable[str]) -> dict[str, str | None]:
     owners, versions = _owners(_places()), dict[str, str | None]()
     for name in names:
         candidates = owners.get(name.partition(".")[0], ())
-        packages = [one for one in dict.fromkeys(candidates) if len(candidates) == 1 or _has(one, name)] or candidates
-        versions |= {printable_line(one): _version(one) for one in packages}
+        packages = [
+            package for package in dict.fromkeys(candidates) if len(candidates) == 1 or _has(package, name)
+        ] or candidates
+        versions |= {printable_line(package): _version(package) for package in packages}
         if not packages and not name.startswith("_"):
             versions[printable_line(name)] = None
     return dict(sorted(versions.items()))

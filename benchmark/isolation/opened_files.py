@@ -98,7 +98,11 @@ class OpenedFiles:
         left, result, skipped = _MOST_BYTES, dict[str, str | None](), {path.resolve() for path in known}
         for name, path in sorted(self._found.items()):
             real = path.resolve()
-            if real in skipped or "__pycache__" in path.parts or any(real.is_relative_to(one) for one in self._hidden):
+            if (
+                real in skipped
+                or "__pycache__" in path.parts
+                or any(real.is_relative_to(folder) for folder in self._hidden)
+            ):
                 continue
             left -= real.stat().st_size if real.is_file() else 0
             counts = left >= 0 and len(result) < _MOST_FILES
@@ -121,5 +125,5 @@ def _folders(path: Path, hidden: Sequence[Path]) -> Iterator[Path]:
         for folder in level:
             yield folder
             with suppress(OSError):  # a folder that cannot be listed
-                below += sorted(Path(one.path) for one in os.scandir(folder) if one.is_dir(follow_symlinks=False))
-        level = [one for one in below if one.name != "__pycache__" and one not in hidden]
+                below += sorted(Path(entry.path) for entry in os.scandir(folder) if entry.is_dir(follow_symlinks=False))
+        level = [entry for entry in below if entry.name != "__pycache__" and entry not in hidden]

@@ -388,7 +388,7 @@ class GuestProcess:
         self._shares = len(references) > 1
         order = {
             "nonce": nonce,
-            "references": [asdict(one) for one in references],
+            "references": [asdict(each) for each in references],
             "memory_mb": limits.memory_mb,
             "serves": self._serves,
         }

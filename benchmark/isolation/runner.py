@@ -183,7 +183,7 @@ class Harness:
 
 def _together(references: Sequence[Reference]) -> list[list[int]]:
     """Places of the methods that have a process together: the built-in ones; every other has its own."""
-    built_in = [place for place, one in enumerate(references) if one.kind == "built-in"]
+    built_in = [place for place, reference in enumerate(references) if reference.kind == "built-in"]
     return [[place] for place in range(len(references)) if place not in built_in] + [built_in] * bool(built_in)
 
 

@@ -98,7 +98,7 @@ def place_in(error: BaseException, file: str = "") -> str:
 def sentence_of(error: BaseException, file: str = "") -> str:
     """An exception in one sentence, with the method's own line."""
     what, place = _in_words(error), place_in(error, file)
-    denied = next((one for one in _causes(error) if isinstance(one, PermissionError)), None)
+    denied = next((cause for cause in _causes(error) if isinstance(cause, PermissionError)), None)
     because = f", because of {_in_words(denied)}" if denied is not None and denied is not error else ""
     return f"{what}{because}{f' ({place})' if place else ''}{_on_relative(error) if file else ''}"
 
@@ -110,7 +110,7 @@ def _in_words(error: BaseException) -> str:
 
 def _on_relative(error: BaseException) -> str:
     """Advice if a file was looked for in the working folder, which is not where the user is."""
-    lost = next((one for one in _causes(error) if isinstance(one, FileNotFoundError)), None)
+    lost = next((cause for cause in _causes(error) if isinstance(cause, FileNotFoundError)), None)
     name = lost.filename if lost is not None else None
     if not isinstance(name, str) or not name or Path(name).is_absolute():
         return ""
@@ -338,10 +338,10 @@ _NO_MEMORY = re.compile(
 def is_out_of_memory(error: BaseException | None) -> bool:
     """Tell an error for want of memory, or one that was raised because of such an error."""
     return any(
-        isinstance(one, MemoryError)
-        or (isinstance(one, OSError) and one.errno == errno.ENOMEM)
-        or lacks_memory(_text_of(one))
-        for one in _causes(error)
+        isinstance(cause, MemoryError)
+        or (isinstance(cause, OSError) and cause.errno == errno.ENOMEM)
+        or lacks_memory(_text_of(cause))
+        for cause in _causes(error)
     )
 
 

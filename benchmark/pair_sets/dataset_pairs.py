@@ -89,7 +89,7 @@ class DatasetPairs(DrawnPairs, ShortForm):
         return {
             "data set": self.dataset.folder,
             "pairs": len(self),
-            "presets": ", ".join(dict.fromkeys(one.preset for one in self.pair_draws)),
+            "presets": ", ".join(dict.fromkeys(draw.preset for draw in self.pair_draws)),
         }
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -134,10 +134,10 @@ class DatasetPairs(DrawnPairs, ShortForm):
         DatasetError
             If there is none, or several for want of a preset.
         """
-        numbers = [one for one in self.pair_draws if (one.sample_id, one.draw) == (sample_id, draw)]
-        numbers = [one for one in numbers if preset in (None, one.preset)]
+        numbers = [each for each in self.pair_draws if (each.sample_id, each.draw) == (sample_id, draw)]
+        numbers = [each for each in numbers if preset in (None, each.preset)]
         if len(numbers) != 1:
-            presets = sorted({one.preset for one in numbers})
+            presets = sorted({each.preset for each in numbers})
             say = f"it is there in {', '.join(presets)}: give one" if numbers else "there is no such pair"
             raise DatasetError(f"sample '{sample_id}', draw {draw}, preset {preset or 'any'}: {say}")
         return numbers[0].number
@@ -174,7 +174,7 @@ class DatasetPairs(DrawnPairs, ShortForm):
         """Frames and numbers of the sensor that are not the recipe's: scores of others are not comparable."""
         changed: dict[str, Any] = {}
         if (counts := sorted({draw.frames for draw in self.pair_draws})) != [(1, 1)]:
-            changed["frames"] = [list(one) for one in counts]
+            changed["frames"] = [list(count) for count in counts]
         if self._sensor is not None:
             text = json.dumps([self._sensor.preset, dict(self._sensor.numbers)], sort_keys=True)
             changed["sensor_sha256"] = hashlib.sha256(text.encode()).hexdigest()
@@ -270,10 +270,12 @@ def _distractions(sample: CachedSample, side: PositionLight, position: str) -> t
     """Lights beside the spot that this image shows."""
     return tuple(
         Distraction(
-            one.kind, (truth.u_px, truth.v_px), spot_electrons(one.layers[position].total_electrons_per_s, side)
+            distractor.kind,
+            (truth.u_px, truth.v_px),
+            spot_electrons(distractor.layers[position].total_electrons_per_s, side),
         )
-        for one in sample.distractors
-        if (truth := one.truths[position]).visible
+        for distractor in sample.distractors
+        if (truth := distractor.truths[position]).visible
     )
 
 

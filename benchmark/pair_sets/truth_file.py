@@ -108,7 +108,7 @@ def truth_of(row: TruthRow) -> PairTruth:
 
 def _spot(row: SpotTruthRow) -> ImageTruth:
     matrices = {name: _array(getattr(row, name)) for name in _MATRICES}
-    distractions = tuple(Distraction(**dict(one)) for one in row.distractions)
+    distractions = tuple(Distraction(**dict(distraction)) for distraction in row.distractions)
     return ImageTruth(**{**dict(row), **matrices, "phi_rad": dict(row.phi_rad), "distractions": distractions})
 
 

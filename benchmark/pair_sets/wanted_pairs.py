@@ -75,14 +75,14 @@ def wanted_pairs(dataset: Dataset | ImportedSet | FramesSet, choice: PairChoice)
         As `dataset_pairs`, or if the calibration cannot be read or is that of another rig.
     """
     if isinstance(dataset, FramesSet):
-        if any(one is not None for one in (choice.calibration, choice.boxes_px, choice.sensor, choice.frames)):
+        if any(option is not None for option in (choice.calibration, choice.boxes_px, choice.sensor, choice.frames)):
             raise DatasetError(
                 f"{dataset.folder} holds frames that are drawn: leave --calibration, --boxes, --sensor and --frames "
                 "out, or score the data set that it comes from"
             )
         return dataset.pairs(choice.preset, choice.draws, pairs=choice.pairs, hints=choice.hints)
     if isinstance(dataset, ImportedSet):
-        if any(one is not None for one in (choice.boxes_px, choice.sensor, choice.frames)):
+        if any(option is not None for option in (choice.boxes_px, choice.sensor, choice.frames)):
             raise DatasetError(
                 f"{dataset.folder} holds pictures: their boxes are not known, and sensor and frames are those of the "
                 "import; leave --boxes, --sensor and --frames out"

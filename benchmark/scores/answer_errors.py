@@ -188,7 +188,7 @@ def kept(function: Callable[P, T]) -> Callable[P, T]:
 
     @lru_cache(_KEPT)
     def of_values(*arguments: _ByValue) -> Any:
-        result = function(*(one.value for one in arguments))  # type: ignore[call-arg]
+        result = function(*(argument.value for argument in arguments))  # type: ignore[call-arg]
         for array in (result, *getattr(result, "__dict__", {}).values()):
             if isinstance(array, np.ndarray):
                 array.flags.writeable = False

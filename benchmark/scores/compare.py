@@ -187,10 +187,10 @@ def note_on_others(mine: Sequence[ScoreDocument], every: Sequence[ScoreDocument]
     every : these and all others
     """
     first = mine[0]
-    apart = [one for one in every if same_pairs(one) == same_pairs(first) and one.pairs != first.pairs]
+    apart = [score for score in every if same_pairs(score) == same_pairs(first) and score.pairs != first.pairs]
     if not apart:
         return ""
-    told = ", ".join(f"{one.method.name} ({one.pairs})" for one in apart[:_TOLD])
+    told = ", ".join(f"{score.method.name} ({score.pairs})" for score in apart[:_TOLD])
     more = f" and {len(apart) - _TOLD} more" if len(apart) > _TOLD else ""
     return f"{first.pairs} pairs are counted here, other numbers elsewhere: {told}{more}; such scores do not compare"
 

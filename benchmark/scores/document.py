@@ -308,7 +308,7 @@ def document_of(
         program=program_version(),
         code_sha256=code_behind(SCORER),
         missed_relative=missed,
-        flags=[Flag(**{**asdict(one), "ratio": finite(one.ratio)}) for one in excesses(whole.images)],
+        flags=[Flag(**{**asdict(excess), "ratio": finite(excess.ratio)}) for excess in excesses(whole.images)],
         metrics={name: _metric(name, value) for name, value in measured(whole, rules, "score", seed).items()},
         strata=[_stratum(stratum, rules, seed) for stratum in others],
         causes=count(table),

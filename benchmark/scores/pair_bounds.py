@@ -80,8 +80,8 @@ def pair_bounds(
     bounds : (down, up)
     """
     at = rig, stroke_m, true_px[0], depth_m
-    joint = _joint_bound(*at, *(one.image_px2 for one in bounds))
-    possible_px2 = [least_px2(one.image_px2, one.raw_px2) for one in bounds]
+    joint = _joint_bound(*at, *(bound.image_px2 for bound in bounds))
+    possible_px2 = [least_px2(bound.image_px2, bound.raw_px2) for bound in bounds]
     possible = _joint_bound(*at, *possible_px2)
     of_both = possible.covariance_down_px2, possible.covariance_up_px2
     least = [clipped(_or(C, alone)) for C, alone in zip(of_both, possible_px2, strict=True)]

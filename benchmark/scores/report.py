@@ -320,10 +320,10 @@ def _frames(
     frames: dict[str, EncodedPicture] = {}
     places: dict[tuple[str, int], str] = {}
     for name, score in scores.items():
-        for place, one in enumerate(score.worst):
-            if one.frame is not None:
-                key = ids.setdefault(one.frame.base64, f"frame-{number}-{len(ids) + 1}")
-                frames[key], places[name, place] = one.frame, key
+        for place, image in enumerate(score.worst):
+            if image.frame is not None:
+                key = ids.setdefault(image.frame.base64, f"frame-{number}-{len(ids) + 1}")
+                frames[key], places[name, place] = image.frame, key
     return frames, places
 
 

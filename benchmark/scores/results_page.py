@@ -172,9 +172,9 @@ def _head(name: str) -> str:
 
 def _board(part: ScoreGroup, title: str, names: Sequence[str]) -> TextTable:
     rows = []
-    for one in part.scores:
-        cells = (" ".join(shown_parts(m, one.metrics[m])) if applies(m, one.method.sees) else "" for m in names)
-        rows.append((f"{one.method.name}{FLAGGED if one.flags else ''}", *(_cut(cell) for cell in cells)))
+    for score in part.scores:
+        cells = (" ".join(shown_parts(m, score.metrics[m])) if applies(m, score.method.sees) else "" for m in names)
+        rows.append((f"{score.method.name}{FLAGGED if score.flags else ''}", *(_cut(cell) for cell in cells)))
     note = " ".join(filter(None, (frames_line(part.scores[0]), light_line(part.scores[0]))))
     return TextTable(title, ("method", *map(_head, names)), tuple(rows), "l" + "r" * len(names), note)
 
@@ -188,7 +188,7 @@ def _cut(cell: str) -> str:
 def _differences(part: ScoreGroup) -> TextTable:
     rows = []
     for name, found in part.differences.items():
-        by_name = {one.name: one for one in found}
+        by_name = {difference.name: difference for difference in found}
         cells = (_change(by_name[metric]) for metric in _DIFFERENCES)
         rows.append((name, *cells))
     heads = ("method", *map(_head, _DIFFERENCES))
@@ -205,15 +205,15 @@ def _change(one: Difference) -> str:
 
 def _strata(part: ScoreGroup) -> TextTable:
     """Found spots and their median error in each stratum; of one method per column."""
-    order = [one for one in part.scores if one.method.name != part.against]
-    base = next(one for one in part.scores if one.method.name == part.against)
+    order = [score for score in part.scores if score.method.name != part.against]
+    base = next(score for score in part.scores if score.method.name == part.against)
     shown = [*order[: _SHOWN - 1], base]
     rows = []
     for stratum in base.strata:
         if stratum.by in _STRATA:
-            cells = (_in_stratum(one, stratum) for one in shown)
+            cells = (_in_stratum(score, stratum) for score in shown)
             rows.append((stratum.by, stratum.label, str(stratum.images), *cells))
-    heads = ("by", "stratum", "images", *(one.method.name for one in shown))
+    heads = ("by", "stratum", "images", *(score.method.name for score in shown))
     return TextTable("Found / %; median error / px", heads, tuple(rows), "llr" + "r" * len(shown))
 
 
@@ -302,7 +302,7 @@ def results_html(parts: Sequence[ScoreGroup], by: str = "phi") -> str:
 def _source_rows(parts: Sequence[ScoreGroup]) -> Iterator[tuple[str, ...]]:
     for part in parts:
         first = part.scores[0]
-        programs = sorted({one.program or "not told" for one in part.scores})
+        programs = sorted({score.program or "not told" for score in part.scores})
         digest = str(first.pair_set.get("dataset_sha256"))[:12]
         cells = (part.title, first.pair_set.get("name"), first.pairs, first.samples, first.pair_set.get("task_version"))
         yield (*map(str, cells), digest, ", ".join(programs))
@@ -317,7 +317,7 @@ def results_document(parts: Sequence[ScoreGroup]) -> dict[str, Any]:
             {
                 "title": part.title,
                 "against": part.against,
-                "scores": [one.model_copy(update={"worst": []}).model_dump(mode="json") for one in part.scores],
+                "scores": [score.model_copy(update={"worst": []}).model_dump(mode="json") for score in part.scores],
                 "differences": {name: json.loads(differences_json(found)) for name, found in part.differences.items()},
                 "notes": list(part.notes),
             }

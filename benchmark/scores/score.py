@@ -153,8 +153,8 @@ def _examine_each(
     for part, outcomes in zip(parts, zip(*answers, strict=True), strict=True):
         with _timed("statistics", stages):
             added.append(examine(held, outcomes, rules, part[-1].leading if part else None, fits))
-    for part, one in zip(parts, added, strict=True):
-        part.append(one)
+    for part, examined in zip(parts, added, strict=True):
+        part.append(examined)
 
 
 def _unfinished(
@@ -331,9 +331,9 @@ def saved_each(scores: Sequence[Scored], files: Sequence[Path]) -> list[Scored]:
         When all others are written, with the files that are not.
     """
     written, faults = [], []
-    for one, file in zip(scores, files, strict=True):
+    for score, file in zip(scores, files, strict=True):
         try:
-            written.append(saved(one, file))
+            written.append(saved(score, file))
         except (DatasetError, OSError) as error:  # the others are written all the same
             faults.append(f"{file} could not be written: {error}")
     if faults:

@@ -253,7 +253,7 @@ def false_line(records: pl.DataFrame) -> str:
     ((kind, number),) = Counter(kind.removesuffix(NOISE) for kind in kinds.elements()).most_common(1)
     # one place may look like either; a method subtracts the laser-off image everywhere or nowhere
     bright = ("lamp", "region")
-    subtracts = sum(kinds[one + NOISE] for one in bright) > sum(kinds[one] for one in bright)
+    subtracts = sum(kinds[cause + NOISE] for cause in bright) > sum(kinds[cause] for cause in bright)
     what, advice = TAKEN_FOR[kind + NOISE if kind in bright and subtracts else kind]
     return f"{100 * number / len(answers):.0f} % of the answers are {what}: {advice}"
 
@@ -360,9 +360,9 @@ def print_scores(scored: Sequence[HasScore], form: str, by: str, wide: bool, cal
     calibrated : bool
         Say how well the predicted error of D holds.
     """
-    refusals = {id(one): f"not compared: it {why}" for one in scored if (why := refused(one.records))}
-    every = [one.document for one in scored]
-    documents = [one.document for one in scored if id(one) not in refusals] or every
+    refusals = {id(each): f"not compared: it {why}" for each in scored if (why := refused(each.records))}
+    every = [each.document for each in scored]
+    documents = [each.document for each in scored if id(each) not in refusals] or every
     board = leaderboard(documents, by, wide)
     if form != "terminal":
         table = {"markdown": markdown, "latex": latex}
@@ -371,21 +371,21 @@ def print_scores(scored: Sequence[HasScore], form: str, by: str, wide: bool, cal
         return
     console = table_console(wide)
     show_grid(console, board if wide or len(documents) > 1 else score_table(documents[0], by))
-    failed = {id(one): line for one in scored if (line := failure_line(one.records))}
+    failed = {id(each): line for each in scored if (line := failure_line(each.records))}
     failed |= refusals
-    for one in scored:
-        lines = [failed.get(id(one), ""), *(flag.text for flag in one.document.flags), false_line(one.records)]
+    for each in scored:
+        lines = [failed.get(id(each), ""), *(flag.text for flag in each.document.flags), false_line(each.records)]
         for line in filter(None, lines):
-            _line(console, f"{one.document.method.name}: {line}")
+            _line(console, f"{each.document.method.name}: {line}")
     missing = any(any(kind.values()) for document in documents for kind in document.causes.values())
     if missing and (len(scored) > 1 or not failed):
         show_grid(console, cause_table(documents))
-    for one in scored:
-        said = [] if id(one) in failed else silences(one.records)
-        lines = [*([depth_line(one.document)] if calibrated and _finds(one.document) else []), *said, *_printed(one)]
-        lines += [one.document.isolation] if one.document.isolation.startswith("not isolated") else []
+    for each in scored:
+        said = [] if id(each) in failed else silences(each.records)
+        lines = [*([depth_line(each.document)] if calibrated and _finds(each.document) else []), *said, *_printed(each)]
+        lines += [each.document.isolation] if each.document.isolation.startswith("not isolated") else []
         for line in lines:
-            _line(console, f"{one.document.method.name}: {line}")
+            _line(console, f"{each.document.method.name}: {line}")
     if len(documents) == 1 and _finds(documents[0]):
         show_grid(console, strata_table(documents[0], wide))
 
@@ -464,7 +464,9 @@ def scores_csv(documents: Sequence[ScoreDocument], by: str = "phi") -> str:
     rows = []
     for document in ranked(documents, by):
         values = ((document.metrics[name], len(ends[name])) for name in METRICS)
-        numbers = [x for one, n in values for x in (one.value, one.low, one.high, one.share)[:n]]
+        numbers = [
+            x for estimate, n in values for x in (estimate.value, estimate.low, estimate.high, estimate.share)[:n]
+        ]
         flags = ", ".join(flag.quantity for flag in document.flags)
         rows.append([document.method.name, document.pairs, document.images, document.samples, flags, *numbers])
     return _csv(["method", "pairs", "images", "samples", "knows_more", *names], rows)

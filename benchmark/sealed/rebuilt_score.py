@@ -72,7 +72,7 @@ def alike(given: EncodedPicture | None, right: EncodedPicture | None) -> bool:
     if given.model_dump(exclude=place) != right.model_dump(exclude=place):
         return False
     try:
-        first, second = (_pixels(one) for one in (given, right))
+        first, second = (_pixels(picture) for picture in (given, right))
     except (DatasetError, ValueError):  # no picture: not the same
         return False
     return first.shape == second.shape and float(np.abs(first - second).mean()) <= _CODES

@@ -255,7 +255,7 @@ def _built_again(document: ScoreDocument, table: pl.DataFrame, data: Path, conso
     names = [name for name in right.records.columns if name not in GIVEN]
     faults = list(differences(table, right.records, names, "what answers and data set give"))
     faults += [] if faults else _of_parts(document, right.document, table)
-    stated, found = (_but(one, "provenance") for one in (document.pair_set, pairs.document()))
+    stated, found = (_but(described, "provenance") for described in (document.pair_set, pairs.document()))
     faults += _unequal(stated, found, "pair_set", "the data set gives")
     faults += _of_worst(document.worst, right.document.worst)
     return _Again(tuple(faults), pairs)
@@ -268,7 +268,7 @@ def _but(fields: Mapping[str, Any], name: str) -> dict[str, Any]:
 def _of_worst(given: Sequence[Worst], right: Sequence[Worst]) -> Iterator[str]:
     """Worst images that are not those of answers and data set; a picture may differ as its coder does."""
     stated, found = (
-        [one.model_dump(mode="json", exclude={"crop", "frame"}) for one in some] for some in (given, right)
+        [image.model_dump(mode="json", exclude={"crop", "frame"}) for image in some] for some in (given, right)
     )
     if faults := list(_unequal(stated, found, "worst", "the data set gives")):
         yield from faults
@@ -296,7 +296,7 @@ def _of_parts(document: ScoreDocument, again: ScoreDocument, table: pl.DataFrame
     if document.results_sha256 != results_sha256(table):
         yield "results_sha256 is not that of the records: hand in both files of one run"
     for name in _FROM_RECORDS:
-        given, right = (one.model_dump(mode="json")[name] for one in (document, again))
+        given, right = (score.model_dump(mode="json")[name] for score in (document, again))
         yield from _unequal(given, right, name)
 
 

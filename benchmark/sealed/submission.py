@@ -370,7 +370,7 @@ def unseal(public: str | Path, truth: str | Path, submission: str | Path) -> Uns
     pairs = SealedPairs(Path(public))
     pairs.check()
     truths = read_truth_file(Path(truth), pairs.seal.truth_sha256)
-    if [one.number for one in truths] != list(range(len(pairs))):
+    if [truth_of_pair.number for truth_of_pair in truths] != list(range(len(pairs))):
         raise DatasetError(f"{truth} does not hold the truth of each pair once; seal the data set again")
     document = read_submission(Path(submission))
     check_complete(document, pairs.seal, str(submission))

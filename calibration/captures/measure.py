@@ -226,7 +226,9 @@ def _measured(test: ChainTest, stroke_m: float, setting: KnownNumbers) -> Measur
     if not parts:
         raise faults[0]
     found = parts[0][0]
-    down, up = (_mixed([(one.spots[name], chance) for one, chance in parts], test.added_px) for name in POSITIONS)
+    down, up = (
+        _mixed([(measured.spots[name], chance) for measured, chance in parts], test.added_px) for name in POSITIONS
+    )
     depth = depth_general(
         found.rig,
         found.stroke_m,
@@ -303,7 +305,7 @@ def _without(
     def of(group: Sequence[Photo]) -> tuple[Photo, ...]:
         return tuple(replace(photo, pixels=_cut(photo.pixels, du, dv)) for photo in group)
 
-    down, up = (PositionPhotos(of(one.on), of(one.off)) for one in (photos.down, photos.up))
+    down, up = (PositionPhotos(of(position.on), of(position.off)) for position in (photos.down, photos.up))
     known = replace(setting.known, rig=_rig_at(setting.known.rig, -du, -dv))
     held = setting.calibration
     held = None if held is None else replace(held, rig=_rig_at(held.rig, -du, -dv))
@@ -373,7 +375,7 @@ def _corrected(setting: KnownNumbers, outlines: Sequence[Outline], why: str) -> 
         values, covariance = np.zeros(len(PARAMETERS)), np.diag(prior_sigmas() ** 2)
         return nominal, covariance, values, f"rig: as in the rig file, with the errors of a ruler; no outline: {why}"
     bundle = calibrate(nominal, outlines_as_one(outlines))
-    kind = ", by its edge alone" if any(one.by_edge for one in outlines) else ""
+    kind = ", by its edge alone" if any(outline.by_edge for outline in outlines) else ""
     text = f"rig: corrected by the mirror's outline in these pictures{kind}; the rest has the errors of a ruler"
     return bundle.rig, bundle.covariance, bundle.values, text
 
@@ -417,7 +419,7 @@ def _calibration_note(held: Calibration, nominal: Rig, outlines: Sequence[Outlin
 
 def with_blur_of(rig: Rig, outlines: Sequence[Outline]) -> Rig:
     """Rig with the blur that the outlines' light has; as it is where none could be fitted."""
-    blurs = [one.blur_px for one in outlines if math.isfinite(one.blur_px)]
+    blurs = [outline.blur_px for outline in outlines if math.isfinite(outline.blur_px)]
     return replace(rig, camera=replace(rig.camera, blur_sigma_px=float(np.mean(blurs)))) if blurs else rig
 
 
@@ -427,7 +429,7 @@ def with_blur_of(rig: Rig, outlines: Sequence[Outline]) -> Rig:
 def seen_images(pair: Pair) -> dict[str, SpotPicture]:
     """Pictures of a pair, by position, in which `detect` sees the spot."""
     detection = detect(pair)
-    return spot_images(pair, *(Spot(None if one is None else one.uv_px) for one in (detection.down, detection.up)))
+    return spot_images(pair, *(Spot(None if spot is None else spot.uv_px) for spot in (detection.down, detection.up)))
 
 
 def _shape(setting: KnownNumbers, pair: Pair, images: dict[str, SpotPicture], outlines: Sequence[Outline]) -> SpotShape:
@@ -440,7 +442,7 @@ def _shape(setting: KnownNumbers, pair: Pair, images: dict[str, SpotPicture], ou
 
 def shape_prior(rig: Rig, outlines: Sequence[Outline]) -> SpotShape:
     """Shape that a rig says, with the blur of outlines in it where their light could be fitted."""
-    by_light = any(math.isfinite(one.blur_px) for one in outlines)
+    by_light = any(math.isfinite(outline.blur_px) for outline in outlines)
     return SpotShape.prior(rig, OUTLINE_SIGMA_PX if by_light else PRIOR_SIGMA[0])
 
 

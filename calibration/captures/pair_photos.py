@@ -194,7 +194,7 @@ def exchanged_colours(pair: Pair, photos: PairPhotos) -> DatasetError | None:
 
 def _evidence(found: PairDetection) -> float:
     """Significance of both spots together."""
-    return math.hypot(*(one.significance for one in (found.down, found.up) if one is not None), 0.0)
+    return math.hypot(*(spot.significance for spot in (found.down, found.up) if spot is not None), 0.0)
 
 
 def moved_note(photos: PairPhotos, position: str, shift_px: float) -> str:
@@ -240,7 +240,7 @@ _MORE_EVIDENCE = 1.5  # of blue spots over red ones, from which on the colours a
 
 def _both(found: PairDetection) -> bool:
     """True where both spots are sure."""
-    z = [one.significance for one in (found.down, found.up) if one is not None]
+    z = [spot.significance for spot in (found.down, found.up) if spot is not None]
     return len(z) == len(POSITIONS) and min(z) >= _EACH_SIGMAS and math.hypot(*z) >= math.sqrt(2.0) * _SURE_SIGMAS
 
 

@@ -358,7 +358,7 @@ def _as_jpeg(photos: PairPhotos, quality: int, sampling: Subsampling) -> PairPho
     def of(group: Sequence[Photo]) -> tuple[Photo, ...]:
         return tuple(replace(photo, kind="jpeg", tables=tables, subsampling=sampling) for photo in group)
 
-    down, up = (PositionPhotos(of(one.on), of(one.off)) for one in (photos.down, photos.up))
+    down, up = (PositionPhotos(of(position.on), of(position.off)) for position in (photos.down, photos.up))
     return PairPhotos(down, up)
 
 

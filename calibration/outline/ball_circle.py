@@ -208,9 +208,9 @@ def circles(
     block = max(1, math.ceil(max(light.shape[:2]) / LONGEST_PX))
     radii = None if radii_px is None else _over(radii_px, block)
     curves = _settled(log_colours(shrunk(light, block)), radii, count)
-    for one in curves:
-        others = [other[0] for other in curves if other is not one]
-        yield _measured(_clearer(one), max(others, default=0.0), block)
+    for curve in curves:
+        others = [other[0] for other in curves if other is not curve]
+        yield _measured(_clearer(curve), max(others, default=0.0), block)
 
 
 def shrunk(light: NDArray[Any], block: int) -> NDArray[Any]:

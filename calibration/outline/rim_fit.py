@@ -55,7 +55,7 @@ def rim_light(rig: Rig, contour: Contour, blur_px2: float) -> EdgeLight:
     d = distances_px()
     kernel = line_spread(rig.camera, contour.depth_m, blur_px2)
     outside = np.where(np.abs(d) < 0.25 * STEP_PX, 0.5, (d > 0.0).astype(float))  # the middle of a step is half of it
-    columns = [blurred(one, kernel) for one in (outside, 1.0 - outside, outside * d, (1.0 - outside) * d)]
+    columns = [blurred(column, kernel) for column in (outside, 1.0 - outside, outside * d, (1.0 - outside) * d)]
     return EdgeLight(np.broadcast_to(_with_derivatives(columns), (3, len(d), 3 * _COLUMNS)))
 
 
@@ -68,7 +68,7 @@ def grazing_light(rig: Rig, contour: Contour, blur_px2: float) -> EdgeLight:
     turn, tables = 2.0 * np.arcsin(cos_i), []
     for wavelength_nm in camera.detector.band_wavelength_nm:
         sharp = np.where(d < 0.0, rig.mirror.reflectance(cos_i, wavelength_nm), 1.0)
-        columns = [blurred(one, kernel) for one in (sharp, sharp * turn, sharp * turn**2)]
+        columns = [blurred(column, kernel) for column in (sharp, sharp * turn, sharp * turn**2)]
         tables.append(_with_derivatives([*columns, np.zeros_like(d)]))
     return EdgeLight(np.stack(tables))
 

@@ -68,7 +68,7 @@ class DatasetCalibration:
 
     def write_picture(self, path: Path) -> Path:
         """Overlay of the image whose outline fits worst, see `outline_picture.write_overlay`."""
-        worst = int(np.argmax([one.shift_rms_px for one in self.outlines]))
+        worst = int(np.argmax([outline.shift_rms_px for outline in self.outlines]))
         image, title = self.images[worst], self.names[worst]
         return write_overlay(path, image.pixels, image.card, self.nominal, self.outlines[worst], title)
 
@@ -159,7 +159,7 @@ def calibrate_dataset(
         images = [photograph(dataset, sample, position, preset) for sample, position in one_per_pose(chosen)]
         known = frame_spots(dataset, chosen, preset, ruler) if sources.spots else []
     measured = [find_outline(image.pixels, rig, image.card) for image in images]
-    outlines = [one.widened(sources.outline_sigma_factor) for one in measured]
+    outlines = [outline.widened(sources.outline_sigma_factor) for outline in measured]
     upright = _vertical(images, outlines, rig) if sources.vertical else None
     sigmas = sources.sigmas
     bundle = calibrate(rig, mean_outline(outlines), known, upright, sigmas)

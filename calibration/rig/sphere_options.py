@@ -38,7 +38,7 @@ class SphereOptions:
 
     def given(self) -> dict[str, float]:
         """Values of the options that are given."""
-        values = ((f"--{one.name.replace('_', '-')}", getattr(self, one.name)) for one in fields(self))
+        values = ((f"--{field.name.replace('_', '-')}", getattr(self, field.name)) for field in fields(self))
         return {option: value for option, value in values if value is not None}
 
     def require_sound(self) -> None:

@@ -66,9 +66,9 @@ def verdict_of(bundle: Bundle, prior: Array, outlines: list[Outline]) -> Verdict
     with np.errstate(all="ignore"):
         far = np.nan_to_num(np.abs(bundle.values) / prior)
         left = np.sqrt(np.diag(bundle.covariance)) / prior
-    worst, arc = int(np.argmax(far)), min(one.arc for one in outlines)
+    worst, arc = int(np.argmax(far)), min(outline.arc for outline in outlines)
     least = _ARC if outlines[0].ellipse_px is None else _RIM_ARC
-    shift_px = max(one.shift_rms_px for one in outlines)
+    shift_px = max(outline.shift_rms_px for outline in outlines)
     faults = [
         # an underflow of p is a bad fit
         (_level(-np.log(max(p, 1e-300)), *(-np.log(_P))), f"chi2 is too large, p = {p:.1e}"),

@@ -50,7 +50,7 @@ def open_descriptor(path: Path) -> Capture:
     """
     file = InputFile(path, _REMEDY, CaptureError, SETTINGS_BYTES)
     lines = list(_lines(file))
-    formats = [one for one in lines if one.key == "n"]
+    formats = [line for line in lines if line.key == "n"]
     if len(formats) != 1:
         raise file.fault(f"has {len(formats)} lines `n`, and one is needed")
     bits, width, height = (_whole(file, formats[0], text) for text in formats[0].values)
@@ -93,13 +93,13 @@ def _lines(file: InputFile) -> Iterator[_Line]:
 
 def _groups(file: InputFile, lines: list[_Line]) -> Iterator[tuple[FrameGroup, bool]]:
     """Levels with their pictures, and whether they are bright."""
-    heads = [k for k, one in enumerate(lines) if one.key in "bd"]
+    heads = [k for k, line in enumerate(lines) if line.key in "bd"]
     first = heads[0] if heads else len(lines)
-    if stray := [one for one in lines[:first] if one.key == "i"]:
+    if stray := [line for line in lines[:first] if line.key == "i"]:
         raise file.fault(f"line {stray[0].number}: a picture stands before the first level")
     for k, end in zip(heads, [*heads, len(lines)][1:], strict=True):
         head = lines[k]
-        pictures = tuple(_picture(file, one) for one in lines[k + 1 : end] if one.key == "i")
+        pictures = tuple(_picture(file, line) for line in lines[k + 1 : end] if line.key == "i")
         if len(pictures) < 2:
             raise file.fault(f"line {head.number}: a level with {len(pictures)} pictures, and noise needs two or more")
         seconds = _NS * _number(file, head, head.values[0])

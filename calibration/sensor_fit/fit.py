@@ -203,7 +203,7 @@ def _fit_noise(draft: _Draft, capture: Capture, tone: ToneFit | None) -> Process
     for group in capture.flats:
         frames = capture.stack(group)
         levels.append(stack_level(group.name, frames, _mean_rgb(frames, capture, card)))
-    if not any(max(one.codes) < 254.0 for one in levels):  # 255 is cut, and 254 may be
+    if not any(max(level.codes) < 254.0 for level in levels):  # 255 is cut, and 254 may be
         raise CaptureError(f"{capture.folder}: every level of flat/ is saturated; take levels from code 20 to 240")
     return fit_noise(levels, _toned(card, tone), capture.notes.analogue_gain)
 

@@ -58,10 +58,10 @@ def numbers_of(found: SensorFit) -> list[tuple[str, str, str]]:
     for name, value in found.file.numbers.items():
         sigma = tables.sigma.get(name)
         rows.append((name, _text(value), _sigma(sigma)))
-    for name, one in tables.measured.items():
-        sigma_text = _sigma(one.sigma) if one.sigma != 0.0 else ""
-        unit = "" if one.unit == "1" else f" {one.unit}"
-        rows.append((f"measured {name}", f"{_text(one.value)}{unit}", sigma_text))
+    for name, measured in tables.measured.items():
+        sigma_text = _sigma(measured.sigma) if measured.sigma != 0.0 else ""
+        unit = "" if measured.unit == "1" else f" {measured.unit}"
+        rows.append((f"measured {name}", f"{_text(measured.value)}{unit}", sigma_text))
     return rows
 
 
@@ -166,9 +166,9 @@ def _draw_noise(axes: Axes, found: SensorFit) -> None:
     codes = [level.codes[1] for level in levels]
     main = "Y'" if found.capture.kind == "yuyv" else "R"
     covariances = [level.planes[0].covariance[0] for level in levels]
-    axes.plot(codes, [np.sqrt(max(float(one[0]), 0.0)) for one in covariances], "k.-", label="rms, codes")
+    axes.plot(codes, [np.sqrt(max(float(covariance[0]), 0.0)) for covariance in covariances], "k.-", label="rms, codes")
     for column, label in ((1, "correlation beside"), (2, "correlation below")):
-        axes.plot(codes, [float(one[column] / one[0]) for one in covariances], label=label)
+        axes.plot(codes, [float(covariance[column] / covariance[0]) for covariance in covariances], label=label)
     axes.set(xlabel="green code", title=f"Noise of {main}")
     axes.legend(fontsize=8)
 

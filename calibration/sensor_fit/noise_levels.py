@@ -119,7 +119,7 @@ def _both(main: Array, other: Array, halved: bool) -> PlaneNoise:
 
 
 def _spatial(stack: Array) -> Array:
-    temporal = np.mean([_rough(one) ** 2 for one in _noise(stack)], axis=0)
+    temporal = np.mean([_rough(frame) ** 2 for frame in _noise(stack)], axis=0)
     spatial = _rough(stack.mean(axis=0)) ** 2 - temporal / len(stack)
     return _leave_one_out(spatial) / _leave_one_out(np.ones_like(spatial))
 

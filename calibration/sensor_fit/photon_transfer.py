@@ -103,8 +103,8 @@ def fit_transfer(capture: Capture) -> TransferFit:
         raise CaptureError(f"{capture.folder} has no flat frames: put frames of an even surface into flat/LEVEL/")
     top = (1 << capture.notes.bits) - 1
     dark_frames = _frames(capture, capture.dark, top)
-    levels = [one for group in capture.flats for one in _levels(capture, group, top)]
-    exposures = [one for group in capture.exposures if len(group.files) > 1 for one in _levels(capture, group, top)]
+    levels = [level for group in capture.flats for level in _levels(capture, group, top)]
+    exposures = [level for group in capture.exposures if len(group.files) > 1 for level in _levels(capture, group, top)]
     timed = [
         (float(group.seconds or 0.0), block_sums(_frames(capture, group, top), top).jackknife())
         for group in capture.dark_exposures
@@ -202,8 +202,8 @@ class _Fit:
 
     def _usable(self) -> list[_Level]:
         ceiling = self._ceiling()
-        used = [one for one in self.levels if self._reach(one) < ceiling and self._signal(one)[0] > 0.0]
-        if not used and any(self._reach(one) < self.top for one in self._plateau()):
+        used = [level for level in self.levels if self._reach(level) < ceiling and self._signal(level)[0] > 0.0]
+        if not used and any(self._reach(level) < self.top for level in self._plateau()):
             raise self._no_growth()
         if not used:
             raise CaptureError(
@@ -222,10 +222,12 @@ class _Fit:
         """Levels at which the wells are full: hardly more noise than in the dark, below the last code."""
         if len(self.levels) < 2:
             return []
-        bright = [one for one in self.levels if self._signal(one)[0] > _FAINT * self._range]
-        usual = max((self._excess(one) / float(self._signal(one)[0]) for one in bright), default=0.0)
+        bright = [level for level in self.levels if self._signal(level)[0] > _FAINT * self._range]
+        usual = max((self._excess(level) / float(self._signal(level)[0]) for level in bright), default=0.0)
         return [
-            one for one in bright if self._excess(one) < 0.02 * usual * self._signal(one)[0] and one.sums.full == 0.0
+            level
+            for level in bright
+            if self._excess(level) < 0.02 * usual * self._signal(level)[0] and level.sums.full == 0.0
         ]
 
     def _excess(self, one: _Level) -> float:
@@ -237,29 +239,29 @@ class _Fit:
         return self.top - float(self.black[0])
 
     def _ceiling(self) -> float:
-        flat = [float(one.sums.mean_dn[0]) for one in self._plateau()]
+        flat = [float(level.sums.mean_dn[0]) for level in self._plateau()]
         return min([float(self.top), *flat])
 
     def _response(self, used: list[_Level]) -> Response:
         """K with the response: the temporal variance against the mean, through the dark frames' point."""
         levels = [
             NoiseOfLevel(
-                one.name,
-                self._signal(one),
-                one.sums.temporal_dn2,
-                float(one.sums.mean_dn[0]),
-                float(np.sqrt(max(one.sums.spatial_dn2[0], 0.0))),
-                float(one.sums.pixels[0] * (one.sums.frames - 1)),
+                level.name,
+                self._signal(level),
+                level.sums.temporal_dn2,
+                float(level.sums.mean_dn[0]),
+                float(np.sqrt(max(level.sums.spatial_dn2[0], 0.0))),
+                float(level.sums.pixels[0] * (level.sums.frames - 1)),
             )
-            for one in used
+            for level in used
         ]
         no_dark = self._is_cut or self.is_hidden  # the dark frames' own variance says nothing
-        dark_dn2 = _intercept(levels) if no_dark and len({one.name for one in used}) > 1 else self.dark_dn2
+        dark_dn2 = _intercept(levels) if no_dark and len({level.name for level in used}) > 1 else self.dark_dn2
         try:
             response = fit_response(levels, dark_dn2, self._range)
         except ValueError:
             raise self._no_growth() from None
-        signal = np.array([float(one.signal_dn[0]) for one in levels])
+        signal = np.array([float(level.signal_dn[0]) for level in levels])
         unknown = float(response.gain[0]) * self._unknown_black() * float(signal.sum() / np.sum(signal**2))
         if no_dark and response.is_bent:  # a line through levels that bend has another intercept
             other = fit_response(levels, self.dark_dn2, self._range)
@@ -373,10 +375,10 @@ class _Fit:
         return min(float(ndtr((-0.5 - float(self.black[0])) / spread)), self.dark.zero)
 
     def _prnu(self, used: list[_Level], response: Response) -> None:
-        shown = np.stack([self._signal(one) for one in used])
+        shown = np.stack([self._signal(level) for level in used])
         signal = np.stack([response.linear(y) / response.slope(y) for y in shown])  # dy / y' is the change of x
-        pattern = np.stack([one.sums.spatial_dn2 for one in used]) - self.dark.spatial_dn2
-        temporal = np.array([one.sums.temporal_dn2[0] / one.sums.frames for one in used])
+        pattern = np.stack([level.sums.spatial_dn2 for level in used]) - self.dark.spatial_dn2
+        temporal = np.array([level.sums.temporal_dn2[0] / level.sums.frames for level in used])
         weights = (signal[:, 0] ** 2 / (np.maximum(pattern[:, 0], 0.0) + temporal)) ** 2
         square = np.sum(weights[:, None] * pattern / signal**2, axis=0) / weights.sum()
         if self._is_cut and response.is_bent:
@@ -392,32 +394,32 @@ class _Fit:
     def _full_well(self, response: Response) -> None:
         plateau = self._plateau()
         if plateau:
-            level = np.mean([one.sums.mean_dn for one in plateau], axis=0)
+            level = np.mean([flat.sums.mean_dn for flat in plateau], axis=0)
             self.values["full_well_e"] = response.linear(level - self.dark.mean_dn) / response.gain
             return
         gain = float(response.gain[0])
         end_e = float(response.linear(np.asarray(self._range))) / gain
-        largest = max(float(response.linear(np.asarray(self._signal(one)[0]))) for one in self.levels) / gain
+        largest = max(float(response.linear(np.asarray(self._signal(flat)[0]))) for flat in self.levels) / gain
         self.reasons["full_well_e"] = (
             f"the converter ends first, at {end_e:.0f} electrons"
-            if any(one.sums.full > 0.0 for one in self.levels)
+            if any(flat.sums.full > 0.0 for flat in self.levels)
             else f"no level of flat/ is saturated; above {largest:.0f} electrons"
         )
 
     def _linearity(self, dark_dn_per_s: float) -> None:
         """Signal against stated light: of an exposure series, or of flat levels whose photons are known."""
         ceiling, start = self._ceiling(), self.notes.exposure_s or 0.0
-        named = self.exposures or [one for one in self.levels if one.light is not None]
+        named = self.exposures or [level for level in self.levels if level.light is not None]
         levels: dict[str, list[_Level]] = {}
-        for one in named:
-            levels.setdefault(one.name, []).append(one)
+        for level in named:
+            levels.setdefault(level.name, []).append(level)
         lights, unit = [], "seconds"
         for sites in levels.values():
-            if any(self._reach(one) >= ceiling or one.light is None for one in sites):
+            if any(self._reach(level) >= ceiling or level.light is None for level in sites):
                 continue
             light, unit = sites[0].light or (0.0, unit)
             dark = dark_dn_per_s * ((sites[0].seconds or start) - start)
-            signal = float(np.mean([self._signal(one)[0] for one in sites])) - dark
+            signal = float(np.mean([self._signal(level)[0] for level in sites])) - dark
             flicker = float(np.mean([s.sums.flicker_dn2 for s in sites])) + self.common.level_dn2 / self.dark.frames
             lights.append(LightLevel(light, signal, float(np.sqrt(flicker))))
         linearity = fit_linearity(lights, unit)
@@ -446,8 +448,8 @@ class _Fit:
 
 def _intercept(levels: list[NoiseOfLevel]) -> Array:
     """Variance at no light by the line through the levels alone, DN^2, at least 0, shape (replicates,)."""
-    y = np.stack([one.signal_dn for one in levels])
-    v = np.stack([one.temporal_dn2 for one in levels]) - 1.0 / 12.0
+    y = np.stack([level.signal_dn for level in levels])
+    v = np.stack([level.temporal_dn2 for level in levels]) - 1.0 / 12.0
     weight = v[:, :1] ** -2.0
     y0, v0 = ((weight * x).sum(axis=0) / weight.sum() for x in (y, v))
     slope = np.sum(weight * (y - y0) * (v - v0), axis=0) / np.sum(weight * (y - y0) ** 2, axis=0)

@@ -88,7 +88,7 @@ def fit_noise(
     threshold_codes : float, optional
         Of denoising that spares edges, where edges have told it.
     """
-    used = [one for one in levels if _usable(one)]
+    used = [level for level in levels if _usable(level)]
     if not used:
         reason = f"no level between codes {_LEAST_CODE:g} and {_MOST_CODE:g} has noise above {_LEAST_VARIANCE} codes^2"
         names = ("gain_dn_per_e", "read_noise_e", "sharpen_amount", "prnu", "denoise_luma", "denoise_chroma")
@@ -96,7 +96,7 @@ def fit_noise(
             {}, {}, dict.fromkeys((*names, "white_balance"), reason), float("nan"), tuple(levels), card
         )
     first = _solved(used, PlaneModel(card, 1, threshold_codes), (), None, None)
-    lattice = [first.model.lattice_errors(one, first.numbers()) for one in used]
+    lattice = [first.model.lattice_errors(level, first.numbers()) for level in used]
     best = _solved(used, first.model, (), first.numbers(), lattice)
     for reach, extra in _CHAINS:
         solution = _solved(used, PlaneModel(card, reach, threshold_codes), extra, best.numbers(), lattice)
@@ -123,21 +123,21 @@ def _solved(
     lattice: list[list[float]] | None,
 ) -> _Solution:
     names = (*_BASE, *(("left", "right") if model.halved else ()), *extra)
-    seen = np.concatenate([plane.covariance[0] for one in used for plane in one.planes])
+    seen = np.concatenate([plane.covariance[0] for level in used for plane in level.planes])
     scatter = [
         jackknife_sigma(plane.covariance[:, i])
-        for one in used
-        for plane in one.planes
+        for level in used
+        for plane in level.planes
         for i in range(plane.covariance.shape[1])
     ]
-    planes = [plane for one in used for plane in one.planes]
-    errors = [0.0] * len(planes) if lattice is None else [error for one in lattice for error in one]
+    planes = [plane for level in used for plane in level.planes]
+    errors = [0.0] * len(planes) if lattice is None else [error for level in lattice for error in level]
     alike = [e * p.covariance[0] for e, p in zip(errors, planes, strict=True)]
     sigma = np.sqrt(np.square(scatter) + _FLOOR**2 + np.concatenate(alike) ** 2)
 
     def predicted(x: Array) -> Array:
         numbers = _numbers(names, x)
-        return np.concatenate([part for one in used for part in model.covariances(one, numbers)])
+        return np.concatenate([part for level in used for part in model.covariances(level, numbers)])
 
     given = start or PlaneParameters(red=model.card.white_balance[0], blue=model.card.white_balance[2])
     first = np.array([np.log(given.white_e) if n == "white_e" else getattr(given, n) for n in names])
@@ -150,7 +150,7 @@ def _solved(
     scale = [_SCALE.get(n, 0.1) for n in names]
     done = least_squares(lambda x: (predicted(x) - seen) / sigma, first, bounds=(low, high), x_scale=scale)
     gain = np.linalg.pinv(done.jac)  # change of the parameters by standardised residuals
-    rows = [np.concatenate([p.covariance[r] for one in used for p in one.planes]) for r in range(_count(used))]
+    rows = [np.concatenate([p.covariance[r] for level in used for p in level.planes]) for r in range(_count(used))]
     replicates = done.x + ((np.stack(rows) - seen) / sigma) @ gain.T
     misfit = float(np.sum(done.fun**2))
     # all lags of a plane err together
@@ -164,7 +164,7 @@ def _solved(
 
 
 def _count(used: list[NoiseLevel]) -> int:
-    return min(len(plane.covariance) for one in used for plane in one.planes)
+    return min(len(plane.covariance) for level in used for plane in level.planes)
 
 
 def _told(
@@ -210,11 +210,11 @@ def _told(
 
 def _prnu(used: list[NoiseLevel], model: PlaneModel, numbers: PlaneParameters) -> Array | None:
     """Squared PRNU and its replicates."""
-    known = [one for one in used if np.isfinite(one.spatial).all()]
+    known = [level for level in used if np.isfinite(level.spatial).all()]
     if not known:
         return None
-    unit = np.array([model.pattern(one, numbers) for one in known])
-    spatial = np.stack([one.spatial for one in known])
-    noise = np.array([jackknife_sigma(one.spatial) for one in known])
+    unit = np.array([model.pattern(level, numbers) for level in known])
+    spatial = np.stack([level.spatial for level in known])
+    noise = np.array([jackknife_sigma(level.spatial) for level in known])
     weights = (unit / noise) ** 2
     return np.asarray(np.sum(weights[:, None] * spatial / unit[:, None], axis=0) / weights.sum())

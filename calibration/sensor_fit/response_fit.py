@@ -235,15 +235,15 @@ class _Fitter:
 
 def _mean(sets: list[_Set], count: int, names: int, range_dn: float, reach_dn: float) -> Response:
     """Mean of the sets by their weights."""
-    freedom = [max(count - 1 - len(one.terms), 1) for one in sets]
-    misfits = [one.chi2 / n for one, n in zip(sets, freedom, strict=True)]
+    freedom = [max(count - 1 - len(fitted.terms), 1) for fitted in sets]
+    misfits = [fitted.chi2 / n for fitted, n in zip(sets, freedom, strict=True)]
     least = min(misfits)
     birge = max(least, 1.0)
-    prior = np.array([(1.0 - _STRAIGHT_PRIOR) / 7.0 if one.terms else _STRAIGHT_PRIOR for one in sets])
-    evidence = np.array([-0.5 * (one.chi2 / birge + len(one.terms) * np.log(count)) for one in sets])
+    prior = np.array([(1.0 - _STRAIGHT_PRIOR) / 7.0 if fitted.terms else _STRAIGHT_PRIOR for fitted in sets])
+    evidence = np.array([-0.5 * (fitted.chi2 / birge + len(fitted.terms) * np.log(count)) for fitted in sets])
     weight = prior * np.exp(evidence - evidence.max())
     weight /= weight.sum()
-    x = np.stack([_padded(one) for one in sets])
+    x = np.stack([_padded(fitted) for fitted in sets])
     mean = np.tensordot(weight, x, axes=1)
     spread2 = weight @ (x[:, 0] - mean[0]) ** 2
     unseen = _unseen_bend(sets, names)
@@ -261,7 +261,7 @@ def _mean(sets: list[_Set], count: int, names: int, range_dn: float, reach_dn: f
         straight_sigma=jackknife_sigma(straight),
         straight_misfit=misfits[0],
         misfit=least,
-        refused=all(scipy.stats.chi2.sf(one.chi2, n) < _CHANCE for one, n in zip(sets, freedom, strict=True)),
+        refused=all(scipy.stats.chi2.sf(fitted.chi2, n) < _CHANCE for fitted, n in zip(sets, freedom, strict=True)),
         bent=float(1.0 - weight[0]),
         reach_dn=reach_dn,
         levels=names,
@@ -273,7 +273,7 @@ def _unseen_bend(sets: list[_Set], names: int) -> float:
     """Standard deviation of a_1 where none is found: what is usual, or less where the noise would show it."""
     if names == 1:
         return _UNSEEN_BY_ONE
-    shown = [jackknife_sigma(one.x[:, 1]) for one in sets if one.terms == _TERMS[:1]]
+    shown = [jackknife_sigma(fitted.x[:, 1]) for fitted in sets if fitted.terms == _TERMS[:1]]
     return float(sum(sigma**-2 for sigma in [_UNSEEN, *shown] if sigma > 0.0) ** -0.5)
 
 
@@ -336,16 +336,16 @@ def fit_linearity(levels: Sequence[LightLevel], unit: str) -> Linearity | None:
     """Deviation of levels that are not saturated; None if fewer than four lie in the range."""
     if not levels:
         return None
-    end = max(one.signal_dn for one in levels)
-    used = [one for one in levels if _LEAST * end <= one.signal_dn <= _MOST * end]
-    light: Array = np.array([one.light for one in used])
+    end = max(level.signal_dn for level in levels)
+    used = [level for level in levels if _LEAST * end <= level.signal_dn <= _MOST * end]
+    light: Array = np.array([level.light for level in used])
     if len(set(light)) < _NEEDED:
         return None
-    signal = np.array([one.signal_dn for one in used])
+    signal = np.array([level.signal_dn for level in used])
     design = np.stack([np.ones_like(light), light / light.max()], axis=1)
     line = design @ np.linalg.lstsq(design / signal[:, None], np.ones_like(signal), rcond=None)[0]
     percent = 100.0 * (signal - line) / line
     most = int(np.argmax(np.abs(percent)))
     # two frames of one level say little of its scatter, all levels together enough
-    sigma = float(np.sqrt(np.mean([(one.sigma_dn / one.signal_dn) ** 2 for one in used])))
+    sigma = float(np.sqrt(np.mean([(level.sigma_dn / level.signal_dn) ** 2 for level in used])))
     return Linearity(float(np.abs(percent).mean()), float(abs(percent[most])), float(signal[most]), 100.0 * sigma, unit)

@@ -372,22 +372,25 @@ class PairForecast:
 def pair_forecasts(plan: Plan, pairs: Sequence[PairPlan] | None = None) -> Iterator[PairForecast]:
     """Trace the chief rays of all pairs of a plan, or of some, room by room; nothing is rendered."""
     rooms, pairs = {name: number for number, name in enumerate(plan.rooms)}, plan.pairs if pairs is None else pairs
-    forecasts = {one.pair.sample_id: one for one in _traced(plan, sorted(pairs, key=lambda pair: rooms[pair.room]))}
+    forecasts = {
+        forecast.pair.sample_id: forecast
+        for forecast in _traced(plan, sorted(pairs, key=lambda pair: rooms[pair.room]))
+    }
     return (forecasts[pair.sample_id] for pair in pairs)
 
 
 def rim_lines(plan: Plan, pairs: Iterable[PairForecast]) -> list[str]:
     """Say what to do about spots that the rim of a mirror of revolution hides; no line where there are none."""
     hidden = [
-        one.pair.sample_id
-        for one in pairs
-        if isinstance(plan.rigs[one.pair.rig].mirror, RevolvedMirror)
-        and {one.down.cause, one.up.cause} & {NO_REFLECTION, EDGE}
+        forecast.pair.sample_id
+        for forecast in pairs
+        if isinstance(plan.rigs[forecast.pair.rig].mirror, RevolvedMirror)
+        and {forecast.down.cause, forecast.up.cause} & {NO_REFLECTION, EDGE}
     ]
     if not hidden:
         return []
-    one = next(pair for pair in plan.pairs if pair.sample_id == hidden[0])
-    if cause := _below_cone(plan.rigs[one.rig], np.array(plan.spots[one.spot].position_world_m)):
+    first = next(pair for pair in plan.pairs if pair.sample_id == hidden[0])
+    if cause := _below_cone(plan.rigs[first.rig], np.array(plan.spots[first.spot].position_world_m)):
         return [f"{NO_REFLECTION} and {EDGE} of {hidden[0]}: {cause}"]
     return [
         f"{NO_REFLECTION} and {EDGE} of {hidden[0]}: the mirror ends at its rim, before the place that would show the "
@@ -425,8 +428,10 @@ def _traced(plan: Plan, pairs: Iterable[PairPlan]) -> Iterator[PairForecast]:
 def pair_table(pairs: Iterable[PairForecast]) -> list[str]:
     """Lines of a table: sample, D, stroke, and the pixel of the spot in both images or why it is not seen."""
     rows = [("sample", "D m", "stroke m", "down u, v px", "up u, v px")]
-    for one in pairs:
-        places = [f"{t.u_px:.1f}, {t.v_px:.1f}" if t.visible else t.cause for t in (one.down, one.up)]
-        rows.append((one.pair.sample_id, f"{one.depth_m:.3f}", f"{one.pair.stroke_m:.3f}", places[0], places[1]))
+    for forecast in pairs:
+        places = [f"{t.u_px:.1f}, {t.v_px:.1f}" if t.visible else t.cause for t in (forecast.down, forecast.up)]
+        rows.append(
+            (forecast.pair.sample_id, f"{forecast.depth_m:.3f}", f"{forecast.pair.stroke_m:.3f}", places[0], places[1])
+        )
     widths = [max(len(row[k]) for row in rows) for k in range(5)]
     return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]

@@ -35,7 +35,9 @@ _NOT_DRAWN = ("frames", "distractors", "ambient")  # tables on which no draw dep
 def seen_causes(plan: Plan) -> dict[str, Causes]:
     """Causes of both views of every pair by id: those that are known, the others traced; nothing is rendered."""
     open_ = [pair for pair in plan.pairs if pair.sample_id not in plan.seen]
-    traced = {one.pair.sample_id: (one.down.cause, one.up.cause) for one in pair_forecasts(plan, open_)}
+    traced = {
+        forecast.pair.sample_id: (forecast.down.cause, forecast.up.cause) for forecast in pair_forecasts(plan, open_)
+    }
     known = {**plan.seen, **traced}
     return {pair.sample_id: known[pair.sample_id] for pair in plan.pairs}
 
@@ -56,7 +58,7 @@ def read_draws(out: Path, recipe: Recipe, files: RoomFiles) -> Kept:
     # a file of kept draws is a saving alone: without it samples are drawn anew
     except (DatasetError, ValidationError, RoomError):
         return {}
-    return {number: one for number, one in document[1].items() if isinstance(one, str) or _is_draw(one)}
+    return {number: draw for number, draw in document[1].items() if isinstance(draw, str) or _is_draw(draw)}
 
 
 def _is_draw(one: KeptSample) -> bool:

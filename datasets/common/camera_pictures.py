@@ -253,7 +253,7 @@ def _other_format(data: bytes, suffix: str) -> str:
     if data[4:8] == b"ftyp":
         brand = data[8:12]  # ISO base media: after size and "ftyp"
         named = next((name for name, (brands, _) in _BRANDS.items() if brand in brands), None)
-        if named == "HEIC" and any(one in data[16:64] for one in _BRANDS["AVIF"][0]):
+        if named == "HEIC" and any(brand_of_avif in data[16:64] for brand_of_avif in _BRANDS["AVIF"][0]):
             named = "AVIF"
         if named is None:
             return "is a video; `ffmpeg -i FILE %04d.png` takes single frames out of it"

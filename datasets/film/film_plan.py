@@ -120,8 +120,8 @@ def film_scene(plan: Plan, table: FilmTable, pair: PairPlan) -> FilmScene:
     frames = frames_of(carriage, table.rate_hz, drive) if table.frames is None else table.frames
     times = FilmTimes(frames, table.rate_hz, table.exposure_s, table.readout_s, height)
     bands = tuple(
-        Vibration.band(one.axis, one.low_hz, one.high_hz, one.rms_m, *seed, number)
-        for number, one in enumerate(table.vibration)
+        Vibration.band(band.axis, band.low_hz, band.high_hz, band.rms_m, *seed, number)
+        for number, band in enumerate(table.vibration)
     )
     path = SpotPath(tuple(Waypoint(*row) for row in table.path))
     code = BlinkCode(table.code, table.bit_s, table.code_start_s)
@@ -136,7 +136,7 @@ def _lights(plan: Plan, table: FilmTable, pair: PairPlan, code: BlinkCode) -> tu
     room, laser = plan.room(pair.room), plan.recipe.laser
     if laser.albedo == OWN_ALBEDO:  # a light is a disc, which may move; a beam's spot stays where it ends
         laser = laser.model_copy(update={"albedo": _DISC_ALBEDO})
-    return tuple(_light(laser, room, one, code) for one in table.lights)
+    return tuple(_light(laser, room, light, code) for light in table.lights)
 
 
 def _light(laser: LaserTable, room: Room, table: FilmLightTable, code: BlinkCode) -> FilmLight:

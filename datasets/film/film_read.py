@@ -161,7 +161,7 @@ class Film:
         region, (height, width) = self.info.region, self.plan.size
         ambient = np.zeros((3, height, width), np.float32)
         ambient[(slice(None), *region.slices())] = self.room(frame)
-        return film_light(self.plan.scene, ambient, self.spots[frame], [one[frame] for one in self.light_spots])
+        return film_light(self.plan.scene, ambient, self.spots[frame], [images[frame] for images in self.light_spots])
 
     def window(self, frame: int, side_px: int | None = None) -> Region:
         """Pixels of a frame that are drawn: the square around the spot, or the whole image.

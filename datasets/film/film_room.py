@@ -189,7 +189,7 @@ def _frame_between(
     film: FilmPlan, parts: PoseParts, part: int, places: Array, views: NDArray[np.float32], images: Sequence[RowsImage]
 ) -> int | None:
     number, at = parts.places(film.scene.times.frame_s)
-    light = np.array([max(float(one.electrons_per_s.sum()), 0.0) for one in images])
+    light = np.array([max(float(image.electrons_per_s.sum()), 0.0) for image in images])
     mine = number == part
     if not mine.any():
         return None

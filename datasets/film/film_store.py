@@ -192,11 +192,11 @@ def read_view(path: Path, region: Region) -> NDArray[np.float32]:
 def write_spots(path: Path, images: Sequence[RowsImage]) -> None:
     """Write the spot's images of all frames: origins, shapes, and the values one after the other."""
     stacks = [
-        np.stack([one.electrons_per_s, one.du_electrons_per_s_px, one.dv_electrons_per_s_px]).astype("<f4")
-        for one in images
+        np.stack([image.electrons_per_s, image.du_electrons_per_s_px, image.dv_electrons_per_s_px]).astype("<f4")
+        for image in images
     ]
     arrays: dict[str, Any] = {
-        "origin_px": np.array([(one.u0_px, one.v0_px) for one in images], "<i8").reshape(-1, 2),
+        "origin_px": np.array([(image.u0_px, image.v0_px) for image in images], "<i8").reshape(-1, 2),
         "shape_px": np.array([stack.shape[2:] for stack in stacks], "<i8").reshape(-1, 2),
         "images_per_s": np.concatenate([stack.ravel() for stack in stacks] or [np.zeros(0, "<f4")]),
     }
@@ -258,13 +258,13 @@ class FrameTruth:
             "electrons_per_s": list(self.electrons_per_s),
         }
         both = (("", self.at_frame), ("row_", self.at_row))
-        columns = {prefix + name: value for prefix, one in both for name, value in _columns(one).items()}
+        columns = {prefix + name: value for prefix, instant in both for name, value in _columns(instant).items()}
         return head | _light_columns(self.light) | {"row_light_depth_m": self.light_depth_m} | columns
 
 
 def _light_columns(light: SpotLight | None) -> dict[str, Any]:
     """Columns `row_light_`, with NaN where there is no light."""
-    names = [one.name for one in fields(SpotLight)]
+    names = [field.name for field in fields(SpotLight)]
     values = {name: getattr(light, name, (math.nan,) * 3 if name.endswith("_m") else math.nan) for name in names}
     return {f"row_light_{name}": list(v) if isinstance(v, tuple) else v for name, v in values.items()}
 

@@ -111,7 +111,7 @@ def light_images(film: FilmPlan, room: Room, number: int) -> tuple[list[RowsImag
     images, centres = frame_spots(alone, room, times)
     colour = film.scene.lights[number].colour
     if colour is not None:
-        images = [coloured(one, colour) for one in images]
+        images = [coloured(image, colour) for image in images]
     return images, frame_truths(alone, room, times, images, centres)
 
 

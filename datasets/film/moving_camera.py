@@ -169,7 +169,7 @@ def open_baked_rooms(folder: str | Path) -> dict[str, BakedRoom]:
     if not (path / INFO).is_file():
         raise DatasetError(f"{path} holds no baked rooms: it has no {INFO}; make them with `phibench loop bake`")
     info = InputFile(path / INFO, _AGAIN).document(BakedSetInfo)
-    return {one.name: _read(path, one) for one in info.rooms}
+    return {entry.name: _read(path, entry) for entry in info.rooms}
 
 
 def _read(folder: Path, info: BakedRoomInfo) -> BakedRoom:

@@ -133,7 +133,7 @@ def _found(sample: _Sample) -> tuple[Distractor, ...]:
         return ()
     room = sample.dataset.rooms.surfaces(sample.row.room)
     placed = (_placed(sample, room, i, tables[i]) for i in numbers)
-    return tuple(one for one in placed if one is not None)
+    return tuple(distractor for distractor in placed if distractor is not None)
 
 
 def _placed(sample: _Sample, room: Room, number: int, table: DistractorTable) -> Distractor | None:

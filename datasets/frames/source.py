@@ -271,7 +271,7 @@ def _side(sample: SampleLayers, position: str, request: FrameRequest, sensor: Se
         lamp_level=request.lamp_level,
         laser_level=request.laser_level,
         f_number=camera.f_number,
-        others=tuple(one.other(position, request.laser_level) for one in sample.distractors),
+        others=tuple(distractor.other(position, request.laser_level) for distractor in sample.distractors),
     )
     moving = _moving(sample, position, spot, sensor, request.carriage_speed_m_s)
     region = _region(sample.row, position, request.region, light.size)

@@ -55,22 +55,22 @@ def rebuilt(
     )
     by_draw: dict[int, list[int]] = defaultdict(list)
     for number in wanted:
-        if isinstance(one := kept.get(number), KeptSample):
-            by_draw[one.tries].append(number)
+        if isinstance(sample := kept.get(number), KeptSample):
+            by_draw[sample.tries].append(number)
     targets, samples = [target.name for target in recipe.targets], dict[int, RandomSample]()
     for tries, numbers in by_draw.items():
         points = points_of(recipe, table, first, numbers, tries - 1)
         rows = rows_of(draw_values(table, targets, points), len(numbers))
         for number, drawn in zip(numbers, rows, strict=True):
-            one = kept[number]
-            assert isinstance(one, KeptSample)
+            sample = kept[number]
+            assert isinstance(sample, KeptSample)
             try:
-                rigs, spot = drawn_rigs(recipe, dict(drawn)), _spot(recipe, one)
+                rigs, spot = drawn_rigs(recipe, dict(drawn)), _spot(recipe, sample)
             except SceneError:  # of an older draw: it is drawn anew
                 continue
-            place = (rooms[number % len(rooms)], rigs.rig, one.surface, spot)
+            place = (rooms[number % len(rooms)], rigs.rig, sample.surface, spot)
             numbers_of = (rigs.stroke_m, rigs.nominal_rig, rigs.nominal_stroke_m)
-            samples[number] = RandomSample(number, tries, drawn, *place, *numbers_of, one.causes)
+            samples[number] = RandomSample(number, tries, drawn, *place, *numbers_of, sample.causes)
     return samples
 
 

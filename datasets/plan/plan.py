@@ -223,11 +223,13 @@ def _rigs_plan(recipe: Recipe, table: DrawnRigsTable, rig: Rig, room: RoomSource
     """Every experiment with every drawn rig; samples are called after both."""
     drawn = draw_rigs(recipe, table, rig, room_of(room))
     pairs = tuple(
-        replace(pair, sample_id=f"{pair.sample_id}-{one.rig_id}", drawn=one.drawn, tries=one.tries)
-        for one in drawn
-        for pair in _experiment_pairs(recipe, one.misalignment, one.rig_id)
+        replace(pair, sample_id=f"{pair.sample_id}-{drawn_rig.rig_id}", drawn=drawn_rig.drawn, tries=drawn_rig.tries)
+        for drawn_rig in drawn
+        for pair in _experiment_pairs(recipe, drawn_rig.misalignment, drawn_rig.rig_id)
     )
-    return _experiment_plan(recipe, {RECIPE_RIG: rig} | {one.rig_id: one.rig for one in drawn}, room, pairs)
+    return _experiment_plan(
+        recipe, {RECIPE_RIG: rig} | {drawn_rig.rig_id: drawn_rig.rig for drawn_rig in drawn}, room, pairs
+    )
 
 
 def _experiment_pairs(recipe: Recipe, misalignment: Misalignment, rig_id: str) -> tuple[PairPlan, ...]:

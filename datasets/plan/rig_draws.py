@@ -96,7 +96,7 @@ def _made(
     try:
         misalignment = drawn_misalignment(recipe.misalignment, drawn)
         rig = nominal.perturbed(misalignment)
-        strokes_m = {true_stroke_m(misalignment, h) for one in recipe.experiments for h in one.strokes_m}
+        strokes_m = {true_stroke_m(misalignment, h) for experiment in recipe.experiments for h in experiment.strokes_m}
     except SceneError as error:
         return by_keys(str(error))
     faults = (rig_fault(rig, stroke_m, top_m, boards) for stroke_m in sorted(strokes_m))
@@ -107,7 +107,7 @@ def _made(
 def _rig_distributions(table: DrawnRigsTable) -> dict[str, DistributionTable]:
     """Distribution by parameter, in the order of `[misalignment]`."""
     given = ((key, getattr(table.misalignment, key)) for key in type(table.misalignment).model_fields)
-    return {PREFIX + key: one for key, one in given if isinstance(one, DistributionTable)}
+    return {PREFIX + key: distribution for key, distribution in given if isinstance(distribution, DistributionTable)}
 
 
 def _row(values: Mapping[str, Array], k: int) -> dict[str, Value]:

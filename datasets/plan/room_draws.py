@@ -81,7 +81,7 @@ def room_files(recipe: Recipe, files: RoomFiles) -> RoomFiles:
     known = {name: digest for name, digest in pinned.items() if digest is not None}
     files = RoomFiles(files.folder, {**files.digests, **known})
     sources = used_rooms(recipe, files).values() if recipe.rooms is not None and recipe.rooms.exported else ()
-    made = [one.settings.path.as_posix() for one in sources if isinstance(one, PanoramaRoom | MeshRoom)]
+    made = [source.settings.path.as_posix() for source in sources if isinstance(source, PanoramaRoom | MeshRoom)]
     return files.of([*pinned, *(name for name in made if name not in pinned)])
 
 
@@ -107,16 +107,19 @@ def _panoramas(table: RoomsTable, files: RoomFiles, stroke_m: float) -> list[tup
         (
             f"panorama{k:06d}",
             PanoramaRoom(
-                one.settings(stroke_m), files.sha256(one.file), "" if one.mesh is None else files.sha256(one.mesh.file)
+                panorama.settings(stroke_m),
+                files.sha256(panorama.file),
+                "" if panorama.mesh is None else files.sha256(panorama.mesh.file),
             ),
         )
-        for k, one in enumerate(table.panoramas)
+        for k, panorama in enumerate(table.panoramas)
     ]
 
 
 def _meshes(table: RoomsTable, files: RoomFiles, stroke_m: float) -> list[tuple[str, RoomSource]]:
     return [
-        (f"mesh{k:06d}", MeshRoom(one.settings(stroke_m), files.sha256(one.file))) for k, one in enumerate(table.meshes)
+        (f"mesh{k:06d}", MeshRoom(mesh.settings(stroke_m), files.sha256(mesh.file)))
+        for k, mesh in enumerate(table.meshes)
     ]
 
 

@@ -90,7 +90,7 @@ def first_points(
 
     power = max(count - 1, 0).bit_length()  # scipy warns about numbers that are no power of two
     sequences = (qmc.Sobol(PARAMETERS.index(name) + 1, rng=stream) for name, stream in streams.items())
-    return {name: one.random_base2(power)[:count, -1] for name, one in zip(streams, sequences, strict=True)}
+    return {name: points.random_base2(power)[:count, -1] for name, points in zip(streams, sequences, strict=True)}
 
 
 def further_points(
@@ -185,8 +185,10 @@ def draw_samples(
     dataset, held = recipe.dataset, held or {}
     first = first_points(table.sequence, dataset.name, dataset.seed, table.samples, drawn_parameters(table))
     wanted = range(table.samples) if wanted is None else wanted
-    samples = {number: one for number in wanted if isinstance(one := held.get(number), RandomSample)}
-    refused = {number: one for number in wanted if isinstance(one := held.get(number), str)}
+    samples = {
+        number: sample_or_cause for number in wanted if isinstance(sample_or_cause := held.get(number), RandomSample)
+    }
+    refused = {number: sample_or_cause for number in wanted if isinstance(sample_or_cause := held.get(number), str)}
     for k, room_id in enumerate(rooms):  # a room is built once, and let go before the next
         every = range(wanted.start + (k - wanted.start) % len(rooms), wanted.stop, len(rooms))
         if numbers := [number for number in every if number not in held]:
@@ -229,7 +231,11 @@ def have_own_rigs(recipe: Recipe, table: RandomTable) -> bool:
     drawn from an interval; and the recipe's own rig has a name of its own.
     """
     drawn = dict(_sample_distributions(table))
-    spread = {name for name, one in drawn.items() if isinstance(one, DistributionTable) and one.choice is None}
+    spread = {
+        name
+        for name, distribution in drawn.items()
+        if isinstance(distribution, DistributionTable) and distribution.choice is None
+    }
     if spread & {f"rig.{key}" for key in DRAWABLE}:
         return True
     if any(name.startswith("rig.") for name in drawn):
@@ -294,7 +300,9 @@ class _Makers:
     def _reason(self, tries: int, last: str) -> str:
         where = "" if self._room_id == ONLY_ROOM else f" in {self._room_id}"
         boards = " or move the boards" if self._targets else ""
-        spreads = [name for name, one in _sample_distributions(self._table) if len(set(_support(one))) > 1]
+        spreads = [
+            name for name, distribution in _sample_distributions(self._table) if len(set(_support(distribution))) > 1
+        ]
         drawn = f"narrow the distributions ({', '.join(spreads[:4])}{', ...' * (len(spreads) > 4)})" if spreads else ""
         advice = " or ".join(filter(None, ("change the numbers that are fixed", drawn)))
         why = f"{UNDRAWN}{where} in {tries} draws; the last: {last}"
@@ -412,7 +420,7 @@ def draw_values(table: RandomTable, targets: list[str], points: Mapping[str, Arr
         values["spot.target"] = pick(names, points["spot.target"])
     if "spot.hidden" in points and table.spot.hidden is not None:
         hidden = points["spot.hidden"] < table.spot.hidden
-        values["spot.hidden"] = [HIDDEN if one else SHOWN for one in hidden]
+        values["spot.hidden"] = [HIDDEN if is_hidden else SHOWN for is_hidden in hidden]
         if table.spot.hidden_elevation_deg is not None:
             there = quantile(table.spot.hidden_elevation_deg, points["spot.elevation_deg"])
             values["spot.elevation_deg"] = np.where(hidden, there, values.get("spot.elevation_deg", 0.0))

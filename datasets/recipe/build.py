@@ -137,7 +137,7 @@ def idle_mirror_keys(path: str, table: MirrorTable, shapes: Sequence[str] = ()) 
 
 def drawn_mirror_faults(path: str, drawn: Mapping[str, Any], shapes: Sequence[str]) -> list[Fault]:
     """Faults of drawn keys of a mirror that none of its shapes has, or of whose values a shape refuses some."""
-    given = [key for key, one in drawn.items() if one is not None]
+    given = [key for key, value in drawn.items() if value is not None]
     faults = _idle_of_shapes(path, given, shapes)
     if "conic" in given:
         least, most = drawn["conic"].support

@@ -322,8 +322,8 @@ def _holder(raw: Raw) -> Iterator[Fault]:
     """Keys of a holder that none of its kinds has; a drawn kind makes the sizes of each of its names useful."""
     fixed, drawn = table_of(raw, "rig", "holder"), table_of(raw, "random", "rig", "holder")
     sound, chosen = sound_of(fixed, HolderTable), sound_of(drawn, RandomHolderTable)
-    for table, one in ((fixed, sound), (drawn, chosen)):
-        if one is None or ("kind" in table and "kind" not in one.model_fields_set):
+    for table, holder in ((fixed, sound), (drawn, chosen)):
+        if holder is None or ("kind" in table and "kind" not in holder.model_fields_set):
             return  # told by the tables
     assert sound is not None
     assert chosen is not None

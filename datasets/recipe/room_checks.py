@@ -37,8 +37,8 @@ def room_faults(raw: Raw) -> Iterator[Fault]:
     elif "azimuth_deg" not in table_of(raw, "random", "spot"):
         yield Fault("random.spot.azimuth_deg", "missing; in these rooms a ray finds the spot, give its azimuth_deg")
     yield from _counts(raw)
-    for path, one in _file_rooms(raw):
-        if fault := _settings_fault(path, one, raw):
+    for path, table in _file_rooms(raw):
+        if fault := _settings_fault(path, table, raw):
             yield fault
     yield from _ray_height(raw)
 
@@ -133,10 +133,10 @@ def _least_stroke_m(raw: Raw) -> float:
 
 def file_faults(raw: Raw, files: RoomFiles) -> Iterator[Fault]:
     """Files of rooms that are missing, too large, or not those of the stated SHA-256."""
-    for path, one in _file_rooms(raw):
-        yield from _file_fault(path, one, files)
-        if isinstance(one, PanoramaTable) and one.mesh is not None:
-            yield from _file_fault(f"{path}.mesh", one.mesh, files)
+    for path, table in _file_rooms(raw):
+        yield from _file_fault(path, table, files)
+        if isinstance(table, PanoramaTable) and table.mesh is not None:
+            yield from _file_fault(f"{path}.mesh", table.mesh, files)
 
 
 def _file_fault(path: str, one: PanoramaTable | GeometryTable, files: RoomFiles) -> Iterator[Fault]:

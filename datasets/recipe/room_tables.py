@@ -247,14 +247,14 @@ class RoomsTable(Table):
     def pinned(self) -> Mapping[str, str | None]:
         """SHA-256 of the files of all rooms by name, None where the recipe does not state it; in their order."""
         digests: dict[str, str | None] = {}
-        for one in self.file_tables:
-            digests[one.file] = digests.get(one.file) or one.sha256
+        for table in self.file_tables:
+            digests[table.file] = digests.get(table.file) or table.sha256
         return digests
 
     @property
     def file_tables(self) -> tuple[PanoramaTable | GeometryTable, ...]:
         """All tables that name a file."""
-        geometries = (one.mesh for one in self.panoramas if one.mesh is not None)
+        geometries = (panorama.mesh for panorama in self.panoramas if panorama.mesh is not None)
         return (*self.panoramas, *geometries, *self.meshes)
 
 

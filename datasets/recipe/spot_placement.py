@@ -64,7 +64,10 @@ def cut_part(view: View, plate: Cuboid) -> str | None:
     """
     if plate.distance_m(view.sphere_centre_m) <= view.rig.mirror.bound_m:
         return "mirror"
-    boxes = [Cuboid(one.name, one.T_world_shape, one.size_m) for one in view.holder_shapes]
+    boxes = [
+        Cuboid(part_of_holder.name, part_of_holder.T_world_shape, part_of_holder.size_m)
+        for part_of_holder in view.holder_shapes
+    ]
     if (tube := view.tube) is not None:
         middle = tube.origin_m + 0.5 * (tube.low_m + tube.high_m) * tube.axis
         upright = replace(boxes[0].T_world_shape, translation_m=as_vector(middle))

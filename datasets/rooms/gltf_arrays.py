@@ -74,7 +74,7 @@ class GltfDocument:
         """List of tables at the root."""
         if key not in self._rows:  # looked at once: a thousand nodes ask for it a thousand times
             entries = self.tree.get(key, [])
-            if not isinstance(entries, list) or not all(isinstance(one, dict) for one in entries):
+            if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
                 raise self.file.fault(f"is damaged: '{key}' is not a list of tables")
             self._rows[key] = entries
         return self._rows[key]

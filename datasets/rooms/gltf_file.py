@@ -184,9 +184,9 @@ class _Reader:
             raise self.file.fault(f"has copies of '{shown}' as instances (EXT_mesh_gpu_instancing): make them nodes")
         weights = node.get("weights", mesh.get("weights", []))
         primitives = mesh.get("primitives", [])
-        if not isinstance(primitives, list) or not all(isinstance(one, dict) for one in primitives):
+        if not isinstance(primitives, list) or not all(isinstance(primitive, dict) for primitive in primitives):
             raise self.file.fault("is damaged: 'primitives' is not a list of tables")
-        parts = (self._of_primitive(label, one, transform, weights) for one in primitives)
+        parts = (self._of_primitive(label, primitive, transform, weights) for primitive in primitives)
         return [part for part in parts if part is not None]
 
     def _of_primitive(self, label: str, primitive: dict[str, Any], transform: Array, weights: Any) -> MeshPart | None:

@@ -92,9 +92,9 @@ def _lamps(settings: MeshSettings, parts: list[MeshPart]) -> tuple[tuple[Rectang
     """Rectangles that shine evenly, the strongest of them as lamps, and all other parts."""
     lamps = [
         rectangle(
-            f"lamp_{k}", one.centre_m, one.normal, one.size_m, texture=_BLACK, radiance_w_m2_sr=one.radiance_w_m2_sr
+            f"lamp_{k}", lamp.centre_m, lamp.normal, lamp.size_m, texture=_BLACK, radiance_w_m2_sr=lamp.radiance_w_m2_sr
         )
-        for k, one in enumerate(settings.lamps, 1)
+        for k, lamp in enumerate(settings.lamps, 1)
     ]
     rectangles: list[tuple[float, Rectangle, int, NDArray[np.bool_]]] = []
     for number, part in enumerate(parts):

@@ -273,7 +273,7 @@ class DatasetInfo(Document):
     @property
     def causes(self) -> dict[str, str]:
         """Cause by id of the samples that were left out."""
-        return {one.sample_id: one.cause for one in self.left_out}
+        return {sample.sample_id: sample.cause for sample in self.left_out}
 
 
 # Lines and columns.

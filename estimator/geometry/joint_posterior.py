@@ -161,7 +161,7 @@ def _first_box(
     if image.status != Status.OK:
         return None
     G = np.asarray(image.jacobian)
-    extent = [np.array([np.ptp(one.u_px), np.ptp(one.v_px)]) for one in (down, up)]
+    extent = [np.array([np.ptp(image_map.u_px), np.ptp(image_map.v_px)]) for image_map in (down, up)]
     along = G[:, 2] / float(G[:, 2] @ G[:, 2])
     reach = float(np.abs(along) @ (extent[1] + np.abs(G[:, :2]) @ extent[0]))
     return [

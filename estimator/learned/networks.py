@@ -274,7 +274,9 @@ def weight_shapes(name: str) -> dict[str, tuple[int, ...]]:
         [("cells", (3, CONVOLUTIONS[-1][2], 1, 1), 3)] if name == CROP else [("heat", (1, DETECTOR[-1][2], 1, 1), 1)]
     )
     layers = CONVOLUTIONS if name == CROP else DETECTOR
-    sizes: list[tuple[str, tuple[int, ...], int]] = [(one[0], (one[2], one[1], 3, 3), one[2]) for one in layers]
+    sizes: list[tuple[str, tuple[int, ...], int]] = [
+        (layer[0], (layer[2], layer[1], 3, 3), layer[2]) for layer in layers
+    ]
     sizes += [*of_cells, *((key, (of, to), to) for key, of, to in DENSE if name == CROP)]
     return {f"{key}{end}": shape for key, w, b in sizes for end, shape in ((".w", w), (".b", (b,)))}
 

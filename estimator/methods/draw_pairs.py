@@ -141,7 +141,7 @@ def pairs_of(
     few = replace(dataset, rows=tuple(sample.row for sample in samples))
     chosen = sorted(pair_draws(few, preset, draws), key=lambda pair_draw: (order[pair_draw.sample_id], pair_draw.draw))
     counts = (1, 1) if frames is None else (frames.on, frames.off)
-    numbered = (replace(one, number=k, laser_off=laser_off, frames=counts) for k, one in enumerate(chosen))
+    numbered = (replace(draw, number=k, laser_off=laser_off, frames=counts) for k, draw in enumerate(chosen))
     return DrawnPairs(few, tuple(numbered))
 
 

@@ -45,7 +45,7 @@ def kept(pair: Pair, separate: Answer, together: Answer) -> Answer:
     """The answer for both images together; the separate one where a spot of it left its detection."""
     detections = detected(pair)
     for position in POSITIONS:
-        one, spot = getattr(detections, position), getattr(together, position)
-        if one is not None and left_px(one, spot) is not None:
+        detection, spot = getattr(detections, position), getattr(together, position)
+        if detection is not None and left_px(detection, spot) is not None:
             return separate
     return together

@@ -132,9 +132,9 @@ def claimed_px2(uv_px: Array, covariance_px2: Array, likelihood: Callable[[], Sp
     The mean square of the posterior about the fit's place holds other minima as well. None where the posterior has no
     end near the place: nothing can be claimed then.
     """
-    if np.trace(covariance_px2) < 2.0 * FAINT_PX**2 or (one := likelihood()) is None:
+    if np.trace(covariance_px2) < 2.0 * FAINT_PX**2 or (of_spot := likelihood()) is None:
         return covariance_px2
-    posterior = None if (places := likelihood_map(one)) is None else single_posterior(places)
+    posterior = None if (places := likelihood_map(of_spot)) is None else single_posterior(places)
     if posterior is None:
         return None
     mean, covariance = posterior

@@ -100,7 +100,7 @@ class SharedPair(Pair):
     @classmethod
     def of(cls, pair: Pair) -> SharedPair:
         """The same pair, nothing done."""
-        return cls(**{one.name: getattr(pair, one.name) for one in fields(Pair)})
+        return cls(**{field.name: getattr(pair, field.name) for field in fields(Pair)})
 
 
 def once(pair: Pair, stage: str, make: Callable[[Pair], T]) -> T:

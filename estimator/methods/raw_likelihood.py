@@ -193,8 +193,8 @@ def with_posteriors(pair: Pair, separate: Answer) -> Answer:
 def _with_posterior(pair: Pair, position: str, spot: Spot, depth_m: float | None) -> Spot:
     if spot.covariance_px2 is None or np.trace(spot.covariance_px2) < 2.0 * FAINT_PX**2:
         return spot
-    one = _likelihood(pair, position, spot, depth_m)
-    places = None if one is None else likelihood_map(one)
+    of_spot = _likelihood(pair, position, spot, depth_m)
+    places = None if of_spot is None else likelihood_map(of_spot)
     posterior = None if places is None else single_posterior(places)
     return spot if posterior is None else _joint_spot(*posterior)
 
@@ -263,7 +263,7 @@ def _combined(pair: Pair, separate: Answer) -> Answer:
 
 def _posterior(pair: Pair, likelihoods: Sequence[SpotLikelihood | None]) -> JointPosterior | None:
     """Posterior of both images; None where one has no likelihood about its fit."""
-    down, up = (None if one is None else likelihood_map(one) for one in likelihoods)
+    down, up = (None if likelihood is None else likelihood_map(likelihood) for likelihood in likelihoods)
     return None if down is None or up is None else joint_posterior(pair.rig, pair.stroke_m, down, up)
 
 

@@ -256,11 +256,11 @@ def spot_window(
     """
     planes = _checked(image, card, image.shape[-1])
     region, corner = _region(planes[0], origin[0], card, background, 0, size_px)
-    one = blur.each(1)
-    lens = SpotBlur(np.asarray(one.sigma_px))
+    single = blur.each(1)
+    lens = SpotBlur(np.asarray(single.sigma_px))
     start = first_fit(planes, origin, card, lens, model.response, background, uv_px)[0]
     chain = _chain(card, background)
-    window, first = region_window(region, chain, uv_px - origin[0] - corner, one, model)
+    window, first = region_window(region, chain, uv_px - origin[0] - corner, single, model)
     place = first + corner + origin[0]
     start[:2] = uv_px - place
     return window, start, place

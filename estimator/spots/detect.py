@@ -160,8 +160,8 @@ def _single(down: Candidates, up: Candidates, rows: tuple[int | None, int | None
     """One candidate, the more significant of two: both could not be one point."""
     if rows[0] is None or rows[1] is None:
         return Choice(rows[0], rows[1])
-    one = down.z[rows[0]] >= up.z[rows[1]]
-    return Choice(rows[0] if one else None, None if one else rows[1], apart=True)
+    in_down = down.z[rows[0]] >= up.z[rows[1]]
+    return Choice(rows[0] if in_down else None, None if in_down else rows[1], apart=True)
 
 
 # -- detection -------------------------------------------------------------------------------------------------------

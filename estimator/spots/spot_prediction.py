@@ -90,7 +90,7 @@ def _parts(view: View, uv_px: Array, point_m: Array | None, lens_px2: Array, of_
     if point_m is None:
         ray = reflect(view, uv_px)
         point_m = ray.origin_world_m + _FAR_M * ray.direction_world
-    places, shares = (np.array(x) for x in zip(*(_through(view, one, point_m) for one in lens_m), strict=True))
+    places, shares = (np.array(x) for x in zip(*(_through(view, place_m, point_m) for place_m in lens_m), strict=True))
     if not np.isfinite(places).all():
         return None
     weights = weights * shares

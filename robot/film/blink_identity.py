@@ -144,8 +144,8 @@ def evidence(electrons: Array, sigma_e: Array, exposures: Sequence[Exposures], b
     bits : str
     """
     best = Evidence(-math.inf)
-    for phase, one in enumerate(exposures):
-        of_phase = _of_phase(electrons, sigma_e, one, bits)
+    for phase, exposure in enumerate(exposures):
+        of_phase = _of_phase(electrons, sigma_e, exposure, bits)
         if of_phase.log_odds > best.log_odds:
             best = replace(of_phase, phase=phase)
     return replace(best, log_odds=best.log_odds - math.log(len(exposures)))
@@ -275,7 +275,7 @@ class TargetTracker:
     ) -> None:
         _check(times, codes)
         self.rig, self.times, self.card = rig, times, card
-        self._states = {one.name: _Search(one, one.dark_frames(times.rate_hz)) for one in codes}
+        self._states = {target.name: _Search(target, target.dark_frames(times.rate_hz)) for target in codes}
         tentative = max(state.dark_frames for state in self._states.values())
         self.tracker = SpotTracker(
             FrameSearch(rig, card, box), max(round(patience_s * times.rate_hz), tentative), tentative
@@ -398,17 +398,17 @@ class TargetTracker:
         """Lock on the brightest light that has the code, once no brighter one may have it: a reflection is fainter."""
         taken = {id(other.hold.track) for other in self._states.values() if other.hold is not None}
         candidates = [
-            (one, track)
+            (told, track)
             for track in self.tracker.live
             if id(track) not in taken
             and (track.dark <= state.dark_frames if track is state.past else self._may_lock(state, track))
-            and (one := self.evidence(state, track)).log_odds > 0.0
+            and (told := self.evidence(state, track)).log_odds > 0.0
         ]
         sure = [pair for pair in candidates if pair[0].log_odds >= (REGAIN if pair[1] is state.past else LOCK)]
         if not sure:
             return
         best, track = max(sure, key=lambda pair: pair[0].electrons)
-        if any(one.electrons > best.electrons for one, _ in candidates):
+        if any(told.electrons > best.electrons for told, _ in candidates):
             return
         state.hold = Hold(state.code.name, track, self.frame, log_odds=best.log_odds)
         self.holds.append(state.hold)
@@ -423,7 +423,7 @@ class TargetTracker:
         """
         self.first_lock(name)
         places: dict[int, tuple[float, float]] = {}
-        for hold in (one for one in self.holds if one.target == name):
+        for hold in (kept for kept in self.holds if kept.target == name):
             track, first = hold.track, hold.locked - math.floor(LOCK / math.log(2.0))
             last = hold.lost if hold.lost >= 0 else track.last
             for number, uv, seen in zip(track.frames.tolist(), track.uv_px, track.detected, strict=True):
@@ -476,11 +476,11 @@ def track_targets(
 def _check(times: FilmTimes, codes: Sequence[TargetCode]) -> None:
     if not codes:
         raise SceneError("no code to look for; give a TargetCode for each target")
-    if len({one.name for one in codes}) < len(codes):
-        raise SceneError(f"targets {[one.name for one in codes]} share a name; name each differently")
-    for one in codes:
-        if times.duration_s < one.code.duration_s * (1.0 - 1e-9):  # a film of just so many frames holds it
+    if len({target.name for target in codes}) < len(codes):
+        raise SceneError(f"targets {[target.name for target in codes]} share a name; name each differently")
+    for target in codes:
+        if times.duration_s < target.code.duration_s * (1.0 - 1e-9):  # a film of just so many frames holds it
             raise SceneError(
-                f"film of {times.frames} frames takes {times.duration_s:.3g} s, and the code of '{one.name}' "
-                f"{one.code.duration_s:.3g} s: give a film that holds the whole code, or a shorter code"
+                f"film of {times.frames} frames takes {times.duration_s:.3g} s, and the code of '{target.name}' "
+                f"{target.code.duration_s:.3g} s: give a film that holds the whole code, or a shorter code"
             )

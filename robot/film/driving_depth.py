@@ -262,10 +262,10 @@ class _Problem:
         columns = np.zeros((len(poses), 2, len(PARAMETERS)))
         for number, name in enumerate(PARAMETERS if self.parts.size else ()):
             if name not in STROKE_PARAMETERS:
-                one = MISALIGNMENT[name]
-                rigs = [one.apply(self.rig, sign * one.step) for sign in (1.0, -1.0)]
+                parameter = MISALIGNMENT[name]
+                rigs = [parameter.apply(self.rig, sign * parameter.step) for sign in (1.0, -1.0)]
                 after, before = (self._images(rig, X, poses, frames)[0] for rig in rigs)
-                columns[:, :, number] = (after - before) / (2.0 * one.step)
+                columns[:, :, number] = (after - before) / (2.0 * parameter.step)
         return columns
 
     def result(self, x: Array) -> DrivingDepth:
@@ -332,7 +332,7 @@ def driving_film_depth(
     for _ in range(_ROUNDS):
         times = frames.times.row_s(numbers.astype(float), places[:, 1])
         # tracks are read with every frame, and run evenly from one to the next
-        tracks = np.stack([np.interp(times, frames.times.frame_s, one) for one in read.T], axis=1)
+        tracks = np.stack([np.interp(times, frames.times.frame_s, column) for column in read.T], axis=1)
         way = RobotWay(drive.vehicle, tracks, drive.state(times)[:, 3])
         depth = driving_depth(frames.rig, way, _spread(positions, on, len(numbers)), covariance_rig)
         if abs(depth.depth_m[0] - before_m) < _SAME * depth.sigma_m[0]:

@@ -212,9 +212,9 @@ def rig_derivatives(rig: Rig, X: Array, offsets: Array, by_offset: Array) -> Arr
             share = offsets if name == "stroke_relative" else offsets / offsets.max()  # of a stroke that long
             columns.append((share[:, None] * by_offset).ravel())
             continue
-        one = MISALIGNMENT[name]
-        after, before = (_predicted(one.apply(rig, sign * one.step), X, offsets).uv for sign in (1.0, -1.0))
-        columns.append((after - before) / (2.0 * one.step))
+        parameter = MISALIGNMENT[name]
+        after, before = (_predicted(parameter.apply(rig, sign * parameter.step), X, offsets).uv for sign in (1.0, -1.0))
+        columns.append((after - before) / (2.0 * parameter.step))
     return np.stack(columns, axis=1)
 
 

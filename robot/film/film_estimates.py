@@ -252,7 +252,7 @@ def track_film(
             'view = "full" in [film]'
         )
     codes = [TargetCode(TARGET, scene.code, phase_known)]
-    codes += [TargetCode(one.name, one.code, phase_known) for one in scene.lights if one.is_target]
+    codes += [TargetCode(light.name, light.code, phase_known) for light in scene.lights if light.is_target]
     tracker = TargetTracker(film.plan.nominal.rig, card_of(film.sensor(preset)), scene.times, codes)
     told = film.table["encoder_m"].to_numpy()
     driven = np.abs(np.diff(scene.robot_state(scene.times.frame_s), axis=0, prepend=0.0)).max(axis=1)

@@ -160,7 +160,7 @@ class FrameSearch:
         lit, dark = x.sum(axis=0), (1.0 - x).sum(axis=0)
         if min(lit.min(), dark.min()) < 1.0:
             return np.zeros((0, 2))
-        reds = np.stack([one.values_e[0] for one in frames])
+        reds = np.stack([frame.values_e[0] for frame in frames])
         on, off = (
             np.einsum("nr,nrc->rc", np.asarray(weights, np.float32), reds) for weights in (x / lit, (1.0 - x) / dark)
         )
@@ -180,7 +180,7 @@ class FrameSearch:
     ) -> Array:
         """Places relative to the box, shape (n, 2), that are brighter than before; `scale` is that of the noise."""
         step = 2 if planes.mosaic else 1
-        now, then = (one.values_e[0][::step, ::step] for one in (planes, before))
+        now, then = (frame.values_e[0][::step, ::step] for frame in (planes, before))
         z = (now - then) / scale / np.sqrt(2.0 * variance_e2(np.maximum(now, then), self.card, True))
         kernel = np.array([_SIDE_SHARE, 1.0, _SIDE_SHARE]) / math.sqrt(1.0 + 2.0 * _SIDE_SHARE**2)
         z = correlate1d(correlate1d(z, kernel, axis=0), kernel, axis=1) * where[::step, ::step]
@@ -375,7 +375,11 @@ class SpotTracker:
         frames, earlier = list(self._before)[-len(levels) :], {}
         start = self.frame - len(frames) + 1
         for uv in self.search.following(frames, levels):
-            near = [one for one in self.live if np.linalg.norm(np.array(one.place_px) - uv) < _SAME_PX]
+            near = [
+                other_track
+                for other_track in self.live
+                if np.linalg.norm(np.array(other_track.place_px) - uv) < _SAME_PX
+            ]
             light = np.concatenate([self.search.light(planes, uv) for planes in frames], axis=1)
             if near:
                 for track in near:

@@ -210,7 +210,7 @@ def _upright(boxes: Boxes) -> Boxes:
 
 def baked_arenas(folder: str | Path) -> tuple[Arena, ...]:
     """Arenas of the baked rooms in a folder (`phibench loop bake`), of which there are pixels."""
-    return tuple(replace(arena_of(one.room), baked=one) for one in open_baked_rooms(folder).values())
+    return tuple(replace(arena_of(baked.room), baked=baked) for baked in open_baked_rooms(folder).values())
 
 
 def generated_arena(*stream: Name) -> Arena:

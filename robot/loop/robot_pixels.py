@@ -181,9 +181,9 @@ class SpotReader:
         readings = [reading for window in windows for reading in self._in_window(window, card)]
         readings.sort(key=lambda reading: -reading.electrons)
         apart: list[SpotReading] = []
-        for one in readings:
-            if all(math.hypot(one.u_px - other.u_px, one.v_px - other.v_px) > _APART_PX for other in apart):
-                apart.append(one)
+        for brightest in readings:
+            if all(math.hypot(brightest.u_px - other.u_px, brightest.v_px - other.v_px) > _APART_PX for other in apart):
+                apart.append(brightest)
         return tuple(sorted(apart[:_MOST_SPOTS]))
 
     def _in_window(self, window: Window, card: SensorCard) -> list[SpotReading]:

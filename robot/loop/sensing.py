@@ -174,8 +174,8 @@ class Sensing:
         seen = [self._image(light, R, origin, stroke_m) for light in lights]
         hidden = self._hidden(seen, placement, stroke_m, arena)
         return [
-            self._reading(one, light.power, exposure, rng, stands)
-            for one, light, stands in zip(seen, lights, hidden, strict=True)
+            self._reading(image, light.power, exposure, rng, stands)
+            for image, light, stands in zip(seen, lights, hidden, strict=True)
         ]
 
     def unhidden(
@@ -190,13 +190,13 @@ class Sensing:
         seen = [self._image(light, R, origin, stroke_m) for light in lights]
         robot = self._hidden(seen, placement, stroke_m, None, robot=True)
         result: list[tuple[float, float] | str] = []
-        for one, light, stands in zip(seen, lights, robot, strict=True):
-            if one is None:
+        for image, light, stands in zip(seen, lights, robot, strict=True):
+            if image is None:
                 result.append(OUTSIDE)
-            elif stands or one.facing <= 0.0 or self._in_shadow(one, light, placement, stroke_m, arena.baked):
+            elif stands or image.facing <= 0.0 or self._in_shadow(image, light, placement, stroke_m, arena.baked):
                 result.append(HIDDEN)
             else:
-                result.append((one.image.u_px, one.image.v_px))
+                result.append((image.image.u_px, image.image.v_px))
         return result
 
     def _in_shadow(
@@ -240,18 +240,18 @@ class Sensing:
 
         Without an arena nothing does, or the `robot` alone.
         """
-        found = [one for one in seen if one is not None]
+        found = [image for image in seen if image is not None]
         if (arena is None and not robot) or not found:
             return [False] * len(seen)
-        own = np.array([one.own_m for one in found])
-        mirror = np.array([self.imager.mirror_point_m(one.image, *one.lowered_m.tolist()) for one in found])
+        own = np.array([image.own_m for image in found])
+        mirror = np.array([self.imager.mirror_point_m(image.image, *image.lowered_m.tolist()) for image in found])
         mirror += stroke_m * self._axis
         R, origin = placement
         stands = self._robot.block(mirror, own)
         if arena is not None:
             stands |= arena.sight.block(mirror @ R.T + origin, own @ R.T + origin)
         each = iter(stands.tolist())
-        return [one is not None and next(each) for one in seen]
+        return [image is not None and next(each) for image in seen]
 
 
 # -- directions of pixels --------------------------------------------------------------------------------------------

@@ -143,10 +143,10 @@ class SmoothedBelief(Belief):
 
     def update(self, seen: Direction, stroke_m: float, held: Stance | None = None) -> None:
         """Take in a direction, after `predict`; one that the rig as believed cannot see says nothing."""
-        one = self._frame(seen, stroke_m, held)
-        if not np.isfinite(self._residuals(self._x, one)).all():
+        frame = self._frame(seen, stroke_m, held)
+        if not np.isfinite(self._residuals(self._x, frame)).all():
             return
-        self._frames = self._frames.joined(one)
+        self._frames = self._frames.joined(frame)
         if len(self._frames.time_s) > _MOST_FRAMES:
             self._frames = self._frames.thinned()
         self._solve()
@@ -252,7 +252,7 @@ class SmoothedBelief(Belief):
         if self._latest is not None and self._latest[0][0] is seen and self._latest[0][1:] == when[1:]:
             return self._latest[1]
         R, t = self._tilt(held)
-        one = FrameHistory(
+        frame = FrameHistory(
             seen.uv_px[None],
             seen.covariance_px2[None],
             np.array([stroke_m]),
@@ -264,8 +264,8 @@ class SmoothedBelief(Belief):
             np.array([seen.shared_px]),
             np.array([seen.stroke_sigma_m]),
         )
-        self._latest = when, one
-        return one
+        self._latest = when, frame
+        return frame
 
     def _view_rays(self, uv_px: Array, stroke_m: Array) -> Array:
         """Rays of pixels by the middle rig and those beside it, shape (N, m + 1, 3, 3, 3)."""

@@ -44,10 +44,10 @@ class SpotPath:
     waypoints: tuple[Waypoint, ...] = ()
 
     def __post_init__(self) -> None:
-        for one in self.waypoints:
+        for waypoint in self.waypoints:
             for name in ("time_s", "across_m", "up_m"):
-                finite("Waypoint", name, getattr(one, name))
-        times = [one.time_s for one in self.waypoints]
+                finite("Waypoint", name, getattr(waypoint, name))
+        times = [waypoint.time_s for waypoint in self.waypoints]
         if any(after <= before for before, after in itertools.pairwise(times)):
             raise SceneError(f"SpotPath: times {times} of the waypoints must rise")
 
@@ -70,7 +70,7 @@ class SpotPath:
 
     @property
     def _table(self) -> tuple[Array, Array]:
-        rows = np.array([(one.time_s, one.across_m, one.up_m) for one in self.waypoints])
+        rows = np.array([(waypoint.time_s, waypoint.across_m, waypoint.up_m) for waypoint in self.waypoints])
         return rows[:, 0], rows[:, 1:]
 
 
@@ -173,8 +173,8 @@ class FilmScene:
 
     def of_light(self, number: int) -> FilmScene:
         """Same film with another light in place of the target's spot."""
-        one = self.lights[number]
-        return replace(self, spot=one.spot, path=one.path, code=one.code, lights=())
+        light = self.lights[number]
+        return replace(self, spot=light.spot, path=light.path, code=light.code, lights=())
 
     def offset_m(self, times_s: Times) -> Array:
         """Carriage and vibration along the stroke axis."""

@@ -211,7 +211,7 @@ def tried(both: Binocular, heights_m: Sequence[float], laws: Laws, light: Array,
         "depth_m": [replace(both, depth_m=depth) for depth in laws.depths_m],
         "apart_m": [replace(both, apart_m=apart) for apart in laws.apart_m],
     }
-    tries = {of: [gain(one, light, sensor, laws.draws) for one in pairs] for of, pairs in varied.items()}
+    tries = {of: [gain(pair, light, sensor, laws.draws) for pair in pairs] for of, pairs in varied.items()}
     gains = {of: [row for row in rows if row is not None] for of, rows in tries.items()}
     return binocular_findings(shares, {of: rows for of, rows in gains.items() if len(rows) >= _LEAST_FITS})
 

@@ -22,10 +22,10 @@ def noise_drawing(curves: Mapping[str, tuple[Array, Array]], noise: Mapping[str,
             if name not in noise:
                 continue
             rows = noise[name]
-            value = np.array([1e3 * one.scatter_m.value for one in rows])
-            low, high = (np.array([1e3 * getattr(one.scatter_m, end) for one in rows]) for end in ("low", "high"))
+            value = np.array([1e3 * row.scatter_m.value for row in rows])
+            low, high = (np.array([1e3 * getattr(row.scatter_m, end) for row in rows]) for end in ("low", "high"))
             error = np.nan_to_num(np.maximum([value - low, high - value], 0.0))
-            places = [one.azimuth_deg for one in rows]
+            places = [row.azimuth_deg for row in rows]
             marks = {**line_style(i), "linestyle": "none", "markersize": 4}
             ax.errorbar(places, value, error, label=f"{name}, measured", capsize=3, **marks)
         ax.set_yscale("log")
@@ -77,5 +77,5 @@ def lines_drawing(aligned: Sequence[Line], tilted: Sequence[Line], centre_px: Ar
 
 
 def _range(rows: Sequence[AzimuthNoise]) -> str:
-    values = [1e3 * one.scatter_m.value for one in rows]
+    values = [1e3 * row.scatter_m.value for row in rows]
     return f"{min(values):.2g} to {max(values):.2g}"

@@ -246,9 +246,12 @@ def azimuth_noise(pair: BaselinePair, sensor: Sensor, draws: int, baseline: str,
 
 def isotropy(noise: Sequence[AzimuthNoise], false_alarm: float) -> Isotropy:
     """Test whether the scatter is the same at all azimuths, and whether it is relative to each spot's bound."""
-    scatter = [one.scatter_m.value for one in noise if one.errors_m.size > 1]
+    scatter = [at_azimuth.scatter_m.value for at_azimuth in noise if at_azimuth.errors_m.size > 1]
     ratio = max(scatter) / min(scatter) if scatter else math.nan
-    plain, scaled = ([one.errors_m for one in noise], [one.errors_m / one.bound_m for one in noise])
+    plain, scaled = (
+        [at_azimuth.errors_m for at_azimuth in noise],
+        [at_azimuth.errors_m / at_azimuth.bound_m for at_azimuth in noise],
+    )
     return Isotropy(_equal_scatter(plain), _equal_scatter(scaled), false_alarm, ratio)
 
 

@@ -245,19 +245,19 @@ def _noise_table(noise: dict[str, tuple[AzimuthNoise, ...]]) -> pl.DataFrame:
         [
             {
                 "baseline": name,
-                "azimuth_deg": one.azimuth_deg,
-                "depth_m": one.depth_m,
-                "bound_m": one.bound_m,
-                "scatter_m": one.scatter_m.value,
-                "scatter_low_m": one.scatter_m.low,
-                "scatter_high_m": one.scatter_m.high,
-                "bias_m": one.bias_m,
-                "bias_sigma_m": one.bias_sigma_m,
-                "draws": len(one.errors_m),
-                "missing": one.missing,
+                "azimuth_deg": row.azimuth_deg,
+                "depth_m": row.depth_m,
+                "bound_m": row.bound_m,
+                "scatter_m": row.scatter_m.value,
+                "scatter_low_m": row.scatter_m.low,
+                "scatter_high_m": row.scatter_m.high,
+                "bias_m": row.bias_m,
+                "bias_sigma_m": row.bias_sigma_m,
+                "draws": len(row.errors_m),
+                "missing": row.missing,
             }
             for name, rows in noise.items()
-            for one in rows
+            for row in rows
         ]
     )
 
@@ -285,7 +285,7 @@ def _columns(values: dict[str, Array], what: str) -> dict[str, Array]:
 
 
 def _notes(noise: dict[str, tuple[AzimuthNoise, ...]]) -> tuple[str, ...]:
-    lost = {name: sum(one.missing for one in rows) for name, rows in noise.items()}
+    lost = {name: sum(row.missing for row in rows) for name, rows in noise.items()}
     missing = [f"{name}: {n} fits found no spot and are left out" for name, n in lost.items() if n]
     return (
         *missing,
@@ -300,10 +300,10 @@ def _notes(noise: dict[str, tuple[AzimuthNoise, ...]]) -> tuple[str, ...]:
 def scatter_findings(name: str, noise: Sequence[AzimuthNoise], test: Isotropy) -> Iterator[Finding]:
     """Smallest and largest scatter of one baseline, and the tests of isotropy; none with too few azimuths."""
     for word, pick in (("smallest", min), ("largest", max)):
-        one = pick(noise, key=lambda each: each.scatter_m.value)
-        ends = (one.scatter_m.value, one.scatter_m.low, one.scatter_m.high)
+        azimuth = pick(noise, key=lambda each: each.scatter_m.value)
+        ends = (azimuth.scatter_m.value, azimuth.scatter_m.low, azimuth.scatter_m.high)
         yield Finding.ranged(f"{name}: {word} scatter of D", ends, "mm", 1e3)
-        yield Finding(f"{name}: azimuth of the {word} scatter", one.azimuth_deg, unit="deg")
+        yield Finding(f"{name}: azimuth of the {word} scatter", azimuth.azimuth_deg, unit="deg")
     yield Finding(f"{name}: D", noise[0].depth_m, unit="m")
     if test.tested:
         yield Finding(f"{name}: largest over smallest scatter", test.ratio)
@@ -330,10 +330,10 @@ def grid_findings(single: Array, averaged: Array) -> Iterator[Finding]:
 
     The mosaic's grid makes the difference where averaging takes away more than half of the excess over 1.
     """
-    one, mean = ratio(single), ratio(averaged)
-    yield Finding("even background: largest over smallest bound", one)
+    of_single, mean = ratio(single), ratio(averaged)
+    yield Finding("even background: largest over smallest bound", of_single)
     yield Finding("even background: the same, averaged over places in a Bayer cell", mean).judged(
-        "<=", 1.0 + 0.5 * (one - 1.0)
+        "<=", 1.0 + 0.5 * (of_single - 1.0)
     )
 
 
@@ -406,14 +406,14 @@ def noise_rows(noise: Mapping[str, Sequence[AzimuthNoise]]) -> tuple[Row, ...]:
         *(
             (
                 name,
-                f"{one.azimuth_deg:.0f}",
-                f"{1e3 * one.bound_m:.2f}",
-                _interval(one),
-                f"{1e3 * one.bias_m:+.2f} +- {1e3 * one.bias_sigma_m:.2f}",
-                str(one.missing),
+                f"{row.azimuth_deg:.0f}",
+                f"{1e3 * row.bound_m:.2f}",
+                _interval(row),
+                f"{1e3 * row.bias_m:+.2f} +- {1e3 * row.bias_sigma_m:.2f}",
+                str(row.missing),
             )
             for name, rows in noise.items()
-            for one in rows
+            for row in rows
         ),
     )
 

@@ -169,15 +169,17 @@ def summary(episodes: Sequence[Episode]) -> ConditionSummary:
 
     The share has the exact interval of Clopper and Pearson, as every rate of this package.
     """
-    reached = [one for one in episodes if one.reached]
+    reached = [episode for episode in episodes if episode.reached]
     low, high = scipy.stats.binomtest(len(reached), len(episodes)).proportion_ci(method="exact")
-    pulls = np.array([one.pull for one in episodes if math.isfinite(one.pull)])
-    errors = np.array([one.stated_m / one.distance_m - 1.0 for one in episodes if math.isfinite(one.stated_m)])
+    pulls = np.array([episode.pull for episode in episodes if math.isfinite(episode.pull)])
+    errors = np.array(
+        [episode.stated_m / episode.distance_m - 1.0 for episode in episodes if math.isfinite(episode.stated_m)]
+    )
     return ConditionSummary(
         (len(reached) / len(episodes), float(low), float(high)),
-        interval([one.time_s for one in reached]),
-        interval([one.driven_m for one in reached]),
-        interval([one.strokes for one in reached]),
+        interval([episode.time_s for episode in reached]),
+        interval([episode.driven_m for episode in reached]),
+        interval([episode.strokes for episode in reached]),
         interval(pulls, rms),
         interval(errors, rms),
     )
@@ -204,8 +206,10 @@ def interval(values: Sequence[float] | Array, statistic: Callable[..., Any] = np
 
 def delay(episodes: Sequence[Episode], base: Sequence[Episode]) -> tuple[float, float, float]:
     """Mean difference in time from the base, over episodes that both reached."""
-    times = {one.number: one.time_s for one in base if one.reached}
-    return interval([one.time_s - times[one.number] for one in episodes if one.reached and one.number in times])
+    times = {episode.number: episode.time_s for episode in base if episode.reached}
+    return interval(
+        [episode.time_s - times[episode.number] for episode in episodes if episode.reached and episode.number in times]
+    )
 
 
 # -- result ----------------------------------------------------------------------------------------------------------
@@ -254,7 +258,9 @@ def _findings(runs: Runs, main: dict[Condition, ConditionSummary], base: Sequenc
         if condition.group == "vehicle":
             yield Finding.ranged(f"later by, {condition.name}", delay(episodes, base), "s")
             yield Finding(
-                f"reached, {condition.name}", 100.0 * sum(one.reached for one in episodes) / len(episodes), unit="%"
+                f"reached, {condition.name}",
+                100.0 * sum(episode.reached for episode in episodes) / len(episodes),
+                unit="%",
             )
 
 
@@ -282,7 +288,7 @@ def vehicle_table(runs: Runs, base: Sequence[Episode]) -> tuple[Row, ...]:
         (
             c.name,
             PARAMETERS[c.name.split(" ")[0]].unit,
-            f"{sum(one.reached for one in found)} of {len(found)}",
+            f"{sum(episode.reached for episode in found)} of {len(found)}",
             _cell(delay(found, base)),
         )
         for c, found in runs.items()

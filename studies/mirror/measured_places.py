@@ -259,7 +259,9 @@ def errors(rig: Rig, kind: str, size: float, points_m: Array, stroke_m: float) -
     along, *across = DIRECTIONS[kind]
     # an aligned rig and its mirror image across world x are one, so that both signs across give the same
     signed = [{along: size}, {along: -size}, *({name: size} for name in across)]
-    return np.asarray(np.max([_errors_of(rig, Misalignment(**one), points_m, stroke_m) for one in signed], axis=0))
+    return np.asarray(
+        np.max([_errors_of(rig, Misalignment(**deviation), points_m, stroke_m) for deviation in signed], axis=0)
+    )
 
 
 def _errors_of(rig: Rig, wrong: Misalignment, points_m: Array, stroke_m: float) -> Array:

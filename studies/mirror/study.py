@@ -261,13 +261,13 @@ def bound_frame(found: Mapping[str, Compared]) -> pl.DataFrame:
             "preset": preset,
             "height_m": h,
             "depth_m": d,
-            "sigma_relative": one.relative,
-            "theta_down_deg": math.degrees(one.theta_rad[0]),
-            "theta_up_deg": math.degrees(one.theta_rad[1]),
-            "radial_blur_px": one.radial_blur_px,
+            "sigma_relative": bound.relative,
+            "theta_down_deg": math.degrees(bound.theta_rad[0]),
+            "theta_up_deg": math.degrees(bound.theta_rad[1]),
+            "radial_blur_px": bound.radial_blur_px,
         }
         for name, compared in found.items()
-        for (preset, h, d), one in compared.bounds.items()
+        for (preset, h, d), bound in compared.bounds.items()
     ]
     return pl.DataFrame(rows)
 

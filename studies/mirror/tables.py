@@ -310,7 +310,7 @@ def _together(depth_m: float, kinds: Sequence[str]) -> Callable[[Compared], floa
 
 
 def _largest_blur(compared: Compared, preset: str, height_m: float) -> float:
-    blurs = [one.radial_blur_px for (p, h, _), one in compared.bounds.items() if (p, h) == (preset, height_m)]
+    blurs = [bound.radial_blur_px for (p, h, _), bound in compared.bounds.items() if (p, h) == (preset, height_m)]
     known = [value for value in blurs if math.isfinite(value)]
     return max(known) if known else math.nan
 
@@ -318,9 +318,11 @@ def _largest_blur(compared: Compared, preset: str, height_m: float) -> float:
 def pick_table(found: Mapping[str, Compared], asked: Asked) -> tuple[Row, ...]:
     """Criteria as rows, mirrors as columns, and the best and the worst of them."""
     rows: list[Row] = [("criterion", "unit", *found, "best", "worst")]
-    for one in criteria(asked):
-        values = {name: one.value(c) for name, c in found.items()}
-        rows.append((one.label, one.unit, *(_short(x) for x in values.values()), *_ends(values, one.small)))
+    for criterion in criteria(asked):
+        values = {name: criterion.value(c) for name, c in found.items()}
+        rows.append(
+            (criterion.label, criterion.unit, *(_short(x) for x in values.values()), *_ends(values, criterion.small))
+        )
     return tuple(rows)
 
 
@@ -349,12 +351,12 @@ def _names(names: Sequence[str]) -> str:
 
 def criteria_findings(found: Mapping[str, Compared], asked: Asked) -> Iterator[Finding]:
     """Best and worst value of each criterion, of the mirrors that have one."""
-    for one in criteria(asked):
-        known = sorted((x, name) for name, c in found.items() if math.isfinite(x := one.value(c)))
+    for criterion in criteria(asked):
+        known = sorted((x, name) for name, c in found.items() if math.isfinite(x := criterion.value(c)))
         if known:
-            ends = (known[0], known[-1]) if one.small else (known[-1], known[0])
+            ends = (known[0], known[-1]) if criterion.small else (known[-1], known[0])
             for word, (value, name) in zip(("best", "worst"), ends, strict=True):
-                yield Finding(f"{one.label}, {word}: {name}", value, unit=one.unit)
+                yield Finding(f"{criterion.label}, {word}: {name}", value, unit=criterion.unit)
 
 
 def ratio_findings(found: Mapping[str, Compared], asked: Asked) -> Iterator[Finding]:
@@ -375,7 +377,9 @@ def ratio_findings(found: Mapping[str, Compared], asked: Asked) -> Iterator[Find
 def place_findings(found: Mapping[str, Compared], asked: Asked) -> Iterator[Finding]:
     """Nearest distance with a bound, and the pixels that are spent on what is above the horizon."""
     for name, c in found.items():
-        seen = [d for (_, h, d), one in c.bounds.items() if h == asked.spot_height_m and math.isfinite(one.relative)]
+        seen = [
+            d for (_, h, d), bound in c.bounds.items() if h == asked.spot_height_m and math.isfinite(bound.relative)
+        ]
         yield Finding(f"nearest D of spots at {asked.spot_height_m:g} m: {name}", min(seen, default=None), unit="m")
     for name, c in found.items():
         yield Finding(f"pixels above the horizon: {name}", 100.0 * c.down.above_horizon, unit="%")

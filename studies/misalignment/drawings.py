@@ -17,7 +17,7 @@ _CURVES, _BARS = 5, 14  # as many as can be told apart
 
 def azimuth_drawing(table: pl.DataFrame, rendered: pl.DataFrame, ranks: Sequence[Rank], stroke_m: float) -> Drawing:
     """Change of D against the azimuth, exact estimator: lines predicted, crosses rendered; nearest and farthest D."""
-    names = [one.parameter for one in ranks[:_CURVES]]
+    names = [rank.parameter for rank in ranks[:_CURVES]]
     depths = (ranks[0].depths_m[0], ranks[0].depths_m[-1])
     with canvas(9.0, 4.2) as figure:
         axes = figure.subplots(1, 2, sharex=True)
@@ -32,7 +32,7 @@ def azimuth_drawing(table: pl.DataFrame, rendered: pl.DataFrame, ranks: Sequence
             ax.set(title=f"D = {D:g} m", xlabel="azimuth of the spot, degrees", ylabel="change of D, %")
             ax.set_xticks(range(0, 361, 90))
         figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
-        parts = ", ".join(f"{one.parameter} {percent(one.worst[-1])} %" for one in ranks[:_CURVES])
+        parts = ", ".join(f"{rank.parameter} {percent(rank.worst[-1])} %" for rank in ranks[:_CURVES])
         alt = (
             "Change of the exact estimator's D against the spot's azimuth for the costliest misalignments, predicted "
             f"as lines and rendered as crosses, at D = {depths[0]:g} and {depths[1]:g} m; largest at {depths[1]:g} m: "
@@ -67,25 +67,26 @@ def ranking_drawing(by_estimator: Mapping[str, Sequence[Rank]], depth_index: int
 
 def interaction_drawing(found: Sequence[Interactions]) -> Drawing:
     """First-order and total indices of the relative error with intervals, at the farthest D."""
-    one = [each for each in found if each.output == "error"][-1]
-    p = len(one.parameters)
-    order = np.argsort(-one.total, kind="stable")[:10]  # the others have no effect that a bar shows
+    error_of = [each for each in found if each.output == "error"][-1]
+    p = len(error_of.parameters)
+    order = np.argsort(-error_of.total, kind="stable")[:10]  # the others have no effect that a bar shows
     with canvas(9.0, 4.0) as figure:
         ax = figure.subplots()
         for i, (label, start) in enumerate((("first order", 0), ("total", p))):
             at = start + order
-            value, low, high = (row[at] for row in (one.indices, one.low, one.high))
+            value, low, high = (row[at] for row in (error_of.indices, error_of.low, error_of.high))
             error = np.maximum([value - low, high - value], 0.0)
             x = np.arange(len(order)) + (i - 0.5) * 0.25
             style = {**line_style(i), "linestyle": "none"}
             ax.errorbar(x, value, error, label=label, capsize=3, **style)
-        ax.set_xticks(range(len(order)), [one.parameters[i] for i in order], rotation=30, ha="right")
-        ax.set(ylabel="Sobol index (95 %)", xlabel=f"parameter; D = {one.depth_m:g} m, spots along x")
+        ax.set_xticks(range(len(order)), [error_of.parameters[i] for i in order], rotation=30, ha="right")
+        ax.set(ylabel="Sobol index (95 %)", xlabel=f"parameter; D = {error_of.depth_m:g} m, spots along x")
         ax.legend()
         alt = (
-            f"Sobol indices of the relative error of D at {one.depth_m:g} m; the first-order ones sum to "
-            f"{one.indices[-2]:.2f} ({one.low[-2]:.2f} to {one.high[-2]:.2f}); largest total {one.total.max():.2f}, "
-            f"{one.parameters[int(np.argmax(one.total))]}."
+            f"Sobol indices of the relative error of D at {error_of.depth_m:g} m; the first-order ones sum to "
+            f"{error_of.indices[-2]:.2f} ({error_of.low[-2]:.2f} to {error_of.high[-2]:.2f}); largest total "
+            f"{error_of.total.max():.2f}, "
+            f"{error_of.parameters[int(np.argmax(error_of.total))]}."
         )
         return drawn("interactions", figure, alt)
 

@@ -177,17 +177,17 @@ def rows(found: Sequence[Interactions], estimator: str, places: Places) -> list[
     return [
         {
             "estimator": estimator,
-            "output": one.output,
-            "depth_m": one.depth_m,
+            "output": interaction.output,
+            "depth_m": interaction.depth_m,
             "stroke_m": places.stroke_m,
             "parameter": name,
-            **_cells("first", one, i),
-            **_cells("total", one, i + len(one.parameters)),
-            **_cells("first_sum", one, -2),
-            **_cells("rms_relative", one, -1),
+            **_cells("first", interaction, i),
+            **_cells("total", interaction, i + len(interaction.parameters)),
+            **_cells("first_sum", interaction, -2),
+            **_cells("rms_relative", interaction, -1),
         }
-        for one in found
-        for i, name in enumerate(one.parameters)
+        for interaction in found
+        for i, name in enumerate(interaction.parameters)
     ]
 
 
@@ -198,18 +198,18 @@ def _cells(name: str, one: Interactions, i: int) -> dict[str, float]:
 
 def interaction_findings(found: Sequence[Interactions]) -> Iterator[Finding]:
     """All parameters drawn at once: rms change of D, sum of the first-order indices, largest total index."""
-    signed = [one for one in found if one.output == "error"]
-    for one in signed:
-        together = (one.indices[-1], one.low[-1], one.high[-1])
-        yield Finding.ranged(f"all drawn at once, rms change of D, D = {one.depth_m:g} m", together, "%", 100.0)
-    for one in signed:
-        first = (one.indices[-2], one.low[-2], one.high[-2])
-        total = Finding.ranged(f"sum of the first-order Sobol indices, D = {one.depth_m:g} m", first)
+    signed = [interaction for interaction in found if interaction.output == "error"]
+    for interaction in signed:
+        together = (interaction.indices[-1], interaction.low[-1], interaction.high[-1])
+        yield Finding.ranged(f"all drawn at once, rms change of D, D = {interaction.depth_m:g} m", together, "%", 100.0)
+    for interaction in signed:
+        first = (interaction.indices[-2], interaction.low[-2], interaction.high[-2])
+        total = Finding.ranged(f"sum of the first-order Sobol indices, D = {interaction.depth_m:g} m", first)
         yield total.judged(">=", _ADDITIVE)
         rest = (1.0 - first[0], 1.0 - first[2], 1.0 - first[1])
-        yield Finding.ranged(f"variance by interaction, D = {one.depth_m:g} m", rest, "%", 100.0)
-    one = max(signed, key=lambda each: float(np.max(each.total)))
-    top = int(np.argmax(one.total))
-    i = len(one.parameters) + top
-    label = f"largest total Sobol index ({one.parameters[top]}, D = {one.depth_m:g} m)"
-    yield Finding(label, one.total[top], one.low[i], one.high[i])
+        yield Finding.ranged(f"variance by interaction, D = {interaction.depth_m:g} m", rest, "%", 100.0)
+    interaction = max(signed, key=lambda each: float(np.max(each.total)))
+    top = int(np.argmax(interaction.total))
+    i = len(interaction.parameters) + top
+    label = f"largest total Sobol index ({interaction.parameters[top]}, D = {interaction.depth_m:g} m)"
+    yield Finding(label, interaction.total[top], interaction.low[i], interaction.high[i])

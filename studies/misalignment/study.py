@@ -318,19 +318,19 @@ def tightest_table(rows: Sequence[dict[str, Any]], estimator: str, depth_m: floa
 
 def ranking_rows(ranks: Sequence[Rank], calibrated: Sequence[Rank]) -> tuple[Row, ...]:
     """Table: what every parameter costs, % of D, rms over azimuths."""
-    after = {one.parameter: one for one in calibrated}
+    after = {rank.parameter: rank for rank in calibrated}
     depths = [f"{D:g} m" for D in ranks[0].depths_m]
     heads = ("parameter", "size", *depths, *(f"calibrated, {D}" for D in depths))
     return (
         heads,
         *(
             (
-                one.parameter,
-                shown(one.parameter, PARAMETERS[one.parameter].study),
-                *map(percent, one.rms),
-                *map(percent, after[one.parameter].rms),
+                rank.parameter,
+                shown(rank.parameter, PARAMETERS[rank.parameter].study),
+                *map(percent, rank.rms),
+                *map(percent, after[rank.parameter].rms),
             )
-            for one in ranks
+            for rank in ranks
         ),
     )
 

@@ -106,15 +106,15 @@ def _possible(nominal: Rig, m: Misalignment) -> bool:
 
 def tolerance(nominal: Rig, parameter: str, of: Errors, aligned: Array, search: Search) -> Array:
     """Values at which the cost is reached, shape (statistics, estimators, d); NaN where it never is."""
-    one = PARAMETERS[parameter]
+    deviation = PARAMETERS[parameter]
 
     def cost(value: float) -> Array:
         both = [of(Misalignment(**{parameter: s * value})) - aligned for s in signs(nominal, parameter, value)]
         # a rig that cannot be costs nothing: the search ends without a crossing
         return over_azimuths(np.concatenate(both, axis=-1) if both else np.zeros(aligned.shape))
 
-    limit = min(search.largest * one.study, one.limit)
-    return first_crossing(cost, search.cost, search.start * one.study, limit, search.factor)
+    limit = min(search.largest * deviation.study, deviation.limit)
+    return first_crossing(cost, search.cost, search.start * deviation.study, limit, search.factor)
 
 
 Cost = Callable[[float], Array]
@@ -172,17 +172,17 @@ def calibrated_or_lost(nominal: Rig, m: Misalignment, places: Places, calibrate:
 def _row(
     parameter: str, estimator: str, depth_m: float, places: Places, statistic: str, value: float
 ) -> dict[str, Any]:
-    one, reached = PARAMETERS[parameter], bool(np.isfinite(value))
+    deviation, reached = PARAMETERS[parameter], bool(np.isfinite(value))
     return {
         "parameter": parameter,
-        "unit": one.unit,
+        "unit": deviation.unit,
         "estimator": estimator,
         "depth_m": depth_m,
         "stroke_m": places.stroke_m,
         "height_m": places.height_m,
         "statistic": statistic,
         "value": float(value) if reached else None,
-        "value_over_study": float(value) / one.study if reached else None,
+        "value_over_study": float(value) / deviation.study if reached else None,
     }
 
 
@@ -209,11 +209,15 @@ def study_table(
 def rendered_table(found: Sequence[Rendered], places: Places) -> pl.DataFrame:
     """Rows of rendered spots: rendered and predicted change of D's relative error."""
     frames = []
-    for one in found:
-        for name, change, predicted in zip(NOMINAL, one.change, one.predicted, strict=True):
+    for estimate in found:
+        for name, change, predicted in zip(NOMINAL, estimate.change, estimate.predicted, strict=True):
             frames.append(
                 _frame(
-                    one.parameter, one.value, name, places, {"rendered_relative": change, "whole_relative": predicted}
+                    estimate.parameter,
+                    estimate.value,
+                    name,
+                    places,
+                    {"rendered_relative": change, "whole_relative": predicted},
                 )
             )
     return pl.concat(frames)
@@ -316,11 +320,11 @@ _SCALES = {"m": (1e3, "mm"), "rad": (math.degrees(1.0), "deg"), "px": (1.0, "px"
 
 def cost_findings(ranks: Sequence[Rank]) -> Iterator[Finding]:
     """Costliest parameters of one estimator at the usual size, at the nearest and the farthest D."""
-    for one in ranks[:_LISTED]:
+    for rank in ranks[:_LISTED]:
         for i in (0, -1):
-            size = shown(one.parameter, PARAMETERS[one.parameter].study)
-            label = f"change of D, {one.estimator}: {one.parameter} {size}, D = {one.depths_m[i]:g} m"
-            yield Finding(label, 100.0 * one.rms[i], unit="%")
+            size = shown(rank.parameter, PARAMETERS[rank.parameter].study)
+            label = f"change of D, {rank.estimator}: {rank.parameter} {size}, D = {rank.depths_m[i]:g} m"
+            yield Finding(label, 100.0 * rank.rms[i], unit="%")
 
 
 def slope_findings(miss: tuple[str, float, float], target: float) -> Iterator[Finding]:
@@ -335,17 +339,17 @@ def rendered_findings(found: Sequence[Rendered], tolerance: float) -> Iterator[F
     off, name = worst_disagreement(found)
     worst = Finding(f"rendered against predicted change of D, largest difference ({name})", off, unit="of D")
     yield worst.judged("<=", tolerance)
-    yield Finding("rendered estimates", sum(one.change.size for one in found))
-    drift = 1e3 * max(one.centroid_px for one in found)
+    yield Finding("rendered estimates", sum(estimate.change.size for estimate in found))
+    drift = 1e3 * max(estimate.centroid_px for estimate in found)
     yield Finding("centroid against chief ray, largest drift by a misalignment", drift, unit="mpx")
 
 
 def worst_disagreement(found: Sequence[Rendered]) -> tuple[float, str]:
     """Largest |rendered - predicted| change and its parameter; infinite where one of them is missing."""
     sizes = []
-    for one in found:
-        off = np.abs(one.change - one.predicted)
-        sizes.append((float(np.max(np.where(np.isfinite(off), off, np.inf))), one.parameter))
+    for estimate in found:
+        off = np.abs(estimate.change - estimate.predicted)
+        sizes.append((float(np.max(np.where(np.isfinite(off), off, np.inf))), estimate.parameter))
     return max(sizes)
 
 
@@ -367,19 +371,19 @@ def tolerance_findings(
 
 def calibrated_findings(ranks: Sequence[Rank], before: Sequence[Rank]) -> Iterator[Finding]:
     """Change of D that a calibration leaves, and the parameters that it makes worse."""
-    far = 100.0 * max(float(np.max(one.rms)) for one in before)
+    far = 100.0 * max(float(np.max(rank.rms)) for rank in before)
     yield Finding("largest change of D before a calibration", far, unit="%")
     left = Finding("largest change of D after a calibration", 100.0 * float(np.max(ranks[0].rms)), unit="%")
     yield left.judged("<=", far)
-    for one in ranks[:_LEFT]:
+    for rank in ranks[:_LEFT]:
         for i in (0, -1):
-            label = f"change of D after a calibration: {one.parameter}, D = {one.depths_m[i]:g} m"
-            yield Finding(label, 100.0 * one.rms[i], unit="%")
-    untouched = {one.parameter: one for one in before}
-    for one in ranks:
-        excess = 100.0 * float(np.max(one.rms - untouched[one.parameter].rms))
+            label = f"change of D after a calibration: {rank.parameter}, D = {rank.depths_m[i]:g} m"
+            yield Finding(label, 100.0 * rank.rms[i], unit="%")
+    untouched = {rank.parameter: rank for rank in before}
+    for rank in ranks:
+        excess = 100.0 * float(np.max(rank.rms - untouched[rank.parameter].rms))
         if not excess <= 100.0 * _NOTABLE:
-            worse = Finding(f"change of D that a calibration adds: {one.parameter}", excess, unit="%")
+            worse = Finding(f"change of D that a calibration adds: {rank.parameter}", excess, unit="%")
             yield worse.judged("<=", 100.0 * _NOTABLE)
 
 

@@ -230,7 +230,7 @@ def _places(cell: Cell) -> tuple[Rig, list[SpotPair]]:
     stroke_m, spot = sample.row.stroke_m, sample.laser_spot
     spots = [placed(spot, sample.row.depth_m, (*NAMES, cell.sample, k)) for k in range(cell.places)]
     return rig, [
-        SpotPair.of(rig, stroke_m, one, dataset.room, ambient, f"{cell.sample}-{k}") for k, one in enumerate(spots)
+        SpotPair.of(rig, stroke_m, uv_px, dataset.room, ambient, f"{cell.sample}-{k}") for k, uv_px in enumerate(spots)
     ]
 
 

@@ -119,8 +119,8 @@ def frames_needed(bounds: pl.DataFrame, target: float, pattern_known: bool = Fal
     squares = squares[:, np.isfinite(squares).all(axis=0)]
     if not squares.size or not target > 0.0:
         raise DatasetError(f"{squares.shape[1]} bounds and a target of {target:g}: both must be above 0")
-    one, rest = (float(mean) for mean in np.mean(squares, axis=1))
-    left = target**2 - max(one - rest, 0.0)
+    single, rest = (float(mean) for mean in np.mean(squares, axis=1))
+    left = target**2 - max(single - rest, 0.0)
     return max(math.ceil(rest / left), 1) if left > 0.0 else None
 
 

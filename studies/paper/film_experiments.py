@@ -130,11 +130,11 @@ def _rows(film: Film, bundle: Bundle, procedure: FilmProcedure, camera: int) -> 
         estimates.append(("stroke", whole, frames, None))
     pair, depth_m, parts = film.plan.pair, film.light_depth_m, _independent(bundle.covariance)
     rows = []
-    for way, one, frames, at_light in estimates:
-        estimate, sigma = (nan, nan) if one is None else (one.depth_m, one.sigma_m)
+    for way, depth, frames, at_light in estimates:
+        estimate, sigma = (nan, nan) if depth is None else (depth.depth_m, depth.sigma_m)
         two_ends_m = at_light.two_ends_m if at_light else nan
-        calibration = np.full(len(parts), nan) if one is None else one.by_rig_m @ parts
-        pixels_m = np.sqrt(max(sigma**2 - float(calibration @ calibration), 0.0)) if one else nan
+        calibration = np.full(len(parts), nan) if depth is None else depth.by_rig_m @ parts
+        pixels_m = np.sqrt(max(sigma**2 - float(calibration @ calibration), 0.0)) if depth else nan
         rows.append(
             {
                 "film": film.info.film,
@@ -198,11 +198,11 @@ def bursts(film: Film, bundle: Bundle, procedure: FilmProcedure, camera: int) ->
     frames = sum(pair.count(name) for name in ("down", "down_off", "up", "up_off"))
     uv, C, corner = np.full((2, 2), np.nan), np.full((2, 2, 2), np.nan), (film.info.u0_px, film.info.v0_px)
     answer = method_for(pair.card)(pair)
-    for k, one in enumerate((answer.down, answer.up)):
-        if one.uv_px is not None:
-            uv[k] = np.array(one.uv_px) + corner
-        if one.covariance_px2 is not None:
-            C[k] = one.covariance_px2
+    for k, spot in enumerate((answer.down, answer.up)):
+        if spot.uv_px is not None:
+            uv[k] = np.array(spot.uv_px) + corner
+        if spot.covariance_px2 is not None:
+            C[k] = spot.covariance_px2
     fitted = np.where(np.isfinite(C).all(axis=2), uv, np.nan)
     positions, offsets = FilmPositions(fitted, C, np.zeros((2, 2, 2, 2))), np.array([0.0, pair.stroke_m])
     depth = _depth(bundle, positions, offsets, np.zeros(2)) if positions.good.all() else None

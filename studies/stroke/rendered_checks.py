@@ -118,8 +118,8 @@ def run_checks(checks: Sequence[RenderedCheck], datasets: StudyDatasets) -> list
     """Measure, with the workers of the data sets."""
     with Steps(datasets.console, "stroke, frames", len(checks)) as steps:
         outcomes = []
-        for one in parallel_map(measured, checks, datasets.workers):
-            outcomes.append(one)
+        for outcome in parallel_map(measured, checks, datasets.workers):
+            outcomes.append(outcome)
             steps.advance()
     return outcomes
 
