@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from phibench.calibration.rig.sphere_options import SphereOptions
-from phibench.cli.options import DEFAULT_PRESET, Preset
+from phibench.cli.options import DEFAULT_PRESET, DataFolder, Preset, SensorFile
 
 if TYPE_CHECKING:
     from phibench.calibration.rig.from_dataset import CalibrationSources
@@ -83,7 +83,7 @@ _OUTLINES = SourceOptions()
 
 
 def calibrate(
-    directory: Path,
+    directory: DataFolder,
     *,
     out: Path,
     sample: Annotated[tuple[str, ...], Parameter(consume_multiple=True, negative="")] = (),
@@ -95,8 +95,6 @@ def calibrate(
 
     Parameters
     ----------
-    directory
-        Folder of a data set.
     out
         JSON file to write.
     sample
@@ -183,7 +181,7 @@ def align(
     rig: Path | None = None,
     stated: Annotated[SphereOptions, Parameter(name="*")] = _DEFAULT_RIG,
     doubts: Doubts = _BY_HAND,
-    sensor: Path | None = None,
+    sensor: SensorFile = None,
     vertical: bool = True,
 ) -> int:
     """Print by how far and in which direction the mirror must move to be centred, and how sharp the picture is.
@@ -203,8 +201,6 @@ def align(
         the current folder.
     rig
         TOML file with what is known of the rig, as for `phibench measure`; instead of the numbers of camera and mirror.
-    sensor
-        TOML file of the sensor; by default the preset of the kind of file is assumed.
     vertical
         Use the room's vertical edges, where three or more agree; --no-vertical leaves them out.
     """

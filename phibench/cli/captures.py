@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import App, Parameter
 
-from phibench.cli.options import SENSOR, number
+from phibench.cli.options import SENSOR, SensorFile, number
 
 if TYPE_CHECKING:
     from phibench.calibration.captures.measure import KnownNumbers
@@ -55,7 +55,7 @@ def measure(
     rig: Path,
     pair: PairPictures = _FOLDER,
     calibration: Path | None = None,
-    sensor: Path | None = None,
+    sensor: SensorFile = None,
     out: Path | None = None,
 ) -> int:
     """Measure D from two pictures of a laser spot in the mirror, down and up; or from a folder of such pairs.
@@ -68,8 +68,6 @@ def measure(
         TOML file with what is known of the rig: `[rig]` of a recipe. docs/measure.md has an example.
     calibration
         File of `phibench calibrate`, made with the same rig file.
-    sensor
-        TOML file of the sensor; by default the preset of the kind of file is assumed.
     out
         PNG or JPEG to write: spots, epipolar line and outline. Of a folder, CSV of the results.
     """

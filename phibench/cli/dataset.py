@@ -11,7 +11,19 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from cyclopts import App, Parameter
 
 from phibench.cli.completions import parts, pictures, recipes, released
-from phibench.cli.options import DEFAULT_PRESET, START, OwnOrPreset, Preset, Variant, Whole
+from phibench.cli.options import (
+    DEFAULT_PRESET,
+    START,
+    DataFolder,
+    OneSample,
+    OutFolder,
+    OwnOrPreset,
+    Preset,
+    Scheduler,
+    Variant,
+    Whole,
+    Workers,
+)
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -29,16 +41,12 @@ class ProcessOptions:
 
     Parameters
     ----------
-    workers
-        Number of processes; one for each core by default.
-    scheduler
-        Address or scheduler file of a running dask scheduler, to use its workers instead.
     wait_for_workers
         With --scheduler: wait so many seconds at most until its file is there and a worker has come.
     """
 
-    workers: Whole | None = None
-    scheduler: str | None = None
+    workers: Workers = None
+    scheduler: Scheduler = None
     wait_for_workers: Whole | None = None
 
     def wait(self) -> None:
@@ -146,18 +154,8 @@ def _secret(path: Path, seed: int | None, make_it: bool) -> int | None:
 
 
 @dataset.command
-def repair(directory: Path, *, workers: Whole | None = None, scheduler: str | None = None) -> int:
-    """Render again what is damaged or missing in a data set.
-
-    Parameters
-    ----------
-    directory
-        Folder of a data set.
-    workers
-        Number of processes; one for each core by default.
-    scheduler
-        Address or scheduler file of a running dask scheduler, to use its workers instead.
-    """
+def repair(directory: DataFolder, *, workers: Workers = None, scheduler: Scheduler = None) -> int:
+    """Render again what is damaged or missing in a data set."""
     from phibench.studies.paper.sensitivity_table import repair as repair_dataset
 
     for name in repair_dataset(directory, workers, scheduler=scheduler):
@@ -166,15 +164,13 @@ def repair(directory: Path, *, workers: Whole | None = None, scheduler: str | No
 
 
 @dataset.command
-def merge(*shards: Path, out: Path) -> int:
+def merge(*shards: Path, out: OutFolder) -> int:
     """Put the shards of a data set together.
 
     Parameters
     ----------
     shards
         Folders of all shards.
-    out
-        Folder to write.
     """
     from phibench.studies.paper.sensitivity_table import merge as merge_shards
 
@@ -248,7 +244,7 @@ def _by_mitsuba(directory: Path, count: int, *, silent: bool) -> tuple[tuple[str
 
 @dataset.command
 def show(
-    directory: Path,
+    directory: DataFolder,
     *,
     out: Path | None = None,
     sample: str | None = None,
@@ -259,8 +255,6 @@ def show(
 
     Parameters
     ----------
-    directory
-        Folder of a data set.
     out
         PNG file for the contact sheet; by default contact_sheet.png in the folder.
     sample
@@ -310,8 +304,6 @@ class DrawOptions:
         Side in pixels of a square around the spot, instead of the whole image.
     camera_seed
         Names the camera whose fixed pattern the frames share; by default the recipe's cameras.
-    workers
-        Number of processes; one for each core by default.
     """
 
     draws: Whole = 1
@@ -319,7 +311,7 @@ class DrawOptions:
     exposure: str | None = None
     region: Whole | None = None
     camera_seed: Whole | None = None
-    workers: Whole | None = None
+    workers: Workers = None
 
     def options(self, preset: str, numbers: Mapping[str, Any]) -> FrameOptions:
         """Options of frames; what is not given is the recipe's."""
@@ -337,7 +329,7 @@ _ALL_ONCE = DrawOptions()
 
 @dataset.command
 def frames(
-    directory: Path,
+    directory: DataFolder,
     *,
     preset: OwnOrPreset = None,
     sensor: Path | None = None,
@@ -349,8 +341,6 @@ def frames(
 
     Parameters
     ----------
-    directory
-        Folder of a data set.
     preset
         Where the chain ends: "ideal" (EXR, expected electrons), "mono-raw", "bayer-raw" (PNG of 16 bits that holds
         10-bit DN, not scaled), "srgb8" (PNG), "yuyv" (PNG of Y' and chroma) or "mjpeg" (JPEG; PNG with
@@ -403,10 +393,10 @@ _TENTHS = SplitOptions()
 
 
 def export(
-    directory: Path,
+    directory: DataFolder,
     *,
     to: Literal["parquet", "webdataset", "frames"],
-    out: Path,
+    out: OutFolder,
     preset: Preset = DEFAULT_PRESET,
     laser_off: bool | None = None,
     drawing: DrawOptions = _ALL_ONCE,
@@ -419,12 +409,8 @@ def export(
 
     Parameters
     ----------
-    directory
-        Folder of a data set.
     to
         "parquet" (read by `datasets`), "webdataset" (tar files) or "frames" (image files; `score` takes them, too).
-    out
-        Folder to write.
     preset
         Where the camera's chain ends: "mono-raw", "bayer-raw", "srgb8", "yuyv" or "mjpeg" (the camera's own JPEG).
     laser_off
@@ -455,7 +441,7 @@ def release(
     part: Annotated[tuple[str, ...], Parameter(negative="", completer=parts)] = (),
     samples: Whole | None = None,
     use: Annotated[tuple[Path, ...], Parameter(negative="")] = (),
-    workers: Whole | None = None,
+    workers: Workers = None,
     dry_run: bool = False,
 ) -> int:
     """Make the frozen benchmark as archives to be published, with a list of their hashes.
@@ -477,8 +463,6 @@ def release(
         Samples of each part that draws its samples, instead of the recipe's number.
     use
         Folder of a finished data set of a part, to be packed in place of a rendered one. May be given several times.
-    workers
-        Number of processes; one for each core by default.
     dry_run
         Say how many samples, bytes and CPU-hours each part takes; render nothing.
     """
@@ -533,8 +517,6 @@ class ViewOptions:
 
     Parameters
     ----------
-    sample
-        Sample: its number, counted from 0, or its id; the first one by default.
     position
         Which of its two views.
     preset
@@ -543,7 +525,7 @@ class ViewOptions:
         PNG or JPEG to unroll in place of the sample's frame, taken with the same rig.
     """
 
-    sample: str | None = None
+    sample: OneSample = None
     position: Literal["down", "up"] = "down"
     preset: Annotated[str, Parameter(completer=pictures)] = DEFAULT_PRESET
     image: Path | None = None
@@ -561,7 +543,7 @@ _FIRST_VIEW = ViewOptions()
 
 @dataset.command
 def panorama(
-    directory: Path,
+    directory: DataFolder,
     *,
     out: Path,
     view: ViewOptions = _FIRST_VIEW,
@@ -577,8 +559,6 @@ def panorama(
 
     Parameters
     ----------
-    directory
-        Folder of a data set.
     out
         PNG file to write.
     by
@@ -611,15 +591,13 @@ def panorama(
 
 
 @dataset.command
-def sensitivities(directory: Path, *, out: Path | None = None) -> int:
+def sensitivities(directory: DataFolder, *, out: Path | None = None) -> int:
     """Write dD/d(parameter) of every sample and estimator as a Parquet table.
 
     The estimate is made with the nominal rig, the parameter is one of the true rig: docs/misalignment.md has them all.
 
     Parameters
     ----------
-    directory
-        Folder of a data set.
     out
         Parquet file to write; by default sensitivities.parquet in the folder, as `dataset make` does.
     """

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import App, Parameter
 
 from phibench.cli.completions import policies, recipes
-from phibench.cli.options import DATA, SENSOR, Preset, Variant, Whole
+from phibench.cli.options import DATA, SENSOR, FilmFolder, OutFolder, Preset, Variant, Whole, Workers
 
 if TYPE_CHECKING:
     from phibench.robot.loop.episodes import Episode
@@ -23,8 +23,8 @@ film = App(name="film", group=DATA, help="Make, check and show films of the stro
 def make(
     recipe: Annotated[str, Parameter(completer=recipes(films=True))],
     *,
-    out: Path,
-    workers: Whole | None = None,
+    out: OutFolder,
+    workers: Workers = None,
     dry_run: bool = False,
     variant: Variant = None,
 ) -> int:
@@ -34,10 +34,6 @@ def make(
     ----------
     recipe
         TOML file, or the name of a shipped recipe.
-    out
-        Folder to write.
-    workers
-        Number of processes; one for each core by default.
     dry_run
         Say what will be made, how many bytes and how long it takes; render nothing.
     """
@@ -55,14 +51,8 @@ def make(
 
 
 @film.command
-def verify(directory: Path) -> int:
-    """Check every file of a data set of films; exit code 1 if there is a fault.
-
-    Parameters
-    ----------
-    directory
-        Folder of films.
-    """
+def verify(directory: FilmFolder) -> int:
+    """Check every file of a data set of films; exit code 1 if there is a fault."""
     from phibench.datasets.film.film_store import verify as verify_films
 
     faults = verify_films(directory)
@@ -74,14 +64,12 @@ def verify(directory: Path) -> int:
 
 @film.command
 def show(
-    directory: Path, *, name: str | None = None, preset: Preset = "mjpeg", draw: int = 0, out: Path | None = None
+    directory: FilmFolder, *, name: str | None = None, preset: Preset = "mjpeg", draw: int = 0, out: Path | None = None
 ) -> int:
     """Print a table of films and write one of them as an MP4 with overlays.
 
     Parameters
     ----------
-    directory
-        Folder of films.
     name
         Id of the film; the first one by default.
     preset
@@ -139,13 +127,13 @@ _BURSTS = FilmOptions()
 
 
 @film.command
-def experiments(directory: Path, *, calibration: Path, bursts: FilmOptions = _BURSTS, out: Path | None = None) -> int:
+def experiments(
+    directory: FilmFolder, *, calibration: Path, bursts: FilmOptions = _BURSTS, out: Path | None = None
+) -> int:
     """Depth of every film with rigs that calibrate themselves: bursts at both ends, and the whole stroke.
 
     Parameters
     ----------
-    directory
-        Folder of films.
     calibration
         Data set of the same rigs with an experiment "calibration", as the recipe paper-misaligned has it.
     out
@@ -236,12 +224,12 @@ def track(
 def frames(
     directory: Path,
     *,
-    out: Path,
+    out: OutFolder,
     preset: Literal["mjpeg", "yuyv"] = "mjpeg",
     draws: Whole = 1,
     camera_seed: Whole = 0,
     container: Literal["avi", "mkv"] = "mkv",
-    workers: Whole | None = None,
+    workers: Workers = None,
 ) -> int:
     """Write the camera's own frames of whole images, one video per film and draw; the frames' bytes are untouched.
 
@@ -249,8 +237,6 @@ def frames(
     ----------
     directory
         Folder of films with view = "full".
-    out
-        Folder to write.
     preset
         What the camera sends.
     draws
@@ -259,8 +245,6 @@ def frames(
         Videos of one seed share the fixed pattern.
     container
         Format of the file.
-    workers
-        Number of processes; one for each core by default.
     """
     from phibench.datasets.film.film_video import write_videos
 
@@ -332,19 +316,15 @@ _ROBOT = RobotOptions()
 
 
 @loop.command
-def bake(*, out: Path, rooms: Whole = 5, seed: str = "rooms", workers: Whole | None = None) -> int:
+def bake(*, out: OutFolder, rooms: Whole = 5, seed: str = "rooms", workers: Workers = None) -> int:
     """Bake the light of generated rooms, so that a robot's camera can stand anywhere in them.
 
     Parameters
     ----------
-    out
-        Folder to write.
     rooms
         Number of rooms; one takes some 20 CPU-s.
     seed
         Name of the stream that the rooms are drawn from.
-    workers
-        Number of processes; one for each core by default.
     """
     from phibench.datasets.film.moving_camera import bake_rooms
     from phibench.datasets.frames.request import whole_number

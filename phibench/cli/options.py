@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Group, Parameter, Token
@@ -66,6 +67,30 @@ Variant = Annotated[
     ),
 ]
 Whole = Annotated[int, Parameter(converter=_whole)]
+DataFolder = Annotated[Path, Parameter(help="Folder of a data set.")]
+FilmFolder = Annotated[Path, Parameter(help="Folder of films.")]
+OutFolder = Annotated[Path, Parameter(help="Folder to write.")]
+OneSample = Annotated[
+    str | None, Parameter(help="Sample: its number, counted from 0, or its id; the first one by default.")
+]
+SensorFile = Annotated[
+    Path | None,
+    Parameter(help="TOML file of the sensor; by default the preset of the kind of file is assumed."),
+]
+Workers = Annotated[int | None, Parameter(converter=_whole, help="Number of processes; one for each core by default.")]
+Scheduler = Annotated[
+    str | None,
+    Parameter(help="Address or scheduler file of a running dask scheduler, to use its workers instead."),
+]
+PairsAtOnce = Annotated[
+    int,
+    Parameter(
+        converter=_whole,
+        help="Pairs that are worked on at a time. From 2 on, as many further processes draw them, where they are 40 or "
+        "more.",
+    ),
+]
+BootstrapSeed = Annotated[int, Parameter(converter=_whole, help="Seed of the bootstrap that makes the intervals.")]
 Preset = Annotated[str, Parameter(completer=presets)]
 OwnOrPreset = Annotated[str | None, Parameter(completer=presets)]
 Methods = Annotated[

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import App, Parameter
 
-from phibench.cli.options import DATA, Whole
+from phibench.cli.options import DATA, DataFolder, OneSample, OutFolder, Whole
 
 if TYPE_CHECKING:
     from phibench.calibration.outline.mirror_ball import BallPhoto
@@ -210,7 +210,7 @@ scene = App(name="scene", group=DATA, help="Write samples as scenes for other pr
 
 @scene.command
 def export(
-    directory: Path, *, out: Path, sample: str | None = None, position: Literal["down", "up"] | None = None
+    directory: DataFolder, *, out: OutFolder, sample: OneSample = None, position: Literal["down", "up"] | None = None
 ) -> int:
     """Write a sample as Mitsuba XML with meshes and pictures, for an unmodified Mitsuba.
 
@@ -219,12 +219,6 @@ def export(
 
     Parameters
     ----------
-    directory
-        Folder of a data set.
-    out
-        Folder to write.
-    sample
-        Sample: its number, counted from 0, or its id; the first one by default.
     position
         "down" or "up"; both by default.
     """

@@ -10,13 +10,26 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
-from phibench.cli.options import LIMITS, BuiltIn, Limits, Methods, OwnOrPreset, Whole
+from phibench.cli.options import (
+    LIMITS,
+    BootstrapSeed,
+    BuiltIn,
+    DataFolder,
+    Limits,
+    Methods,
+    OwnOrPreset,
+    PairsAtOnce,
+    Whole,
+)
 
 if TYPE_CHECKING:
     from phibench.benchmark.scores.document import MethodCard, ScoreDocument
     from phibench.estimator.pair_set import PairSet
 
-Rank = Literal["phi", "depth"]
+Rank = Annotated[
+    Literal["phi", "depth"],
+    Parameter(help="Error that methods are ranked by, missed spots and false detections counted: phi, or depth for D."),
+]
 
 
 @Parameter(name="*")
@@ -107,13 +120,13 @@ _ALL = ChoiceOptions()
 
 
 def score(
-    directory: Path,
+    directory: DataFolder,
     *,
     method: Methods = None,
     choice: ChoiceOptions = _ALL,
     rank: Rank = "phi",
-    bootstrap_seed: Whole = 0,
-    workers: Whole = 1,
+    bootstrap_seed: BootstrapSeed = 0,
+    workers: PairsAtOnce = 1,
     limits: Limits = LIMITS,
     out: Path | None = None,
     output: Output = _TABLES,
@@ -122,14 +135,6 @@ def score(
 
     Parameters
     ----------
-    directory
-        Folder of a data set.
-    rank
-        Error that methods are ranked by, missed spots and false detections counted: phi, or depth for D.
-    bootstrap_seed
-        Seed of the bootstrap that makes the intervals.
-    workers
-        Pairs that are worked on at a time. From 2 on, as many further processes draw them, where they are 40 or more.
     out
         JSON file for the score, records beside it as Parquet; with several methods their names are added to it.
     """
@@ -161,7 +166,7 @@ def score(
     return 0
 
 
-def compare(first: Path, second: Path, *, bootstrap_seed: Whole = 0, output: Output = _TABLES) -> int:
+def compare(first: Path, second: Path, *, bootstrap_seed: BootstrapSeed = 0, output: Output = _TABLES) -> int:
     """Compare two scores of the same pairs, sample by sample.
 
     Parameters
@@ -170,8 +175,6 @@ def compare(first: Path, second: Path, *, bootstrap_seed: Whole = 0, output: Out
         JSON file that `score --method --out` wrote, with its Parquet file beside it.
     second
         Another one, of the same pairs.
-    bootstrap_seed
-        Seed of the bootstrap that makes the intervals.
     """
     from phibench.benchmark.scores.compare import compare as compare_scores
     from phibench.benchmark.scores.compare import note_on_code, note_on_pairs, note_on_size
@@ -205,8 +208,6 @@ def report(
         JSON files that `score --method --out` wrote, with their Parquet files beside them.
     out
         HTML file to write.
-    rank
-        Error that methods are ranked by, missed spots and false detections counted: phi, or depth for D.
     study
         Folders that `phibench study` wrote.
     """
@@ -242,8 +243,6 @@ def results(
         Page in HTML to write: one file, without network and scripts.
     against
         Method that the others are compared with, sample by sample; the best one where it has no score.
-    rank
-        Error that methods are ranked by, missed spots and false detections counted: phi, or depth for D.
     bootstrap_seed
         Seed of the bootstrap that makes the intervals of differences.
     """
@@ -296,7 +295,7 @@ def bench(
     out: Path,
     method: BuiltIn = None,
     pairs: Whole | None = None,
-    workers: Whole = 1,
+    workers: PairsAtOnce = 1,
     calibration: Path | None = None,
     limits: Limits = LIMITS,
 ) -> int:
@@ -310,8 +309,6 @@ def bench(
         Folder for the scores and report.html.
     pairs
         Only the first so many of each preset.
-    workers
-        Pairs that are worked on at a time. From 2 on, as many further processes draw them, where they are 40 or more.
     calibration
         File of `phibench calibrate`: only its rig's pairs, with the calibrated rig and stroke.
     """

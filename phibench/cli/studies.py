@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import App, Parameter
 
-from phibench.cli.options import DEFAULT_PRESET, KEEPERS, OwnOrPreset, Preset, Whole, number
+from phibench.cli.options import DEFAULT_PRESET, KEEPERS, DataFolder, OutFolder, OwnOrPreset, Preset, Whole, number
 
 if TYPE_CHECKING:
     from phibench.estimator.limits.best_stroke import BestStroke
@@ -67,7 +67,7 @@ _BY_DEFAULT = MisalignedOptions()
 
 
 def paper(
-    directory: Path,
+    directory: DataFolder,
     *,
     misaligned: Annotated[bool, Parameter(negative="")] = False,
     calibration: Path | None = None,
@@ -82,8 +82,6 @@ def paper(
 
     Parameters
     ----------
-    directory
-        Folder of a data set.
     misaligned
         The misaligned experiments instead of the tables.
     calibration
@@ -274,7 +272,7 @@ study = App(name="study", group=KEEPERS, help="Run a study: its data sets, table
 def _command(name: str, sentence: str) -> None:
     def run(
         *,
-        out: Path,
+        out: OutFolder,
         quick: Annotated[bool, Parameter(negative="")] = False,
         settings: Path | None = None,
         data: Path | None = None,
@@ -285,8 +283,6 @@ def _command(name: str, sentence: str) -> None:
 
         Parameters
         ----------
-        out
-            Folder to write.
         quick
             The reduced version, some minutes.
         settings
