@@ -209,15 +209,19 @@ def _lowest(q: Radius, radius_m: float, count: int) -> Array:
 def _first_zero(q: Radius, lowest: Array, reach: Array) -> Array:
     """Zero of q about `reach` before its lowest place, shape (N,); NaN where `reach` is."""
     with np.errstate(invalid="ignore", divide="ignore"):
-        old, new = lowest - reach, lowest - 0.999 * reach
-        q_old, q_new = q(old), q(new)
-        for _ in range(_SECANTS):
-            step = q_new * (new - old) / (q_new - q_old)
-            step = np.where(np.isfinite(step) | np.isnan(new), step, 0.0)  # two equal values: nothing more to find
-            old, q_old, new = new, q_new, new - step
-            q_new = q(new)
-            if not np.any(np.abs(step) > _SETTLED):
-                break
+        return _secants(q, lowest - reach, lowest - 0.999 * reach, _SECANTS, _SETTLED)
+
+
+def _secants(f: Radius, old: Array, new: Array, most: int, rest: float) -> Array:
+    """Zeros by secants from two places each, shape (N,), until no step is above `rest`, `most` of them at most."""
+    f_old, f_new = f(old), f(new)
+    for _ in range(most):
+        step = f_new * (new - old) / (f_new - f_old)
+        step = np.where(np.isfinite(step) | np.isnan(new), step, 0.0)  # two equal values: nothing more to find
+        old, f_old, new = new, f_new, new - step
+        f_new = f(new)
+        if not np.any(np.abs(step) > rest):
+            break
     return new
 
 
@@ -317,16 +321,7 @@ def _secant_to_sag(foot: Array, d: Array, x: Array, profile: Profile) -> Array:
         P = foot + x[:, None] * d
         return np.asarray(profile.sag(P[:, 0] ** 2 + P[:, 1] ** 2).z_m - P[:, 2])
 
-    old, new = x, x - 1e-4 * profile.rim_radius_m
-    f_old, f_new = excess(old), excess(new)
-    for _ in range(_REGULA_STEPS):
-        step = f_new * (new - old) / (f_new - f_old)
-        step = np.where(np.isfinite(step) | np.isnan(new), step, 0.0)
-        old, f_old, new = new, f_new, new - step
-        f_new = excess(new)
-        if not np.any(np.abs(step) > _REST_M):
-            break
-    return new
+    return _secants(excess, x, x - 1e-4 * profile.rim_radius_m, _REGULA_STEPS, _REST_M)
 
 
 # Form error of a mirror of revolution.

@@ -35,11 +35,12 @@ where it moves by dW, the reflection point moves by M^-1 (I - u u^T) dW / l, tan
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from phibench.render.optics.revolved_reflection import revolved_determinant, revolved_points
+from phibench.render.optics.revolved_reflection import revolved_determinant, revolved_points, rising_root
 from phibench.scenes.frames import Array, BoolArray
 from phibench.scenes.glass_tube import GlassTube, across
 from phibench.scenes.mirror import Form, Level, SphereMirror, deviation, level
@@ -238,27 +239,14 @@ def reflection_points(points_m: Array, eyes_m: Array, radius_m: float) -> tuple[
         low = np.maximum(0.0, beta - np.arccos(radius_m / p))
         high = np.minimum(beta, np.arccos(radius_m / c))
         lit = low <= high
-        gamma = _solve(p, c, beta, np.where(lit, low, np.nan), np.where(lit, high, np.nan), radius_m)
+        low, high = np.where(lit, low, np.nan), np.where(lit, high, np.nan)
+        f = partial(_stationarity, p, c, beta, radius_m)
+        gamma = rising_root(f, 0.5 * (low + high), (low, high), 4e-16 * beta, _ALHAZEN_STEPS)
     found = radius_m * (np.cos(gamma)[:, None] * e1 + np.sin(gamma)[:, None] * e2)
     return np.where(lit[:, None], found, np.nan), lit
 
 
-def _solve(p: Array, c: Array, beta: Array, low: Array, high: Array, radius: float) -> Array:
-    """Root gamma of f in [low, high], shape (N,): Newton, bisection where a step would leave the bracket."""
-    gamma = 0.5 * (low + high)
-    for _ in range(_ALHAZEN_STEPS):
-        f, slope = _stationarity(p, c, beta, gamma, radius)
-        low, high = np.where(f < 0.0, gamma, low), np.where(f > 0.0, gamma, high)
-        step = gamma - f / slope
-        new = np.where((step >= low) & (step <= high), step, 0.5 * (low + high))
-        moving = np.abs(new - gamma) > 4e-16 * beta
-        gamma = new
-        if not moving.any():
-            break
-    return gamma
-
-
-def _stationarity(p: Array, c: Array, beta: Array, gamma: Array, radius: float) -> tuple[Array, Array]:
+def _stationarity(p: Array, c: Array, beta: Array, radius: float, gamma: Array) -> tuple[Array, Array]:
     """f(gamma) and its derivative."""
     f_c, slope_c = _tangential(c, gamma, radius)
     f_p, slope_p = _tangential(p, beta - gamma, radius)

@@ -26,6 +26,8 @@ they may not; what is lost there begins again where a careful descent ends (`_de
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -190,17 +192,31 @@ def _in_meridian(point: Plane, eye: Plane, profile: Profile, *, to_end: bool) ->
     low, high = _seen_part(eye, profile, reach)
     inside, outside = _slope(low, point, eye, profile)[0] > 0.0, _slope(high, point, eye, profile)[0] < 0.0
     ends = np.where(inside, low, high), inside | outside
-    r = np.where(ends[1], np.nan, 0.5 * (low + high))
-    for _ in range(_PLANE_STEPS):
-        f, bend = _slope(r, point, eye, profile)
-        low, high = np.where(f < 0.0, r, low), np.where(f > 0.0, r, high)
-        step = r - f / bend
+    start, rest = np.where(ends[1], np.nan, 0.5 * (low + high)), _START * profile.rim_radius_m
+    r = rising_root(lambda r: _slope(r, point, eye, profile), start, (low, high), rest, _PLANE_STEPS)
+    return np.where(ends[1], ends[0], r) if to_end else r
+
+
+Rising = Callable[[Array], tuple[Array, Array]]
+"""Function that is below 0 before its root and above 0 behind it: values and slopes at places, shape (N,)."""
+
+
+def rising_root(f: Rising, start: Array, ends: Plane, rest: Array | float, most: int) -> Array:
+    """Roots by Newton's method in the bracket between two ends, which is halved where a step would leave it.
+
+    The search ends when no step is above `rest`, after `most` of them at most.
+    """
+    (low, high), x = ends, start
+    for _ in range(most):
+        value, slope = f(x)
+        low, high = np.where(value < 0.0, x, low), np.where(value > 0.0, x, high)
+        step = x - value / slope
         new = np.where((step >= low) & (step <= high), step, 0.5 * (low + high))
-        moving = np.abs(new - r) > _START * profile.rim_radius_m
-        r = new
+        moving = np.abs(new - x) > rest
+        x = new
         if not moving.any():
             break
-    return np.where(ends[1], ends[0], r) if to_end else r
+    return x
 
 
 def _seen_part(eye: Plane, profile: Profile, reach: float) -> Plane:
