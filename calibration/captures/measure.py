@@ -168,11 +168,6 @@ class Measurement:
         return float(self.depth.sigma_m)
 
     @property
-    def one_point(self) -> bool:
-        """The spots can be images of one point."""
-        return bool(self.depth.p_value >= DOUBTFUL_P)
-
-    @property
     def doubts(self) -> tuple[str, ...]:
         """Sentences on why D may be wrong by far more than its sigma says; none of a sound pair."""
         return tuple(note for note in self.notes if note.startswith(_DOUBTFUL_SPOTS))

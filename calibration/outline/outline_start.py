@@ -94,27 +94,11 @@ def rig_circle(rig: Rig) -> Circle:
     return float(u), float(v), 0.5 * float(np.ptp(outline, axis=0).mean())
 
 
-def plain_circle(points_px: Array) -> Circle:
-    """Least-squares circle (u, v, radius) through edges, shape (n, 2), pixels."""
-    from skimage.measure import CircleModel  # takes half a second, and the search needs it not
-
-    model = CircleModel.from_estimate(points_px)  # type: ignore[no-untyped-call]
-    return float(model.center[0]), float(model.center[1]), float(model.radius)
-
-
 def sphere_from_circle(circle: Circle, camera: Camera, radius_m: float) -> Array:
     """Sphere centre as the plain circle has it: its centre's ray, and |s| = R / sin(radius / f)."""
     u, v, radius = circle
     f = np.sqrt(camera.fx_px * camera.fy_px)
     return np.asarray(camera.rays(np.array([u, v])) * radius_m / np.sin(np.arctan(radius / f)))
-
-
-def sphere_from_ellipse(points_px: Array, camera: Camera, radius_m: float) -> Array:
-    """Sphere centre from the least-squares ellipse through edges: the cone over it."""
-    from skimage.measure import EllipseModel  # as above
-
-    model = EllipseModel.from_estimate(points_px)  # type: ignore[no-untyped-call]
-    return sphere_from_rays(camera.rays(model.predict_xy(np.linspace(0.0, 2.0 * np.pi, 360))), radius_m)
 
 
 def sphere_from_rays(rays: Array, radius_m: float) -> Array:

@@ -383,12 +383,6 @@ def _undetermined(covariance: Array, names: Sequence[str]) -> tuple[WeakDirectio
     return tuple(WeakDirection(part, float(np.sqrt(size[i]))) for part, i in zip(parts, weak, strict=True))
 
 
-def with_radius(measured: PoseMeasurement, nominal_m: float, other_m: float) -> PoseMeasurement:
-    """An outline's centre for another radius: R and |s| scale together."""
-    factor = other_m / nominal_m
-    return replace(measured, value=measured.value * factor, covariance=measured.covariance * factor**2)
-
-
 # -- outline and vertical of a true rig, as the nominal one gives them -------------------------------------------------
 
 _STEP_PX = 2.0  # of the principal point, for differences: the vertical is smooth in it

@@ -156,31 +156,6 @@ class PlanarPose:
         return PlanarPose(self.x_m + c * x - s * y, self.y_m + s * x + c * y, self.heading_rad + arc.turn_rad)
 
 
-def odometry_covariance(vehicle: Vehicle, tracks_m: Sequence[tuple[float, float]], start: PlanarPose) -> Array:
-    """Covariance of (x, y, heading), world, shape (3, 3), after steps of the tracks, to first order.
-
-    Random part of the tracks' ways only; slip and skid are nominal. Many short steps and few long ones differ by what
-    the heading does within a step, of second order in its turn.
-
-    Parameters
-    ----------
-    vehicle : Vehicle
-    tracks_m : sequence of (left, right), metres
-    start : PlanarPose, known exactly
-    """
-    P, pose = np.zeros((3, 3)), start
-    for left, right in tracks_m:
-        arc, c, s = vehicle.arc(left, right), math.cos(pose.heading_rad), math.sin(pose.heading_rad)
-        turned = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-        pose_after = pose.after(arc)
-        F = np.eye(3)
-        F[:2, 2] = pose.y_m - pose_after.y_m, pose_after.x_m - pose.x_m
-        G = turned @ arc.jacobian()
-        P = F @ P @ F.T + G @ arc_covariance(vehicle, left, right) @ G.T
-        pose = pose_after
-    return P
-
-
 def arc_covariance(vehicle: Vehicle, left_m: float, right_m: float) -> Array:
     """Covariance of (length, turn) of an arc by the random parts of both tracks, shape (2, 2)."""
     kept, turning = 1.0 - vehicle.slip, vehicle.skid * vehicle.gauge_m

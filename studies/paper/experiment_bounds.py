@@ -7,7 +7,6 @@ frames keeps their part. The rest (photons, read noise, rounding) falls as 1 / n
 from __future__ import annotations
 
 import io
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -85,43 +84,6 @@ def spot_bounds(
             }
         )
     return pl.DataFrame(rows)
-
-
-def frames_needed(bounds: pl.DataFrame, target: float, pattern_known: bool = False) -> int | None:
-    """Frames per position of one camera whose mean has a bound with an rms relative error of at most `target`.
-
-    With B of one frame and B_0 of one frame without a pattern, both mean squares over the samples, n frames have
-    B(n) = (B - B_0) + B_0 / n. The bound of n frames with weights of its own is not above that: the inverse Fisher
-    matrix is concave and homogeneous in the pixels' variance P + R / n, so that its slope in 1 / n at n = 1 is B_0 or
-    more. For a method at k times the bound ask for target / k.
-
-    Parameters
-    ----------
-    bounds : polars.DataFrame
-        Of `spot_bounds`.
-    target : float
-        Of sigma_D / D.
-    pattern_known : bool
-        Whether PRNU and DSNU are calibrated and taken out: then all of the bound falls as 1 / n.
-
-    Returns
-    -------
-    int or None
-        None where the pattern alone is the target or more, so that no number of frames reaches it.
-
-    Raises
-    ------
-    DatasetError
-        If no sample has a bound, or the target is not above 0.
-    """
-    names = ("relative_pattern_known",) * 2 if pattern_known else ("relative", "relative_pattern_known")
-    squares = np.stack([bounds[name].cast(pl.Float64).to_numpy() ** 2 for name in names])
-    squares = squares[:, np.isfinite(squares).all(axis=0)]
-    if not squares.size or not target > 0.0:
-        raise DatasetError(f"{squares.shape[1]} bounds and a target of {target:g}: both must be above 0")
-    single, rest = (float(mean) for mean in np.mean(squares, axis=1))
-    left = target**2 - max(single - rest, 0.0)
-    return max(math.ceil(rest / left), 1) if left > 0.0 else None
 
 
 def _sources(

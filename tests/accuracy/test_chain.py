@@ -10,15 +10,15 @@ import pytest
 import scipy
 from helpers.chain_scenes import COLLECTED, MIDDLE, ROOM, SQUARE, drawn, scene
 from helpers.mjpeg_grid import line
+from helpers.processed_fisher import processed_fisher
+from helpers.sensor_moments import drawn_moments
 
 from phibench.datasets.frames.sensor_card import card_of
 from phibench.estimator.limits.position_bound import limit_of
 from phibench.estimator.limits.processed_bound import chain_limit
-from phibench.estimator.spots.fisher import processed_fisher
 from phibench.estimator.spots.gaussian_spot import SpotBlur
 from phibench.render.sensor.camera_chain import Chain
 from phibench.render.sensor.light import Region
-from phibench.render.sensor.moments import drawn_moments
 from phibench.render.sensor.noise_tiles import NoiseStream
 from phibench.render.sensor.settings import Sensor, sensor
 

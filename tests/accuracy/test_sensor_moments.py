@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import scipy
 from helpers.sensor_light import spot_at
+from helpers.sensor_moments import QUANTISATION_DN2, drawn_moments, linear_moments, linear_operator, raw_moments
 
 from phibench.render.sensor import processing
 from phibench.render.sensor.camera_chain import Chain
 from phibench.render.sensor.light import Light, Region
-from phibench.render.sensor.moments import QUANTISATION_DN2, drawn_moments, linear_moments, linear_operator, raw_moments
 from phibench.render.sensor.noise_tiles import NoiseStream
 from phibench.render.sensor.settings import sensor
 

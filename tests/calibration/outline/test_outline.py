@@ -16,10 +16,8 @@ from phibench.calibration.outline.outline_fit import step_from
 from phibench.calibration.outline.outline_result import binned_rig
 from phibench.calibration.outline.outline_start import (
     grey,
-    plain_circle,
     rough_outlines,
     sphere_from_circle,
-    sphere_from_ellipse,
     sphere_from_rays,
 )
 from phibench.calibration.outline.sphere_outline import _approach as approach
@@ -33,8 +31,25 @@ from phibench.render.sensor.noise_tiles import NoiseStream
 from phibench.render.sensor.processing import demosaic, eight_bit
 from phibench.render.sensor.processing import srgb_encoded as srgb_of_the_camera
 from phibench.render.sensor.settings import sensor
+from phibench.scenes.camera import Camera
 from phibench.scenes.frames import Pose
 from phibench.scenes.rig import Rig
+
+
+def plain_circle(points_px: np.ndarray) -> tuple[float, float, float]:
+    """Least-squares circle (u, v, radius) through edges, shape (n, 2), pixels."""
+    from skimage.measure import CircleModel
+
+    model = CircleModel.from_estimate(points_px)  # type: ignore[no-untyped-call]
+    return float(model.center[0]), float(model.center[1]), float(model.radius)
+
+
+def sphere_from_ellipse(points_px: np.ndarray, camera: Camera, radius_m: float) -> np.ndarray:
+    """Sphere centre from the least-squares ellipse through edges: the cone over it."""
+    from skimage.measure import EllipseModel
+
+    model = EllipseModel.from_estimate(points_px)  # type: ignore[no-untyped-call]
+    return sphere_from_rays(camera.rays(model.predict_xy(np.linspace(0.0, 2.0 * np.pi, 360))), radius_m)
 
 
 def grey_room(points: np.ndarray, directions: np.ndarray) -> np.ndarray:

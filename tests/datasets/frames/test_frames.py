@@ -14,6 +14,7 @@ from subprocess import CompletedProcess
 import numpy as np
 import pytest
 import scipy
+from helpers.sensor_moments import raw_moments
 from PIL import Image
 
 from phibench.datasets.common.errors import DatasetError
@@ -21,7 +22,6 @@ from phibench.datasets.frames.request import FrameOptions, jpeg_tables
 from phibench.datasets.frames.source import FrameSource
 from phibench.datasets.read import Dataset, Sample, open_dataset
 from phibench.render.sensor.light import Region
-from phibench.render.sensor.moments import raw_moments
 from phibench.render.sensor.noise_tiles import NoiseStream
 
 SEEN, HALF = "seen-near-h0.500", "half-hidden-h1.400"

@@ -6,6 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 import scipy
+from helpers.pair_tracker import PairTracker
 from helpers.stroke_film import DEPTH_M, ENCODER_M, FRAMES, NOISE_PX, POINT, SCENE, SPOT, drawn, exact
 from scipy.special import ndtr
 
@@ -28,7 +29,6 @@ from phibench.robot.film.film_frames import FilmFrames, RoomWeights, held_out_ch
 from phibench.robot.film.film_positions import FilmPositions, fit_positions, stepped_positions
 from phibench.robot.film.processed_film import processed_positions
 from phibench.robot.film.spot_tracks import FrameSearch, SpotTrack, fitted_positions
-from phibench.robot.loop.belief import PairTracker
 from phibench.robot.loop.sensing import SpotReading
 from phibench.robot.loop.smoothing import film_beliefs
 from phibench.scenes.frames import Array

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scipy
+from helpers.pair_tracker import PairTracker
 from helpers.target_approach import (
     OF_SPHERE,
     RIG,
@@ -24,7 +25,7 @@ from phibench.estimator.geometry.mirror_image import image_of
 from phibench.estimator.geometry.rig_parameters import PARAMETERS, PRIOR_SIGMA, RigBias, drawn_deviation
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.robot.film.film_positions import FilmPositions
-from phibench.robot.loop.belief import Belief, PairTracker, TargetBelief, TargetPrior
+from phibench.robot.loop.belief import Belief, TargetBelief, TargetPrior
 from phibench.robot.loop.sensing import direction_of, direction_read
 from phibench.robot.loop.smoothing import SmoothedBelief, belief_of, film_beliefs
 from phibench.scenes.frames import Array

@@ -19,8 +19,8 @@ from phibench.scenes.motion.vehicle import (
     PlanarPose,
     Stance,
     Vehicle,
+    arc_covariance,
     flipper_pitch_rad,
-    odometry_covariance,
     rig_placement,
     rig_pose,
     stance,
@@ -30,6 +30,31 @@ from phibench.scenes.room import chassis
 from phibench.scenes.validation import SceneError
 
 ESCALADE = Vehicle()
+
+
+def odometry_covariance(vehicle: Vehicle, tracks_m: list[tuple[float, float]], start: PlanarPose) -> np.ndarray:
+    """Covariance of (x, y, heading), world, shape (3, 3), after steps of the tracks, to first order.
+
+    Random part of the tracks' ways only; slip and skid are nominal. Many short steps and few long ones differ by what
+    the heading does within a step, of second order in its turn.
+
+    Parameters
+    ----------
+    vehicle : Vehicle
+    tracks_m : sequence of (left, right), metres
+    start : PlanarPose, known exactly
+    """
+    P, pose = np.zeros((3, 3)), start
+    for left, right in tracks_m:
+        arc, c, s = vehicle.arc(left, right), math.cos(pose.heading_rad), math.sin(pose.heading_rad)
+        turned = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        pose_after = pose.after(arc)
+        F = np.eye(3)
+        F[:2, 2] = pose.y_m - pose_after.y_m, pose_after.x_m - pose.x_m
+        G = turned @ arc.jacobian()
+        P = F @ P @ F.T + G @ arc_covariance(vehicle, left, right) @ G.T
+        pose = pose_after
+    return P
 
 
 def test_arcs_agree_with_integration_of_the_tracks_speeds() -> None:

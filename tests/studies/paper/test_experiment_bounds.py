@@ -9,11 +9,10 @@ from pathlib import Path
 import polars as pl
 import pytest
 
-from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.frames.sensor_card import SensorCard, sensor_card
 from phibench.datasets.read import open_finished
 from phibench.estimator.limits.processed_bound import spot_sigma
-from phibench.studies.paper.experiment_bounds import frames_needed, spot_bounds
+from phibench.studies.paper.experiment_bounds import spot_bounds
 
 
 @pytest.mark.parametrize("preset", ["bayer-raw", "mjpeg"])
@@ -41,33 +40,6 @@ def test_a_calibrated_pattern_is_known_better(tiny_dataset: Path) -> None:
     row = spot_bounds(dataset, "bayer-raw", [sample], exposure=1 / 500).row(0, named=True)
     assert 0.0 < row["bound_pattern_known_m"] < row["bound_m"]
     assert row["relative_pattern_known"] == pytest.approx(row["bound_pattern_known_m"] / row["depth_m"])
-
-
-def _bounds(relative: list[float], pattern_known: list[float]) -> pl.DataFrame:
-    return pl.DataFrame({"relative": relative, "relative_pattern_known": pattern_known})
-
-
-def test_frames_needed_without_a_pattern_fall_as_one_over_n() -> None:
-    bounds = _bounds([0.01, 0.03, float("nan")], [0.01, 0.03, float("nan")])
-    assert frames_needed(bounds, 0.03) == 1
-    assert frames_needed(bounds, 0.01) == 5  # (1 + 9) / 2
-    assert frames_needed(bounds, 0.0099) == 6
-    with pytest.raises(DatasetError, match="0 bounds"):
-        frames_needed(bounds.clear(), 0.01)
-    with pytest.raises(DatasetError, match="must be above 0"):
-        frames_needed(bounds, 0.0)
-
-
-def test_frames_of_one_camera_share_its_pattern() -> None:
-    # mean squares 25 and 16 e-6: the pattern's 9 e-6 stay, 16 e-6 / n fall
-    bounds = _bounds([3e-3, math.sqrt(41e-6), 1.0], [2e-3, math.sqrt(28e-6), math.nan])
-    assert frames_needed(bounds, 5.001e-3) == 1
-    assert frames_needed(bounds, 4.999e-3) == 2
-    assert frames_needed(bounds, math.sqrt(13.001e-6)) == 4
-    assert frames_needed(bounds, math.sqrt(12.999e-6)) == 5
-    assert frames_needed(bounds, 2.99e-3) is None
-    assert frames_needed(bounds, 2.001e-3, pattern_known=True) == 4
-    assert frames_needed(bounds, 1.0001e-3, pattern_known=True) == 16
 
 
 def _raw_variance_px2(card: SensorCard, flux_e: float) -> float:
