@@ -27,7 +27,6 @@ from phibench.render.sensor.processing import eight_bit
 from phibench.render.sensor.srgb import srgb_encoded
 from phibench.scenes.faces import IntArray
 from phibench.scenes.frames import Array
-from phibench.scenes.revolved_mirror import RevolvedMirror
 from phibench.scenes.rig import POSITIONS, View
 from phibench.scenes.shapes import Cuboid, Mesh, Prism, Rectangle, Shape, faces
 from phibench.scenes.textures import Bitmap
@@ -258,30 +257,17 @@ def _rig_lines(sample: Sample, position: str) -> dict[str, Any]:
         spot = np.array([sample.row.spot_world_m])
         points = mirror_points(view, spot, view.camera_centre_m[None])
         way = [view.camera_centre_m, *(leg[0][0] for leg in onward(view, points, spot).legs), spot[0]]
-    mirror = view.rig.mirror
     return {
         "position": position,
         "lens": _rounded(view.camera_centre_m, 4),
         "centre": _rounded(view.sphere_centre_m, 4),
-        "radius_m": None if isinstance(mirror, RevolvedMirror) else mirror.radius_m,
-        "mirror": [[_rounded(p, 4) for p in line] for line in _mirror_lines(view)],
+        "radius_m": view.rig.mirror.radius_m,
+        "mirror": [
+            [_rounded(p, 4) for p in view.T_world_sphere.points(line)] for line in view.rig.mirror.drawn_lines()
+        ],
         "chief_ray": [_rounded(p, 4) for p in way],
         "visible": row.visible,
     }
-
-
-def _mirror_lines(view: View) -> Iterator[Array]:
-    """Lines on a mirror of revolution, world: rings and meridians. A sphere is drawn as a disc."""
-    mirror = view.rig.mirror
-    if not isinstance(mirror, RevolvedMirror):
-        return
-    rim, turn = mirror.profile.rim_radius_m, np.linspace(0.0, 2.0 * np.pi, 33)
-    circle = np.stack([np.cos(turn), np.sin(turn)], axis=1)
-    lines = [s * rim * circle for s in (0.25, 0.5, 0.75, 1.0)]
-    lines += [np.linspace(-rim, rim, 17)[:, None] * circle[k] for k in (0, 4, 8, 12)]
-    for line in lines:
-        height = mirror.profile.heights(line[:, 0], line[:, 1]).z_m
-        yield np.asarray(view.T_world_sphere.points(np.column_stack([line, height])))
 
 
 def _polygons(shapes: list[tuple[int, Shape]]) -> list[dict[str, Any]]:

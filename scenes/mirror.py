@@ -1,4 +1,4 @@
-"""Spherical mirror: radius, form error and roughness; and polished metals, of which mirrors of all shapes are.
+"""Mirrors: what each of them says of itself, the polished metals that they are of, and the sphere.
 
 The form error adds low-order harmonics to the sphere's radius. The surface is r(n) = R + sum of c_k h_k(n), with
 n = (x, y, z) a unit direction in the sphere's own frame (`T_camera_sphere`). `Rig.perturbed` lays its axes along the
@@ -34,14 +34,16 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cache, cached_property
 from types import MappingProxyType
-from typing import Literal
+from typing import ClassVar, Literal, Protocol, Self
 
 import numpy as np
 
-from phibench.scenes.frames import Array
+from phibench.scenes.camera import Camera
+from phibench.scenes.frames import Array, Pose
+from phibench.scenes.holder import Extent
 from phibench.scenes.validation import SceneError, finite, positive, within
 
 _A, _B = 3.0 * math.sqrt(15.0) / 16.0, 3.0 * math.sqrt(3.0) / 2.0
@@ -375,6 +377,12 @@ class MetalSurface:
     roughness_alpha: float
     reflectance_table: ReflectanceTable | None
 
+    @property
+    def unsaid(self) -> tuple[str, ...]:
+        """Fields that a document leaves out, as older ones did: a mirror of steel, without a measured reflectance."""
+        idle = {"metal": self.metal == "steel", "reflectance_table": self.reflectance_table is None}
+        return tuple(name for name, is_idle in idle.items() if is_idle)
+
     def refractive_index(self, wavelength_nm: float) -> complex:
         """Complex index n + i k of the metal, linear between the table's wavelengths (400 to 700 nm)."""
         if not _SHORTEST_NM <= wavelength_nm <= _LONGEST_NM:
@@ -398,6 +406,88 @@ class MetalSurface:
     def reflectance(self, cos_incidence: Array, wavelength_nm: float) -> Array:
         """Unpolarised power reflectance, shape of `cos_incidence` (cosine of the angle of incidence)."""
         return self.band(wavelength_nm).at(cos_incidence)
+
+
+# Every mirror.
+
+
+class Mirror(Protocol):
+    """Facts and geometry that scenes, recipes and files ask of a mirror, whatever its shape.
+
+    The optics of a shape stand on both sides of the wall: `estimator.geometry.mirror_geometry` for estimators, and
+    `reflection_point` and `ray_tracer` in `render.optics`, which certify each other.
+    Points are in the mirror's own frame, called "sphere" in poses; its z axis leads away from a camera ahead.
+    """
+
+    @property
+    def form(self) -> Form | None:
+        """Deviation from the surface."""
+
+    @property
+    def shape(self) -> str:
+        """Name of the surface."""
+
+    @property
+    def radius_m(self) -> float | None:
+        """Radius of the sphere that the mirror is, but for its form; None for other surfaces."""
+
+    @property
+    def vertex_m(self) -> float:
+        """Height of the vertex over the frame's origin."""
+
+    @property
+    def bound_m(self) -> float:
+        """No point of the surface is farther from the origin than this."""
+
+    @property
+    def has_axes(self) -> bool:
+        """Return True if it looks otherwise when it is turned about its origin."""
+
+    @property
+    def has_rim(self) -> bool:
+        """Return True if it ends somewhere."""
+
+    @property
+    def without_effect(self) -> tuple[str, ...]:
+        """Deviations of `misalignment.PARAMETERS` that mean nothing for it."""
+
+    @property
+    def least_theta_rad(self) -> float:
+        """Angle from straight down, seen from the axis, below which it shows nothing."""
+
+    @property
+    def unsaid(self) -> tuple[str, ...]:
+        """Fields that its document leaves out."""
+
+    def level(self, points_m: Array) -> Level:
+        """Level function at points (..., 3): 0 on the surface, above 0 before it."""
+
+    def check_place(self, T_camera_mirror: Pose, camera: Camera) -> None:
+        """Raise `SceneError` where the camera cannot see it so."""
+
+    def extent(self, axis: Array) -> Extent:
+        """Reach around the axis of a holder, a unit vector (3,)."""
+
+    def outline(self, T_camera_mirror: Pose, count: int) -> Array:
+        """Lines of sight, camera frame, shape (count, 3), that touch it: its occluding contour."""
+
+    def grid(self, rings: int, spokes: int) -> tuple[Array, Array]:
+        """Points and outward unit normals of its mesh, shape (rings, spokes, 3) each."""
+
+    def drawn_lines(self) -> list[Array]:
+        """Lines on it for a drawing, shape (n, 3) each; none where its outline alone says what it is."""
+
+    def deviated(self, radius_m: float, rim_radius_m: float, roughness_alpha: float, form: Form) -> Self:
+        """Mirror with these added."""
+
+
+def added(old: Form | None, new: Form) -> Form:
+    """Sum of two forms in the same frame."""
+    return new if old is None else Form(*(a + b for a, b in zip(old.coefficients_m, new.coefficients_m, strict=True)))
+
+
+OF_REVOLVED = ("mirror_tilt_x_rad", "mirror_tilt_y_rad", "rim_radius_m")
+"""Deviations of mirrors of revolution: a perfect sphere has neither axis nor rim."""
 
 
 # The sphere.
@@ -431,6 +521,11 @@ class SphereMirror(MetalSurface):
     metal: MetalName = "steel"
     reflectance_table: ReflectanceTable | None = None
 
+    shape: ClassVar[str] = "sphere"
+    has_rim: ClassVar[bool] = False
+    without_effect: ClassVar[tuple[str, ...]] = OF_REVOLVED
+    least_theta_rad: ClassVar[float] = 0.0
+
     def __post_init__(self) -> None:
         positive("SphereMirror", "radius_m", self.radius_m)
         within("SphereMirror", "roughness_alpha", self.roughness_alpha, 0.0, 0.05)
@@ -447,9 +542,66 @@ class SphereMirror(MetalSurface):
         """No point of the surface is farther from the centre than this; the radius of a perfect sphere."""
         return self.radius_m if self.form is None else self.radius_m + self.form.bound_m
 
+    @property
+    def vertex_m(self) -> float:
+        """Height of the lowest point of the sphere, over its centre."""
+        return -self.radius_m
+
+    @property
+    def has_axes(self) -> bool:
+        """Return True with a form."""
+        return self.form is not None
+
     def level(self, points_m: Array) -> Level:
         """g of the module's docstring at points (..., 3) in the sphere's frame."""
         return level(points_m, self.radius_m, self.form or Form())
+
+    def check_place(self, T_camera_mirror: Pose, camera: Camera) -> None:
+        """Raise `SceneError` if the sphere is not wholly before the camera."""
+        ahead_m, distance = T_camera_mirror.translation_m[2], math.hypot(*T_camera_mirror.translation_m)
+        if ahead_m <= self.bound_m or distance <= self.bound_m:
+            raise SceneError(
+                f"Rig.T_camera_sphere: the sphere centre is {ahead_m:.4f} m in front of the camera; it must be more "
+                f"than the mirror radius {self.bound_m:.4f} m"
+            )
+
+    def extent(self, axis: Array) -> Extent:
+        """Reach of the sphere, from its centre."""
+        return Extent(self.bound_m, self.bound_m, self.radius_m)
+
+    def outline(self, T_camera_mirror: Pose, count: int) -> Array:
+        """Lines of sight that touch the sphere, camera frame, shape (count, 3)."""
+        s = T_camera_mirror.t
+        distance = float(np.linalg.norm(s))
+        axis = s / distance
+        side = np.cross(axis, [0.0, 1.0, 0.0] if abs(axis[1]) < 0.9 else [1.0, 0.0, 0.0])  # never near the axis
+        side /= np.linalg.norm(side)
+        turn = np.linspace(0.0, 2.0 * np.pi, count, endpoint=False)[:, None]
+        rim = np.cos(turn) * side + np.sin(turn) * np.cross(axis, side)
+        if self.form is not None:
+            turned = T_camera_mirror.R
+            return T_camera_mirror.points(limb_points(-s @ turned, rim @ turned, self.radius_m, self.form))
+        sine = self.radius_m / distance
+        return np.asarray(math.sqrt(1.0 - sine * sine) * axis + sine * rim)
+
+    def grid(self, rings: int, spokes: int) -> tuple[Array, Array]:
+        """Points and outward unit normals from pole to pole, shape (rings, spokes, 3)."""
+        polar = np.linspace(0.0, np.pi, rings)[:, None]
+        turn = np.linspace(0.0, 2.0 * np.pi, spokes, endpoint=False)
+        grid = np.broadcast_arrays(np.sin(polar) * np.cos(turn), np.sin(polar) * np.sin(turn), np.cos(polar))
+        n, form = np.stack(grid, axis=-1), self.form or Form()
+        points = (self.radius_m + deviation(n, form).value_m)[..., None] * n
+        normals = level(points, self.radius_m, form).gradient
+        return points, normals / np.linalg.norm(normals, axis=-1, keepdims=True)
+
+    def drawn_lines(self) -> list[Array]:
+        """Return no lines: a sphere is drawn as a disc."""
+        return []
+
+    def deviated(self, radius_m: float, rim_radius_m: float, roughness_alpha: float, form: Form) -> Self:
+        """Sphere with these added; it has no rim."""
+        alpha = self.roughness_alpha + roughness_alpha
+        return replace(self, radius_m=self.radius_m + radius_m, roughness_alpha=alpha, form=added(self.form, form))
 
 
 def _check_convex(radius_m: float, form: Form) -> None:
@@ -462,3 +614,59 @@ def _check_convex(radius_m: float, form: Form) -> None:
     else:
         told = f"its peaks add up to {form.bound_m:g} m; less than half the radius is needed"
     raise SceneError(f"SphereMirror.form is too far from round for radius_m = {radius_m:g}: {told}; make it smaller")
+
+
+# Outline of a sphere with a form.
+#
+# g(P) = 0 on the surface, and a point P of the outline as seen from the eye E has grad g . (P - E) = 0. In the
+# half-plane of the eye, the centre and a direction across there is one such point: the mirror is convex and holds the
+# centre.
+
+_LIMB_STEPS = 8  # Newton's method starts within the form's slopes, some 1e-3 rad
+_CLOSE_RAD = 1e-9  # the step after that would be its square
+
+
+def limb_points(eye_m: Array, across: Array, radius_m: float, form: Form) -> Array:
+    """Points of the contour, shape (N, 3), metres, sphere's frame.
+
+    Parameters
+    ----------
+    eye_m : array, shape (3,)
+        Camera centre, metres, sphere's frame.
+    across : array, shape (N, 3)
+        Unit vectors at right angles to the eye's direction.
+    radius_m : float
+        Radius of the perfect sphere.
+    form : Form
+        Deviation from it.
+    """
+    distance = float(np.linalg.norm(eye_m))
+    axis = eye_m / distance
+    angle = np.full(len(across), np.arccos(radius_m / distance))
+    for _ in range(_LIMB_STEPS):
+        n, n1 = _directions(axis, across, angle)
+        P = _surface(n, radius_m, form)
+        at = level(P, radius_m, form)
+        rho = np.linalg.norm(P, axis=-1, keepdims=True)
+        rho1 = -rho * np.sum(
+            at.gradient * n1, axis=-1, keepdims=True
+        )  # d rho / d angle: n is radial, grad g = n - grad f
+        P1 = rho * n1 + rho1 * n
+        facing = np.sum(at.gradient * (P - eye_m), axis=-1)
+        slope = np.einsum("ni,nij,nj->n", P1, at.hessian_per_m, P - eye_m)
+        step = facing / slope
+        angle = angle - step
+        if not np.any(np.abs(step) > _CLOSE_RAD):
+            break
+    return _surface(_directions(axis, across, angle)[0], radius_m, form)
+
+
+def _directions(axis: Array, across: Array, angle: Array) -> tuple[Array, Array]:
+    """Unit vectors at angles from the axis, and their derivatives by the angle."""
+    c, s = np.cos(angle)[:, None], np.sin(angle)[:, None]
+    return c * axis + s * across, c * across - s * axis
+
+
+def _surface(n: Array, radius_m: float, form: Form) -> Array:
+    """Surface points in directions n."""
+    return (radius_m + deviation(n, form).value_m)[:, None] * n

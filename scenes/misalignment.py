@@ -21,8 +21,7 @@ import numpy as np
 
 from phibench.scenes.camera import Camera
 from phibench.scenes.frames import IDENTITY, Array, Matrix, Pose, Vector, as_matrix, as_vector, rotation_xyz
-from phibench.scenes.mirror import HARMONICS, Form, SphereMirror
-from phibench.scenes.revolved_mirror import RevolvedMirror
+from phibench.scenes.mirror import HARMONICS, Form, Mirror
 from phibench.scenes.validation import SceneError, within
 
 
@@ -86,6 +85,7 @@ class _Perturbed(Protocol):
 
 
 _Rig = TypeVar("_Rig", bound=_Perturbed)
+_Mirror = TypeVar("_Mirror", bound=Mirror)
 _FOCAL_PX = 1430.0  # of the C310, for which a focal length's step and prior were set in pixels
 
 
@@ -244,28 +244,10 @@ class Misalignment:
         added = {name: getattr(nominal, name) + getattr(self, name) for name in _ADDED_TO_CAMERA}
         return replace(nominal, fx_px=nominal.fx_px * scale, fy_px=nominal.fy_px * scale, **added)
 
-    def mirror(self, nominal: SphereMirror | RevolvedMirror) -> SphereMirror | RevolvedMirror:
+    def mirror(self, nominal: _Mirror) -> _Mirror:
         """True mirror; forms add up in the mirror's own frame."""
-        form, old = Form(**{name: getattr(self, name) for name in HARMONICS}), nominal.form
-        if old is not None:
-            form = Form(*(a + b for a, b in zip(old.coefficients_m, form.coefficients_m, strict=True)))
-        if isinstance(nominal, RevolvedMirror):
-            return self._revolved(nominal, form)
-        alpha = nominal.roughness_alpha + self.roughness_alpha
-        return replace(nominal, radius_m=nominal.radius_m + self.radius_m, roughness_alpha=alpha, form=form)
-
-    def _revolved(self, nominal: RevolvedMirror, form: Form) -> RevolvedMirror:
-        """True mirror of revolution: `radius_m` is added to the vertex radius; a cone has none and stays as it is.
-
-        A new form belongs to the disc of the nominal rim: where the mirror is cut does not change its surface.
-        """
-        profile, disc_m = nominal.profile, nominal.form_radius_m or nominal.profile.rim_radius_m
-        if self.rim_radius_m:
-            profile = replace(profile, rim_radius_m=profile.rim_radius_m + self.rim_radius_m)
-        if self.radius_m and profile.shape != "cone":
-            profile = replace(profile, vertex_radius_m=profile.vertex_radius_m + self.radius_m)
-        alpha = nominal.roughness_alpha + self.roughness_alpha
-        return replace(nominal, profile=profile, roughness_alpha=alpha, form=form, form_radius_m=disc_m)
+        form = Form(**{name: getattr(self, name) for name in HARMONICS})
+        return nominal.deviated(self.radius_m, self.rim_radius_m, self.roughness_alpha, form)
 
     def poses(self, T_world_camera: Pose, T_camera_sphere: Pose) -> tuple[Pose, Pose]:
         """True camera pose in the world and sphere pose in the camera, both down."""
@@ -315,7 +297,5 @@ class Misalignment:
 
 PARAMETERS = {entry.name: RigParameter(entry.name, **entry.metadata) for entry in fields(Misalignment)}
 """All parameters of `Misalignment` by name, in order."""
-OF_REVOLVED = ("mirror_tilt_x_rad", "mirror_tilt_y_rad", "rim_radius_m")
-"""Parameters that mean nothing for a perfect sphere, which has neither axis nor rim."""
 
 _ADDED_TO_CAMERA = ("cx_px", "cy_px", "k1", "k2", "k3", "p1", "p2", "focus_distance_m")

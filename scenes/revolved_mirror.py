@@ -44,21 +44,24 @@ it is then 0. What is left has two signs on every circle. So no form error leave
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from phibench.scenes.frames import Array
-from phibench.scenes.mirror import HARMONICS, Form, Level, MetalName, MetalSurface, ReflectanceTable, known_metal
+from phibench.scenes.camera import Camera
+from phibench.scenes.frames import Array, Pose
+from phibench.scenes.holder import Extent
+from phibench.scenes.mirror import HARMONICS, Form, Level, MetalName, MetalSurface, ReflectanceTable, added, known_metal
 from phibench.scenes.validation import SceneError, finite, positive, within
 
 ComplexArray = NDArray[np.complexfloating]
 Shape = Literal["sphere", "ellipsoid", "paraboloid", "hyperboloid", "cone", "polynomial"]
 
 _LARGEST_M = 1.0
+_AROUND = 360  # places of the rim
 _BISECTIONS = 55
 _PLACES = 2001  # where a polynomial's curvature is looked at, from the axis to the rim
 _WIDEST = 1.0 - 1e-6  # of an ellipsoid's equator: at it the slope is infinite
@@ -120,6 +123,9 @@ class Profile:
     conic: float
     rim_radius_m: float
     even_terms: tuple[float, ...] = ()
+
+    form: ClassVar[None] = None
+    reach_m: ClassVar[float] = 0.0
 
     def __post_init__(self) -> None:
         positive("Profile", "rim_radius_m", self.rim_radius_m)
@@ -200,6 +206,28 @@ class Profile:
     def heights(self, x: Array, y: Array) -> Heights:
         """z at places off the axis, and its derivatives."""
         return _raised(self.sag(x * x + y * y), x, y)
+
+    def points(self, across: Array, radius: Array) -> Array:
+        """Points, shape (n, 3), at radii (n,) in directions (n, 2) across the axis."""
+        return np.concatenate([radius[:, None] * across, self.sag(radius**2).z_m[:, None]], axis=-1)
+
+    def grid(self, radii_m: Array, turns_rad: Array) -> tuple[Array, Array]:
+        """Points and unit normals, shape (rings, spokes, 3), for falling radii."""
+        sag = self.sag(radii_m**2)
+        # a cone's tip has the normals of all its spokes
+        rise = (
+            2.0 * radii_m * sag.slope_per_m
+            if self.shape != "cone"
+            else np.full_like(radii_m, (-1.0 - self.conic) ** -0.5)
+        )
+        across = np.stack([np.cos(turns_rad), np.sin(turns_rad)], axis=-1)
+
+        def grid(flat: Array, z: Array) -> Array:
+            tall = np.broadcast_to(z[:, None, None], (len(radii_m), len(turns_rad), 1))
+            return np.concatenate([flat[:, None, None] * across, tall], axis=-1)
+
+        normals = grid(rise, np.full_like(rise, -1.0))
+        return grid(radii_m, sag.z_m), normals / np.linalg.norm(normals, axis=-1, keepdims=True)
 
     @property
     def ideal(self) -> Profile:
@@ -338,6 +366,18 @@ class FormedProfile:
             k2 * (twice_t - S_pp.real + 4.0 * Y * (Y * S_tt - S_tp.imag)),
         )
 
+    def points(self, across: Array, radius: Array) -> Array:
+        """Points, shape (n, 3), at radii (n,) in directions (n, 2) across the axis."""
+        flat = radius[:, None] * across
+        return np.concatenate([flat, self.heights(*flat.T).z_m[:, None]], axis=-1)
+
+    def grid(self, radii_m: Array, turns_rad: Array) -> tuple[Array, Array]:
+        """Points and unit normals, shape (rings, spokes, 3), for falling radii."""
+        x, y = radii_m[:, None] * np.cos(turns_rad), radii_m[:, None] * np.sin(turns_rad)
+        at = self.heights(x, y)
+        normals = np.stack([at.x, at.y, np.full(x.shape, -1.0)], axis=-1)
+        return np.stack([x, y, at.z_m], axis=-1), normals / np.linalg.norm(normals, axis=-1, keepdims=True)
+
     def level(self, points_m: Array) -> Level:
         """Level of the surface: 0 on it, above 0 before it, at points (..., 3)."""
         return height_level(self, points_m)
@@ -429,6 +469,11 @@ class RevolvedMirror(MetalSurface):
     form: Form | None = None
     form_radius_m: float = 0.0
 
+    radius_m: ClassVar[None] = None
+    vertex_m: ClassVar[float] = 0.0
+    has_axes: ClassVar[bool] = True
+    has_rim: ClassVar[bool] = True
+
     def __post_init__(self) -> None:
         within("RevolvedMirror", "roughness_alpha", self.roughness_alpha, 0.0, 0.05)
         known_metal("RevolvedMirror", self.metal)
@@ -451,9 +496,29 @@ class RevolvedMirror(MetalSurface):
         return self.profile if self.form is None else FormedProfile(self.profile, self.form, self.form_radius_m)
 
     @property
+    def shape(self) -> Shape:
+        """Name of the profile."""
+        return self.profile.shape
+
+    @property
     def reach_m(self) -> float:
         """No point of the surface is farther from the ideal one than this, along the axis."""
-        return 0.0 if isinstance(self.surface, Profile) else self.surface.reach_m
+        return self.surface.reach_m
+
+    @property
+    def without_effect(self) -> tuple[str, ...]:
+        """A cone has no vertex radius."""
+        return ("radius_m",) if self.shape == "cone" else ()
+
+    @property
+    def least_theta_rad(self) -> float:
+        """Twice what is left of the half angle to 90 degrees, of a cone; otherwise 0."""
+        return float(np.pi - 2.0 * np.arctan(np.sqrt(-1.0 - self.profile.conic))) if self.shape == "cone" else 0.0
+
+    @property
+    def unsaid(self) -> tuple[str, ...]:
+        """As of every mirror, and the form where there is none."""
+        return super().unsaid + (("form", "form_radius_m") if self.form is None else ())
 
     @property
     def bound_m(self) -> float:
@@ -463,6 +528,80 @@ class RevolvedMirror(MetalSurface):
     def level(self, points_m: Array) -> Level:
         """Level of the surface: 0 on it, above 0 before it, at points (..., 3) in the mirror's frame."""
         return self.surface.level(points_m)
+
+    def check_place(self, T_camera_mirror: Pose, camera: Camera) -> None:
+        """Raise `SceneError` if the lens is inside the mirror or behind its rim."""
+        lens, ahead_m = T_camera_mirror.inverse().t, T_camera_mirror.translation_m[2]
+        if self.profile.holds(lens + [0.0, 0.0, self.reach_m]):
+            raise SceneError(
+                f"Rig.T_camera_sphere: the lens is inside the mirror, whose vertex is at {ahead_m:.4f} m in front of "
+                "it; put the vertex farther away"
+            )
+        if ahead_m <= 0.0:
+            raise SceneError(
+                f"Rig.T_camera_sphere: the mirror's vertex is at {ahead_m:.4f} m in front of the lens; it must be "
+                "above 0: put the vertex farther away"
+            )
+        if not lens[2] < self.profile.depth_m - self.reach_m:
+            raise SceneError("Rig.T_camera_sphere: the lens is behind the mirror's rim; turn the mirror towards it")
+        if self.shape == "cone":
+            _check_cone(self.profile.rim_radius_m, T_camera_mirror.t, camera)
+
+    def extent(self, axis: Array) -> Extent:
+        """Reach around an axis: the rim, to which the profile rises, is what reaches farthest."""
+        profile, turn = self.profile, np.linspace(0.0, 2.0 * np.pi, _AROUND, endpoint=False)
+        flat = profile.rim_radius_m * np.stack([np.cos(turn), np.sin(turn)])
+        rim = np.concatenate([flat, np.full((1, _AROUND), profile.depth_m)])
+        along = axis @ rim
+        wide_m = float(np.linalg.norm(rim - axis[:, None] * along, axis=0).max())
+        return Extent(wide_m + self.reach_m, float(along.max()) + self.reach_m, profile.depth_m)
+
+    def outline(self, T_camera_mirror: Pose, count: int) -> Array:
+        """Points of the rim or of the limb before it, camera frame, shape (count, 3)."""
+        turns = np.linspace(0.0, 2.0 * np.pi, count, endpoint=False)
+        return T_camera_mirror.points(rim_points(self.surface, T_camera_mirror.inverse().t, turns))
+
+    def grid(self, rings: int, spokes: int) -> tuple[Array, Array]:
+        """Points and unit normals, shape (rings, spokes, 3): rings lie closer towards the rim, which may be steep."""
+        radii_m = self.profile.rim_radius_m * np.sin(np.linspace(0.5 * np.pi, 0.0, rings))
+        return self.surface.grid(radii_m, np.linspace(0.0, 2.0 * np.pi, spokes, endpoint=False))
+
+    def drawn_lines(self) -> list[Array]:
+        """Rings and meridians."""
+        rim, turn = self.profile.rim_radius_m, np.linspace(0.0, 2.0 * np.pi, 33)
+        circle = np.stack([np.cos(turn), np.sin(turn)], axis=1)
+        lines = [s * rim * circle for s in (0.25, 0.5, 0.75, 1.0)]
+        lines += [np.linspace(-rim, rim, 17)[:, None] * circle[k] for k in (0, 4, 8, 12)]
+        return [np.column_stack([flat, self.profile.heights(*flat.T).z_m]) for flat in lines]
+
+    def deviated(self, radius_m: float, rim_radius_m: float, roughness_alpha: float, form: Form) -> Self:
+        """Mirror with these added, `radius_m` to the vertex radius; a cone has none and stays as it is.
+
+        A new form belongs to the disc of the nominal rim: where the mirror is cut does not change its surface.
+        """
+        profile, disc_m = self.profile, self.form_radius_m or self.profile.rim_radius_m
+        if rim_radius_m:
+            profile = replace(profile, rim_radius_m=profile.rim_radius_m + rim_radius_m)
+        if radius_m and self.shape != "cone":
+            profile = replace(profile, vertex_radius_m=profile.vertex_radius_m + radius_m)
+        alpha, form = self.roughness_alpha + roughness_alpha, added(self.form, form)
+        return replace(self, profile=profile, roughness_alpha=alpha, form=form, form_radius_m=disc_m)
+
+
+def _check_cone(rim_radius_m: float, tip: Array, camera: Camera) -> None:
+    """Raise `SceneError` for a cone of which the image shows the tip alone.
+
+    Nearer to the tip than the aperture's diameter a part of the lens sees no reflection.
+    """
+    u, v, aperture_m = camera.width_px - 0.5, camera.height_px - 0.5, camera.aperture_radius_m
+    rays = camera.rays(np.array([[-0.5, -0.5], [u, -0.5], [-0.5, v], [u, v]]))
+    shown_m = np.linalg.norm(rays[:, :2] / rays[:, 2:] * tip[2] - tip[:2], axis=1).max()
+    seen_m = min(rim_radius_m, float(shown_m) if np.isfinite(shown_m) else math.inf)
+    if seen_m <= 2.0 * aperture_m:
+        raise SceneError(
+            f"Profile.rim_radius_m = {rim_radius_m:g}: the tip of the cone is all that is seen, up to {seen_m:.2g} "
+            f"m from the axis; more than {2.0 * aperture_m:.2g} m, the lens's aperture, is needed"
+        )
 
 
 def rim_points(profile: Profile | FormedProfile, eye_m: Array, turns_rad: Array) -> Array:
@@ -480,15 +619,9 @@ def rim_points(profile: Profile | FormedProfile, eye_m: Array, turns_rad: Array)
         facing = _faces(profile, across, middle, eye_m)
         low, high = np.where(facing, middle, low), np.where(facing, high, middle)
     radius = np.where(seen, profile.rim_radius_m, 0.5 * (low + high))
-    return _points(profile, across, radius)
-
-
-def _points(profile: Profile | FormedProfile, across: Array, radius: Array) -> Array:
-    flat = radius[:, None] * across
-    z = profile.sag(radius**2).z_m if isinstance(profile, Profile) else profile.heights(*flat.T).z_m
-    return np.concatenate([flat, z[:, None]], axis=-1)
+    return profile.points(across, radius)
 
 
 def _faces(profile: Profile | FormedProfile, across: Array, radius: Array, eye_m: Array) -> Array:
-    P = _points(profile, across, radius)
+    P = profile.points(across, radius)
     return np.einsum("ni,ni->n", profile.level(P).gradient, eye_m - P) > 0.0

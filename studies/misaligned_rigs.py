@@ -29,7 +29,8 @@ from phibench.render.optics.reflection_point import reflection_points
 from phibench.render.optics.spot_layer import spot_layer
 from phibench.scenes.frames import Array
 from phibench.scenes.laser import LaserSpot, beam_diameter_m
-from phibench.scenes.misalignment import OF_REVOLVED, PARAMETERS, Misalignment
+from phibench.scenes.mirror import OF_REVOLVED
+from phibench.scenes.misalignment import PARAMETERS, Misalignment
 from phibench.scenes.rig import Rig, View
 from phibench.scenes.validation import SceneError
 

@@ -27,7 +27,6 @@ from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.estimator.interface import Answer, Image, Pair
 from phibench.estimator.spots.detect import FARTHEST_M, NEAREST_M, PairDetection, detect
 from phibench.scenes.frames import Array
-from phibench.scenes.revolved_mirror import RevolvedMirror
 from phibench.scenes.rig import POSITIONS, Rig
 
 LEAST_STROKE_M, MOST_STROKE_M = 1e-3, 10.0  # those of a recipe
@@ -118,7 +117,7 @@ def nothing_found(pair: Pair, photos: PairPhotos, answer: Answer) -> DatasetErro
 
 def _highest_seen(rig: Rig) -> str:
     """Say how high above the horizon a mirror of revolution shows anything, by the rays of its outline."""
-    if not isinstance(rig.mirror, RevolvedMirror):
+    if not rig.mirror.has_rim:
         return ""
     outline = rig.outline_px(_OUTLINE_POINTS)
     middle = outline.mean(axis=0)

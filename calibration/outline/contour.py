@@ -23,7 +23,7 @@ import scipy
 from phibench.calibration.outline.outline_fit import OutlinePixels, Place
 from phibench.scenes.frames import Array, BoolArray, as_vector
 from phibench.scenes.misalignment import Misalignment
-from phibench.scenes.revolved_mirror import RevolvedMirror, rim_points
+from phibench.scenes.revolved_mirror import rim_points
 from phibench.scenes.rig import Rig
 
 PLACES = 5
@@ -219,12 +219,11 @@ def _radius_at(turn: Array, outline_px: Array, middle: Array) -> Array:
 
 def _seen(rig: Rig, t: Array, middle: Array) -> tuple[BoolArray, float, float]:
     """Parts where the rim is seen, mean depth, and mean `bend` of the rest."""
-    mirror = rig.mirror
-    assert isinstance(mirror, RevolvedMirror)
+    profile = rig.revolved.profile
     eye = rig.T_camera_sphere.inverse().t
-    P = rim_points(mirror.profile, eye, np.linspace(0.0, 2.0 * np.pi, POINTS, endpoint=False))
+    P = rim_points(profile, eye, np.linspace(0.0, 2.0 * np.pi, POINTS, endpoint=False))
     # a contour that is the rim is on it to rounding
-    rim = np.hypot(P[:, 0], P[:, 1]) > (1.0 - 1e-9) * mirror.profile.rim_radius_m
+    rim = np.hypot(P[:, 0], P[:, 1]) > (1.0 - 1e-9) * profile.rim_radius_m
     in_camera = rig.T_camera_sphere.points(P)
     off = rig.camera.project(in_camera) - middle
     angle = np.arctan2(off[:, 1], off[:, 0])
@@ -235,6 +234,6 @@ def _seen(rig: Rig, t: Array, middle: Array) -> tuple[BoolArray, float, float]:
     touched = P[~rim]
     sight = touched - eye
     distance = np.linalg.norm(sight, axis=-1)
-    level, d = mirror.profile.level(touched), sight / distance[:, None]
+    level, d = profile.level(touched), sight / distance[:, None]
     curvature = np.einsum("ni,nij,nj->n", d, level.hessian_per_m, d) / np.linalg.norm(level.gradient, axis=-1)
     return rim[nearest], depth_m, float(np.mean(distance * curvature))

@@ -10,7 +10,6 @@ from phibench.calibration.outline.outline_result import Outline
 from phibench.calibration.outline.rim_outline import find_rim_outline
 from phibench.calibration.outline.sphere_outline import find_sphere_outline
 from phibench.datasets.frames.sensor_card import SensorCard
-from phibench.scenes.revolved_mirror import RevolvedMirror
 from phibench.scenes.rig import Rig
 
 
@@ -32,5 +31,5 @@ def find_outline(image: NDArray[Any], rig: Rig, card: SensorCard | None = None) 
     ImageError
         For an image without a mirror, or with less than half of its outline.
     """
-    find = find_rim_outline if isinstance(rig.mirror, RevolvedMirror) else find_sphere_outline
+    find = find_rim_outline if rig.mirror.has_rim else find_sphere_outline
     return find(image, rig, card)

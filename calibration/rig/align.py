@@ -43,7 +43,6 @@ from phibench.estimator.spots.image_planes import ImageError
 from phibench.scenes.camera import Camera
 from phibench.scenes.frames import Array
 from phibench.scenes.mirror import SphereMirror
-from phibench.scenes.revolved_mirror import RevolvedMirror
 from phibench.scenes.rig import Rig
 
 _SIGNIFICANT = 2.5  # of a distance in two axes: 4 % of aligned mirrors are further off
@@ -195,7 +194,7 @@ def alignment(
     own = R @ outline.covariance_m2 @ R.T
     sigma_outline = float(np.sqrt(0.5 * (own[0, 0] + own[1, 1])))
     doubt = float(np.sqrt(0.5 * np.trace(doubt_m2)))
-    if isinstance(rig.mirror, RevolvedMirror):
+    if rig.mirror.has_rim:
         doubt = math.hypot(doubt, mirror_tilt_sigma_rad * aside_by_tilt_m(rig))
     move_px = camera.project(s + in_camera) - camera.project(s)
     return Alignment(move, in_camera, move_px, sigma_outline, math.hypot(sigma_outline, doubt), outline, known, meeting)

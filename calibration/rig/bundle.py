@@ -38,7 +38,6 @@ from phibench.estimator.geometry.rig_parameters import PARAMETERS, changed, has_
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.scenes.frames import Array, as_vector
 from phibench.scenes.misalignment import Misalignment
-from phibench.scenes.revolved_mirror import RevolvedMirror
 from phibench.scenes.rig import Rig, View
 from phibench.scenes.validation import SceneError
 
@@ -290,13 +289,12 @@ def _ellipse_slopes(problem: _Problem, x: Array) -> tuple[Array, Array]:
     -(f k / 4) (1 - k^2) (r^2 - g^2) to second order. Here g = b / (1 - k^2) and r = a - g are complex numbers, a the
     direction of the mirror's axis and b that of the circle's middle, both against the optical axis.
     """
-    mirror = problem.nominal.mirror
-    assert isinstance(mirror, RevolvedMirror)
+    profile = problem.nominal.revolved.profile
 
     def tilt(rig: Rig) -> Array:
         pose = rig.T_camera_sphere
-        a, c = pose.R[:, 2], pose.t + pose.R[:, 2] * mirror.profile.depth_m
-        return np.asarray(a[:2] / a[2] - c[:2] / c[2] / (1.0 - (mirror.profile.rim_radius_m / c[2]) ** 2))
+        a, c = pose.R[:, 2], pose.t + pose.R[:, 2] * profile.depth_m
+        return np.asarray(a[:2] / a[2] - c[:2] / c[2] / (1.0 - (profile.rim_radius_m / c[2]) ** 2))
 
     def at(x: Array) -> Rig:
         return changed(problem.nominal, problem.values(x))
@@ -399,7 +397,7 @@ def apparent_outline(nominal: Rig, true: Rig) -> Array:
     centre. Of a mirror of revolution it is the `contour` of the nominal one that is nearest.
     """
     uv = true.outline_px(90)
-    if isinstance(nominal.mirror, RevolvedMirror):
+    if nominal.mirror.has_rim:
         return place_of_outline(nominal, uv)
     rays = nominal.camera.rays(uv)
     x = np.linalg.lstsq(rays, np.ones(len(rays)), rcond=None)[0]  # n / cos a0

@@ -23,8 +23,7 @@ from phibench.datasets.store.documents import from_json, to_json
 from phibench.datasets.store.files import write_text
 from phibench.estimator.geometry.rig_parameters import PARAMETERS, RENAMED, changed
 from phibench.scenes.frames import IDENTITY, Array
-from phibench.scenes.mirror import SphereMirror
-from phibench.scenes.misalignment import OF_REVOLVED
+from phibench.scenes.mirror import OF_REVOLVED
 from phibench.scenes.misalignment import PARAMETERS as MISALIGNMENT
 from phibench.scenes.rig import Rig
 from phibench.scenes.validation import SceneError, printable_line
@@ -203,7 +202,7 @@ def _relative_focal(path: Path, nominal: Rig, values: Array, covariance: Array) 
 
 def _document(rig: Rig) -> dict[str, Any]:
     """Rig as JSON; the rotation of a perfect sphere means nothing, and version 1 left it out."""
-    if isinstance(rig.mirror, SphereMirror) and rig.mirror.form is None:
+    if not rig.mirror.has_axes:
         rig = replace(rig, T_camera_sphere=replace(rig.T_camera_sphere, rotation=IDENTITY))
     return dict(to_json(rig))
 

@@ -31,7 +31,6 @@ from phibench.render.room.light_map import fixed_shapes, texel_count
 from phibench.render.room.texel_grid import TexelGrid
 from phibench.scenes.faces import face_table
 from phibench.scenes.frames import Array
-from phibench.scenes.revolved_mirror import RevolvedMirror
 from phibench.scenes.rig import POSITIONS, Rig
 from phibench.scenes.room import Room
 
@@ -384,7 +383,7 @@ def rim_lines(plan: Plan, pairs: Iterable[PairForecast]) -> list[str]:
     hidden = [
         forecast.pair.sample_id
         for forecast in pairs
-        if isinstance(plan.rigs[forecast.pair.rig].mirror, RevolvedMirror)
+        if plan.rigs[forecast.pair.rig].mirror.has_rim
         and {forecast.down.cause, forecast.up.cause} & {NO_REFLECTION, EDGE}
     ]
     if not hidden:
@@ -400,16 +399,13 @@ def rim_lines(plan: Plan, pairs: Iterable[PairForecast]) -> list[str]:
 
 def _below_cone(rig: Rig, point_world_m: Array) -> str:
     """Sentence if a cone shows a point at no size: its side turns a ray along the axis by twice the half angle."""
-    if not isinstance(rig.mirror, RevolvedMirror) or rig.mirror.profile.shape != "cone":
-        return ""
-    half_angle = np.arctan(np.sqrt(-1.0 - rig.mirror.profile.conic))
-    least = np.degrees(np.pi - 2.0 * half_angle)
+    least = np.degrees(rig.mirror.least_theta_rad)
     away = point_world_m - rig.at(0.0).sphere_centre_m
     theta = np.degrees(np.arctan2(np.hypot(away[0], away[1]), -away[2]))
     if theta >= least:
         return ""
     return (
-        f"a cone of {np.degrees(half_angle):.0f} degrees shows nothing less than {least:.0f} degrees from straight "
+        f"a cone of {90.0 - 0.5 * least:.0f} degrees shows nothing less than {least:.0f} degrees from straight "
         f"down, whatever its rim, and the spot is at {theta:.1f}; raise the spot, or make half_angle_deg of "
         "[rig.mirror] larger"
     )

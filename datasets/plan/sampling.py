@@ -45,8 +45,9 @@ from phibench.datasets.recipe.tables import (
 from phibench.datasets.rooms.room_sources import ONLY_ROOM, MeshRoom, PanoramaRoom, RoomSource, is_exported, room_of
 from phibench.scenes.frames import Array
 from phibench.scenes.laser import LaserSpot
-from phibench.scenes.misalignment import OF_REVOLVED, Misalignment
+from phibench.scenes.mirror import OF_REVOLVED
 from phibench.scenes.misalignment import PARAMETERS as MISALIGNMENT
+from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.random_streams import generator
 from phibench.scenes.rig import Rig
 from phibench.scenes.room import Room

@@ -57,8 +57,8 @@ from phibench.datasets.recipe.tables import (
 from phibench.render.room.subpixel_grid import FilmGrid
 from phibench.render.sensor.settings import SensorError, sensor
 from phibench.scenes.catalog import BOARD_SIZE_M, board
-from phibench.scenes.mirror import SphereMirror
-from phibench.scenes.misalignment import OF_REVOLVED, Misalignment
+from phibench.scenes.mirror import OF_REVOLVED
+from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.rig import Rig
 from phibench.scenes.room import Room, chassis
 from phibench.scenes.validation import Fault, SceneError, close_names, nearest
@@ -383,11 +383,9 @@ def _rig(draft: _Draft) -> Iterator[Fault]:
 
 def _without_axis(raw: Raw, rig: Rig) -> Iterator[Fault]:
     """Faults of deviations of a sphere that has neither axis nor rim."""
-    if not isinstance(rig.mirror, SphereMirror):
-        return
     for path in (("misalignment",), ("random", "misalignment"), ("rigs", "misalignment")):
         for key in table_of(raw, *path):
-            if key in OF_REVOLVED:
+            if key in OF_REVOLVED and key in rig.mirror.without_effect:
                 text = "is of mirrors of revolution; a sphere has neither axis nor rim: remove it, or give [rig.mirror]"
                 yield Fault(".".join((*path, key)), text)
 
@@ -436,7 +434,7 @@ def _height(table: RigTable, rig: Rig, room: Room) -> Fault | None:
     if above_m < 0.0:
         return None
     given = {key: getattr(table, key) for key in ("camera_height_m", "z_c_m")}
-    if isinstance(rig.mirror, SphereMirror):
+    if rig.mirror.radius_m is not None:
         given["radius_m"] = rig.mirror.radius_m
     elif not any(given.values()):
         given["camera_height_m"] = rig.T_world_camera.translation_m[2]

@@ -40,8 +40,8 @@ from phibench.datasets.recipe.mirror_tables import (
 )
 from phibench.datasets.recipe.room_tables import RoomsTable, RoomTable
 from phibench.scenes.catalog import BOARD_SIZE_M
-from phibench.scenes.mirror import MetalName
-from phibench.scenes.misalignment import OF_REVOLVED, PARAMETERS
+from phibench.scenes.mirror import OF_REVOLVED, MetalName
+from phibench.scenes.misalignment import PARAMETERS
 from phibench.scenes.random_streams import LARGEST_SEED
 
 MIN_STROKE_M, MAX_STROKE_M = 1e-3, 10.0  # below a millimetre there is no parallax to measure

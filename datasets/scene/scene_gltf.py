@@ -12,11 +12,8 @@ import math
 import numpy as np
 
 from phibench.datasets.rooms.gltf_export import GltfWriter, y_up
-from phibench.render.plugins.mirror_plugins import cap_grid, form_grid, grid_triangles
-from phibench.scenes.frames import Array
+from phibench.render.plugins.mirror_plugins import grid_triangles
 from phibench.scenes.laser import LaserSpot
-from phibench.scenes.mirror import SphereMirror
-from phibench.scenes.revolved_mirror import RevolvedMirror
 from phibench.scenes.rig import View
 from phibench.scenes.room import MIRROR_NAME, Room
 
@@ -37,17 +34,9 @@ def scene_glb(view: View, room: Room, spot: LaserSpot | None = None) -> bytes:
     return document.encoded(room.name)
 
 
-def mirror_grid(mirror: SphereMirror | RevolvedMirror, rings: int, spokes: int) -> tuple[Array, Array]:
-    """Points and outward unit normals of a mirror in its own frame, shape (rings, spokes, 3) each."""
-    if isinstance(mirror, RevolvedMirror):
-        radii = mirror.profile.rim_radius_m * np.sin(np.linspace(0.5 * np.pi, 0.0, rings))
-        return cap_grid(mirror.surface, radii, np.linspace(0.0, 2.0 * np.pi, spokes, endpoint=False))
-    return form_grid(mirror, rings, spokes)
-
-
 def _add_mirror(document: GltfWriter, view: View) -> None:
     mirror = view.rig.mirror
-    points, normals = mirror_grid(mirror, _RINGS, _SPOKES)
+    points, normals = mirror.grid(_RINGS, _SPOKES)
     pose = view.T_world_sphere
     bands = view.rig.camera.detector.band_wavelength_nm
     colour = [float(mirror.reflectance(np.array(1.0), nm)) for nm in bands]

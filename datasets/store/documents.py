@@ -45,7 +45,6 @@ from phibench.datasets.store.schema import (
 )
 from phibench.scenes.holder import OF_TUBES
 from phibench.scenes.random_streams import LARGEST_SEED
-from phibench.scenes.revolved_mirror import RevolvedMirror
 from phibench.scenes.rig import Rig
 from phibench.scenes.validation import nearest, printable_line
 
@@ -68,12 +67,8 @@ def to_json(value: object) -> Any:
     """
     document = _adapter(cast(Any, type(value))).dump_python(value, mode="json")
     if isinstance(value, Rig):
-        if value.mirror.metal == "steel":
-            del document["mirror"]["metal"]
-        if value.mirror.reflectance_table is None:
-            del document["mirror"]["reflectance_table"]
-        if isinstance(value.mirror, RevolvedMirror) and value.mirror.form is None:
-            del document["mirror"]["form"], document["mirror"]["form_radius_m"]
+        for name in value.mirror.unsaid:
+            del document["mirror"][name]
         if value.holder is None:
             del document["holder"]
         elif value.holder.kind != "tube":

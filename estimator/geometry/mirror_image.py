@@ -12,25 +12,18 @@ Line of sight: segments against boxes, by clipping (`blocked`).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import suppress
-from dataclasses import dataclass, replace
-from functools import lru_cache
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from phibench.estimator.geometry.mirror_geometry import geometry_of
 from phibench.estimator.geometry.reflection import room_rays, room_rays_jacobian
 from phibench.estimator.geometry.status import Status, StatusArray, first_fault, flag, keep, stroke_status
 from phibench.scenes.frames import Array, BoolArray
-from phibench.scenes.revolved_mirror import Profile, RevolvedMirror
 from phibench.scenes.rig import Rig, View
 from phibench.scenes.shapes import Cuboid
-from phibench.scenes.validation import SceneError
 
-_BISECTIONS = 4  # the error of the start falls by R / distance in each
-_HALVINGS = 40  # of the rim's diameter: the place is known to 1e-13 m
-_WIDER = (1.2, 1.1, 1.05, 1.02, 1.01)  # times the rim's radius
-_UNEVEN = 0.999  # so that no middle is on the axis, where a cone has its tip
 _NEWTON_STEPS = 12
 _TOLERANCE_PX = 1e-10  # of a step: the next one, of the order of its square, is below rounding
 
@@ -59,9 +52,9 @@ def image_of(view: View, points_world_m: Array) -> MirrorImage:
     view : View
     points_world_m : shape (..., 3), outside the sphere
     """
-    X = np.asarray(points_world_m, float)
+    X, geometry = np.asarray(points_world_m, float), geometry_of(view.rig.mirror)
     with np.errstate(all="ignore"):
-        uv, wide = _start(view, X), _beyond_rim(view)
+        uv, wide = geometry.start_px(view, X), geometry.beyond_rim(view)
         for _ in range(_NEWTON_STEPS):
             step, _ = _newton(wide, uv, X)
             uv = uv + step
@@ -75,59 +68,6 @@ def image_of(view: View, points_world_m: Array) -> MirrorImage:
         flag((~np.isfinite(X).all(axis=-1), Status.NOT_FINITE)), flag((~(at_rest & ahead), Status.NOT_CONVERGED))
     )
     return MirrorImage(keep(uv, status), keep(px_per_m, status), status)
-
-
-def _start(view: View, X: Array) -> Array:
-    """Pixel of the point of the sphere whose normal halves the angle between camera and point."""
-    if isinstance(view.rig.mirror, RevolvedMirror):
-        return _start_in_meridian(view, X, view.rig.mirror.profile)
-    S, C, R = view.sphere_centre_m, view.camera_centre_m, view.rig.mirror.radius_m
-    P = np.broadcast_to(S, X.shape)
-    for _ in range(_BISECTIONS):
-        n = _unit(C - P) + _unit(X - P)
-        P = S + R * _unit(n)
-    T = view.T_world_camera
-    return view.rig.camera.project((P - T.t) @ T.R)
-
-
-def _beyond_rim(view: View) -> View:
-    """View of a mirror that goes on behind its rim, which Newton's method may pass on its way."""
-    return replace(view, rig=_wider(view.rig)) if isinstance(view.rig.mirror, RevolvedMirror) else view
-
-
-@lru_cache(maxsize=64)
-def _wider(rig: Rig) -> Rig:
-    assert isinstance(rig.mirror, RevolvedMirror)
-    profile = rig.mirror.profile
-    for factor in _WIDER:
-        with suppress(SceneError):  # folds, is no longer convex, or meets its holder
-            wide = replace(profile, rim_radius_m=factor * profile.rim_radius_m)
-            return replace(rig, mirror=replace(rig.mirror, profile=wide))
-    return rig
-
-
-def _start_in_meridian(view: View, X: Array, profile: Profile) -> Array:
-    """Pixel of the point of the profile, in the meridian of X, from where the reflected ray goes to X.
-
-    The camera is moved into the meridian; on the axis it lies in all of them. From the axis to the rim the ray turns
-    from straight down outwards, and passes X once: bisection finds where.
-    """
-    pose = view.T_world_sphere.inverse()
-    point, eye = pose.points(X), pose.points(view.camera_centre_m)
-    away = np.linalg.norm(point[..., :2], axis=-1)
-    across = np.where(away[..., None] > 0.0, point[..., :2] / away[..., None], [1.0, 0.0])
-    aside = across @ eye[:2]
-    high = np.full(away.shape, profile.rim_radius_m)
-    low = -_UNEVEN * high
-    for _ in range(_HALVINGS):
-        r = 0.5 * (low + high)
-        sag = profile.sag(r * r)
-        normal = np.arctan2(2.0 * r * sag.slope_per_m, 1.0)  # angles from straight down, outwards
-        ray = 2.0 * normal - np.arctan2(aside - r, sag.z_m - eye[2])
-        before = ray < np.arctan2(away - r, sag.z_m - point[..., 2])
-        low, high = np.where(before, r, low), np.where(before, high, r)
-    P = np.concatenate([r[..., None] * across, profile.sag(r * r).z_m[..., None]], axis=-1)
-    return view.rig.camera.project(view.rig.T_camera_sphere.points(P))
 
 
 def _newton(view: View, uv: Array, X: Array) -> tuple[Array, Array]:
@@ -149,10 +89,6 @@ def _safe(matrix: Array) -> Array:
     with np.errstate(invalid="ignore"):
         good = np.isfinite(matrix).all(axis=(-1, -2)) & (np.abs(np.linalg.det(matrix)) > 0.0)
     return np.where(good[..., None, None], matrix, np.eye(2))
-
-
-def _unit(vector: Array) -> Array:
-    return vector / np.linalg.norm(vector, axis=-1, keepdims=True)
 
 
 # -- epipolar line -----------------------------------------------------------------------------------------------------

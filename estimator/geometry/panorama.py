@@ -23,10 +23,10 @@ from scipy.spatial import cKDTree
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.read import Sample
 from phibench.datasets.store.pictures import display_exposure_s, to_srgb
+from phibench.estimator.geometry.mirror_geometry import geometry_of
 from phibench.estimator.geometry.mirror_image import image_of
 from phibench.estimator.geometry.reflection import reflect
 from phibench.scenes.frames import Array
-from phibench.scenes.revolved_mirror import RevolvedMirror
 from phibench.scenes.rig import POSITIONS, View
 from phibench.scenes.room import Room
 from phibench.scenes.shapes import Cuboid, Rectangle, Shape, faces
@@ -305,26 +305,9 @@ def ray_directions(truth: Mapping[str, NDArray[Any]], view: View) -> Array:
     """
     angle, turn = truth["phi_normal_rad"], truth["azimuth_rad"]
     n = np.stack([np.sin(angle) * np.cos(turn), np.sin(angle) * np.sin(turn), -np.cos(angle)], axis=-1)
-    away = np.stack([truth[name] for name in ("x_m", "y_m", "z_m")], axis=-1) - _places_of_normals(n, view)
+    places = geometry_of(view.rig.mirror).place_of_normal(n, view.T_world_sphere)
+    away = np.stack([truth[name] for name in ("x_m", "y_m", "z_m")], axis=-1) - places
     return np.asarray(away / np.linalg.norm(away, axis=-1, keepdims=True))
-
-
-def _places_of_normals(normals: Array, view: View) -> Array:
-    """Places on the mirror, world, shape (H, W, 3), that have these outward unit normals, world."""
-    mirror = view.rig.mirror
-    if not isinstance(mirror, RevolvedMirror):
-        return np.asarray(view.sphere_centre_m + mirror.radius_m * normals)
-    profile, n = mirror.profile, normals @ view.T_world_sphere.R
-    if profile.shape == "cone":
-        raise DatasetError(
-            "a panorama by the truth layer needs a mirror whose normal tells the place on it, and a cone has the same "
-            "slope everywhere: use the model (--by model)"
-        )
-    across = np.hypot(n[..., 0], n[..., 1])
-    r = profile.radius_at_slope(-across / n[..., 2])
-    share = r / np.maximum(across, 1e-300)  # at the vertex 0 / 0: r is 0 as well
-    P = np.stack([share * n[..., 0], share * n[..., 1], profile.sag(r * r).z_m], axis=-1)
-    return view.T_world_sphere.points(P)
 
 
 def pixels_by_truth(directions: Array, grid: PanoramaGrid) -> Array:

@@ -16,10 +16,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from phibench.estimator.geometry.mirror_geometry import geometry_of
 from phibench.estimator.geometry.reflection import ON_AXIS_SINE, reflect, reflect_jacobian
 from phibench.estimator.geometry.status import Status, StatusArray, flag, keep
 from phibench.scenes.frames import Array
-from phibench.scenes.revolved_mirror import RevolvedMirror
 from phibench.scenes.rig import Rig, View
 from phibench.scenes.validation import SceneError, nearest
 
@@ -96,11 +96,7 @@ def phi_outline(view: View, uv_px: Array) -> Array:
     uv = np.asarray(uv_px, float)
     centre, radius_px = outline_circle(view.rig)
     ratio = np.minimum(np.linalg.norm(uv - centre, axis=-1) / radius_px, 1.0)
-    if isinstance(view.rig.mirror, RevolvedMirror):
-        profile = view.rig.mirror.profile
-        r = ratio * profile.rim_radius_m
-        return keep(np.arctan(2.0 * r * profile.sag(r * r).slope_per_m), _outline_status(view, uv))
-    return keep(np.arcsin(ratio), _outline_status(view, uv))
+    return keep(geometry_of(view.rig.mirror).normal_angle(ratio), _outline_status(view, uv))
 
 
 def outline_circle(rig: Rig) -> tuple[Array, float]:
@@ -124,16 +120,7 @@ def _incidence_gradient(view: View, uv_px: Array) -> Array:
 
 def _outline_gradient(view: View, uv_px: Array) -> Array:
     centre, radius_px = outline_circle(view.rig)
-    offset = np.asarray(uv_px, float) - centre
-    r2 = np.sum(offset * offset, axis=-1, keepdims=True)
-    if isinstance(view.rig.mirror, RevolvedMirror):
-        profile = view.rig.mirror.profile
-        scale = profile.rim_radius_m / radius_px
-        s = r2 * scale * scale
-        sag = profile.sag(s)
-        steeper = (2.0 * sag.slope_per_m + 4.0 * s * sag.bend_per_m3) / (1.0 + 4.0 * s * sag.slope_per_m**2)
-        return offset / np.sqrt(r2) * scale * steeper
-    return offset / np.sqrt(r2 * (radius_px**2 - r2))
+    return geometry_of(view.rig.mirror).normal_angle_gradient(np.asarray(uv_px, float) - centre, radius_px)
 
 
 CONVENTIONS: dict[str, Convention] = {

@@ -24,9 +24,9 @@ from phibench.datasets.common.errors import DatasetError
 from phibench.estimator.geometry.sphere_image import SphereImage, SphereImager
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.scenes.frames import Array, BoolArray
-from phibench.scenes.misalignment import OF_REVOLVED, Misalignment
+from phibench.scenes.mirror import OF_REVOLVED
 from phibench.scenes.misalignment import PARAMETERS as MISALIGNMENT
-from phibench.scenes.revolved_mirror import RevolvedMirror
+from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.rig import Rig
 from phibench.scenes.validation import SceneError, nearest
 
@@ -73,10 +73,7 @@ def has_effect(rig: Rig) -> BoolArray:
 
     A sphere has neither axis nor rim, and a cone no vertex radius.
     """
-    idle: tuple[str, ...] = OF_REVOLVED
-    if isinstance(rig.mirror, RevolvedMirror):
-        idle = ("radius_m",) if rig.mirror.profile.shape == "cone" else ()
-    return np.array([name not in idle for name in PARAMETERS])
+    return np.array([name not in rig.mirror.without_effect for name in PARAMETERS])
 
 
 def moves_rays(rig: Rig) -> BoolArray:

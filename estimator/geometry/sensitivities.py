@@ -14,16 +14,16 @@ from functools import partial
 
 import numpy as np
 
+from phibench.estimator.geometry.mirror_geometry import geometry_of
 from phibench.estimator.geometry.mirror_image import image_of
-from phibench.estimator.geometry.paper_depth import paper_gradient, revolved_gradient
+from phibench.estimator.geometry.paper_depth import paper_gradient
 from phibench.estimator.geometry.phi import CONVENTIONS, GRADIENTS
 from phibench.estimator.geometry.reflection import ray_basis, ray_slope, reflect
 from phibench.estimator.geometry.triangulate import ESTIMATORS, exact_gradient
 from phibench.scenes.camera import Camera
 from phibench.scenes.frames import Array
-from phibench.scenes.mirror import HARMONICS, Form, Level, gradients_by_parameter
+from phibench.scenes.mirror import Level
 from phibench.scenes.misalignment import PARAMETERS as MISALIGNMENT
-from phibench.scenes.revolved_mirror import FormedProfile, Heights, RevolvedMirror, height_level, lengthening
 from phibench.scenes.rig import POSITIONS, Rig, Stroke, View
 
 _MOVES_NO_RAY = ("focus_distance_m", "roughness_alpha", "rim_radius_m")
@@ -128,47 +128,12 @@ def _ray_changes(view: View, uv_px: Array) -> tuple[Array, Array]:
 
 def _surface_changes(view: View, P: Array) -> tuple[Level, Array, Array]:
     """Level function g of the mirror, world axes about its centre, at P, shape (3,), and dg/dp, d(grad g)/dp at P."""
-    axes, mirror = view.form_axes, view.rig.mirror
-    at = height_level(mirror.surface, P @ axes) if isinstance(mirror, RevolvedMirror) else mirror.level(P @ axes)
-    world = Level(at.value_m, axes @ at.gradient, axes @ at.hessian_per_m @ axes.T)
+    axes, geometry = view.form_axes, geometry_of(view.rig.mirror)
+    at = geometry.changing_level(P @ axes)
     g1, gradient1 = np.zeros(len(PARAMETERS)), np.zeros((len(PARAMETERS), 3))
-    if isinstance(mirror, RevolvedMirror):
-        for name, (value, gradient) in _height_changes(mirror, P @ axes).items():
-            g1[PARAMETERS.index(name)], gradient1[PARAMETERS.index(name)] = value, axes @ gradient
-        return world, g1, gradient1
-    values, gradients = gradients_by_parameter(P @ axes)
-    rows = [PARAMETERS.index(name) for name in HARMONICS]
-    g1[rows], gradient1[rows] = -values, -gradients @ axes.T
-    g1[PARAMETERS.index("radius_m")] = -1.0
-    return world, g1, gradient1
-
-
-def _height_changes(mirror: RevolvedMirror, P: Array) -> dict[str, tuple[Array, Array]]:
-    """Changes of z(x, y) - z and of its gradient at P, mirror's frame, by the peaks of a form and the vertex radius.
-
-    z = sag - h N is linear in the peaks. With w of the sag, dsag/dR = -s / (w (R + w)); N changes with sag'.
-    """
-    profile, (x, y) = mirror.profile, P[:2]
-    if profile.shape == "cone":
-        return {}
-    disc_m, across, s = mirror.form_radius_m or profile.rim_radius_m, np.array([x, y, 0.0]), x * x + y * y
-    N, N_s, _ = lengthening(profile, s)
-
-    def raised(h: Heights, N: Array, N_s: Array) -> tuple[Array, Array]:
-        """Value and gradient of -h N."""
-        return -h.z_m * N, -np.array([h.x, h.y, 0.0]) * N - 2.0 * h.z_m * N_s * across
-
-    changes = {
-        name: raised(FormedProfile(profile, Form(**{name: 1.0}), disc_m).deviation(x, y), N, N_s) for name in HARMONICS
-    }
-    R, A, sag = profile.vertex_radius_m, 1.0 + profile.conic, profile.sag(s)
-    w, p, p_s = np.sqrt(R * R - A * s), sag.slope_per_m, sag.bend_per_m3
-    q, q_s = -0.5 * R / w**3, -0.75 * R * A / w**5  # change of p = sag' by R, and its own by s
-    turned = 4.0 * s * p * q / N
-    turned_s = (4.0 * p * q + 4.0 * s * (p_s * q + p * q_s) - turned * N_s) / N
-    value, gradient = raised(FormedProfile(profile, mirror.form or Form(), disc_m).deviation(x, y), turned, turned_s)
-    changes["radius_m"] = value - s / (w * (R + w)), gradient + 2.0 * q * across
-    return changes
+    for name, (value, gradient) in geometry.level_changes(P @ axes, axes).items():
+        g1[PARAMETERS.index(name)], gradient1[PARAMETERS.index(name)] = value, gradient
+    return Level(at.value_m, axes @ at.gradient, axes @ at.hessian_per_m @ axes.T), g1, gradient1
 
 
 def _rigid_changes(view: View) -> tuple[Array, Array, Array, Array]:
@@ -228,24 +193,19 @@ def _normalised_changes(camera: Camera, uv_px: Array, xy: Array) -> Array:
     return np.linalg.solve(camera.distort_jacobian(xy), right)
 
 
-def _paper_pixel_gradient(convention: str, of_radius: float, rig: Rig, h: float, down_px: Array, up_px: Array) -> Array:
-    """dD/d(u1, v1, u2, v2), shape (4,), of eq. (4), or of eq. (5) with `of_radius` 0 in place of 1."""
+def _paper_pixel_gradient(convention: str, of_radius: bool, rig: Rig, h: float, down_px: Array, up_px: Array) -> Array:
+    """dD/d(u1, v1, u2, v2), shape (4,), of eq. (4), or of eq. (5), which leaves out the radius."""
     views, pixels = (rig.at(0.0), rig.at(h)), (down_px, up_px)
     phi1, phi2 = (CONVENTIONS[convention](view, uv) for view, uv in zip(views, pixels, strict=True))
     with np.errstate(all="ignore"):
         slopes = [GRADIENTS[convention](view, uv) for view, uv in zip(views, pixels, strict=True)]
-    if isinstance(rig.mirror, RevolvedMirror):
-        by_phi = (
-            revolved_gradient(phi1, phi2, h, rig.mirror.profile) if of_radius else paper_gradient(phi1, phi2, h, 0.0)
-        )
-    else:
-        by_phi = paper_gradient(phi1, phi2, h, of_radius * rig.mirror.radius_m)
+    by_phi = geometry_of(rig.mirror).paper_gradient(phi1, phi2, h) if of_radius else paper_gradient(phi1, phi2, h, 0.0)
     return np.concatenate([by_phi[i] * slopes[i] for i in range(2)])
 
 
 PIXEL_GRADIENTS: dict[str, PixelGradient] = {
-    **{f"paper_{name}": partial(_paper_pixel_gradient, name, 1.0) for name in CONVENTIONS},
-    "approx_ray": partial(_paper_pixel_gradient, "ray", 0.0),
+    **{f"paper_{name}": partial(_paper_pixel_gradient, name, True) for name in CONVENTIONS},
+    "approx_ray": partial(_paper_pixel_gradient, "ray", False),
     "exact": exact_gradient,
 }
 """dD/d(u1, v1, u2, v2), shape (4,), metres per pixel, of every estimator of `score.ESTIMATORS`."""

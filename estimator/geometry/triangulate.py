@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from phibench.datasets.store.short_form import ShortForm, short
-from phibench.estimator.geometry.paper_depth import PARALLEL_SINE, depth_approx, depth_paper, depth_revolved
+from phibench.estimator.geometry.mirror_geometry import geometry_of
+from phibench.estimator.geometry.paper_depth import PARALLEL_SINE, depth_approx
 from phibench.estimator.geometry.phi import CONVENTIONS
 from phibench.estimator.geometry.reflection import room_rays, room_rays_jacobian
 from phibench.estimator.geometry.status import (
@@ -31,7 +32,6 @@ from phibench.estimator.geometry.status import (
     stroke_status,
 )
 from phibench.scenes.frames import Array
-from phibench.scenes.revolved_mirror import RevolvedMirror
 from phibench.scenes.rig import Rig
 from phibench.scenes.validation import SceneError
 
@@ -336,9 +336,7 @@ Estimator = Callable[[Rig, float, Array, Array], DepthEstimate]
 def paper_estimator(convention: str, rig: Rig, stroke_m: float, uv_down_px: Array, uv_up_px: Array) -> DepthEstimate:
     """Eq. (4) with phi in one convention; on a mirror of revolution, with its profile."""
     phi1, phi2 = _phis(convention, rig, stroke_m, uv_down_px, uv_up_px)
-    if isinstance(rig.mirror, RevolvedMirror):
-        return depth_revolved(phi1, phi2, stroke_m, rig.mirror.profile)
-    return depth_paper(phi1, phi2, stroke_m, rig.mirror.radius_m)
+    return geometry_of(rig.mirror).paper_depth(phi1, phi2, stroke_m)
 
 
 def approx_estimator(convention: str, rig: Rig, stroke_m: float, uv_down_px: Array, uv_up_px: Array) -> DepthEstimate:

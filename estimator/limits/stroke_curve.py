@@ -30,7 +30,6 @@ from phibench.estimator.geometry.status import Status
 from phibench.estimator.limits.processed_bound import SpotSigma
 from phibench.estimator.spots.spot_prediction import Laser, spot_electrons_per_s
 from phibench.scenes.frames import Array
-from phibench.scenes.revolved_mirror import RevolvedMirror
 from phibench.scenes.rig import Rig
 from phibench.scenes.room import escalade360
 
@@ -220,9 +219,10 @@ def _covariance(image: MirrorImage, spot: SpotSigma, electrons: Array) -> Array:
 def outline_distance_px(rig: Rig, uv_px: Array) -> Array:
     """Distance of pixels, shape (m, 2), from the mirror's outline, inwards: angle times focal length.
 
-    That of a mirror of revolution is a polygon in the image.
+    That of a mirror that is no sphere is a polygon in the image.
     """
-    if isinstance(rig.mirror, RevolvedMirror):
+    radius_m = rig.mirror.radius_m
+    if radius_m is None:
         corners = rig.outline_px()
         side, to = np.roll(corners, -1, axis=0) - corners, uv_px[:, None] - corners
         share = np.clip(np.sum(to * side, axis=-1) / np.sum(side * side, axis=-1), 0.0, 1.0)
@@ -230,7 +230,7 @@ def outline_distance_px(rig: Rig, uv_px: Array) -> Array:
         return np.where(reflect(rig.at(0.0), uv_px).status == Status.OK, near, -near)
     centre = rig.sphere_in_camera_m
     away = np.arccos(np.clip(rig.camera.rays(uv_px) @ centre / np.linalg.norm(centre), -1.0, 1.0))
-    rim = math.asin(rig.mirror.radius_m / float(np.linalg.norm(centre)))
+    rim = math.asin(radius_m / float(np.linalg.norm(centre)))
     return np.asarray((rim - away) * rig.camera.fx_px)
 
 

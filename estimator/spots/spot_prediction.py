@@ -32,8 +32,6 @@ from phibench.estimator.geometry.reflection import ON_AXIS_SINE, Reflection, ref
 from phibench.estimator.spots.gaussian_spot import SpotBlur, SpotParts
 from phibench.scenes.frames import Array, as_vector
 from phibench.scenes.laser import Beam
-from phibench.scenes.mirror import SphereMirror
-from phibench.scenes.revolved_mirror import RevolvedMirror
 from phibench.scenes.rig import Rig, View
 
 
@@ -63,7 +61,7 @@ def spot_blur(rig: Rig, uv_px: ArrayLike, depth_m: float | None = None, beam: Be
     if not np.isfinite(lens).all():
         return SpotBlur(camera.blur_sigma_px)
     whole = SpotBlur.of(of_point + lens)
-    parts = _parts(view, uv, point, lens, of_point) if isinstance(rig.mirror, RevolvedMirror) else None
+    parts = _parts(view, uv, point, lens, of_point) if rig.mirror.radius_m is None else None
     return whole if parts is None else replace(whole, parts=parts)
 
 
@@ -150,7 +148,7 @@ def _defocus_px2(view: View, uv_px: Array, point_m: Array | None) -> Array:
 def _curvatures(view: View, hit: Reflection) -> Array:
     """Curvatures of the mirror, 1/m, shape (2,), in the plane of incidence and across it, where a ray meets it."""
     mirror = view.rig.mirror
-    if isinstance(mirror, SphereMirror):
+    if mirror.radius_m is not None:
         return np.full(2, 1.0 / mirror.radius_m)
     axes, n = view.T_world_sphere.R, hit.normal_world
     surface = mirror.level((hit.origin_world_m - view.sphere_centre_m) @ axes)

@@ -35,7 +35,6 @@ from phibench.scenes.faces import FaceTable, IntArray
 from phibench.scenes.frames import Array, BoolArray
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.random_streams import sobol
-from phibench.scenes.revolved_mirror import RevolvedMirror
 from phibench.scenes.rig import View
 
 # Both chief rays are exact up to rounding. Centroid and flux: five and six times what the fewest rays leave, below.
@@ -245,7 +244,7 @@ class TracedSpot:
 def trace_spot(view: View, spot: LaserSpot, room: GeometryLike, truth: SpotTruth, log2_rays: int) -> TracedSpot:
     """Trace the image of a spot from the film.
 
-    Film positions are drawn by a linear map about the image of the spot's centre. In a mirror of revolution each is
+    Film positions are drawn by a linear map about the image of the spot's centre. In a mirror that is no sphere each is
     aimed at its own point of the wall: near a cone's tip no linear map covers the image.
     """
     if spot.beam_direction_world is not None:
@@ -254,7 +253,7 @@ def trace_spot(view: View, spot: LaserSpot, room: GeometryLike, truth: SpotTruth
     x = np.clip(sobol(6, 2**log2_rays), 1e-12, 1.0 - 1e-12)
     bundle = _Bundle(view.rig.camera.aperture_radius_m * _disc(x[:, :2]), _facets(view, x[:, 4:]))
     wall, density = _wall_samples(spot, x[:, 2:4])
-    if isinstance(view.rig.mirror, RevolvedMirror):
+    if view.rig.mirror.radius_m is None:
         uv = aim(view, spot, bundle, wall, _through_chief_point(view, truth, bundle.lens_m))
         jacobian = _wall_jacobian(view, spot, uv, bundle)
     else:

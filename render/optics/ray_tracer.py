@@ -14,13 +14,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from functools import partial
 
 import numpy as np
 
 from phibench.scenes.faces import IntArray
 from phibench.scenes.frames import Array
 from phibench.scenes.glass_tube import GlassTube
-from phibench.scenes.mirror import Form
+from phibench.scenes.mirror import Form, Mirror, SphereMirror
 from phibench.scenes.revolved_mirror import FormedProfile, Profile, RevolvedMirror
 from phibench.scenes.rig import View
 
@@ -78,11 +79,21 @@ def lens_rays(view: View, uv_px: Array, lens_m: Array | None = None) -> tuple[Ar
 
 def reflect(view: View, origins_m: Array, directions: Array) -> MirrorRays:
     """Intersect world rays, shape (N, 3), with the mirror and reflect them."""
-    if isinstance(view.rig.mirror, RevolvedMirror):
-        return _reflect_at_profile(view, origins_m, directions, view.rig.mirror.surface)
-    if view.rig.mirror.form is not None:
-        return _reflect_at_form(view, origins_m, directions)
-    radius, centre, d = view.rig.mirror.radius_m, view.sphere_centre_m[:, None], directions.T
+    return _tracer_of(view.rig.mirror)(view, origins_m, directions)
+
+
+def _tracer_of(mirror: Mirror) -> Callable[[View, Array, Array], MirrorRays]:
+    """Tracer of a mirror: the one test of its type on the camera's side."""
+    if isinstance(mirror, RevolvedMirror):
+        return partial(_reflect_at_profile, mirror.surface)
+    if isinstance(mirror, SphereMirror):
+        radius_m, form = mirror.radius_m, mirror.form
+        return partial(_reflect_at_ball, radius_m) if form is None else partial(_reflect_at_form, radius_m, form)
+    raise TypeError(f"no tracer of {type(mirror).__name__}: add it to render/optics/ray_tracer.py")
+
+
+def _reflect_at_ball(radius: float, view: View, origins_m: Array, directions: Array) -> MirrorRays:
+    centre, d = view.sphere_centre_m[:, None], directions.T
     offset = origins_m.T - centre
     approach = -_inner(offset, d)
     miss = offset + approach * d  # nearest point to the centre: no cancellation
@@ -102,10 +113,9 @@ def _inner(a: Array, b: Array) -> Array:
     return np.asarray(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
 
 
-def _reflect_at_form(view: View, origins_m: Array, directions: Array) -> MirrorRays:
-    axes, centre, mirror = view.T_world_sphere.R, view.sphere_centre_m, view.rig.sphere
-    assert mirror.form is not None
-    points, normals, t = meet((origins_m - centre) @ axes, directions @ axes, mirror.radius_m, mirror.form)
+def _reflect_at_form(radius_m: float, form: Form, view: View, origins_m: Array, directions: Array) -> MirrorRays:
+    axes, centre = view.T_world_sphere.R, view.sphere_centre_m
+    points, normals, t = meet((origins_m - centre) @ axes, directions @ axes, radius_m, form)
     return _reflected(view, points, normals, t, directions)
 
 
@@ -256,7 +266,7 @@ _REGULA_STEPS = 60  # 6 to 10 do
 _REST_M = 1e-16  # less than a rounding of a lens's distance
 
 
-def _reflect_at_profile(view: View, origins_m: Array, directions: Array, surface: Surface) -> MirrorRays:
+def _reflect_at_profile(surface: Surface, view: View, origins_m: Array, directions: Array) -> MirrorRays:
     axes, centre = view.T_world_sphere.R, view.sphere_centre_m
     points, normals, t = meet_profile((origins_m - centre) @ axes, directions @ axes, surface)
     return _reflected(view, points, normals, t, directions)
@@ -272,7 +282,7 @@ def meet_profile(origins_m: Array, directions: Array, surface: Surface) -> tuple
     function, whose secants from there do not pass its first zero.
     """
     profile, height, before_m = surface.ideal, None, 0.0
-    if isinstance(surface, FormedProfile):
+    if surface.form is not None:
         height, before_m = _form_height(surface), _before_m(surface)
     approach = -_dot(origins_m, directions)
     foot, A, R = origins_m + approach[:, None] * directions, 1.0 + profile.conic, profile.vertex_radius_m

@@ -36,6 +36,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,9 +44,9 @@ from numpy.typing import NDArray
 from phibench.render.optics.revolved_reflection import revolved_determinant, revolved_points, rising_root
 from phibench.scenes.frames import Array, BoolArray
 from phibench.scenes.glass_tube import GlassTube, across
-from phibench.scenes.mirror import Form, Level, SphereMirror, deviation, level
+from phibench.scenes.mirror import Form, Level, Mirror, SphereMirror, deviation, level
 from phibench.scenes.revolved_mirror import RevolvedMirror
-from phibench.scenes.rig import Mirror, View
+from phibench.scenes.rig import View
 
 
 @dataclass(frozen=True)
@@ -75,13 +76,13 @@ def mirror_points(view: View, points_m: Array, eyes_m: Array) -> MirrorPoints:
 
     Where glass is around the mirror and no ray through it leads to a point, the straight one is given, and not lit.
     """
-    tube = view.tube
+    tube, solver = view.tube, _solver_of(view.rig.mirror)
     if tube is None:
-        return _straight(view, points_m, eyes_m)
+        return solver.points(view, points_m, eyes_m)
     apparent, bent = points_m, tube.outside(points_m)
     step = np.full(len(points_m), np.inf)
     for _ in range(_GLASS_ROUNDS):
-        found = _straight(view, apparent, eyes_m)
+        found = solver.points(view, apparent, eyes_m)
         with np.errstate(divide="ignore", invalid="ignore"):
             ray = _split(apparent - found.points_m)[1]
             new = np.where(bent[:, None], tube.appearing(points_m, *tube.invariants(found.points_m, ray)), points_m)
@@ -92,25 +93,8 @@ def mirror_points(view: View, points_m: Array, eyes_m: Array) -> MirrorPoints:
     lost = found.lit & ~(step <= _ENOUGH_M)
     if lost.any():
         apparent, bent = np.where(lost[:, None], points_m, apparent), bent & ~lost
-        found = _straight(view, apparent, eyes_m)
+        found = solver.points(view, apparent, eyes_m)
     return MirrorPoints(found.points_m, found.normals, found.lit & ~lost, apparent, bent)
-
-
-def _straight(view: View, points_m: Array, eyes_m: Array) -> MirrorPoints:
-    """Reflection points without glass."""
-    centre, mirror = view.sphere_centre_m, view.rig.mirror
-    axes = view.T_world_sphere.R
-    if isinstance(mirror, RevolvedMirror):
-        ends = ((points_m - centre) @ axes, (eyes_m - centre) @ axes)
-        found, normals, lit = revolved_points(*ends, mirror.surface)
-        return MirrorPoints(found @ axes.T + centre, normals @ axes.T, lit, points_m)
-    if mirror.form is None:
-        found, lit = reflection_points(points_m - centre, eyes_m - centre, mirror.radius_m)
-        found = found + centre
-        return MirrorPoints(found, (found - centre) / mirror.radius_m, lit, points_m)
-    ends = ((points_m - centre) @ axes, (eyes_m - centre) @ axes)
-    found, normals, lit = fermat_points(*ends, mirror.radius_m, mirror.form)
-    return MirrorPoints(found @ axes.T + centre, normals @ axes.T, lit, points_m)
 
 
 @dataclass(frozen=True)
@@ -152,28 +136,98 @@ def onward(view: View, found: MirrorPoints, points_m: Array) -> Onward:
 
 def bundle_spread(view: View, found: MirrorPoints, eyes_m: Array, cos_i: Array) -> Array:
     """Square metres at the eye per steradian at the point, shape (N,), of the bundle that is reflected there."""
-    spread = _spread(view, found.points_m, found.apparent_m, eyes_m, cos_i)
+    spread = _solver_of(view.rig.mirror).spread(view, found.points_m, found.apparent_m, eyes_m, cos_i)
     if view.tube is None or found.bent is None:
         return spread
     return spread * np.where(found.bent, _stretch(view, view.tube, found, eyes_m), 1.0)
 
 
-def _spread(view: View, mirror_m: Array, points_m: Array, eyes_m: Array, cos_i: Array) -> Array:
-    """Spread of a bundle without glass.
+# Kinds of mirror.
 
-    With s the distance point to mirror, l mirror to eye and i the angle of incidence, on a sphere
-    s^2 (1 + l/s_t) (1 + l/s_s); otherwise s^2 l^2 det(M) / cos^2 i.
-    """
-    mirror = view.rig.mirror
-    s, far = (np.linalg.norm(end - mirror_m, axis=-1) for end in (points_m, eyes_m))
-    if isinstance(mirror, SphereMirror) and mirror.form is None:
-        spread = s**2 * (1.0 + far * (1.0 / s + 2.0 / (mirror.radius_m * cos_i)))
-        return spread * (1.0 + far * (1.0 / s + 2.0 * cos_i / mirror.radius_m))
-    axes, centre = view.T_world_sphere.R, view.sphere_centre_m
-    P, a, b = ((place - centre) @ axes for place in (mirror_m, points_m, eyes_m))
+
+class _Solver(Protocol):
+    """World-side optics of one kind of mirror."""
+
+    def points(self, view: View, points_m: Array, eyes_m: Array) -> MirrorPoints:
+        """Reflection points without glass."""
+
+    def spread(self, view: View, mirror_m: Array, points_m: Array, eyes_m: Array, cos_i: Array) -> Array:
+        """Square metres at the eye per steradian at the point, shape (N,), without glass."""
+
+
+def _solver_of(mirror: Mirror) -> _Solver:
+    """Optics of a mirror: the one test of its type on the world's side."""
     if isinstance(mirror, RevolvedMirror):
-        return (s * far / cos_i) ** 2 * revolved_determinant(P, a, b, mirror.surface)
-    return (s * far / cos_i) ** 2 * path_determinant(P, a, b, mirror)
+        return _Revolved(mirror)
+    if isinstance(mirror, SphereMirror):
+        return _Round(mirror) if mirror.form is None else _Formed(mirror, mirror.form)
+    raise TypeError(f"no reflection points of {type(mirror).__name__}: add it to render/optics/reflection_point.py")
+
+
+def _in_mirror(view: View, places_m: Array) -> Array:
+    """World points (N, 3) in the mirror's frame."""
+    return (places_m - view.sphere_centre_m) @ view.T_world_sphere.R
+
+
+def _in_world(view: View, found: Array, normals: Array, lit: BoolArray, points_m: Array) -> MirrorPoints:
+    axes = view.T_world_sphere.R
+    return MirrorPoints(found @ axes.T + view.sphere_centre_m, normals @ axes.T, lit, points_m)
+
+
+@dataclass(frozen=True)
+class _Round:
+    """Alhazen's point; with s the distance point to mirror and l mirror to eye, s^2 (1 + l/s_t) (1 + l/s_s)."""
+
+    mirror: SphereMirror
+
+    def points(self, view: View, points_m: Array, eyes_m: Array) -> MirrorPoints:
+        centre, radius_m = view.sphere_centre_m, self.mirror.radius_m
+        found, lit = reflection_points(points_m - centre, eyes_m - centre, radius_m)
+        found = found + centre
+        return MirrorPoints(found, (found - centre) / radius_m, lit, points_m)
+
+    def spread(self, view: View, mirror_m: Array, points_m: Array, eyes_m: Array, cos_i: Array) -> Array:
+        s, far = (np.linalg.norm(end - mirror_m, axis=-1) for end in (points_m, eyes_m))
+        spread = s**2 * (1.0 + far * (1.0 / s + 2.0 / (self.mirror.radius_m * cos_i)))
+        return np.asarray(spread * (1.0 + far * (1.0 / s + 2.0 * cos_i / self.mirror.radius_m)))
+
+
+@dataclass(frozen=True)
+class _Formed:
+    """Fermat's path from Alhazen's point; s^2 l^2 det(M) / cos^2 i."""
+
+    mirror: SphereMirror
+    form: Form
+
+    def points(self, view: View, points_m: Array, eyes_m: Array) -> MirrorPoints:
+        ends = _in_mirror(view, points_m), _in_mirror(view, eyes_m)
+        return _in_world(view, *fermat_points(*ends, self.mirror.radius_m, self.form), points_m)
+
+    def spread(self, view: View, mirror_m: Array, points_m: Array, eyes_m: Array, cos_i: Array) -> Array:
+        ends = _in_mirror(view, points_m), _in_mirror(view, eyes_m)
+        det = path_determinant(_in_mirror(view, mirror_m), *ends, self.mirror)
+        return _from_determinant(det, mirror_m, points_m, eyes_m, cos_i)
+
+
+@dataclass(frozen=True)
+class _Revolved:
+    """Fermat's path in the coordinates across the axis; the same spread."""
+
+    mirror: RevolvedMirror
+
+    def points(self, view: View, points_m: Array, eyes_m: Array) -> MirrorPoints:
+        ends = _in_mirror(view, points_m), _in_mirror(view, eyes_m)
+        return _in_world(view, *revolved_points(*ends, self.mirror.surface), points_m)
+
+    def spread(self, view: View, mirror_m: Array, points_m: Array, eyes_m: Array, cos_i: Array) -> Array:
+        ends = _in_mirror(view, points_m), _in_mirror(view, eyes_m)
+        det = revolved_determinant(_in_mirror(view, mirror_m), *ends, self.mirror.surface)
+        return _from_determinant(det, mirror_m, points_m, eyes_m, cos_i)
+
+
+def _from_determinant(det: Array, mirror_m: Array, points_m: Array, eyes_m: Array, cos_i: Array) -> Array:
+    s, far = (np.linalg.norm(end - mirror_m, axis=-1) for end in (points_m, eyes_m))
+    return np.asarray((s * far / cos_i) ** 2 * det)
 
 
 # Glass around the mirror.

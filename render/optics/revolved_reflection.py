@@ -76,9 +76,9 @@ def revolved_points(points_m: Array, eyes_m: Array, surface: Surface) -> tuple[A
             ends = points_m[rest], eyes_m[rest]
             P[rest], N[rest], valid[rest] = _search(_start(*ends, surface), *ends, surface)
         rest = np.flatnonzero(~valid)
-        if len(rest) and isinstance(surface, Profile) and surface.shape == "cone":  # a cone bears no form error
+        if len(rest) and surface.ideal.shape == "cone":  # which bears no form error
             ends = points_m[rest], eyes_m[rest]
-            P[rest], N[rest], valid[rest] = _search(_beside_tip(*ends, surface), *ends, surface)
+            P[rest], N[rest], valid[rest] = _search(_beside_tip(*ends, surface.ideal), *ends, surface)
         rest = np.flatnonzero(~valid & (np.linalg.norm(points_m, axis=1) < _BESIDE * surface.rim_radius_m))
         if len(rest):
             ends = points_m[rest], eyes_m[rest]

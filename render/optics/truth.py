@@ -28,8 +28,8 @@ from phibench.render.optics.room_tracer import (
 from phibench.scenes.faces import IntArray
 from phibench.scenes.frames import Array
 from phibench.scenes.laser import LaserSpot
-from phibench.scenes.revolved_mirror import RevolvedMirror
-from phibench.scenes.rig import View, limb_points
+from phibench.scenes.mirror import limb_points
+from phibench.scenes.rig import View
 
 
 @dataclass(frozen=True)
@@ -176,7 +176,7 @@ def _cause(view: View, spot: LaserSpot, room: GeometryLike, found: MirrorPoints,
 
 def _outline_distance_px(view: View, mirror: Array) -> float:
     """Distance of a mirror point's image from the mirror's outline, across it, pixels (angle times focal length)."""
-    if isinstance(view.rig.mirror, RevolvedMirror):
+    if view.rig.mirror.radius_m is None:
         return _polygon_distance_px(view, mirror)
     to_mirror, to_centre = mirror - view.camera_centre_m, view.sphere_centre_m - view.camera_centre_m
     across, along = np.linalg.norm(np.cross(to_mirror, to_centre)), np.dot(to_mirror, to_centre)

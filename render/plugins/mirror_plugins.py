@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from phibench.render.plugins.plugin_tree import Plugin, Rgb, Triangles, Value
 from phibench.render.room.camera_plugin import MM_PER_M
 from phibench.scenes.frames import Array, Vector
-from phibench.scenes.mirror import Form, MetalSurface, SphereMirror, deviation, level
-from phibench.scenes.revolved_mirror import FormedProfile, Profile, RevolvedMirror
+from phibench.scenes.mirror import MetalSurface
 from phibench.scenes.rig import View
 from phibench.scenes.room import MIRROR_NAME
 from phibench.scenes.validation import SceneError
@@ -36,14 +35,10 @@ def mirror_plugin(view: View) -> Plugin:
     """
     mirror = view.rig.mirror
     bsdf = mirror_bsdf(mirror, view.rig.camera.detector.band_wavelength_nm)
-    if isinstance(mirror, RevolvedMirror):
-        grid = cap_grid(mirror.surface, *cap_places(mirror.profile))
-    elif mirror.form is not None:
-        grid = form_grid(mirror)
-    else:
+    if mirror.radius_m is not None and mirror.form is None:
         ball: dict[str, Value] = {"radius": MM_PER_M * mirror.radius_m, "bsdf": bsdf}
         return Plugin("shape", "sphere", ball, MIRROR_NAME, MIRROR_NAME)
-    return grid_plugin(view, *grid, bsdf, closed=True)
+    return grid_plugin(view, *mirror.grid(_RINGS, _SPOKES), bsdf, closed=True)
 
 
 def mirror_bsdf(mirror: MetalSurface, wavelengths_nm: Vector) -> Plugin:
@@ -104,45 +99,3 @@ def grid_triangles(rings: int, spokes: int, *, closed: bool) -> NDArray[np.int64
     a, b = spokes * ring + spoke, spokes * ring + (spoke + 1) % spokes
     c, d = a + spokes, b + spokes
     return np.concatenate([np.stack([a, c, b], -1), np.stack([b, c, d], -1)]).reshape(-1, 3)
-
-
-def form_grid(mirror: SphereMirror, rings: int = _RINGS, spokes: int = _SPOKES) -> tuple[Array, Array]:
-    """Points and outward unit normals of a sphere, with its form error, pole to pole, shape (rings, spokes, 3)."""
-    polar = np.linspace(0.0, np.pi, rings)[:, None]
-    turn = np.linspace(0.0, 2.0 * np.pi, spokes, endpoint=False)
-    grid = np.broadcast_arrays(np.sin(polar) * np.cos(turn), np.sin(polar) * np.sin(turn), np.cos(polar))
-    n = np.stack(grid, axis=-1)
-    form = mirror.form or Form()
-    points = (mirror.radius_m + deviation(n, form).value_m)[..., None] * n
-    normals = level(points, mirror.radius_m, form).gradient
-    return points, normals / np.linalg.norm(normals, axis=-1, keepdims=True)
-
-
-def cap_grid(profile: Profile | FormedProfile, radii_m: Array, turns_rad: Array) -> tuple[Array, Array]:
-    """Points and unit normals of a mirror of revolution, shape (rings, spokes, 3), for falling radii."""
-    if isinstance(profile, FormedProfile):
-        x, y = radii_m[:, None] * np.cos(turns_rad), radii_m[:, None] * np.sin(turns_rad)
-        at = profile.heights(x, y)
-        normals = np.stack([at.x, at.y, np.full(x.shape, -1.0)], axis=-1)
-        return np.stack([x, y, at.z_m], axis=-1), normals / np.linalg.norm(normals, axis=-1, keepdims=True)
-    sag = profile.sag(radii_m**2)
-    # a cone's tip has the normals of all its spokes
-    rise = (
-        2.0 * radii_m * sag.slope_per_m
-        if profile.shape != "cone"
-        else np.full_like(radii_m, (-1.0 - profile.conic) ** -0.5)
-    )
-    across = np.stack([np.cos(turns_rad), np.sin(turns_rad)], axis=-1)
-
-    def grid(flat: Array, z: Array) -> Array:
-        tall = np.broadcast_to(z[:, None, None], (len(radii_m), len(turns_rad), 1))
-        return np.concatenate([flat[:, None, None] * across, tall], axis=-1)
-
-    normals = grid(rise, np.full_like(rise, -1.0))
-    return grid(radii_m, sag.z_m), normals / np.linalg.norm(normals, axis=-1, keepdims=True)
-
-
-def cap_places(profile: Profile) -> tuple[Array, Array]:
-    """Radii and turns of the whole cap's grid: rings lie closer towards the rim, where the surface may be steep."""
-    angle = np.linspace(0.5 * np.pi, 0.0, _RINGS)
-    return profile.rim_radius_m * np.sin(angle), np.linspace(0.0, 2.0 * np.pi, _SPOKES, endpoint=False)

@@ -84,7 +84,7 @@ class _Revolved:
         terms = profile.even_terms if not profile.is_quadric else ()
         self._terms = [number(a * MM_PER_M ** (1 - 2 * i)) for i, a in enumerate(terms, start=2)]
         self._form, before_m = None, -_least_of_terms(profile)
-        if isinstance(surface, FormedProfile):
+        if surface.form is not None:
             self._form, before_m = _DiscForm(number, surface), before_m + surface.reach_m
         self._least, self._is_plain = number(-MM_PER_M * before_m), not terms and self._form is None
 

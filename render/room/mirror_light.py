@@ -53,7 +53,7 @@ def mirror_body(mi: ModuleType, view: View) -> MirrorBody | None:
     if view.rig.holder is None:
         return None
     mirror = view.rig.mirror
-    return _revolved(mi, view, mirror) if isinstance(mirror, RevolvedMirror) else _ball(mi, mirror.radius_m)
+    return _ball(mi, mirror.radius_m) if mirror.radius_m is not None else _revolved(mi, view, mirror)
 
 
 def _ball(mi: ModuleType, radius_m: float) -> MirrorBody:

@@ -29,8 +29,9 @@ from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.estimator.interface import Spot
 from phibench.estimator.methods.registry import METHODS
 from phibench.scenes.frames import Array
-from phibench.scenes.misalignment import OF_REVOLVED, Misalignment
+from phibench.scenes.mirror import OF_REVOLVED
 from phibench.scenes.misalignment import PARAMETERS as MISALIGNMENT
+from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.random_streams import generator
 from phibench.scenes.rig import Rig
 from phibench.scenes.validation import SceneError

@@ -20,7 +20,6 @@ from phibench.estimator.geometry.mirror_image import blocked
 from phibench.estimator.geometry.reflection import reflect, reflect_jacobian
 from phibench.estimator.geometry.status import Status
 from phibench.scenes.frames import Array, BoolArray
-from phibench.scenes.revolved_mirror import RevolvedMirror
 from phibench.scenes.rig import Rig
 from phibench.scenes.room import escalade360
 
@@ -86,12 +85,7 @@ def meridian(rig: Rig) -> Meridian:
     with np.errstate(divide="ignore"):  # a ray straight down meets the axis nowhere
         above = place[:, 2] - place[:, 0] * d[:, 2] / d[:, 0]
     seen = (ray.status == Status.OK) & np.isfinite(per_px)
-    return Meridian(radius[seen], theta[seen], 1.0 / per_px[seen], (above - _vertex_m(rig))[seen])
-
-
-def _vertex_m(rig: Rig) -> float:
-    """Height of the mirror's vertex over the origin of its frame; that of a sphere is its centre."""
-    return 0.0 if isinstance(rig.mirror, RevolvedMirror) else -rig.sphere.radius_m
+    return Meridian(radius[seen], theta[seen], 1.0 / per_px[seen], (above - rig.mirror.vertex_m)[seen])
 
 
 @dataclass(frozen=True)

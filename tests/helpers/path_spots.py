@@ -10,7 +10,7 @@ import numpy as np
 
 from phibench.render.optics.spot_layer import spot_layer
 from phibench.render.optics.truth import spot_truth
-from phibench.render.plugins.mirror_plugins import cap_grid, grid_plugin, mirror_bsdf, mirror_plugin
+from phibench.render.plugins.mirror_plugins import grid_plugin, mirror_bsdf, mirror_plugin
 from phibench.render.plugins.plugin_tree import Plugin, mitsuba_dict
 from phibench.render.plugins.room_plugins import to_scene_mm
 from phibench.render.room.camera_plugin import MM_PER_M, sensor_dict
@@ -67,7 +67,7 @@ def _mirror(view: View, spot: LaserSpot) -> Plugin:
     x, y, _ = ((place - view.sphere_centre_m) @ view.T_world_sphere.R)[0]
     radius, turn, steps = math.hypot(x, y), math.atan2(y, x), np.linspace(-1.0, 1.0, _FACETS + 1)
     assert _PATCH_M < radius < mirror.profile.rim_radius_m - _PATCH_M
-    grid = cap_grid(mirror.profile, radius - _PATCH_M * steps, turn + _PATCH_M / radius * steps)
+    grid = mirror.profile.grid(radius - _PATCH_M * steps, turn + _PATCH_M / radius * steps)
     bsdf = mirror_bsdf(mirror, view.rig.camera.detector.band_wavelength_nm)
     return grid_plugin(view, *grid, bsdf, closed=False)
 

@@ -30,8 +30,8 @@ from phibench.render.sensor.rolling_shutter import spot_velocity_px_per_s
 from phibench.scenes.catalog import c310_rig, default_rig
 from phibench.scenes.frames import Pose
 from phibench.scenes.laser import LaserSpot
-from phibench.scenes.mirror import HARMONICS, Form
-from phibench.scenes.misalignment import OF_REVOLVED, PARAMETERS, Misalignment, Motion
+from phibench.scenes.mirror import HARMONICS, OF_REVOLVED, Form
+from phibench.scenes.misalignment import PARAMETERS, Misalignment, Motion
 from phibench.scenes.rig import Rig
 from phibench.scenes.room import carriage
 from phibench.scenes.validation import SceneError

@@ -19,7 +19,8 @@ from phibench.estimator.geometry.rig_parameters import PARAMETERS as CALIBRATION
 from phibench.render.optics.truth import spot_truth
 from phibench.scenes.catalog import default_rig
 from phibench.scenes.laser import LaserSpot
-from phibench.scenes.misalignment import OF_REVOLVED, PARAMETERS, Misalignment
+from phibench.scenes.mirror import OF_REVOLVED
+from phibench.scenes.misalignment import PARAMETERS, Misalignment
 from phibench.scenes.random_streams import generator
 from phibench.studies.framework import StudyDatasets, read_settings
 from phibench.studies.misaligned_rigs import (

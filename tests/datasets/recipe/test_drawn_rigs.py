@@ -15,7 +15,7 @@ from phibench.datasets.recipe.build import build_misalignment
 from phibench.datasets.recipe.load import RECIPES, check_recipe, load_recipe
 from phibench.datasets.recipe.tables import Recipe
 from phibench.estimator.geometry.rig_parameters import PRIOR_SIGMA
-from phibench.scenes.misalignment import OF_REVOLVED
+from phibench.scenes.mirror import OF_REVOLVED
 
 SHIPPED = (RECIPES / "paper-misaligned.toml").read_text(encoding="utf-8")
 

@@ -23,8 +23,9 @@ from phibench.render.optics.reflection_point import mirror_points
 from phibench.scenes.catalog import default_rig
 from phibench.scenes.frames import Array, rotation_xyz
 from phibench.scenes.holder import fitted
-from phibench.scenes.misalignment import OF_REVOLVED, Misalignment
+from phibench.scenes.mirror import OF_REVOLVED
 from phibench.scenes.misalignment import PARAMETERS as MISALIGNMENT
+from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.revolved_mirror import cone, sphere_cap
 from phibench.scenes.rig import Rig, View
 

@@ -9,9 +9,9 @@ import pytest
 from helpers.revolved_rigs import PROFILES, revolved
 
 from phibench.render.optics.ray_tracer import lens_rays, reflect
-from phibench.render.plugins.mirror_plugins import cap_grid, cap_places
 from phibench.render.room.mirror_intersection import mirror_intersection
 from phibench.render.setup.variant import activate
+from phibench.scenes.revolved_mirror import RevolvedMirror
 
 
 @pytest.fixture(scope="module")
@@ -47,9 +47,8 @@ def test_accuracy_rays_that_meet_the_mirror(mi: ModuleType, shape: str, *, align
 def test_mesh_of_the_cap(shape: str) -> None:
     """Corners on the surface with its normals, facets' middles within what `scene` says of its chords."""
     profile = PROFILES[shape]
-    radii, turns = cap_places(profile)
-    points, normals = cap_grid(profile, radii, turns)
-    assert points.shape == normals.shape == (len(radii), len(turns), 3)
+    points, normals = RevolvedMirror(profile).grid(450, 900)
+    assert points.shape == normals.shape == (450, 900, 3)
     rings = points[:-1]  # a cone's tip has no gradient
     gradient = profile.level(rings).gradient
     assert np.abs(profile.level(rings).value_m).max() < 1e-16
