@@ -27,8 +27,7 @@ from scipy import ndimage
 from phibench.datasets.read import Dataset, Sample
 from phibench.datasets.scene.scene_export import expected_radiance, in_carried_pixels, sample_scene
 from phibench.datasets.scene.scene_xml import write_scene
-from phibench.render.plugins.sensor_plugin import carried, etendue, film_axes
-from phibench.render.plugins.standard_scene import Light
+from phibench.render.plugins.standard_scene import Light, carried, etendue, film_axes
 from phibench.render.setup.variant import activate
 from phibench.scenes.frames import Array
 from phibench.scenes.random_streams import seed_32

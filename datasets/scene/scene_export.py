@@ -22,8 +22,7 @@ from phibench.datasets.scene.scene_xml import write_scene
 from phibench.datasets.store.files import require_writable, write_bytes, write_text
 from phibench.datasets.store.layers import write_exr
 from phibench.render.plugins.plugin_tree import Plugin, mitsuba_dict
-from phibench.render.plugins.sensor_plugin import carried, etendue
-from phibench.render.plugins.standard_scene import LIGHTS, Light, standard_scene
+from phibench.render.plugins.standard_scene import LIGHTS, Light, carried, etendue, standard_scene
 from phibench.render.setup.variant import activate
 from phibench.scenes.camera import Camera
 from phibench.scenes.frames import Array

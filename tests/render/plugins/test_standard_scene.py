@@ -14,8 +14,7 @@ from phibench.render.optics.ray_tracer import trace_pixels
 from phibench.render.plugins.mirror_plugins import mirror_bsdf
 from phibench.render.plugins.plugin_tree import BitmapPlugin, Plugin, Rgb, Triangles, mitsuba_dict
 from phibench.render.plugins.room_plugins import to_scene_mm
-from phibench.render.plugins.sensor_plugin import carried, etendue, sensor_plugin
-from phibench.render.plugins.standard_scene import standard_scene
+from phibench.render.plugins.standard_scene import carried, etendue, sensor_plugin, standard_scene
 from phibench.render.setup.variant import activate
 from phibench.scenes.camera import Camera
 from phibench.scenes.catalog import c310_camera, default_rig, lab
