@@ -9,7 +9,7 @@ OUT    ?= out/paper
 SAMPLES ?= 12
 BENCH  ?= out/bench-dev
 STUDIES ?= out/studies
-STUDIES_ALL := noise misalignment baseline cause isotropy stroke mirror loop
+STUDIES_ALL := $(notdir $(patsubst %/,%,$(dir $(wildcard studies/*/study.py))))
 # Environment without Mitsuba, and what is tested in it.
 BASE := out/base-env
 BASE_TESTS := tests/scenes tests/estimator/geometry tests/benchmark/isolation tests/test_package.py

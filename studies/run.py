@@ -35,7 +35,8 @@ DOCUMENT = "study.json"
 _AGAIN = "run `phibench study` again"
 FINDINGS = "findings.md"
 DATA = "data"
-NAMES = ("noise", "misalignment", "baseline", "cause", "isotropy", "stroke", "mirror", "loop")
+NAMES = tuple(sorted(path.parent.name for path in Path(__file__).parent.glob("*/study.py")))
+"""Folders with a study: adding one is adding its folder."""
 
 
 class DrawingEntry(Document):

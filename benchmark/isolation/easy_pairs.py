@@ -31,7 +31,7 @@ from phibench.estimator.methods.locate import around, clipped
 from phibench.estimator.pair_set import ImageTruth, PairTruth
 from phibench.estimator.spots.camera_codes import tone_of, yuyv_image
 from phibench.estimator.spots.gaussian_spot import outer, profile
-from phibench.estimator.spots.image_planes import KINDS, linear_planes, through_jpeg
+from phibench.estimator.spots.image_planes import KINDS, kind_of, linear_planes, through_jpeg
 from phibench.estimator.spots.raw_pixels import bayer_filters
 from phibench.estimator.spots.spot_prediction import spot_blur
 from phibench.scenes.camera import Camera
@@ -235,7 +235,11 @@ class EasyPairs(ShortForm):
     whole: int = 0
 
     def __post_init__(self) -> None:
-        if self.preset not in KINDS:
+        try:
+            kind = kind_of(sensor_card(self.preset))
+        except ValueError:
+            kind = ""  # no such preset
+        if kind not in KINDS:
             raise MethodError(f"no easy pairs for preset '{self.preset}': {nearest(self.preset, KINDS)}")
 
     def _shown(self) -> dict[str, Any]:
@@ -282,7 +286,7 @@ class EasyPairs(ShortForm):
         """The exact answer."""
         scene, camera = _scene(self.rig, number), self._camera()
         down, up = (_spot_truth(camera, scene, spot) for _, spot in _spots(scene))
-        quality = camera.card.jpeg_quality if self.preset == "mjpeg" else None
+        quality = camera.card.jpeg_quality if camera.card.output == "mjpeg" else None
         return PairTruth(
             number,
             f"easy-{number}",

@@ -24,7 +24,6 @@ import numpy as np
 
 from phibench.datasets.common.errors import RecipeError
 from phibench.datasets.recipe.build import (
-    MIRROR_SHAPES,
     build_misalignment,
     build_rig,
     build_target,
@@ -33,7 +32,7 @@ from phibench.datasets.recipe.build import (
     true_stroke_m,
 )
 from phibench.datasets.recipe.distributions import DistributionTable, pick, quantile
-from phibench.datasets.recipe.mirror_tables import DRAWN_OF_MIRROR, HolderTable, MirrorTable
+from phibench.datasets.recipe.mirror_tables import DRAWN_OF_MIRROR, OF_SHAPES, SHAPES, HolderTable, MirrorTable
 from phibench.datasets.recipe.spot_placement import Boards, Placed, place, shown_as
 from phibench.datasets.recipe.tables import (
     DRAWABLE,
@@ -261,7 +260,7 @@ def rig_table(table: RigTable, values: Mapping[str, Value]) -> RigTable:
 def _drawn_mirror(table: MirrorTable, drawn: Mapping[str, Value]) -> MirrorTable:
     """`[rig.mirror]` with drawn values, without what the drawn shape does not have."""
     shape = str(drawn.get("shape", table.shape))
-    idle = dict.fromkeys((key for key, shapes in MIRROR_SHAPES.items() if shape not in shapes), None)
+    idle = dict.fromkeys((key for key in OF_SHAPES if key not in SHAPES[shape].keys), None)
     return table.model_copy(update={**drawn, **idle})
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from phibench.datasets.recipe.mirror_tables import HolderTable, MirrorTable
+from phibench.datasets.recipe.mirror_tables import OF_SHAPES, SHAPES, HolderTable, MirrorTable
 from phibench.datasets.recipe.room_tables import RoomTable
 from phibench.datasets.recipe.tables import (
     OWN_ALBEDO,
@@ -110,25 +110,14 @@ def _rig(table: RigTable) -> Rig:
     return Rig(camera, mirror, T_world_camera, T_camera_sphere, _stroke_axis(table), holder=holder)
 
 
-MIRROR_SHAPES: Mapping[str, tuple[str, ...]] = {
-    "vertex_radius_m": ("ellipsoid", "paraboloid", "hyperboloid", "polynomial"),
-    "conic": ("ellipsoid", "hyperboloid", "polynomial"),
-    "half_angle_deg": ("cone",),
-    "even_terms": ("polynomial",),
-}
-"""Shapes that a key of `[rig.mirror]` belongs to."""
-
 _VERTEX_M = 0.220  # from the lens: rims of 60 mm fit the image
 _VERTEX_RADIUS_M = 0.060  # as the sphere's radius
-CONIC_RANGES = {"ellipsoid": (-1.0, np.inf), "hyperboloid": (-np.inf, -1.0)}
-"""Open ranges of the conic constants of shapes that do not take every one."""
-_CONICS = {"ellipsoid": -0.5, "paraboloid": -1.0, "hyperboloid": -1.5625, "polynomial": -1.0}
 
 
 def idle_mirror_keys(path: str, table: MirrorTable, shapes: Sequence[str] = ()) -> list[Fault]:
     """Faults of keys of `[rig.mirror]` that belong to none of its possible shapes, and of one that a shape needs."""
     shapes = shapes or (table.shape,)
-    given = [key for key in MIRROR_SHAPES if getattr(table, key) is not None]
+    given = [key for key in OF_SHAPES if getattr(table, key) is not None]
     faults = _idle_of_shapes(path, given, shapes)
     if "polynomial" in shapes and not table.even_terms:
         faults.append(Fault(f"{path}.even_terms", 'is missing: shape = "polynomial" needs at least one number'))
@@ -152,12 +141,11 @@ def fixed_conic_faults(path: str, table: MirrorTable, shapes: Sequence[str]) -> 
 
 def _conic_faults(key: str, least: float, most: float, shapes: Sequence[str]) -> list[Fault]:
     faults = []
-    for shape in shapes:
-        low, high = CONIC_RANGES.get(shape, (-np.inf, np.inf))
-        if shape in MIRROR_SHAPES["conic"] and not low < least <= most < high:
-            side = "below" if shape == "hyperboloid" else "above"
+    for name in shapes:
+        shape = SHAPES[name]
+        if "conic" in shape.keys and not shape.low < least <= most < shape.high:
             reach = f"is {least:g}" if least == most else f"reaches from {least:g} to {most:g}"
-            text = f'{reach}; a conic of shape = "{shape}" is {side} -1'
+            text = f'{reach}; a conic of shape = "{name}" is {shape.side}'
             faults.append(Fault(key, f"{text}, give such a one or leave that shape out"))
     return faults
 
@@ -165,7 +153,7 @@ def _conic_faults(key: str, least: float, most: float, shapes: Sequence[str]) ->
 def _idle_of_shapes(path: str, given: Iterable[str], shapes: Sequence[str]) -> list[Fault]:
     faults = []
     for key in given:
-        takers = MIRROR_SHAPES.get(key, shapes)
+        takers = tuple(name for name, shape in SHAPES.items() if key in shape.keys) if key in OF_SHAPES else shapes
         if not set(takers) & set(shapes):
             quoted, is_now = (" or ".join(f'"{shape}"' for shape in names) for names in (takers, shapes))
             text = f"has no effect on shape = {is_now}; remove it, or give shape = {quoted}"
@@ -175,16 +163,15 @@ def _idle_of_shapes(path: str, given: Iterable[str], shapes: Sequence[str]) -> l
 
 def build_profile(table: MirrorTable, vertex_m: float) -> Profile:
     """Profile of a mirror whose vertex lies so far before the lens; the lens is in a hyperboloid's focus by default."""
-    if table.shape == "cone":
+    shape = SHAPES[table.shape]
+    if shape.conic is None:
         return cone(float(np.radians(table.half_angle_deg or 45.0)), table.rim_radius_m)
-    conic = _CONICS[table.shape] if table.conic is None else table.conic
-    low, high = CONIC_RANGES.get(table.shape, (-np.inf, np.inf))
-    if not low < conic < high:
-        side = "below" if table.shape == "hyperboloid" else "above"
-        raise SceneError(f'Profile.conic = {conic:g}: {side} -1 for shape = "{table.shape}"')
+    conic = shape.conic if table.conic is None else table.conic
+    if not shape.low < conic < shape.high:
+        raise SceneError(f'Profile.conic = {conic:g}: {shape.side} for shape = "{table.shape}"')
     radius_m = table.vertex_radius_m
     if radius_m is None:
-        radius_m = vertex_m * ((-conic) ** 0.5 - 1.0) if table.shape == "hyperboloid" else _VERTEX_RADIUS_M
+        radius_m = vertex_m * ((-conic) ** 0.5 - 1.0) if shape.lens_in_focus else _VERTEX_RADIUS_M
     return Profile(radius_m, conic, table.rim_radius_m, table.even_terms or ())
 
 

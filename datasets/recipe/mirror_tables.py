@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer
 
@@ -50,6 +52,50 @@ class HolderTable(OfHolder):
     )
 
 
+@dataclass(frozen=True)
+class MirrorShape:
+    """Shape of `[rig.mirror]`, a profile of revolution.
+
+    Parameters
+    ----------
+    keys : tuple of str
+        Keys that it takes beside the rim.
+    conic : float or None
+        k where none is given; None for a cone, which has a half angle.
+    low, high : float
+        Open range of k.
+    lens_in_focus : bool
+        Without a vertex radius the lens is in its outer focus.
+    """
+
+    keys: tuple[str, ...]
+    conic: float | None = None
+    low: float = -math.inf
+    high: float = math.inf
+    lens_in_focus: bool = False
+
+    @property
+    def side(self) -> str:
+        """Range of k in words."""
+        return f"below {self.high:g}" if math.isinf(self.low) else f"above {self.low:g}"
+
+
+SHAPES = {
+    "ellipsoid": MirrorShape(("vertex_radius_m", "conic"), -0.5, low=-1.0),
+    "paraboloid": MirrorShape(("vertex_radius_m",), -1.0),
+    "hyperboloid": MirrorShape(("vertex_radius_m", "conic"), -1.5625, high=-1.0, lens_in_focus=True),
+    "cone": MirrorShape(("half_angle_deg",)),
+    "polynomial": MirrorShape(("vertex_radius_m", "conic", "even_terms"), -1.0),
+}
+"""Shapes by name; another conic is another line here."""
+if TYPE_CHECKING:
+    ShapeName = str
+else:
+    ShapeName = Literal[tuple(SHAPES)]
+OF_SHAPES = tuple(dict.fromkeys(key for shape in SHAPES.values() for key in shape.keys))
+"""Keys of `[rig.mirror]` that belong to some shapes alone."""
+
+
 class MirrorTable(Table):
     """`[rig.mirror]`: a mirror of revolution instead of the sphere."""
 
@@ -59,9 +105,7 @@ class MirrorTable(Table):
         document: dict[str, Any] = serialised(self)
         return {key: value for key, value in document.items() if not key.startswith("tilt_") or value}
 
-    shape: Literal["ellipsoid", "paraboloid", "hyperboloid", "cone", "polynomial"] = Field(
-        description="surface at z_c_m; a sphere needs no table"
-    )
+    shape: ShapeName = Field(description="surface at z_c_m; a sphere needs no table")
     rim_radius_m: float = Field(default=0.060, gt=0.0, le=1.0, description="radius of the rim, where the mirror ends")
     vertex_radius_m: float | None = Field(
         default=None, gt=0.0, le=1.0, description="R, radius of curvature at the vertex; convex"

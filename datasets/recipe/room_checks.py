@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from pydantic import ValidationError
 
 from phibench.datasets.recipe.distributions import DistributionTable, Raw, distribution_of, table_of, tables_of
-from phibench.datasets.recipe.room_tables import GeometryTable, MeshTable, PanoramaTable, generated_count
+from phibench.datasets.recipe.room_tables import ROOM_LISTS, GeometryTable, MeshTable, PanoramaTable, generated_count
 from phibench.datasets.rooms.room_files import RoomError, RoomFiles
 from phibench.scenes.rig import Rig
 from phibench.scenes.validation import Fault, SceneError
@@ -45,12 +45,17 @@ def room_faults(raw: Raw) -> Iterator[Fault]:
 
 def _counts(raw: Raw) -> Iterator[Fault]:
     rooms = table_of(raw, "rooms")
-    others, exported = sum(len(tables_of(rooms, key)) for key, _ in _KINDS), _exported(rooms)
+    others, exported = _listed(rooms), _exported(rooms)
     if rooms.get("count") == 0 and type(rooms["count"]) is int and not others and not exported:
         text = "0, and there are no panoramas or meshes; give 1 or more, or [[rooms.panoramas]] or [[rooms.meshes]]"
         yield Fault("rooms.count", text)
     elif others and not exported and not rooms.get("count") and table_of(rooms, "properties"):
         yield Fault("rooms.properties", "given, but no room is generated; give rooms.count above 0, or remove it")
+
+
+def _listed(rooms: Raw) -> int:
+    """Number of rooms that the recipe lists one by one."""
+    return sum(len(tables_of(rooms, key)) for key in ROOM_LISTS)
 
 
 def _exported(rooms: Raw) -> int:
@@ -101,7 +106,7 @@ def low_rooms(raw: Raw, rig: Rig) -> Iterator[Fault]:
 def _heights(raw: Raw) -> Iterator[tuple[str, float]]:
     """Path and least height of generated rooms and of boxes."""
     rooms = table_of(raw, "rooms")
-    others, count = sum(len(tables_of(rooms, key)) for key, _ in _KINDS), rooms.get("count")
+    others, count = _listed(rooms), rooms.get("count")
     exported = _exported(rooms)
     if exported or generated_count(count if isinstance(count, int) else None, others):
         default = DistributionTable.model_validate(dict(PROPERTIES["height_m"].default))

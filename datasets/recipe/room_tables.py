@@ -236,7 +236,7 @@ class RoomsTable(Table):
     @property
     def generated(self) -> int:
         """Number of generated rooms that are rendered as they are."""
-        return generated_count(self.count, len(self.panoramas) + len(self.meshes) + self.exported)
+        return generated_count(self.count, sum(len(getattr(self, key)) for key in ROOM_LISTS) + self.exported)
 
     @property
     def exported(self) -> int:
@@ -256,6 +256,10 @@ class RoomsTable(Table):
         """All tables that name a file."""
         geometries = (panorama.mesh for panorama in self.panoramas if panorama.mesh is not None)
         return (*self.panoramas, *geometries, *self.meshes)
+
+
+ROOM_LISTS = tuple(key for key, field in RoomsTable.model_fields.items() if field.default == ())
+"""Keys of `[rooms]` that list rooms one by one."""
 
 
 def generated_count(count: int | None, others: int) -> int:

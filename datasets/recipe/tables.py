@@ -39,6 +39,7 @@ from phibench.datasets.recipe.mirror_tables import (
     Unit,
 )
 from phibench.datasets.recipe.room_tables import RoomsTable, RoomTable
+from phibench.render.sensor.settings import pixel_presets
 from phibench.scenes.catalog import BOARD_SIZE_M
 from phibench.scenes.mirror import OF_REVOLVED, MetalName
 from phibench.scenes.misalignment import PARAMETERS
@@ -51,7 +52,10 @@ Decentre = Annotated[float, Field(ge=-0.1, le=0.1)]
 Distortion = Annotated[float, Field(ge=-1000.0, le=1000.0)]
 FocalPx = Annotated[float, Field(ge=50.0, le=50000.0)]
 Response = Annotated[tuple[Unit, ...], Field(strict=False, min_length=3, max_length=3)]
-Preset = Literal["mono-raw", "bayer-raw", "srgb8", "yuyv", "mjpeg"]
+if TYPE_CHECKING:
+    Preset = str
+else:
+    Preset = Literal[pixel_presets()]
 Probability = Annotated[float, Field(ge=0.0, le=1.0)]
 OWN_ALBEDO = "surface"
 """Value of `laser.albedo`: that of each surface."""

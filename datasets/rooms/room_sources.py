@@ -12,7 +12,7 @@ import tempfile
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Literal, cast
+from typing import Literal, cast, get_args
 
 from phibench.datasets.common.input_files import FILE_NAME
 from phibench.datasets.rooms.mesh_placement import MeshSettings
@@ -200,7 +200,8 @@ def _require_names(*paths: Path) -> None:
 RoomSource = NamedRoom | GeneratedRoom | PanoramaRoom | MeshRoom | UnexportedRoom
 SOURCES: dict[str, type[RoomSource]] = {
     cast(str, kind.__dataclass_fields__["kind"].default): kind
-    for kind in (NamedRoom, GeneratedRoom, PanoramaRoom, MeshRoom)
+    for kind in get_args(RoomSource)
+    if kind is not UnexportedRoom
 }
 """Kinds of sources by the name that their documents have."""
 

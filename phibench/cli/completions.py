@@ -1,11 +1,13 @@
 """Values that the Tab key completes: names of recipes, presets, methods, data sets, parts and policies.
 
-The shell starts `phibench` for them, so that nothing slow may be imported here. Names that stand in modules with NumPy
-stand here again; a test compares the two.
+The shell starts `phibench` for them, so that nothing slow may be imported here. Presets and methods are read from their
+files. Other names that stand in modules with NumPy stand here again; a test compares the two.
 """
 
 from __future__ import annotations
 
+import re
+import tomllib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,23 +16,8 @@ if TYPE_CHECKING:
     from cyclopts.completion import CompletionContext
 
 RECIPES = Path(__file__).parents[1] / "datasets" / "recipes"
-PRESETS = ("mjpeg", "yuyv", "srgb8", "bayer-raw", "mono-raw")
-BUILT_IN = (
-    "brightest_pixel",
-    "red_centroid",
-    "laplacian_blob",
-    "windowed_centroid",
-    "gaussian_least_squares",
-    "off_difference",
-    "raw_maximum_likelihood",
-    "chain_fit",
-    "joint_fit",
-    "detect",
-    "learned_crop",
-    "learned_detect",
-    "photutils_centroid_2dg",
-    "trackpy_refine",
-)
+_PRESETS = Path(__file__).parents[1] / "render" / "sensor" / "settings_presets.toml"
+_REGISTRY = Path(__file__).parents[1] / "estimator" / "methods" / "registry.py"
 PARTS = ("dev", "test", "paper", "mirrors", "films", "drives")
 TITLE = "phibench-v4-"
 POLICIES = ("paper", "greedy", "drive-only", "random", "oracle")
@@ -39,8 +26,9 @@ _MOST_FILES = 200  # that a Tab shows: more is no help
 
 
 def presets(_: CompletionContext) -> tuple[str, ...]:
-    """Presets of the sensor."""
-    return PRESETS
+    """Presets of the sensor that end in pixels."""
+    tables = tomllib.loads(_PRESETS.read_text(encoding="utf-8"))["presets"]
+    return tuple(name for name, table in tables.items() if table["output"] != "electrons")
 
 
 def pictures(_: CompletionContext) -> tuple[str, ...]:
@@ -64,14 +52,14 @@ def methods(context: CompletionContext) -> Iterator[str]:
     """Built-in methods, those of installed packages, and Python files."""
     from importlib.metadata import entry_points
 
-    yield from BUILT_IN
+    yield from named_methods(context)
     yield from (point.name for point in entry_points(group=METHOD_PACKAGES))
     yield from _files(context.incomplete, ".py")
 
 
 def named_methods(_: CompletionContext) -> tuple[str, ...]:
     """Built-in methods, for commands that take no file; names that packages register are not looked up."""
-    return BUILT_IN
+    return tuple(re.findall(r'^    BuiltIn\(\s+"(\w+)"', _REGISTRY.read_text(encoding="utf-8"), re.MULTILINE))
 
 
 def released(_: CompletionContext) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""Commands `phibench paper`, `stroke` and `study ...`: the paper's tables and experiments, strokes, eight studies."""
+"""Commands `phibench paper`, `stroke` and `study ...`: the paper's tables and experiments, strokes, studies."""
 
 from __future__ import annotations
 
@@ -254,17 +254,15 @@ def stroke(
     return 0
 
 
-STUDIES = {
-    "noise": "Error of phi and D against light, distance and stroke, and how near methods come to the bound.",
-    "misalignment": "Error of D that each misalignment of the rig makes, predicted and rendered.",
-    "baseline": "The tables of the paper, with the errors that this camera would make.",
-    "cause": "What makes the error curves that the paper has published.",
-    "isotropy": "Error of D against azimuth, and what panoramas keep.",
-    "stroke": "The stroke that measures a distance best.",
-    "mirror": "Mirrors of other shapes beside each other, for the choice of one.",
-    "loop": "A robot that drives up to its target: time, strokes, success, and what spoils them.",
-}
-"""Every study in one sentence; the names are those of `studies.run`."""
+STUDIES = Path(__file__).parents[1] / "studies"
+
+
+def study_sentences() -> dict[str, str]:
+    """Each study's sentence by its name: the first line of `studies/NAME/study.py`, which is not imported for it."""
+    lines = {path.parent.name: path.open(encoding="utf-8").readline() for path in sorted(STUDIES.glob("*/study.py"))}
+    sentences = {name: line.partition(": ")[2].strip().removesuffix('"""') for name, line in lines.items()}
+    return {name: text[:1].upper() + text[1:] for name, text in sentences.items()}
+
 
 study = App(name="study", group=KEEPERS, help="Run a study: its data sets, tables in Parquet, drawings, and findings.")
 
@@ -308,5 +306,5 @@ def _command(name: str, sentence: str) -> None:
     study.command(run, name=name, help=sentence)
 
 
-for _name, _sentence in STUDIES.items():
+for _name, _sentence in study_sentences().items():
     _command(_name, _sentence)

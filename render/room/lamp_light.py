@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from phibench.render.room.camera_plugin import MM_PER_M
-from phibench.render.room.mirror_light import MirrorBody
+from phibench.render.room.mirror_intersection import MirrorBody
 from phibench.render.room.subpixel_grid import points, shifts
 from phibench.render.room.surfaces import Surfaces, aligned
 from phibench.render.room.texel_points import Texels, chosen, transmitted, vector

@@ -31,7 +31,8 @@ from scipy import ndimage
 
 from phibench.render.room.bounced_light import BrightTexels, bounced_light, finer, gathered, rays_by_area
 from phibench.render.room.lamp_light import direct_light, lamps_in_coats
-from phibench.render.room.mirror_light import mirror_body, mirror_light
+from phibench.render.room.mirror_intersection import mirror_body
+from phibench.render.room.mirror_light import mirror_light
 from phibench.render.room.surfaces import Surfaces
 from phibench.render.room.texel_grid import TexelGrid
 from phibench.render.room.texel_points import Texels, covered_texels, nearest_free, spread_out

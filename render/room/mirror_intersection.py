@@ -19,6 +19,7 @@ before the surface: from where it is met Newton's method runs up to the first ro
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
 
@@ -270,3 +271,84 @@ def _turned(V: Any, matrix: Array, vector: Any) -> Any:
     number = type(vector.x)
     rows = [[dr.opaque(number, float(value)) for value in row] for row in matrix]  # one kernel for all forms
     return V(*(row[0] * vector.x + row[1] * vector.y + row[2] * vector.z for row in rows))
+
+
+# Body that shades and mirrors what stands beside it.
+
+_BODY_PLACES = 401  # of a profile
+_MARGIN = 1.001  # of the ball around it
+
+
+@dataclass(frozen=True)
+class MirrorBody:
+    """The mirror as rays from beside it meet it; in the scene, mm.
+
+    Attributes
+    ----------
+    centre, radius : Dr.Jit
+        Of a ball that holds it.
+    meets : callable
+        From points and unit directions to masks of rays that meet it, their distances from it, outward unit normals
+        there, and masks of what mirrors.
+    """
+
+    centre: Any
+    radius: Any
+    meets: Callable[[Any, Any], tuple[Any, Any, Any, Any]]
+
+
+def mirror_body(mi: ModuleType, view: View) -> MirrorBody | None:
+    """Mirror of a view; None without a holder: it then has nothing beside it that is lit."""
+    if view.rig.holder is None:
+        return None
+    mirror = view.rig.mirror
+    if mirror.radius_m is None:
+        return _revolved_body(mi, view, mirror)
+    return _ball_body(mi, mirror.radius_m)
+
+
+def _ball_body(mi: ModuleType, radius_m: float) -> MirrorBody:
+    import drjit as dr
+
+    radius = dr.opaque(mi.Float, MM_PER_M * radius_m)
+
+    def meets(point: Any, way: Any) -> tuple[Any, Any, Any, Any]:
+        approach = -dr.dot(point, way)
+        foot = point + approach * way
+        square = dr.square(radius) - dr.squared_norm(foot)
+        near, met = approach - dr.sqrt(dr.maximum(square, 0.0)), (square > 0.0) & (approach > 0.0)
+        return met, near, (point + near * way) / radius, met
+
+    return MirrorBody(mi.Vector3f(0.0), radius, meets)
+
+
+def _revolved_body(mi: ModuleType, view: View, mirror: RevolvedMirror) -> MirrorBody:
+    import drjit as dr
+
+    meeting, axes, profile = mirror_intersection(mi, view), view.T_world_sphere.R, mirror.profile
+    r = np.linspace(0.0, profile.rim_radius_m, _BODY_PLACES)
+    z, depth_m = profile.sag(r * r).z_m, profile.depth_m
+    middle_m = min(depth_m, 0.5 * (profile.rim_radius_m**2 + depth_m**2) / depth_m)
+    radius_m = _MARGIN * float(np.hypot(r, z - middle_m).max()) + mirror.reach_m
+    axis = mi.Vector3d(*(dr.opaque(mi.Float64, float(a)) for a in axes[:, 2]))
+    depth, rim2 = (
+        dr.opaque(mi.Float64, value) for value in (MM_PER_M * depth_m, (MM_PER_M * profile.rim_radius_m) ** 2)
+    )
+
+    def meets(point: Any, way: Any) -> tuple[Any, Any, Any, Any]:
+        o, d = mi.Vector3d(point), mi.Vector3d(way)
+        place, normal, found = meeting(o, d)
+        front = found & (dr.dot(normal, d) < 0.0)
+        near = dr.select(front, dr.norm(place - o), dr.inf)
+        fall = dr.dot(axis, d)
+        down = (depth - dr.dot(axis, o)) / fall
+        across = o + down * d - depth * axis
+        back = (fall < 0.0) & (down > 0.0) & (dr.squared_norm(across) <= rim2) & (down < near)
+        met = front | back
+        distance = dr.select(back, down, dr.select(front, near, 0.0))
+        return met, mi.Float(distance), mi.Vector3f(dr.select(back, axis, normal)), front & ~back
+
+    centre = MM_PER_M * middle_m * axes[:, 2]
+    return MirrorBody(
+        mi.Vector3f(*(dr.opaque(mi.Float, float(c)) for c in centre)), dr.opaque(mi.Float, MM_PER_M * radius_m), meets
+    )

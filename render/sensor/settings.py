@@ -135,6 +135,11 @@ def preset_names() -> tuple[str, ...]:
     return tuple(_tables()["presets"])
 
 
+def pixel_presets() -> tuple[str, ...]:
+    """Names of those that end in pixels, as a camera's chain does."""
+    return tuple(name for name, table in _tables()["presets"].items() if table["output"] != "electrons")
+
+
 def sensor(preset: str = "mjpeg", **changes: Any) -> Sensor:
     """A preset, with changes: ``sensor("mjpeg", exposure_s=0.01)``.
 

@@ -1,4 +1,4 @@
-"""Study `baseline`: the paper's tables and figures from rendered frames.
+"""Study `baseline`: the tables of the paper, with the errors that this camera would make.
 
 The settings and the run come first, then the findings and the small tables of the report.
 """

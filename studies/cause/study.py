@@ -1,4 +1,4 @@
-"""Study `cause`: which explanation of the paper's 25 estimates the numbers support, and what they cannot decide.
+"""Study `cause`: what makes the error curves that the paper has published.
 
 The run comes first, then the findings from its tables, then the small tables of the report. Log evidences are natural
 logarithms; a finding gives two of their errors on both sides.

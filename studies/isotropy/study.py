@@ -1,4 +1,4 @@
-"""Study `isotropy`: the error of D against the azimuth, for the vertical stroke and for a horizontal baseline.
+"""Study `isotropy`: error of D against azimuth, and what panoramas keep.
 
 The horizontal baseline is the competitor that the paper names: the same sensor moved sideways by the same length, or
 two of them. D counts from the vertical through the first position, in both cases. Epipolar lines and upright edges of

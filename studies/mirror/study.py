@@ -1,4 +1,4 @@
-"""Study `mirror`: mirrors of equal rim, camera and stroke beside each other, from closed forms."""
+"""Study `mirror`: mirrors of other shapes beside each other, for the choice of one."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Study `noise`: depth, phi and pixel error against exposure, laser, read noise, blur, focus, JPEG, bits and speckle.
+"""Study `noise`: error of phi and D against light, distance and stroke, and how near methods come to the bound.
 
 One factor at a time about base cases; all methods that take the preset, on the same draws, with the bound.
 """

@@ -1,4 +1,4 @@
-"""Study `stroke`: the stroke with the smallest error of D, for three rigs: as built, calibrated, and exactly known."""
+"""Study `stroke`: the stroke that measures a distance best."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ from helpers.districts import DISTRICTS
 from phibench.benchmark.isolation.resolve import RunLimits
 from phibench.cli import main as cli
 from phibench.cli.options import LIMITS, MEMORY_MB, OLD_COMMANDS, OLD_OPTIONS, OLD_POSITIONS, SECONDS
-from phibench.cli.studies import STUDIES
+from phibench.cli.studies import study_sentences
 from phibench.studies.run import NAMES
 
 ROOT = Path(__file__).parents[2]
@@ -51,7 +51,7 @@ def table(heading: str) -> list[tuple[str, str]]:
 
 def test_the_page_lists_every_command() -> None:
     named = {left.strip("`") for left, _ in table("# Commands")}
-    others = {f"study {name}" for name in STUDIES} - {"study noise"}  # named in the text of its row
+    others = {f"study {name}" for name in study_sentences()} - {"study noise"}  # named in the text of its row
     assert named | others == leaves()
     assert len(named) > 20
 
@@ -163,7 +163,10 @@ def test_limits_wherever_methods_run(command: str, capsys: pytest.CaptureFixture
 
 
 def test_every_study_is_a_command() -> None:
-    assert tuple(STUDIES) == NAMES
+    sentences = study_sentences()
+    assert tuple(sentences) == NAMES
+    assert len(NAMES) == 8
+    assert all(text[:1].isupper() and text.endswith(".") for text in sentences.values())
 
 
 OLD_WORDS = re.compile(

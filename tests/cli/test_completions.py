@@ -22,18 +22,19 @@ def completed(words: list[str], capsys: pytest.CaptureFixture[str]) -> list[str]
     """Values that the shell is offered for the last word."""
     capsys.readouterr()
     assert cli.main(["__complete", *words]) == 0
-    return [line.split("\t")[0] for line in capsys.readouterr().out.splitlines() if not line.startswith("\x1f")]
+    lines = capsys.readouterr().out.splitlines()
+    return [line.split("\t")[0] for line in lines if line and not line.startswith("\x1f")]
 
 
-def test_values_that_are_completed_are_those_that_there_are() -> None:
+def test_values_that_are_completed_are_those_that_there_are(capsys: pytest.CaptureFixture[str]) -> None:
     from phibench.benchmark.isolation.resolve import GROUP
     from phibench.benchmark.release.benchmark import PARTS
     from phibench.datasets.recipe.tables import Preset
     from phibench.estimator.methods.registry import KNOWN
     from phibench.robot.loop.policies import POLICIES
 
-    assert set(completions.PRESETS) == set(get_args(Preset))
-    assert completions.BUILT_IN == tuple(KNOWN)
+    assert completed(["score", "x", "--preset", ""], capsys) == list(get_args(Preset))
+    assert completed(["score", "x", "--method", ""], capsys)[: len(KNOWN)] == list(KNOWN)
     assert completions.POLICIES == tuple(POLICIES)
     assert completions.PARTS == tuple(part.name for part in PARTS)
     assert {f"{completions.TITLE}{part}" for part in completions.PARTS} == {part.title for part in PARTS}

@@ -10,9 +10,9 @@ import pytest
 from helpers.room_files import recipe
 
 from phibench.datasets.common.errors import RecipeError
-from phibench.datasets.recipe.build import MIRROR_SHAPES, build_rig
+from phibench.datasets.recipe.build import build_rig
 from phibench.datasets.recipe.load import check_recipe
-from phibench.datasets.recipe.mirror_tables import MirrorTable
+from phibench.datasets.recipe.mirror_tables import OF_SHAPES, MirrorTable
 from phibench.datasets.recipe.tables import RigTable
 from phibench.datasets.store.documents import from_json, to_json
 from phibench.scenes.revolved_mirror import RevolvedMirror
@@ -57,7 +57,7 @@ def test_the_lens_is_in_the_focus_of_a_hyperboloid(z_c_m: float) -> None:
 
 
 def test_every_key_has_its_shapes() -> None:
-    assert set(MIRROR_SHAPES) == set(MirrorTable.model_fields) - {"shape", "rim_radius_m", "tilt_x_rad", "tilt_y_rad"}
+    assert set(OF_SHAPES) == set(MirrorTable.model_fields) - {"shape", "rim_radius_m", "tilt_x_rad", "tilt_y_rad"}
 
 
 @pytest.mark.parametrize(
