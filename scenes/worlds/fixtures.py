@@ -27,10 +27,10 @@ _FRAMES = ("light_wood", "dark_wood", "red_wood", "white_lacquer", "dark_plastic
 def door(rng: Rng, materials: MaterialSet, angle_deg: float) -> Assembly:
     """Door with a frame, ajar by an angle; behind it a dim corridor, a picture 5 mm in front of the wall."""
     made = Assembly()
-    width, high = float(rng.uniform(0.8, 1.0)), float(rng.uniform(1.98, 2.1))
+    width, high = float(rng.uniform(0.8, 1.0)), float(rng.uniform(1.98, 2.1))  # standard leaves
     frame = one_of(rng, materials, _FRAMES, upright=True)
     leaf = one_of(rng, materials, ("white_lacquer", "grey_lacquer", "light_wood", "dark_wood", *_PAINTS), upright=True)
-    if angle_deg > 3.0:
+    if angle_deg > 3.0:  # a door that is closed hides it
         dim = materials.print(graphics.corridor(rng, (80, 36)), (width, high))
         made.panel("corridor", (0.0, -0.005, high / 2.0), _FRONT, (width, high - 0.002), dim)
     half = width / 2.0
@@ -39,8 +39,9 @@ def door(rng: Rng, materials: MaterialSet, angle_deg: float) -> Assembly:
     made.box("lintel", (-half - 0.07, half + 0.07), (-0.03, -0.001), (high, high + 0.07), frame)
     turn = math.radians(angle_deg)
     c, s = math.cos(turn), math.sin(turn)
-    hinge = (-half + 0.03, -0.04)
+    hinge = (-half + 0.03, -0.04)  # the leaf turns clear of the jamb
 
+    # place on the leaf: from the hinge along it, and off its middle
     def at(along: float, off: float) -> tuple[float, float]:
         return hinge[0] + along * c - off * s, hinge[1] - along * s - off * c
 
@@ -59,11 +60,13 @@ def door(rng: Rng, materials: MaterialSet, angle_deg: float) -> Assembly:
 def window(rng: Rng, materials: MaterialSet, width_m: float, height_m: float) -> Assembly:
     """Window: sky above (role "sky"), the view below (role "view"), bars, a sill, curtains or a blind, a radiator."""
     made, bar = Assembly(), one_of(rng, materials, ("white_lacquer", "dark_wood", "grey_lacquer", "light_wood"))
+    # low enough for the mirror to see the sky
     sill, top, half = float(rng.uniform(0.55, 1.0)), min(height_m - 0.12, float(rng.uniform(2.0, 2.6))), width_m / 2.0
     horizon = float(np.clip(rng.uniform(0.9, 1.7), sill, top - 0.5))
     made.panel("sky", (0.0, -0.005, 0.5 * (horizon + top)), _FRONT, (width_m, top - horizon - 0.002), bar, "sky")
     if horizon > sill + 0.05:
         size = (width_m, horizon - sill - 0.002)
+        # texels of 3 cm: what is far has no detail
         columns, rows = int(np.clip(width_m / 0.03, 16, 80)), int(np.clip(size[1] / 0.03, 8, 40))
         view = materials.print(graphics.outdoors(rng, (rows, columns)), size)
         made.panel("view", (0.0, -0.005, 0.5 * (sill + horizon)), _FRONT, size, view, "view")
@@ -72,7 +75,7 @@ def window(rng: Rng, materials: MaterialSet, width_m: float, height_m: float) ->
         x = -half + k * width_m / count
         made.box(f"bar_{k + 1}", (x - 0.03, x + 0.03), (-0.06, -0.008), (sill, top), bar)
     for k, z in enumerate((sill, horizon, top)):
-        if k != 1 or rng.random() < 0.5:
+        if k != 1 or rng.random() < 0.5:  # the horizon's beam is not in every window
             made.box(f"beam_{k + 1}", (-half - 0.03, half + 0.03), (-0.1, -0.062), (z - 0.03, z + 0.03), bar)
     made.box("sill", (-half - 0.1, half + 0.1), (-0.18, -0.001), (sill - 0.07, sill - 0.031), bar)
     kind = rng.integers(3)
@@ -97,7 +100,7 @@ def window(rng: Rng, materials: MaterialSet, width_m: float, height_m: float) ->
             (top - drop, top - 0.031),
             one_of(rng, materials, ("curtain", "white_lacquer")),
         )
-    if sill > 0.6:
+    if sill > 0.6:  # below a lower sill no radiator stands
         white = materials.surface("white_lacquer")
         ribs = int(width_m * 0.7 / 0.09)
         for k in range(ribs):
@@ -118,7 +121,7 @@ def _picture(
     z: float,
     y: float,
 ) -> None:
-    rows, columns = (int(np.clip(length / 0.010, 12, 110)) for length in (size[1], size[0]))
+    rows, columns = (int(np.clip(length / 0.010, 12, 110)) for length in (size[1], size[0]))  # texels of 1 cm
     coat = 1.5 if rng.random() < 0.4 * materials.properties.gloss else 0.0
     made.panel("print", (0.0, y, z), _FRONT, size, materials.print(draw(rng, (rows, columns)), size, coat))
 
@@ -126,7 +129,7 @@ def _picture(
 def poster(rng: Rng, materials: MaterialSet) -> Assembly:
     """Poster, chart or notice without a frame, 5 mm in front of the wall."""
     made = Assembly()
-    width = float(rng.uniform(0.3, 1.1))
+    width = float(rng.uniform(0.3, 1.1))  # A4 to a wall chart
     draw = (graphics.poster, graphics.poster, graphics.notice, graphics.chart, graphics.photograph)[rng.integers(5)]
     _picture(
         rng,
@@ -174,8 +177,9 @@ def notice_board(rng: Rng, materials: MaterialSet) -> Assembly:
         return made
     for k in range(int(rng.integers(3, 9))):
         draw = (graphics.notice, graphics.poster, graphics.chart)[rng.integers(3)]
-        size = (0.21, 0.297) if rng.random() < 0.7 else (0.148, 0.21)
+        size = (0.21, 0.297) if rng.random() < 0.7 else (0.148, 0.21)  # A4 and A5
         surface = materials.print(draw(rng, (36, 26)), size)
+        # each 2 mm before the last one: they may overlap
         x, y = float(rng.uniform(-width / 2 + 0.12, width / 2 - 0.12)), -0.033 - 0.002 * k
         made.panel(f"notice_{k + 1}", (x, y, z + float(rng.uniform(-0.3, 0.3)) * (high - 0.3)), _FRONT, size, surface)
     return made
@@ -230,7 +234,7 @@ def device(rng: Rng, materials: MaterialSet) -> Assembly:
 
 def extinguisher(rng: Rng, materials: MaterialSet) -> Assembly:
     """Fire extinguisher with its sign."""
-    made, z = Assembly(), 0.75
+    made, z = Assembly(), 0.75  # a handle within reach, as rules ask
     made.post("bottle", 0.0, -0.1, (z, z + 0.45), 0.075, materials.surface("paint_red"), 14)
     made.post("valve", 0.0, -0.1, (z + 0.45, z + 0.55), 0.03, materials.surface("dark_plastic"), 6)
     made.panel("sign", (0.0, -0.005, z + 0.85), _FRONT, (0.2, 0.2), materials.surface("paint_red"))
@@ -239,14 +243,14 @@ def extinguisher(rng: Rng, materials: MaterialSet) -> Assembly:
 
 def clock(rng: Rng, materials: MaterialSet) -> Assembly:
     """Round clock with two hands."""
-    made, z, radius = Assembly(), float(rng.uniform(1.9, 2.1)), float(rng.uniform(0.1, 0.18))
+    made, z, radius = Assembly(), float(rng.uniform(1.9, 2.1)), float(rng.uniform(0.1, 0.18))  # above heads
     made.rod("rim", (0.0, -0.003, z), (0.0, -0.04, z), radius, one_of(rng, materials, _FRAMES), 24)
     made.rod("face", (0.0, -0.041, z), (0.0, -0.044, z), 0.9 * radius, materials.surface("paper"), 24)
     for k, length in enumerate((0.5, 0.8)):
         turn = float(rng.uniform(0.0, 2.0 * np.pi))
         centre = (
             0.45 * length * radius * math.sin(turn),
-            -0.047 - 0.003 * k,
+            -0.047 - 0.003 * k,  # hands turn before each other
             z + 0.45 * length * radius * math.cos(turn),
         )
         made.tilted(
@@ -269,7 +273,7 @@ def coats(rng: Rng, materials: MaterialSet) -> Assembly:
             cloth = one_of(
                 rng, materials, ("cloth_grey", "cloth_blue", "cloth_red", "cloth_green", "plaid", "leather"), 3
             )
-            long = float(rng.uniform(0.6, 1.05))
+            long = float(rng.uniform(0.6, 1.05))  # a jacket to a coat
             made.box(f"coat_{k + 1}", (x - 0.11, x + 0.11), (-0.2, -0.04), (1.6 - long, 1.6), cloth)
     return made
 
@@ -279,7 +283,7 @@ def pipes(rng: Rng, materials: MaterialSet) -> Assembly:
     made = Assembly()
     top = materials.properties.height_m - 0.06
     for k in range(int(rng.integers(1, 4))):
-        radius = float(rng.uniform(0.012, 0.055))
+        radius = float(rng.uniform(0.012, 0.055))  # of water and of drains
         surface = one_of(rng, materials, ("copper", "galvanised", "white_lacquer", "steel", *_PAINTS))
         made.post(f"pipe_{k + 1}", -0.15 + 0.15 * k, -0.08, (0.0, top), radius, surface, 10)
     made.rod("valve", (-0.15, -0.15, 1.1), (-0.15, -0.2, 1.1), 0.06, materials.surface("paint_red"), 10)
@@ -294,7 +298,7 @@ def pegboard(rng: Rng, materials: MaterialSet) -> Assembly:
     for k in range(int(rng.integers(3, 11))):
         x, z = float(rng.uniform(-width / 2 + 0.06, width / 2 - 0.1)), float(rng.uniform(low + 0.35, low + 0.85))
         surface = one_of(rng, materials, (*_PAINTS, "steel", "dark_plastic", "light_wood"))
-        near = -0.03 - 0.003 * k
+        near = -0.03 - 0.003 * k  # tools may cross: each hangs before the last one
         made.box(
             f"tool_{k + 1}",
             (x, x + float(rng.uniform(0.02, 0.07))),
@@ -331,7 +335,7 @@ def ceiling_run(rng: Rng, materials: MaterialSet, length_m: float) -> Assembly:
             y, z = -0.1 - 0.13 * k, top - radius - 0.01
             made.rod(f"pipe_{k + 1}", (-half, y, z), (half, y, z), radius, surface, 10)
     elif kind == 1:
-        radius = float(rng.uniform(0.08, 0.14))
+        radius = float(rng.uniform(0.08, 0.14))  # of an air duct
         made.rod(
             "duct",
             (-half, -0.05 - radius, top - radius),

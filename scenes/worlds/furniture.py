@@ -39,17 +39,18 @@ def chair(rng: Rng, materials: MaterialSet) -> Assembly:
     made = Assembly()
     frame = one_of(rng, materials, ("steel", "dark_plastic", *WOODS), upright=True)
     seat = one_of(rng, materials, (*WOODS, *CLOTHS, "dark_plastic", "paint_red", "paint_blue"))
-    half, high = float(rng.uniform(0.19, 0.23)), float(rng.uniform(0.42, 0.46))
+    half, high = float(rng.uniform(0.19, 0.23)), float(rng.uniform(0.42, 0.46))  # of the seat, as chairs are sold
     leg = 0.032
     for k, (sx, sy) in enumerate(((-1, -1), (1, -1), (1, 1), (-1, 1))):
         x, y = sx * (half - 0.02), sy * (half - 0.02)
         top = high if sy < 0 else float(high + 0.42)
-        offset = 0.0 if sy < 0 else 0.02 + 0.5 * leg
+        offset = 0.0 if sy < 0 else 0.02 + 0.5 * leg  # the back legs stand behind the seat and carry the back
         made.box(
             f"leg_{k + 1}", (x - leg / 2, x + leg / 2), (y + offset - leg / 2, y + offset + leg / 2), (0.0, top), frame
         )
     made.box("seat", (-half, half), (-half, half - 0.001), (high, high + 0.045), seat)
     low = high + float(rng.uniform(0.12, 0.25))
+    # between the legs, 2 mm behind the seat
     made.box("back", (-half + 0.041, half - 0.041), (half + 0.002, half + 0.025), (low, high + 0.42), seat)
     return made
 
@@ -71,7 +72,7 @@ def office_chair(rng: Rng, materials: MaterialSet) -> Assembly:
     made.post("column", 0.0, 0.0, (0.06, 0.44), 0.03, dark)
     made.box("seat", (-0.24, 0.24), (-0.24, 0.22), (0.44, 0.52), cloth)
     made.box("stem", (-0.03, 0.03), (0.23, 0.25), (0.46, 0.75), dark)
-    made.tilted("back", (0.0, 0.30, 0.80), (0.44, 0.05, 0.5), cloth, rotation_xyz(x_rad=-0.12))
+    made.tilted("back", (0.0, 0.30, 0.80), (0.44, 0.05, 0.5), cloth, rotation_xyz(x_rad=-0.12))  # 7 degrees back
     if rng.random() < 0.5:
         for k, sign in enumerate((-1.0, 1.0)):
             made.box(f"arm_{k + 1}", (sign * 0.28 - 0.025, sign * 0.28 + 0.025), (-0.15, 0.15), (0.65, 0.69), dark)
@@ -82,9 +83,9 @@ def office_chair(rng: Rng, materials: MaterialSet) -> Assembly:
 def stool(rng: Rng, materials: MaterialSet) -> Assembly:
     """Round stool."""
     made, frame = Assembly(), one_of(rng, materials, ("steel", *WOODS), upright=True)
-    high = float(rng.uniform(0.42, 0.75))
+    high = float(rng.uniform(0.42, 0.75))  # from a chair's seat to a bar's
     for k in range(3):
-        c, s = np.cos(2.1 * k), np.sin(2.1 * k)
+        c, s = np.cos(2.1 * k), np.sin(2.1 * k)  # 120 degrees
         made.rod(f"leg_{k + 1}", (0.18 * c, 0.18 * s, 0.004), (0.1 * c, 0.1 * s, high - 0.004), 0.015, frame, 6)
     made.post("seat", 0.0, 0.0, (high, high + 0.04), 0.17, one_of(rng, materials, (*WOODS, *CLOTHS)), 16)
     return made
@@ -93,7 +94,7 @@ def stool(rng: Rng, materials: MaterialSet) -> Assembly:
 def sofa(rng: Rng, materials: MaterialSet) -> Assembly:
     """Sofa or armchair with cushions."""
     made, cloth = Assembly(), one_of(rng, materials, (*CLOTHS, "leather"), 3)
-    seats = int(rng.integers(1, 4))
+    seats = int(rng.integers(1, 4))  # an armchair to a sofa of three
     half = 0.33 * seats
     made.box("base", (-half, half), (-0.38, 0.28), (0.06, 0.26), cloth)
     made.box("back", (-half, half), (0.28, 0.45), (0.06, 0.82), cloth)
@@ -115,7 +116,7 @@ def sofa(rng: Rng, materials: MaterialSet) -> Assembly:
 def _top(rng: Rng, materials: MaterialSet, made: Assembly, width: float, depth: float, high: float) -> None:
     surface = one_of(rng, materials, (*WOODS, "white_lacquer", "grey_lacquer"))
     legs = one_of(rng, materials, ("steel", "dark_plastic", *WOODS), upright=True)
-    thick = float(rng.uniform(0.022, 0.045))
+    thick = float(rng.uniform(0.022, 0.045))  # of boards
     made.box("top", (-width / 2, width / 2), (-depth / 2, depth / 2), (high - thick, high), surface)
     if rng.random() < 0.3:
         for k, sign in enumerate((-1.0, 1.0)):
@@ -136,11 +137,13 @@ def _top(rng: Rng, materials: MaterialSet, made: Assembly, width: float, depth: 
 def desk(rng: Rng, materials: MaterialSet) -> Assembly:
     """Desk with a monitor, keyboard, lamp, drawers, things and a chair in front."""
     made = Assembly()
+    # offices' sizes
     width, depth, high = float(rng.uniform(1.2, 1.8)), float(rng.uniform(0.65, 0.8)), float(rng.uniform(0.71, 0.76))
     _top(rng, materials, made, width, depth, high)
     back = depth / 2
     for k in range(int(rng.integers(1, 3)) if width > 1.5 else 1):
         made.add(monitor(rng, materials), -0.2 + 0.72 * k, back - 0.15, high, 0.0, f"monitor_{k + 1}")
+    # dark keys
     keys = materials.print(graphics.buttons(rng, (10, 30), graphics.ink_colours(rng, 3) * 0.3), (0.44, 0.14))
     made.box("keyboard", (-0.45, -0.01), (-0.2, -0.06), (high, high + 0.02), keys)
     clutter = materials.properties.clutter
@@ -175,6 +178,7 @@ def desk(rng: Rng, materials: MaterialSet) -> Assembly:
 def dining_table(rng: Rng, materials: MaterialSet) -> Assembly:
     """Table with chairs around and things on it."""
     made = Assembly()
+    # four to ten people
     width, depth, high = float(rng.uniform(1.1, 2.2)), float(rng.uniform(0.75, 1.0)), float(rng.uniform(0.71, 0.77))
     _top(rng, materials, made, width, depth, high)
     scatter(
@@ -187,7 +191,7 @@ def dining_table(rng: Rng, materials: MaterialSet) -> Assembly:
         int(5 * materials.properties.clutter),
     )
     seat = chair if rng.random() < 0.7 else office_chair
-    for k in range(int(width / 0.6)):
+    for k in range(int(width / 0.6)):  # a place is 60 cm wide
         for side, sign in enumerate((-1.0, 1.0)):
             if rng.random() < 0.65:
                 x = -width / 2 + (k + 0.5) * width / int(width / 0.6)
@@ -199,7 +203,7 @@ def dining_table(rng: Rng, materials: MaterialSet) -> Assembly:
 def round_table(rng: Rng, materials: MaterialSet) -> Assembly:
     """Round table on a column, with stools."""
     made = Assembly()
-    radius, high = float(rng.uniform(0.3, 0.55)), float(rng.uniform(0.5, 1.05))
+    radius, high = float(rng.uniform(0.3, 0.55)), float(rng.uniform(0.5, 1.05))  # from a side table to a standing one
     made.post("foot", 0.0, 0.0, (0.0, 0.03), 0.6 * radius, materials.surface("cast_iron"), 16)
     made.post("column", 0.0, 0.0, (0.03, high - 0.03), 0.04, materials.surface("steel"))
     made.post("top", 0.0, 0.0, (high - 0.03, high), radius, one_of(rng, materials, (*WOODS, "white_lacquer")), 24)
@@ -253,7 +257,7 @@ def workbench(rng: Rng, materials: MaterialSet) -> Assembly:
         made.box(
             f"tool_{k + 1}",
             (x, x + float(rng.uniform(0.02, 0.06))),
-            (0.32 - 0.002 * k, 0.355 - 0.002 * k),
+            (0.32 - 0.002 * k, 0.355 - 0.002 * k),  # tools may cross: each hangs 2 mm before the last one
             (z - float(rng.uniform(0.1, 0.28)), z),
             surface,
         )
@@ -266,12 +270,13 @@ def workbench(rng: Rng, materials: MaterialSet) -> Assembly:
 def bookshelf(rng: Rng, materials: MaterialSet) -> Assembly:
     """Open shelf with a back, filled with books and things."""
     made, case = Assembly(), one_of(rng, materials, (*CASES, "plywood"))
+    # shelves for folders and books
     width, depth, high = float(rng.uniform(0.6, 1.4)), float(rng.uniform(0.26, 0.4)), float(rng.uniform(1.1, 2.05))
     board, half, back = 0.022, width / 2, depth / 2
     made.box("side_1", (-half, -half + board), (-back, back), (0.0, high), case)
     made.box("side_2", (half - board, half), (-back, back), (0.0, high), case)
     made.box("back", (-half + board, half - board), (back - 0.01, back), (0.0, high - board), case)
-    rows = int(high / 0.36)
+    rows = int(high / 0.36)  # a folder is 32 cm high
     pitch = (high - 0.06) / rows
     for k in range(rows + 1):
         low = min(0.04 + k * pitch, high - board)
@@ -300,6 +305,7 @@ def bookshelf(rng: Rng, materials: MaterialSet) -> Assembly:
 def rack(rng: Rng, materials: MaterialSet) -> Assembly:
     """Industrial rack: posts, boards, and boxes with labels."""
     made, steel = Assembly(), one_of(rng, materials, ("steel", "galvanised", "paint_blue", "paint_orange"))
+    # industrial racks
     width, depth, high = float(rng.uniform(1.0, 2.2)), float(rng.uniform(0.4, 0.6)), float(rng.uniform(1.6, 2.1))
     for k, (sx, sy) in enumerate(((-1, -1), (1, -1), (1, 1), (-1, 1))):
         x, y = sx * (width / 2 - 0.02), sy * (depth / 2 - 0.02)
@@ -336,7 +342,7 @@ def cabinet(rng: Rng, materials: MaterialSet) -> Assembly:
     """Closed case with doors, handles and things on top."""
     made, case = Assembly(), one_of(rng, materials, CASES, 2, upright=True)
     width, depth = float(rng.uniform(0.6, 1.8)), float(rng.uniform(0.4, 0.62))
-    high = float(rng.choice([0.75, 0.9, 1.2, 1.8, 2.0]))
+    high = float(rng.choice([0.75, 0.9, 1.2, 1.8, 2.0]))  # steps in which cabinets are sold
     made.box(
         "plinth",
         (-width / 2 + 0.02, width / 2 - 0.02),
@@ -345,7 +351,7 @@ def cabinet(rng: Rng, materials: MaterialSet) -> Assembly:
         materials.surface("dark_plastic"),
     )
     made.box("case", (-width / 2, width / 2), (-depth / 2 + 0.02, depth / 2), (0.07, high), case)
-    doors = max(int(width / 0.5), 1)
+    doors = max(int(width / 0.5), 1)  # a door of a cabinet is half a metre wide
     front = one_of(rng, materials, CASES, 2, upright=True)
     for k in range(doors):
         x = -width / 2 + k * width / doors
@@ -356,7 +362,7 @@ def cabinet(rng: Rng, materials: MaterialSet) -> Assembly:
             (0.09, high - 0.01),
             front,
         )
-        handle = x + (0.05 if k % 2 else width / doors - 0.07)
+        handle = x + (0.05 if k % 2 else width / doors - 0.07)  # doors open in pairs, to the left and to the right
         made.box(
             f"handle_{k + 1}",
             (handle, handle + 0.02),
@@ -395,6 +401,7 @@ def machine(rng: Rng, materials: MaterialSet) -> Assembly:
     normal = (0.0, -1.0, 0.0)
     size = (0.8 * width, 0.35 * high)
     front = graphics.buttons(rng, (32, 40), graphics.muted(graphics.ink_colours(rng, 3), 0.25))
+    # 2 mm before the case
     made.panel("controls", (0.0, -depth / 2 - 0.002, 0.72 * high), normal, size, materials.print(front, size))
     if rng.random() < 0.5:
         made.panel(

@@ -35,12 +35,12 @@ from phibench.scenes.worlds.properties import RoomProperties
 from phibench.scenes.worlds.tabletop import Piece
 
 MOST_LIGHTS = 12  # emitting rectangles: each is sampled by itself
-MOST_PATCHES = 3200
+MOST_PATCHES = 3200  # faces of a room: the bake's grids and the time of a ray grow with them
 _FEWEST_PATCHES = 30  # of a piece of furniture, but for boxes
-_TRIES = 25
+_TRIES = 25  # random places for a piece; what does not fit is left out
 _FURNITURE_PATCHES, _WALL_PATCHES, _NEAR_PATCHES, _FLOOR_PATCHES = 1050, 330, 220, 180  # of subjects
-_DAYLIGHT_K, _SUN_K, _SCREEN_K = 6500.0, 5500.0, 6500.0
-_DESK_LUMEN = 400.0
+_DAYLIGHT_K, _SUN_K, _SCREEN_K = 6500.0, 5500.0, 6500.0  # D65; the direct sun; a screen's usual white
+_DESK_LUMEN = 400.0  # of a small lamp
 _FLOORS = {
     "office": ("plain_carpet", "floor_tiles", "planks", "terrazzo", "parquet"),
     "home": ("planks", "parquet", "carpet", "checker_floor", "plain_carpet"),
@@ -115,7 +115,10 @@ class _Generator:
         for k in range(p.doors):
             rng = self.rng("door", k)
             made = fixtures.door(
-                rng, self.materials, p.door_angle_deg if k == 0 else float(rng.choice([0.0, 0.0, 70.0]))
+                # others are mostly closed
+                rng,
+                self.materials,
+                p.door_angle_deg if k == 0 else float(rng.choice([0.0, 0.0, 70.0])),
             )
             for _ in range(_TRIES):
                 wall = self.plan.walls[rng.integers(len(self.plan.walls))]
@@ -138,6 +141,7 @@ class _Generator:
             y + middle * -wall.along[1] + off * wall.normal[1],
         )
         taken = Footprint(*centre, wall.yaw_rad, (whole.half_m[0], 0.5 * deep), whole.z)
+        # a door's way may leave the outline
         if not self.layout.is_free(taken, 0.02, FREE_DISC_M + 0.1, outline=depth_m < 0.7):
             return False
         self.layout.put(kind, made, x, y, wall.yaw_rad, taken)
@@ -149,6 +153,7 @@ class _Generator:
             float(rng.uniform(0.05, 0.12)),
             tabletop.one_of(rng, self.materials, ("white_lacquer", "dark_wood", "light_wood", "grey_plastic")),
         )
+        # from the floor to a head's height
         doors = [taken for taken in self.layout.taken if taken.z[0] < 0.05 and taken.z[1] > 1.9]
         for wall in self.plan.walls:
             for k, (start, end) in enumerate(_gaps(wall, doors)):
@@ -165,6 +170,7 @@ class _Generator:
             rng, left = self.rng("furniture", k), _FURNITURE_PATCHES - spent
             if left < _FEWEST_PATCHES:
                 break
+            # two of five stand free
             table = (furniture.AGAINST_WALLS, furniture.FREE)[int(k % 5 in (1, 3))][self.properties.use]
             kind = list(table)[rng.integers(len(table))]
             if table is furniture.FREE[self.properties.use]:
@@ -197,8 +203,8 @@ class _Generator:
             return 0
         for _ in range(_TRIES):
             x, y = float(rng.uniform(0.3, self.plan.length_m - 0.3)), float(rng.uniform(0.3, self.plan.width_m - 0.3))
-            turn = float(rng.integers(4)) * math.pi / 2.0 + float(rng.normal(0.0, 0.12))
-            if rng.random() < 0.3:
+            turn = float(rng.integers(4)) * math.pi / 2.0 + float(rng.normal(0.0, 0.12))  # nearly along the walls
+            if rng.random() < 0.3:  # some stand anyhow
                 turn = float(rng.uniform(-math.pi, math.pi))
             if self.layout.is_free(footprint_of(made, x, y, turn), 0.05, FREE_DISC_M + 0.07):
                 self.layout.put(kind, made, x, y, turn)
@@ -212,6 +218,7 @@ class _Generator:
             kind = int(rng.integers(len(small_objects.NEAR_THINGS)))
             made = small_objects.NEAR_THINGS[kind](rng, self.materials)
             for _ in range(_TRIES if spent < _NEAR_PATCHES else 0):
+                # from just outside the free cylinder
                 angle, off = float(rng.uniform(-math.pi, math.pi)), float(rng.uniform(0.27, 1.0))
                 x, y = self.plan.robot[0] + off * math.cos(angle), self.plan.robot[1] + off * math.sin(angle)
                 turn = angle + math.pi / 2.0 + float(rng.normal(0.0, 0.2))  # +y towards the axis
@@ -240,7 +247,7 @@ class _Generator:
             if piece in placed and piece in fixtures.ONE_EACH:
                 continue
             made = piece(rng, self.materials)
-            if made.bounds_m()[1, 2] > self.properties.height_m - 0.05:
+            if made.bounds_m()[1, 2] > self.properties.height_m - 0.05:  # higher than the room
                 continue
             for _ in range(_TRIES):
                 wall = self.plan.walls[rng.integers(len(self.plan.walls))]
@@ -251,6 +258,7 @@ class _Generator:
 
     def _ceiling_things(self) -> None:
         rng = self.rng("ceiling")
+        # where pipes are not hidden
         chance = {"workshop": 0.9, "store": 0.8, "laboratory": 0.6, "office": 0.25, "home": 0.1}[self.properties.use]
         for wall in self.plan.walls:
             length = wall.length_m - 0.3
@@ -266,7 +274,7 @@ class _Generator:
             case = self.materials.surface("dark_plastic")
             made.box("case", (-0.05, 0.05), (-0.03, -0.003), (z - 0.05, z + 0.05), case)
             made.panel("light", (0.0, -0.032, z), (0.0, -1.0, 0.0), (2.0 * half, 2.0 * half), case, "indicator")
-            for _ in range(2 * _TRIES):
+            for _ in range(2 * _TRIES):  # small: worth more tries
                 wall = self.plan.walls[rng.integers(len(self.plan.walls))]
                 if self._on_wall("indicator", made, wall, rng, 0.3):
                     break
@@ -292,6 +300,7 @@ class _Generator:
         ceiling = self.materials.shell("ceiling", _CEILINGS[rng.integers(len(_CEILINGS))], p.ceiling_albedo)
         first, other = walls[rng.integers(len(walls))], walls[rng.integers(len(walls))]
         main = self.materials.shell("wall", first, p.wall_albedo)
+        # one wall of another colour
         accent = self.materials.shell("wall", other, p.wall_albedo * 0.85) if rng.random() < 0.5 else main
         count = len(self.plan.walls)
         return tuple(accent if k == count // 2 else main for k in range(count)), floor, ceiling

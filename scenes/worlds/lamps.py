@@ -56,7 +56,7 @@ def ceiling_lamp(rng: np.random.Generator, materials: MaterialSet, kind: str, he
     made, down = Assembly(), (0.0, 0.0, -1.0)
     white = materials.surface("white_plastic")
     if kind == "panels":
-        size = ((0.6, 0.6), (1.2, 0.3), (1.2, 0.6))[rng.integers(3)]
+        size = ((0.6, 0.6), (1.2, 0.3), (1.2, 0.6))[rng.integers(3)]  # of a grid of ceiling panels
         low = height_m - float(rng.uniform(0.03, 0.08))
         made.box(
             "housing",
@@ -67,8 +67,8 @@ def ceiling_lamp(rng: np.random.Generator, materials: MaterialSet, kind: str, he
         )
         made.panel("light", (0.0, 0.0, low - 0.002), down, size, white, "lamp")
     elif kind == "tubes":
-        drop = min(float(rng.uniform(0.08, 0.9)), height_m - _LOWEST_M - 0.15)
-        low, length = height_m - drop, float(rng.choice([1.2, 1.5]))
+        drop = min(float(rng.uniform(0.08, 0.9)), height_m - _LOWEST_M - 0.15)  # on wires, above heads
+        low, length = height_m - drop, float(rng.choice([1.2, 1.5]))  # T8 tubes
         case = one_of(rng, materials, ("white_plastic", "galvanised"))
         made.box("housing", (-length / 2 - 0.03, length / 2 + 0.03), (-0.07, 0.07), (low, low + 0.05), case)
         made.panel("light", (0.0, 0.0, low - 0.002), down, (length, 0.05), white, "lamp")
@@ -81,6 +81,7 @@ def ceiling_lamp(rng: np.random.Generator, materials: MaterialSet, kind: str, he
         made.post("shade", 0.0, 0.0, (low, low + min(0.16, drop - 0.02)), radius, shade, 16)
         if drop > 0.2:
             made.post("cord", 0.0, 0.0, (low + 0.16, height_m - 0.003), 0.008, materials.surface("dark_plastic"), 6)
+        # lamps are rectangles: inside the shade's circle
         made.panel("light", (0.0, 0.0, low - 0.002), down, (radius, radius), white, "lamp")
     return made
 
@@ -88,7 +89,7 @@ def ceiling_lamp(rng: np.random.Generator, materials: MaterialSet, kind: str, he
 def uplight(rng: np.random.Generator, materials: MaterialSet, height_m: float) -> Assembly:
     """Bowl at a wall that lights the ceiling."""
     made = Assembly()
-    top = min(float(rng.uniform(1.75, 2.1)), height_m - 0.45)
+    top = min(float(rng.uniform(1.75, 2.1)), height_m - 0.45)  # above eyes, and away from the ceiling that it lights
     half = float(rng.uniform(0.12, 0.25))
     case = one_of(rng, materials, ("white_lacquer", "steel", "porcelain", "copper"))
     made.box("bowl", (-half, half), (-0.16, -0.002), (top - 0.12, top), case)
@@ -104,15 +105,16 @@ def hang_lamps(layout: Layout, materials: MaterialSet, rng: np.random.Generator,
         return
     plan = layout.plan
     ratio = plan.length_m / plan.width_m
-    across = max(round(float(np.sqrt(most * ratio))), 1)
+    across = max(round(float(np.sqrt(most * ratio))), 1)  # as near to a square grid as the room allows
     along = -(-most // across)
     regular = [
         ((i + 0.5) * plan.length_m / across, (j + 0.5) * plan.width_m / along)
         for i in range(across)
         for j in range(along)
     ]
+    # for the first lamp alone, where the regular places are taken
     dense = [((i + 0.5) * plan.length_m / 24, (j + 0.5) * plan.width_m / 24) for i in range(24) for j in range(24)]
-    turn = 0.0 if rng.random() < 0.7 else 0.5 * np.pi
+    turn = 0.0 if rng.random() < 0.7 else 0.5 * np.pi  # tubes run along the room, or across
     example = _drawn_kind(rng, kind)
     for x, y in (*regular, *dense):
         if placed >= (most if (x, y) in regular else 1):
@@ -142,7 +144,7 @@ def _lamp_fits(layout: Layout, made: Assembly, x: float, y: float, yaw_rad: floa
 
 def _uplights(layout: Layout, materials: MaterialSet, rng: np.random.Generator, most: int) -> int:
     placed = 0
-    for _ in range(12 * most):
+    for _ in range(12 * most):  # most walls have something before them
         wall = layout.plan.walls[rng.integers(len(layout.plan.walls))]
         made = uplight(rng, materials, layout.plan.height_m)
         if wall.length_m < 1.0 or placed >= most:

@@ -73,14 +73,15 @@ def plain(rng: np.random.Generator, shape: Shape2, colours: Array) -> Array:
 def concrete(rng: np.random.Generator, shape: Shape2, colours: Array) -> Array:
     """Concrete: stains at all scales, and pores."""
     stains, pores = fractal(rng, shape, 1.3), fractal(rng, shape, 0.6)
+    # 2.2 sigma: 1.4 % are pores
     return shaded(mixed(colours, 0, 1, 0.4 + 0.35 * stains), 1.0 - 0.25 * (pores > 2.2) + 0.04 * pores)
 
 
 def wood(rng: np.random.Generator, shape: Shape2, colours: Array) -> Array:
     """Wood whose grain runs along the columns: rings, fibres, and knots where the rings bend."""
     y, _ = lattice(shape)
-    bend = fractal(rng, shape, 1.5, (1.0, 5.0))
-    fibres = fractal(rng, shape, 0.5, (1.0, 14.0))
+    bend = fractal(rng, shape, 1.5, (1.0, 5.0))  # five times as long along the grain
+    fibres = fractal(rng, shape, 0.5, (1.0, 14.0))  # fibres are longer still
     rings = np.sin(2.0 * np.pi * (rng.integers(2, 6) * y + 0.45 * bend))
     return shaded(mixed(colours, 0, 1, 0.4 + 0.3 * rings + 0.12 * bend), 1.0 + 0.06 * fibres)
 
@@ -88,6 +89,7 @@ def wood(rng: np.random.Generator, shape: Shape2, colours: Array) -> Array:
 def planks(rng: np.random.Generator, shape: Shape2, colours: Array) -> Array:
     """Floor boards along the columns, each with its own tint and cut, and dark joints."""
     rows, columns = shape
+    # whole texels a board: no seam where the tile repeats
     count = int(rng.choice([d for d in (8, 12, 16) if rows % d == 0] or [1]))
     high = rows // count
     values = wood(rng, shape, colours)
@@ -95,11 +97,11 @@ def planks(rng: np.random.Generator, shape: Shape2, colours: Array) -> Array:
     dark = np.broadcast_to(joints(y, rows, count, 1.0 / rows), shape).copy()
     for board in range(count):
         place = slice(board * high, (board + 1) * high)
-        values[place] = np.roll(values[place], int(rng.integers(columns)), axis=1)
-        cut = rng.random() + np.array([0.0, rng.uniform(0.4, 0.6)])
+        values[place] = np.roll(values[place], int(rng.integers(columns)), axis=1)  # each board is cut from elsewhere
+        cut = rng.random() + np.array([0.0, rng.uniform(0.4, 0.6)])  # two pieces a board
         ends = np.abs(np.mod(x - cut.reshape(2, 1) + 0.5, 1.0) - 0.5) * columns
         dark[place] = np.maximum(dark[place], np.clip(1.0 - ends, 0.0, 1.0).max(axis=0))
-        tint = rng.uniform(0.78, 1.22, 2)
+        tint = rng.uniform(0.78, 1.22, 2)  # one for each of them
         values[place] *= np.where(np.mod(x[0] - cut[0], 1.0) < cut[1] - cut[0], tint[0], tint[1]).reshape(1, -1, 1)
     return shaded(values, 1.0 - 0.6 * dark)
 
@@ -148,10 +150,10 @@ def checker(rng: np.random.Generator, shape: Shape2, colours: Array) -> Array:
 def bricks(rng: np.random.Generator, shape: Shape2, colours: Array) -> Array:
     """Running bond: each brick with its own tint, mortar between them."""
     rows, columns = shape
-    courses, across = 12, 4
+    courses, across = 12, 4  # bricks of 1 to 3, as long ones are laid
     y, x = lattice(shape)
     row = np.broadcast_to((y * courses).astype(int), shape)
-    shifted = x + 0.5 * (row % 2) / across
+    shifted = x + 0.5 * (row % 2) / across  # half a brick in every other course
     column = np.floor(shifted * across).astype(int) % across
     values = mixed(colours, 0, 1, rng.random((courses, across))[row, column] + 0.2 * fractal(rng, shape, 1.0))
     values = shaded(values, 1.0 + 0.08 * fractal(rng, shape, 0.5))
@@ -222,7 +224,7 @@ def pegboard(rng: np.random.Generator, shape: Shape2, colours: Array) -> Array:
     """Board with a square grid of dark holes, four texels apart."""
     rows, columns = shape
     y, x = np.mgrid[:rows, :columns] % 4
-    hole = np.clip(1.2 - np.hypot(y - 1.5, x - 1.5), 0.0, 1.0)
+    hole = np.clip(1.2 - np.hypot(y - 1.5, x - 1.5), 0.0, 1.0)  # round, with an edge of one texel
     values = mixed(colours, 0, 1, 0.5 + 0.2 * fractal(rng, shape, 1.2))
     return values + 0.9 * hole[..., None] * (colours[-1] - values)
 
@@ -240,7 +242,7 @@ def panels(rng: np.random.Generator, shape: Shape2, colours: Array) -> Array:
     """Ceiling panels with flecks, in a grid of metal strips."""
     rows, columns = shape
     y, x = lattice(shape)
-    flecks = np.clip(fractal(rng, shape, 0.3) - 1.3, 0.0, 1.0)
+    flecks = np.clip(fractal(rng, shape, 0.3) - 1.3, 0.0, 1.0)  # a tenth of the panel
     lines = np.maximum(joints(y, rows, 2, 2.0 / rows), joints(x, columns, 2, 2.0 / columns))
     tint = rng.normal(1.0, 0.02, (2, 2))[(y * 2).astype(int), (x * 2).astype(int)]
     values = shaded(mixed(colours, 0, 1, 0.9 * flecks), tint + 0.02 * fractal(rng, shape, 1.4))
@@ -256,6 +258,7 @@ def metal(rng: np.random.Generator, shape: Shape2, colours: Array) -> Array:
 def worn(rng: np.random.Generator, shape: Shape2, colours: Array) -> Array:
     """Paint or plastic in use: smudges, dust, and thin scratches in both directions."""
     dust, smudges = fractal(rng, shape, 0.5), fractal(rng, shape, 1.3)
+    # 2 %
     scratches = [np.clip(fractal(rng, shape, 0.3, stretch) - 2.0, 0.0, 1.0) for stretch in ((1.0, 16.0), (16.0, 1.0))]
     values = mixed(colours, 0, 1, 0.3 + 0.25 * smudges)
     values += 0.4 * np.minimum(sum(scratches), 1.0)[..., None] * (colours[-1] - values)

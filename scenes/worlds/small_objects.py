@@ -38,8 +38,8 @@ def ball(rng: Rng, materials: MaterialSet) -> Assembly:
     made, radius = Assembly(), float(rng.uniform(0.08, 0.16))
     surface = one_of(rng, materials, (*_PAINTS, "leather", "white_plastic"))
     for k in range(5):
-        low, high = (-1.0 + 0.4 * k) * radius, (-0.6 + 0.4 * k) * radius
-        wide = math.sqrt(radius**2 - (0.5 * (low + high)) ** 2)
+        low, high = (-1.0 + 0.4 * k) * radius, (-0.6 + 0.4 * k) * radius  # five rings of a fifth of the diameter
+        wide = math.sqrt(radius**2 - (0.5 * (low + high)) ** 2)  # of the ball at the ring's middle
         made.post(f"ring_{k + 1}", 0.0, 0.0, (radius + low, radius + high), wide, surface, 12)
     return made
 
@@ -106,7 +106,7 @@ def cable(rng: Rng, materials: MaterialSet) -> Assembly:
     made, colour = Assembly(), one_of(rng, materials, ("dark_plastic", "paint_orange", "white_plastic"))
     place, turn = np.array([-0.4, 0.0, 0.008]), float(rng.uniform(-0.6, 0.6))
     for k in range(5):
-        turn += float(rng.uniform(-0.7, 0.7))
+        turn += float(rng.uniform(-0.7, 0.7))  # a cable does not bend sharply
         after = place + float(rng.uniform(0.1, 0.3)) * np.array([math.cos(turn), math.sin(turn), 0.0])
         made.rod(f"piece_{k + 1}", tuple(place), tuple(after), 0.007, colour, 5)
         place = after
@@ -137,8 +137,8 @@ FLOOR_THINGS: tuple[Piece, ...] = (
 
 def hanging_cable(rng: Rng, materials: MaterialSet) -> Assembly:
     """Cable that hangs from the ceiling, with a plug or a hook."""
-    made, top = Assembly(), materials.properties.height_m - 0.004
-    low = float(rng.uniform(0.5, 1.3))
+    made, top = Assembly(), materials.properties.height_m - 0.004  # no face shares the ceiling's plane
+    low = float(rng.uniform(0.5, 1.3))  # beside the mirror's way, up to its top
     colour = one_of(rng, materials, ("dark_plastic", "paint_orange", "paint_yellow", "steel"))
     made.post("cable", 0.0, 0.0, (low, top), float(rng.uniform(0.008, 0.02)), colour, 8)
     made.post("plug", 0.0, 0.0, (low - 0.1, low), 0.035, one_of(rng, materials, (*_PAINTS, "dark_plastic")), 10)
@@ -148,6 +148,7 @@ def hanging_cable(rng: Rng, materials: MaterialSet) -> Assembly:
 def arm(rng: Rng, materials: MaterialSet) -> Assembly:
     """Post with an arm that reaches towards +y, and something at its end."""
     made, frame = Assembly(), one_of(rng, materials, ("steel", "dark_plastic", *_PAINTS))
+    # towards the stroke axis, up to the free cylinder
     high, reach = float(rng.uniform(0.5, 1.5)), float(rng.uniform(0.25, 0.5))
     made.post("foot", 0.0, 0.0, (0.0, 0.03), 0.14, frame, 14)
     made.post("post", 0.0, 0.0, (0.03, high), 0.018, frame)

@@ -21,11 +21,11 @@ from phibench.scenes.worlds.tabletop import (
 def figure(rng: Rng, materials: MaterialSet) -> Assembly:
     """People-sized figure: legs, trunk, arms, head and hair."""
     made = Assembly()
-    tall = float(rng.uniform(1.5, 1.92))
+    tall = float(rng.uniform(1.5, 1.92))  # nine adults of ten
     trousers = one_of(rng, materials, ("cloth_grey", "cloth_grey", "cloth_blue"), 4)
     shirt = one_of(rng, materials, (*CLOTHS, "paper"), 4)
     skin, step = materials.surface("skin", int(rng.integers(3))), float(rng.uniform(0.0, 0.12))
-    hip, neck = 0.5 * tall, 0.84 * tall
+    hip, neck = 0.5 * tall, 0.84 * tall  # parts of the height, as in drawings of people
     for k, sign in enumerate((-1.0, 1.0)):
         made.rod(f"leg_{k + 1}", (sign * 0.1, sign * step, 0.07), (sign * 0.085, 0.0, hip - 0.001), 0.075, trousers, 9)
         made.box(
@@ -53,6 +53,7 @@ def figure(rng: Rng, materials: MaterialSet) -> Assembly:
 def plant(rng: Rng, materials: MaterialSet) -> Assembly:
     """Pot with a stem and leaves as two-sided blades."""
     made = Assembly()
+    # from a pot on the floor to a small tree
     high, reach = float(rng.uniform(0.7, 1.9)), float(rng.uniform(0.25, 0.45))
     pot = float(rng.uniform(0.13, 0.22))
     made.post(
@@ -72,6 +73,7 @@ def plant(rng: Rng, materials: MaterialSet) -> Assembly:
     )
     middle, tip = root + 0.5 * length * away + rise, root + length * away + rise + drop
     vertices = np.stack([root, middle - side, middle + side, tip], axis=1).reshape(-1, 3)
+    # root, two sides, tip: two triangles
     corners = 4 * np.arange(count)[:, None, None] + np.array([[0, 1, 2], [1, 3, 2]])
     made.mesh("leaves", vertices, corners.reshape(-1, 3), materials.surface("leaves", int(rng.integers(3))), 0.008)
     return made
@@ -92,7 +94,7 @@ def boxes(rng: Rng, materials: MaterialSet) -> Assembly:
             surface,
             float(rng.uniform(-0.25, 0.25)),
         )
-        z, half = z + high, half * float(rng.uniform(0.7, 1.0))
+        z, half = z + high, half * float(rng.uniform(0.7, 1.0))  # piles get narrower upwards, and stand
     return made
 
 
@@ -101,6 +103,7 @@ def barrel(rng: Rng, materials: MaterialSet) -> Assembly:
     made, body = Assembly(), one_of(rng, materials, (*PAINTS, "steel", "grey_plastic", "cast_iron"))
     radius, high = float(rng.uniform(0.15, 0.3)), float(rng.uniform(0.4, 0.95))
     made.post("body", 0.0, 0.0, (0.0, high), radius, body, 20)
+    # over the rim
     made.post("lid", 0.0, 0.0, (high, high + 0.03), radius * 1.04, materials.surface("dark_plastic"), 20)
     return made
 
@@ -108,6 +111,7 @@ def barrel(rng: Rng, materials: MaterialSet) -> Assembly:
 def column(rng: Rng, materials: MaterialSet) -> Assembly:
     """Round or square column up to a little below the ceiling."""
     made, surface = Assembly(), one_of(rng, materials, ("concrete_wall", "plaster", "brick_wall", "cast_iron"))
+    # no face shares the ceiling's plane
     high, half = materials.properties.height_m - 0.002, float(rng.uniform(0.1, 0.25))
     if rng.random() < 0.5:
         made.post("shaft", 0.0, 0.0, (0.0, high), half, surface, 20)
@@ -119,7 +123,7 @@ def column(rng: Rng, materials: MaterialSet) -> Assembly:
 def partition(rng: Rng, materials: MaterialSet) -> Assembly:
     """Screen on feet with notices."""
     made, cloth = Assembly(), one_of(rng, materials, ("cloth_blue", "cloth_grey", "cork", "cloth_green"), 2)
-    width, high = float(rng.uniform(0.9, 1.8)), float(rng.uniform(1.3, 1.9))
+    width, high = float(rng.uniform(0.9, 1.8)), float(rng.uniform(1.3, 1.9))  # of offices
     made.box("board", (-width / 2, width / 2), (-0.02, 0.02), (0.12, high), cloth)
     for k, sign in enumerate((-1.0, 1.0)):
         x = sign * (width / 2 - 0.1)
@@ -165,7 +169,7 @@ def trolley(rng: Rng, materials: MaterialSet) -> Assembly:
 def tripod(rng: Rng, materials: MaterialSet) -> Assembly:
     """Tripod with a camera-like box."""
     made, dark = Assembly(), materials.surface("dark_plastic")
-    high = float(rng.uniform(0.8, 1.5))
+    high = float(rng.uniform(0.8, 1.5))  # of the head
     for k in range(3):
         c, s = np.cos(2.1 * k), np.sin(2.1 * k)
         made.rod(f"leg_{k + 1}", (0.35 * c, 0.35 * s, 0.005), (0.03 * c, 0.03 * s, high), 0.012, dark, 6)

@@ -29,7 +29,7 @@ def one_of(rng: Rng, materials: MaterialSet, names: tuple[str, ...], kinds: int 
 
 def carton(rng: Rng, materials: MaterialSet, size_m: tuple[float, float]) -> Surface:
     """Surface of a box whose front has a size: its picture fills the front once."""
-    rows, columns = (int(np.clip(length / 0.012, 8, 48)) for length in (size_m[1], size_m[0]))
+    rows, columns = (int(np.clip(length / 0.012, 8, 48)) for length in (size_m[1], size_m[0]))  # texels of 12 mm
     return materials.print(graphics.carton(rng, (rows, columns)), size_m)
 
 
@@ -41,10 +41,10 @@ def book_row(rng: Rng, materials: MaterialSet, width_m: float, depth_m: float, h
     made, x = Assembly(), -0.5 * width_m
     for k in range(3):
         width = min(float(rng.uniform(0.25, 0.7)) * width_m, 0.5 * width_m - x)
-        if width < 0.06:
+        if width < 0.06:  # less than three books
             break
         high = height_m * float(rng.uniform(0.6, 0.92))
-        columns = int(np.clip(width / 0.007, 8, 96))
+        columns = int(np.clip(width / 0.007, 8, 96))  # texels of 7 mm across: a spine has some
         surface = materials.print(graphics.spines(rng, (24, columns)), (width, high))
         made.box(
             f"books_{k + 1}",
@@ -109,7 +109,7 @@ def scatter(
     name: str = "thing",
 ) -> None:
     """Things in cells of a board that starts at (x, y, z)."""
-    cells = max(int((x[1] - x[0]) / 0.22), 1)
+    cells = max(int((x[1] - x[0]) / 0.22), 1)  # one thing a cell: none stands in another
     for k in rng.permutation(cells)[: min(count, cells)]:
         pitch = (x[1] - x[0]) / cells
         size = min(pitch, y[1] - y[0]) * 0.9
@@ -127,8 +127,8 @@ def scatter(
 def monitor(rng: Rng, materials: MaterialSet) -> Assembly:
     """Screen on a foot."""
     made, dark = Assembly(), materials.surface("dark_plastic")
-    width = float(rng.uniform(0.42, 0.7))
-    high = width * 0.6
+    width = float(rng.uniform(0.42, 0.7))  # 19 to 32 inches
+    high = width * 0.6  # 16:10, with its frame
     made.box("foot", (-0.12, 0.12), (-0.09, 0.09), (0.0, 0.012), dark)
     made.box("neck", (-0.025, 0.025), (0.03, 0.06), (0.012, 0.14 + 0.3 * high), dark)
     made.box("case", (-0.5 * width, 0.5 * width), (-0.02, 0.03), (0.14, 0.14 + high), dark)
