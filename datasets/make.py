@@ -222,7 +222,7 @@ def _hidden(causes: Mapping[str, Causes]) -> list[str]:
     """Warn of pairs that will not be visible in both images."""
     hidden = [name for name, both in causes.items() if both != (VISIBLE, VISIBLE)]
     if not hidden:
-        return []
+        return []  # every spot is seen twice
     told = zip(POSITIONS, causes[hidden[0]], strict=True)
     why = " and ".join(f"{position} {cause}" for position, cause in told if cause != VISIBLE)
     text = f"{len(hidden)} of {len(causes)} pairs will not be visible in both images, such as {hidden[0]}"

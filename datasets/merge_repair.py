@@ -208,7 +208,7 @@ def _lost_head(folder: Path) -> FolderHead | None:
     """
     path, layers = folder / schema.RECIPE, sorted(folder.glob(schema.view_file("*", "ambient")))
     if not (path.is_file() and layers):
-        return None
+        return None  # too little is left to tell what it was
     text = recipe_text(path)
     plan = make_plan(parse_recipe(text, f"{path}"), held_room_files(folder))
     expected = {pose.pose_id: pose.seed for pose in plan.poses}
@@ -264,7 +264,7 @@ def _set_aside(path: Path, console: Console) -> None:
     """Remove an empty folder; give anything else another name."""
     if path.is_dir() and not any(path.iterdir()):
         path.rmdir()
-        return
+        return  # nothing in it that could be lost
     kept = next(other for k in count(1) if not os.path.lexists(other := path.with_name(f"{path.name}.aside-{k}")))
     path.rename(kept)
     console.print(f"{path} was no {'file' if kept.is_dir() else 'folder'}; it is kept as {kept.name}", highlight=False)

@@ -140,7 +140,7 @@ def epipolar_line(sample: Sample, position: str) -> dict[str, Any] | None:
     spot = light if np.isfinite(light).all() else np.array([sample.row.spot_world_m])
     points = mirror_points(view, spot, view.camera_centre_m[None])
     if not np.isfinite(points.points_m).all():
-        return None
+        return None  # the mirror does not show it
     start, end = (leg[0] for leg in onward(view, points, spot).legs[-1])
     reach = float(np.linalg.norm(end - start))
     along = np.sort(np.append(np.geomspace(_NEAREST_M, _FARTHEST_M, _LINE_POINTS), reach))
@@ -160,7 +160,7 @@ def _length_at(start: Array, direction: Array, centre: Array, depth_m: float) ->
     b = float((start - centre)[:2] @ direction[:2])
     c = float((start - centre)[:2] @ (start - centre)[:2]) - depth_m**2
     if a == 0.0 or b * b - a * c < 0.0:
-        return None
+        return None  # the ray never comes so near to the axis
     t = (-b + (b * b - a * c) ** 0.5) / a
     return t if t > 0.0 else None
 
@@ -183,7 +183,7 @@ def _spot(sample: Sample, position: str) -> dict[str, Any] | None:
     planes = window.electrons_per_s
     peak = float(planes.max(initial=0.0))
     if peak <= 0.0:
-        return None
+        return None  # no light of the spot falls on this image
     codes = np.rint(planes[0] / peak * _MOST).astype(np.uint16)
     return {
         "u0": window.u0_px,

@@ -66,7 +66,7 @@ def _distribution(request: ExportRequest, hashes: Mapping[str, str]) -> list[dic
 
 def _images(request: ExportRequest) -> list[dict[str, Any]]:
     if request.form != "frames":
-        return []
+        return []  # pictures lie in tables or archives, which have extracts of their own
     extracts = {"file": ("sc:Text", "filename"), "content": ("sc:ImageObject", "content")}
     fields = [
         {

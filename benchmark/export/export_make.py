@@ -188,7 +188,7 @@ def _shards(dataset: Dataset, request: ExportRequest) -> tuple[list[Shard], list
         pairs = []
         for sample in dataset.samples:
             if split_of[sample.row.sample_id] != split:
-                continue
+                continue  # of another split
             size = sample.rig.camera.height_px, sample.rig.camera.width_px
             if request.frames.region is not None and not all(has_place(sample.truth_row(p), size) for p in POSITIONS):
                 notes.append(f"{sample.row.sample_id} is left out: no image of the spot to put a region around")
@@ -257,7 +257,7 @@ def _claim(out: Path, dataset: Dataset, request: ExportRequest) -> None:
             raise DatasetError(
                 f"{out} holds an export that differs in {', '.join(other)}: give another folder, `--out FOLDER`"
             )
-        return
+        return  # the same export goes on
     write_text(path, json.dumps(meant, indent=1, allow_nan=False) + "\n")
 
 

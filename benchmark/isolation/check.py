@@ -99,7 +99,7 @@ def _until_hopeless(run: Iterator[Outcome]) -> Iterator[Outcome]:
         yield outcome
         late = late + 1 if outcome.failure == "timeout" else 0
         if late == _GIVE_UP:
-            return
+            return  # each further pair would cost the same time
 
 
 def _failures(done: Sequence[Outcome], pairs: EasyPairs) -> Iterator[str]:
@@ -133,14 +133,14 @@ def _missing(done: Sequence[Outcome], pairs: EasyPairs) -> Iterator[str]:
         if 2 * len(missing) > len(asked):
             reason, count = Counter(missing).most_common(1)[0]
             yield f"{len(missing)} of {len(asked)} spots are missing{where}: '{reason}' ({count} times)"
-            return
+            return  # what is said of the few would mislead
 
 
 def _wrong(done: Sequence[Outcome], pairs: EasyPairs) -> Iterator[str]:
     """Sentences about positions, covariances, angles and depths."""
     answered = [outcome for outcome in done if outcome.answer is not None]
     if not answered:
-        return
+        return  # told as missing
     truths = {outcome.number: pairs.truth(outcome.number) for outcome in answered}
     answer_px, truth_px = _positions(answered), np.array([_true_px(truths[o.number]) for o in answered])
     fault = colour_fault(answered, pairs)
@@ -157,7 +157,7 @@ def _notes(done: Sequence[Outcome], pairs: EasyPairs) -> Iterator[str]:
     answered = [outcome for outcome in done if outcome.answer is not None]
     yield f"{len(answered)} of {len(done)} pairs answered"
     if not answered:
-        return
+        return  # nothing to say
     truths = {outcome.number: pairs.truth(outcome.number) for outcome in answered}
     errors = _positions(answered) - np.array([_true_px(truths[o.number]) for o in answered])
     distance = np.linalg.norm(errors, axis=-1)
@@ -274,7 +274,7 @@ def position_fault(answer_px: Array, truth_px: Array, views: Views) -> str:
     """
     error = _median_distance(answer_px, truth_px)
     if not np.isfinite(error):
-        return ""
+        return ""  # too few answers
     if error <= NEAR_PX:
         return _offset_fault((answer_px - truth_px).reshape(-1, 2))
     left = {text: _median_distance(answer_px, rule(truth_px, views)) for text, rule in RULES.items()}
@@ -291,13 +291,13 @@ def colour_fault(answered: Sequence[Outcome], pairs: EasyPairs) -> str:
     """Sentence if most answers in images with a blue spot are that spot; "" if not, or if nothing is answered there."""
     lit = [(outcome, blue) for outcome in answered if (blue := pairs.blue_px(outcome.number)) is not None]
     if not lit:
-        return ""
+        return ""  # no blue light is in these pairs
     distance = np.linalg.norm(
         _positions([outcome for outcome, _ in lit]) - np.array([blue for _, blue in lit]), axis=-1
     )
     seen = distance[np.isfinite(distance)]
     if len(seen) < _LEAST_BLUE or 2 * int((seen <= NEAR_PX).sum()) <= len(seen):
-        return ""
+        return ""  # it takes red ones, or finds few
     return (
         f"{int((seen <= NEAR_PX).sum())} of {len(seen)} spots are a fainter blue light: red and blue look exchanged; "
         "images are R, G, B, not B, G, R, and a mosaic has red at even rows and even columns"
@@ -317,7 +317,7 @@ def whole_fault(error_px: Array, boxed: Sequence[bool]) -> str:
     within, without = distance[inside], distance[~inside]
     seen, near = without[np.isfinite(without)], within[np.isfinite(within)]
     if not (len(seen) and len(near)) or np.median(near) > NEAR_PX or 2 * int((seen > NEAR_PX).sum()) <= len(seen):
-        return ""
+        return ""  # it needs no boxes, or does not work with them either
     return (
         f"{int((seen > NEAR_PX).sum())} of {len(seen)} spots are wrong where a pair has no boxes: search inside the "
         "mirror's outline, `mirror_mask(pair)` in docs/method.md"
@@ -359,7 +359,7 @@ def covariance_fault(error_px: Array, covariance_px2: Array) -> str:
     """
     pull = rms_pull(error_px, covariance_px2)
     if 2 * len(error_px) < _LEAST_PULLS or _PULL[0] <= pull <= _PULL[1]:
-        return ""
+        return ""  # too few, or as they should be
     deviations = np.sqrt(np.mean((error_px / np.diagonal(covariance_px2, axis1=1, axis2=2)) ** 2))
     if _PULL[0] <= deviations <= _PULL[1]:
         return (
@@ -398,14 +398,14 @@ def phi_fault(angles: Sequence[tuple[float, str, dict[str, float]]]) -> str:
     """
     known = [(phi, convention, truth) for phi, convention, truth in angles if convention in truth]
     if not known:
-        return ""
+        return ""  # no angle was answered
     off = {
         name: float(np.median([abs(phi - truth[name]) for phi, _, truth in known]))
         for name in ("ray", "normal", "incidence")
     }
     said = float(np.median([abs(phi - truth[convention]) for phi, convention, truth in known]))
     if said <= _NEAR_RAD:
-        return ""
+        return ""  # the sense that it states is right
     best, convention = min(off, key=lambda name: off[name]), known[0][1]
     if off[best] <= _NEAR_RAD:
         return f"phi_rad is the angle '{best}', not '{convention}': set phi_convention='{best}'"
@@ -420,7 +420,7 @@ def depth_fault(depths: Sequence[tuple[float, float]]) -> str:
         return ""
     ratio = float(np.median([depth / truth for depth, truth in depths]))
     if abs(ratio - 1.0) <= _NEAR_DEPTH:
-        return ""
+        return ""  # metres
     for factor, unit in _UNITS.items():
         if abs(ratio / factor - 1.0) <= _NEAR_DEPTH:
             return f"depth_m is in {unit}: metres are needed"

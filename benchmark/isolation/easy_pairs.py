@@ -278,7 +278,7 @@ class EasyPairs(ShortForm):
     def blue_px(self, number: int) -> tuple[tuple[float, float], tuple[float, float]] | None:
         """Places (u, v) of the blue spots in both images, across the mirror from the red ones; None without them."""
         if not self._is_whole(number) or self._camera().card.mosaic == "mono":
-            return None
+            return None  # boxes hide it, and grey pixels have no blue
         scene = _scene(self.rig, number)
         return self._across(scene.down).uv_px, self._across(scene.up).uv_px
 

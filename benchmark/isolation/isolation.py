@@ -141,7 +141,7 @@ _GPU = ("/dev/dri", "/dev/kfd", "/dev/dxg")  # and /dev/nvidia*
 def _limit_files(kernel: _Kernel, access: Access, shared: Sequence[Path]) -> bool:
     """Rules for all that may be read and written; False if the kernel has none."""
     if kernel.abi < 1:
-        return False
+        return False  # a kernel before 5.13
     every = (1 << max(bits for abi, bits in _RIGHTS.items() if abi <= kernel.abi)) - 1
     ruleset = kernel.ruleset(every)
     hidden = [Path(path) for path in access.hidden]
@@ -174,7 +174,7 @@ def _real(path: Path) -> Path | None:
 def _without(path: Path, hidden: Sequence[Path]) -> Iterator[tuple[Path, int]]:
     """Parts of a folder that hold nothing hidden, with their rights; rules cannot take a part out of a whole."""
     if any(path.is_relative_to(other) for other in hidden):
-        return
+        return  # wholly hidden
     if not any(other.is_relative_to(path) for other in hidden):
         yield path, _LOOK
         return
@@ -275,7 +275,7 @@ class _Kernel:
         user, group = os.geteuid(), os.getegid()
         if self._library.unshare(_NEW_MOUNTS) != 0:
             if self._library.unshare(_NEW_USER | _NEW_MOUNTS) != 0:
-                return False
+                return False  # neither as root nor in a namespace of its own
             try:
                 Path("/proc/self/setgroups").write_text("deny")
                 Path("/proc/self/uid_map").write_text(f"{user} {user} 1")
@@ -317,7 +317,7 @@ class _Kernel:
         """Deny calls that reach other processes or mark files; False on a machine whose calls are not listed."""
         machine = os.uname().machine
         if machine not in _NUMBERS:
-            return False
+            return False  # numbers of system calls are not known there
         lines = _filter(_NUMBERS[machine], _DENIED[machine], os.getppid())
         program = b"".join(struct.pack("=HBBI", *line) for line in lines)
         buffer = ctypes.create_string_buffer(program, len(program))

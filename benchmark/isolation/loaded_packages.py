@@ -38,7 +38,7 @@ def loaded_names(folder: str = "") -> list[str]:
 
 def _is_of_others(name: str, module: Any, folder: str) -> bool:
     if name.partition(".")[0] in sys.stdlib_module_names:
-        return False
+        return False  # Python's own
     file = getattr(module, "__dict__", {}).get("__file__")
     return isinstance(file, str) and not (folder and Path(file).is_relative_to(folder))
 

@@ -56,7 +56,7 @@ class OpenedFiles:
         for place in _folders(path, self._hidden) if path.is_dir() else (path,):
             if len(self._watched) >= _FOLDERS:
                 self.complete = False
-                return
+                return  # told: the list may lack files
             name = place.relative_to(path).as_posix() if place != path else ""
             prefix = "/".join(part for part in (title, name) if part)
             watch = self._library().inotify_add_watch(self._handle, os.fsencode(place), _OPEN)
@@ -103,7 +103,7 @@ class OpenedFiles:
                 or "__pycache__" in path.parts
                 or any(real.is_relative_to(folder) for folder in self._hidden)
             ):
-                continue
+                continue  # Python's, or compiled from what is hashed
             left -= real.stat().st_size if real.is_file() else 0
             counts = left >= 0 and len(result) < _MOST_FILES
             result[printable_line(name)] = _hash(real) if counts else None

@@ -252,7 +252,7 @@ class MethodProcess:
             If the method cannot be imported or its process does not start in time.
         """
         if self._process is not None:
-            return
+            return  # it runs already
         with self._lock:
             if self._closed:
                 raise MethodError(f"method '{self._reference.name}' was stopped")

@@ -110,7 +110,7 @@ def truth_near(
             names = {entry.name for entry in entries}
             if names & _FOLDERS:
                 truths.append(path)
-                continue
+                continue  # all of it is hidden: nothing below need be looked at
             truths += [path / entry.name for entry in entries if _holds_truth(path, entry.name, names)]
             linked.update(_linked(entries))
             below += [path / entry.name for entry in entries if entry.is_dir(follow_symlinks=False)]
@@ -134,7 +134,7 @@ def _holds_truth(folder: Path, name: str, names: set[str]) -> bool:
     if name in _FILES or name.endswith((SEALED_TRUTH, RECORDS_SO_FAR)):
         return True
     if kind not in ("json", "parquet") or not {f"{stem}.json", f"{stem}.parquet"} <= names:
-        return False
+        return False  # a score has two files of one name
     try:
         with (folder / f"{stem}.json").open("rb") as file:
             return b"phibench score" in file.read(_HEAD_BYTES)

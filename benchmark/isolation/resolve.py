@@ -192,7 +192,7 @@ def _imported(file: Path, folder: Path) -> Iterator[Path]:
             base = (*above, *(node.module.split(".") if node.module else ()))
             names = [(*base, alias.name) for alias in node.names] or [base]
         else:
-            continue
+            continue  # no import
         for name in names:
             yield from _files_of(name, folder)
 
@@ -204,7 +204,7 @@ def _files_of(name: tuple[str, ...], folder: Path) -> Iterator[Path]:
         for file in (place / "__init__.py", place.parent / f"{place.name}.py"):
             if file.is_file():
                 yield file
-                break
+                break  # Python takes the first, too
 
 
 _MOST_BYTES = 16 * MIB  # of a method's file

@@ -82,10 +82,10 @@ def _wait(worker: int, line: int, runner: int) -> int | None:
             if pid == worker:
                 return status
         if stopped or os.getppid() != runner:
-            return None
+            return None  # the run was stopped, or is gone
         for handle, _ in events.poll(int(1000 * _LOOK_SECONDS)):
             if handle == line:
-                return None
+                return None  # the run has hung up
             with contextlib.suppress(BlockingIOError):
                 os.read(told, 4096)  # signals are one byte each
 
@@ -96,7 +96,7 @@ def _ended() -> Iterator[tuple[int, int]]:
         while True:
             pid, status = os.waitpid(-1, os.WNOHANG)
             if pid == 0:
-                return
+                return  # those that are left still run
             yield pid, status
 
 

@@ -55,7 +55,7 @@ def limited(limit_bytes: int) -> Iterator[None]:
     """Keep RLIMIT_AS at a limit; taken off afterwards, so that what went wrong can be told."""
     if not _STATM.is_file():
         yield
-        return
+        return  # the size of a process is not known: no limit
     soft, hard = resource.getrlimit(resource.RLIMIT_AS)
     lowest = min((x for x in (limit_bytes, soft, hard) if x != resource.RLIM_INFINITY), default=limit_bytes)
     resource.setrlimit(resource.RLIMIT_AS, (lowest, hard))
@@ -90,7 +90,7 @@ def place_in(error: BaseException, file: str = "") -> str:
     frames = traceback.extract_tb(error.__traceback__)
     own = [frame for frame in frames if frame.filename == file] or frames[-1:]
     if not own:
-        return ""
+        return ""  # no line of Python, such as in a C library
     frame = own[-1]
     return f"{Path(frame.filename).name}, line {frame.lineno}, in {frame.name}"
 
@@ -113,7 +113,7 @@ def _on_relative(error: BaseException) -> str:
     lost = next((cause for cause in _causes(error) if isinstance(cause, FileNotFoundError)), None)
     name = lost.filename if lost is not None else None
     if not isinstance(name, str) or not name or Path(name).is_absolute():
-        return ""
+        return ""  # no relative path: another cause
     return "; the working folder is a fresh one: a path beside the method is Path(__file__).with_name('...')"
 
 

@@ -502,7 +502,7 @@ def _of_another(dataset: Dataset, calibration: Calibration) -> bool:
 
 def _samples_of_its_rig(dataset: Dataset, calibration: Calibration) -> list[Sample]:
     if _of_another(dataset, calibration):
-        return []
+        return []  # it says nothing of these rigs
     made_from = set(calibration.made_from.get("samples", ()))
     rigs = {row.rig for row in dataset.rows if row.sample_id in made_from}
     return [sample for sample in dataset if sample.row.rig in rigs]

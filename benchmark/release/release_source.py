@@ -258,7 +258,7 @@ class Partial:
                 if response.status_code not in (206, 412, 416):  # 503, say: what is there may still do
                     _require_file(response)
                 if not response.headers.get("Content-Range", "").startswith(f"bytes {begun}-"):
-                    return False
+                    return False  # the server knows no ranges: from the beginning
                 self._take(response, pace, "ab")
         return sha256(self.path) == self._archive.sha256
 

@@ -26,7 +26,7 @@ def secret_seed(path: Path, make_it: bool = True) -> int | None:
     """
     if not path.exists():
         if not make_it:
-            return None
+            return None  # a dry run draws none
         path.parent.mkdir(parents=True, exist_ok=True)
         _draw(path)
     if path.stat().st_mode & (stat.S_IRWXG | stat.S_IRWXO):

@@ -196,7 +196,7 @@ def _saturated(case: Case) -> bool:
 
 def _confused(case: Case) -> bool:
     if case.answer_px is None:
-        return False
+        return False  # silence takes no other light for the spot
     if _on_other_light(case, case.answer_px):
         return True
     true_px = np.array(case.spot.uv_px)
@@ -215,7 +215,7 @@ def _below_noise(case: Case) -> bool:
 def _compression(case: Case) -> bool:
     raw = case.spot.raw_bound_px2
     if raw is None or not np.sqrt(np.trace(raw) / 2.0) < GOOD_RAW_PX or case.pair.card.output not in PROCESSED:
-        return False
+        return False  # lost before the 8 bits, or never through them
     return not _stands_out(case)
 
 
@@ -296,10 +296,10 @@ def _is_peak_of_difference(case: Case, uv_px: Array) -> bool:
     look at on alone it exceeds 2.2 deviations at less than half of the positions, of methods that subtract at most.
     """
     if getattr(case.pair, f"{case.position}_off") is None:
-        return False
+        return False  # nothing to subtract
     difference = case.region(uv_px, _AROUND_PX, _AROUND_PX, less_off=True).sum(axis=-1)
     if difference.shape != (2 * _AROUND_PX + 1,) * 2:
-        return False
+        return False  # at the image's edge
     means = uniform_filter(difference, 3)
     rows, columns = np.abs(np.indices(means.shape) - _AROUND_PX)
     distance = np.maximum(rows, columns)
@@ -314,7 +314,7 @@ def _is_lamp(case: Case, uv_px: Array, spot_level: float) -> bool:
     """Tell whether the light at a position is clipped, or in raw pixels thrice the spot's, black level included."""
     part, card = case.region(uv_px, 1, 2), case.pair.card
     if not part.size:
-        return False
+        return False  # outside of the image
     top = float(card.top_dn) if card.output == "raw" else 255.0
     if part.max(axis=-1).mean() >= _CLIPPED * top:
         return True

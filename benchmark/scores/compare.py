@@ -143,7 +143,7 @@ def note_on_size(differences: Sequence[Difference], rules: Mapping[str, float], 
     samples : that both scores have
     """
     if any(item.better != "too few samples" for item in differences):
-        return ""
+        return ""  # there are verdicts
     least = int(rules["least_compared"])
     if samples >= least:
         return (
@@ -162,7 +162,7 @@ def note_on_code(first: ScoreDocument, second: ScoreDocument) -> str:
     a, b = (document.provenance for document in (first, second))
     changed = [key for key in ("code_sha256", "packages") if a.get(key) != b.get(key)]
     if not changed:
-        return ""
+        return ""  # the same program made both
     return (
         f"the two runs differ in {' and '.join(changed)}: the frames may not be the same; score both again to be sure"
     )
@@ -171,7 +171,7 @@ def note_on_code(first: ScoreDocument, second: ScoreDocument) -> str:
 def note_on_pairs(first: ScoreDocument, second: ScoreDocument, first_name: str, second_name: str) -> str:
     """A warning if two scores count different numbers of the same set's pairs; empty if not."""
     if first.pairs == second.pairs:
-        return ""
+        return ""  # the same number
     return (
         f"{first_name} counts {first.pairs} pairs and {second_name} {second.pairs}: the differences are over the pairs "
         "that both have"

@@ -223,7 +223,7 @@ def _curves(axes: Axes, scores: Named, by: str, metric: str, factor: float) -> N
         # 2 % aside: intervals of several methods do not cover each other
         shown = [(x * 1.02 ** (i - len(scores) / 2), value) for x, value in _points(score, by, metric)]
         if not shown:
-            continue
+            continue  # no value in any stratum
         x, y = [x for x, _ in shown], [factor * (value.value or math.nan) for _, value in shown]
         axes.errorbar(x, y, yerr=_bars([value for _, value in shown], factor), label=name, capsize=3, **line_style(i))
         lone = [number for number, (_, value) in enumerate(shown) if value.low is None]
@@ -258,7 +258,7 @@ def _bound(axes: Axes, scores: Named, by: str, metric: str, factor: float) -> No
         shown = [(x, factor * value) for x, value in parts if value]
         if shown:
             axes.plot(*zip(*shown, strict=True), color="black", linewidth=2.0, linestyle=(0, (1, 1)), label="bound")
-            return
+            return  # the line of one method is enough
 
 
 def _strata(score: ScoreDocument, by: str) -> list[tuple[float, StratumScore]]:

@@ -181,7 +181,7 @@ def holm(chances: Sequence[float], alpha: float) -> list[bool]:
     rejected = [False] * len(chances)
     for left, k in zip(range(len(order), 0, -1), order, strict=True):
         if chances[k] > alpha / left:
-            break
+            break  # Holm: what comes later is larger
         rejected[k] = True
     return rejected
 

@@ -248,7 +248,7 @@ def false_line(records: pl.DataFrame) -> str:
     answers = records.filter(pl.col("u_px").is_not_null())
     false = answers.filter("false_detection")
     if not len(false) or len(false) < FULL_OF_FALSE * len(answers):
-        return ""
+        return ""  # too few false answers to say what they are
     kinds = Counter(false["taken_for"].to_list())
     ((kind, number),) = Counter(kind.removesuffix(NOISE) for kind in kinds.elements()).most_common(1)
     # one place may look like either; a method subtracts the laser-off image everywhere or nowhere
@@ -268,7 +268,7 @@ def failure_line(records: pl.DataFrame) -> str:
     asked = records.filter(pl.col("image") == "down")
     said = Counter(asked.select("failure", "message").rows())
     if not said or any(failure == "" for failure, _ in said):
-        return ""
+        return ""  # some pairs were answered
     ((failure, message), number) = min(said.items(), key=lambda item: (-item[1], item[0]))
     often = "for example" if number == 1 else "each time" if number == len(asked) else f"{number} times"
     pairs = "the only pair" if len(asked) == 1 else f"all {len(asked)} pairs, {often}"

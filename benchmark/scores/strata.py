@@ -127,7 +127,7 @@ def _pairs(
     by: str, table: pl.DataFrame, images: pl.DataFrame, low: float, high: float, last: float
 ) -> pl.DataFrame | None:
     if by in _OF_IMAGES:
-        return None
+        return None  # a pair has no pixel or image of its own
     if by == "signal":
         return table.filter(_within("pair_electrons", low, high, last))
     if by == "azimuth":

@@ -70,7 +70,7 @@ def alike(given: EncodedPicture | None, right: EncodedPicture | None) -> bool:
         return given == right
     place = {"base64"}
     if given.model_dump(exclude=place) != right.model_dump(exclude=place):
-        return False
+        return False  # another size or text
     try:
         first, second = (_pixels(picture) for picture in (given, right))
     except (DatasetError, ValueError):  # no picture: not the same
@@ -134,7 +134,7 @@ def differences(table: pl.DataFrame, right: pl.DataFrame, names: Sequence[str], 
     for name in names:
         if name not in table.columns:
             yield f"records: the column {name} is missing"
-            continue
+            continue  # the other columns are compared all the same
         rows = np.flatnonzero(~_same(table[name], right[name]))
         if len(rows):
             number, image = table.select("number", "image").row(int(rows[0]))

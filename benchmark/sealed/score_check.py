@@ -137,7 +137,7 @@ def _of_document(document: ScoreDocument) -> Iterator[str]:
 
 def _of_release(document: ScoreDocument, release: Path | None) -> Iterator[str]:
     if release is None:
-        return
+        return  # none was given: nothing to hold it against
     file = InputFile(release, "give MANIFEST.json of a release")
     parts = file.json().get("parts")
     if not isinstance(parts, dict):
@@ -272,7 +272,7 @@ def _of_worst(given: Sequence[Worst], right: Sequence[Worst]) -> Iterator[str]:
     )
     if faults := list(_unequal(stated, found, "worst", "the data set gives")):
         yield from faults
-        return
+        return  # other images: their pixels need not be compared
     for place, (a, b) in enumerate(zip(given, right, strict=True)):
         for name in ("crop", "frame"):
             if not alike(getattr(a, name), getattr(b, name)):

@@ -60,7 +60,7 @@ def lost_work(out: Path, keys: Mapping[str, str], journal: Journal, wanted: Data
     tasks = _lost_tasks(out, keys, journal)
     files = [] if tasks else _lost_files(out, keys, journal, wanted)
     if not tasks and not files:
-        return None
+        return None  # everything that is there belongs to this run
     counts = Counter(name.split(" ", 1)[0] for name in tasks)
     parts = ", ".join(f"{count} {kind}{'s' * (count != 1)}" for kind, count in counts.items())
     what = f"{len(tasks)} finished task{'s' * (len(tasks) != 1)} ({parts})"
@@ -74,7 +74,7 @@ def finished_without(out: Path, journal: Journal) -> str | None:
     """Sentence on a finished data set that leaves samples out, which a run that needs them all would undo."""
     info = _held_info(out, journal)
     if info is None or not info.left_out or not (out / schema.CHECKSUMS).is_file():
-        return None
+        return None  # nothing was left out before
     keep = f"add `{OPTION}` to keep it so, or `--replace` to try them again"
     return f"{out} is finished, and {left_out_line(info.causes, info.samples)}; {keep}"
 
@@ -94,7 +94,7 @@ def _lost_files(out: Path, keys: Mapping[str, str], journal: Journal, wanted: Da
     known = {name for entry in journal.entries.values() for name in entry.files}
     unknown = {name: digest for name, digest in listed.items() if schema.is_task_file(name) and name not in known}
     if not unknown or _held_keys(out, journal, wanted).items() <= keys.items():
-        return []
+        return []  # the journal knows all of it, or the same keys made it
     return [name for name, digest in unknown.items() if is_intact(Entry("", "", {name: digest}), out)]
 
 
@@ -153,16 +153,16 @@ def _table_cause(name: str, old: Any, new: Any) -> str:
 def kept_samples(out: Path, recipe: Recipe) -> int | None:
     """Number of samples of the finished data set in a folder, if it has more of the same than a recipe asks for."""
     if recipe.random is None or not (out / schema.CHECKSUMS).is_file():
-        return None
+        return None  # experiments have no number of samples
     head = held_head(out)
     try:
         if head is None or parse_info(head.info).shard is not None:
-            return None
+            return None  # nothing there, or a shard, whose number says nothing
         held = parse_recipe(head.recipe)
     except ValueError:  # of another version
         return None
     if held.random is None or held.dataset != recipe.dataset or held.random.samples <= recipe.random.samples:
-        return None
+        return None  # another data set, or not more
     return held.random.samples
 
 

@@ -387,7 +387,7 @@ def rim_lines(plan: Plan, pairs: Iterable[PairForecast]) -> list[str]:
         and {forecast.down.cause, forecast.up.cause} & {NO_REFLECTION, EDGE}
     ]
     if not hidden:
-        return []
+        return []  # no spot is lost at a rim
     first = next(pair for pair in plan.pairs if pair.sample_id == hidden[0])
     if cause := _below_cone(plan.rigs[first.rig], np.array(plan.spots[first.spot].position_world_m)):
         return [f"{NO_REFLECTION} and {EDGE} of {hidden[0]}: {cause}"]
@@ -403,7 +403,7 @@ def _below_cone(rig: Rig, point_world_m: Array) -> str:
     away = point_world_m - rig.at(0.0).sphere_centre_m
     theta = np.degrees(np.arctan2(np.hypot(away[0], away[1]), -away[2]))
     if theta >= least:
-        return ""
+        return ""  # the cone could show it
     return (
         f"a cone of {90.0 - 0.5 * least:.0f} degrees shows nothing less than {least:.0f} degrees from straight "
         f"down, whatever its rim, and the spot is at {theta:.1f}; raise the spot, or make half_angle_deg of "

@@ -172,7 +172,7 @@ def _line(document: dict[str, Any]) -> bytes:
 def _documents(path: Path) -> Iterator[FolderHead | Entry | Refusal | None]:
     """Head, entries and refusals of a journal, line by line; None for a line that is damaged or of another form."""
     if not path.is_file():
-        return
+        return  # nothing is finished
     data = InputFile(path, "remove it, and run `phibench dataset make` again").read()
     for line in data.removesuffix(b"\n").split(b"\n") if data else ():
         check, _, text = line.partition(b" ")

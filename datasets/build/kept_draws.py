@@ -46,12 +46,12 @@ def read_draws(out: Path, recipe: Recipe, files: RoomFiles) -> Kept:
     """Draws that a folder keeps of a recipe's samples; none where they are of something else, or damaged."""
     path = out / schema.DRAWS
     if recipe.random is None or not path.is_file():
-        return {}
+        return {}  # experiments draw nothing
     try:
         data = InputFile(path, "remove it").read()
         digest, _, text = data.partition(b"\n")
         if hashlib.sha256(text).hexdigest().encode() != digest:
-            return {}
+            return {}  # it was cut off, or changed by hand
         document = _FILE.validate_json(text, strict=True)
         if document[0] != _key(recipe, files):
             return {}

@@ -88,7 +88,7 @@ def is_sound(light: LightMap, room: Room, settings: BakeSettings) -> bool:
     shapes = [array.shape for array in (light.irradiance_w_m2, light.sigma_w_m2, light.covered)]
     types = [array.dtype for array in (light.irradiance_w_m2, light.sigma_w_m2, light.covered)]
     if shapes != [(texels, 3), (texels, 3), (texels,)] or types != [np.float32, np.float32, np.bool_]:
-        return False
+        return False  # of another version, or damaged in spite of its hash
     sun = 0.0 if room.sun is None else max(room.sun.irradiance_w_m2)
     # no hemisphere gives more than pi times the radiance, and no bounce more than the light before it
     most = math.pi * max((_radiance(shape) for shape in fixed_shapes(room)), default=0.0) + sun
@@ -130,7 +130,7 @@ def _read(path: Path, recipe: bytes) -> LightMap | None:
         form, digest, body = content.split(b"\n", 2)
         held, payload = body.split(b"\n", 1)
         if (form, held) != (_FORM, recipe) or hashlib.sha256(body).hexdigest().encode() != digest:
-            return None
+            return None  # of another room with the same short name, or damaged
         return LightMap(**file.arrays(ARRAYS, payload))
     except ValueError:  # no entry, or a damaged one
         return None

@@ -101,12 +101,12 @@ def schedule(tasks: Iterable[BuildTask], executor: Executor) -> Iterator[Outcome
             flying -= 1
             if isinstance(outcome, Failed) and outcome.lethal:
                 suspects.append(task)
-                continue
+                continue  # it may have ended the worker: it is tried alone, after the others
         elif suspects:
             task = suspects.popleft()
             outcome = _alone(task, executor)
         else:
-            return
+            return  # all are done
         yield task, outcome
         yield from queue.settle(task, outcome)
 

@@ -121,7 +121,7 @@ def held_head(out: Path) -> FolderHead | None:
     """
     # a run that ended while it exported rooms has left their folder alone
     if not out.is_dir() or all(path.name.startswith(_OWN) or path.name == schema.ROOM_FILES for path in out.iterdir()):
-        return None
+        return None  # nothing of a data set is there
     head = Journal(out).head
     if head is not None:
         return head

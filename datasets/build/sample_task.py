@@ -56,7 +56,7 @@ def spot_noise(
 ) -> NoiseBudget | None:
     """Noise budget of a spot from its layers; None where it is not visible."""
     if not truth.visible:
-        return None
+        return None  # no spot: no budget
     return noise_budget(view, np.array([truth.u_px, truth.v_px]), window, ambient, variance)
 
 

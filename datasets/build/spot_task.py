@@ -55,7 +55,7 @@ def answer_spot(view: View, spot: LaserSpot, room: Room) -> SpotAnswer:
     certificate = certify(view, spot, geometry, truth, layer) if truth.visible else None
     for log2_pairs in _LOG2_MORE_PAIRS:
         if certificate is None or certificate.passed or not certificate.chief_rays_agree:
-            break
+            break  # more pairs do not help where the chief rays disagree
         layer = spot_layer(view, spot, geometry, log2_pairs)
         certificate = certify(view, spot, geometry, truth, layer)
     return SpotAnswer(truth, layer, certificate, _reaches(view, _window(layer)))
@@ -96,7 +96,7 @@ def _write_layer(out: Path, dataset: str, pair: PairPlan, position: str, answer:
     file = schema.spot_file(pair.sample_id, position)
     if not answer.on_image:
         (out / file).unlink(missing_ok=True)
-        return None
+        return None  # a file of an earlier draw must not stay
     write_spot(
         out / file,
         _window(answer.layer),
@@ -161,7 +161,7 @@ def _triple(values: Iterable[float]) -> tuple[float, float, float]:
 def _complaints(position: str, answer: SpotAnswer) -> list[str]:
     c = answer.certificate
     if c is None or c.passed:
-        return []
+        return []  # nothing was traced, or all is well
     numbers = (
         f"chief ray {c.chief_difference_px:.3g} px (tolerance {c.chief_tolerance_px:g}), "
         f"centroid {c.centroid_difference_px:.3g} px ({c.centroid_tolerance_px:g}), "

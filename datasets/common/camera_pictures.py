@@ -275,7 +275,7 @@ def _raw_format(data: bytes, suffix: str) -> str:
     if named := next((name for magic, name in _RAW_MAGIC.items() if data.startswith(magic)), None):
         return named
     if data[:4] not in (b"II*\0", b"MM\0*"):
-        return ""
+        return ""  # no TIFF, in which raw formats are kept
     if data[8:10] == b"CR":
         return "Canon CR2"
     return "DNG" if _DNG in _directory(data) else _RAW_SUFFIXES.get(suffix, "")

@@ -101,7 +101,7 @@ class Steps:
             share = elapsed_s / (elapsed_s + left_s) if left_s is not None else self._done / max(self._total, 1)
             self._share = max(self._share, share)
             self._bar.update(self._task, share=self._share, left=", ".join(filter(None, (left, running))))
-            return
+            return  # the bar's own line tells it
         parts = [f"{self._done}/{self._total} after {elapsed_s:.0f} s", left]
         parts.append(f"running: {running}" if running else "")
         self._console.print(f"{self._title}: {', '.join(filter(None, parts))}", highlight=False, soft_wrap=True)
@@ -109,7 +109,7 @@ class Steps:
     def _left_s(self) -> float | None:
         """Seconds that the rest will take; None at the end, and where nothing tells."""
         if self._done >= self._total or (self._forecast_s is None and not self._done):
-            return None
+            return None  # nothing is left, or nothing has been done to judge by
         if self._forecast_s is not None:
             return self._forecast_s()
         return (time.monotonic() - self._started) / self._done * (self._total - self._done)

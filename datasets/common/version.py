@@ -33,7 +33,7 @@ def checkout_state() -> str:
     """State of the checkout in words, "commit 0123456789, changed since"; "" for an installed package."""
     commit = _git("rev-parse", "--verify", "--quiet", "HEAD")
     if not commit:
-        return ""
+        return ""  # an installed copy, or no commit yet
     changed = _git("status", "--porcelain", "--untracked-files=no")
     return f"commit {commit[:10]}{', changed since' if changed else ''}"
 
@@ -46,7 +46,7 @@ def _root() -> Path:
 def _git(*arguments: str) -> str:
     """Output of a git command in the checkout; "" where there is no checkout, or no git."""
     if not (_root() / ".git").exists():
-        return ""
+        return ""  # a parent folder's repository is not ours
     try:
         command = ["git", "-C", str(_root()), *arguments]
         result = subprocess.run(command, capture_output=True, text=True, timeout=10, check=False)

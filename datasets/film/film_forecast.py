@@ -134,7 +134,7 @@ def _bakes(plan: Plan, films: Sequence[FilmPlan]) -> Iterator[float]:
     for film in films:
         room = plan.room(film.pair.room)
         if not room.lit:
-            continue
+            continue  # a panorama shines by itself: nothing is baked
         for _, views in light_views(plan.rig, film):
             for view in views:
                 key = film.pair.room, repr(view.robot)

@@ -120,7 +120,7 @@ def _refuse_other(out: Path, name: str) -> None:
     if out.is_file():
         raise DatasetError(f"{out} is a file; give a folder")
     if not out.is_dir():
-        return
+        return  # a new folder
     if (out / TruthFolder.DATASET).exists():
         raise DatasetError(f"{out} holds a data set of pairs; give another folder for its films")
     if (out / INFO).is_file() and (held := read_document(out / INFO, SetInfo).name) != name:

@@ -132,7 +132,7 @@ def film_scene(plan: Plan, table: FilmTable, pair: PairPlan) -> FilmScene:
 def _lights(plan: Plan, table: FilmTable, pair: PairPlan, code: BlinkCode) -> tuple[FilmLight, ...]:
     """Other lights of a film."""
     if not table.lights:
-        return ()
+        return ()  # no room need be built
     room, laser = plan.room(pair.room), plan.recipe.laser
     if laser.albedo == OWN_ALBEDO:  # a light is a disc, which may move; a beam's spot stays where it ends
         laser = laser.model_copy(update={"albedo": _DISC_ALBEDO})

@@ -113,7 +113,7 @@ def key_views(
         places = [key_offsets_m(part.low, part.high, n) for part, n in zip(parts.parts, counts, strict=True)]
         for part, at in enumerate(places):
             if part in errors and not errors[part].largest > ALLOWED:
-                continue
+                continue  # proved already
             views = np.stack(
                 [_key_view(film, folder, key, render, parts, (part, float(place)), journal) for place in at]
             )
@@ -192,7 +192,7 @@ def _frame_between(
     light = np.array([max(float(image.electrons_per_s.sum()), 0.0) for image in images])
     mine = number == part
     if not mine.any():
-        return None
+        return None  # no frame of this part
     light = np.where(mine, light, -1.0)
     if len(places) == 1:
         return int(np.argmax(light))

@@ -140,7 +140,7 @@ def frame_spots(film: FilmPlan, room: Room, times_s: Sequence[float]) -> tuple[l
             images.append(images[-1])
             flux.append(flux[-1])
             centres.append(centres[-1])
-            continue
+            continue  # the spot stands still: as the frame before
         if held is None or held[0] != state:
             view = scene.view_at(at)
             layer = spot_layer(view, scene.spot_at(at), room_geometry(room, view))
@@ -157,7 +157,7 @@ def frame_spots(film: FilmPlan, room: Room, times_s: Sequence[float]) -> tuple[l
 def _bends(flux: Array) -> list[int]:
     """Frames beside which the flux of the spot does not change evenly."""
     if len(flux) < 2:
-        return []
+        return []  # a single frame has no neighbours
     padded = np.pad(flux, 1, mode="reflect", reflect_type="odd")
     bent = np.abs(np.diff(padded, n=2)) > _UNEVEN * flux.max(initial=0.0)
     near = bent | np.append(bent[1:], False) | np.append(False, bent[:-1])

@@ -127,7 +127,7 @@ _KEPT = "_distractors"
 def _found(sample: _Sample) -> tuple[Distractor, ...]:
     tables = sample.dataset.recipe.distractors
     if not any(sample.truth_row(position).visible for position in POSITIONS):
-        return ()
+        return ()  # who cannot see the spot is not distracted from it
     numbers = present(sample.stream_names, tables)
     if not numbers:
         return ()
@@ -143,10 +143,10 @@ def _placed(sample: _Sample, room: Room, number: int, table: DistractorTable) ->
     for attempt in range(TRIES):
         spot = _drawn_spot(sample, room, number, table, attempt)
         if spot is None:
-            continue
+            continue  # the ray meets nothing: another draw
         truths = {position: spot_truth(view, spot, rooms[position]) for position, view in views.items()}
         if not truths["down"].visible or any(_too_near(sample, position, truths[position]) for position in POSITIONS):
-            continue
+            continue  # unseen, or in the spot's window: another draw
         layers = {position: spot_layer(view, spot, rooms[position]) for position, view in views.items()}
         ratio = max(_ratio(sample, position, layers[position]) for position in POSITIONS)
         if ratio > 0.0:
@@ -224,7 +224,7 @@ def _board_place(
     allowed = None if table.target is None else set(table.target.choice)
     boards = [t for t in recipe.targets if t.name != sample.row.target and (allowed is None or t.name in allowed)]
     if not boards:
-        return None
+        return None  # the sample's own board is the only one
     board = boards[int(_unit(names, number, "target", attempt) * len(boards))]
     reach_m = _value(names, number, "diameter_m", table.diameter_m)
     across_m, up_m = (

@@ -163,7 +163,7 @@ def read_index(folder: Path) -> dict[str, FrameRow]:
     """
     path = folder / INDEX
     if not path.exists():
-        return {}
+        return {}  # a new folder
     try:
         return {row.file: row for row in read_rows(path, FrameRow)}
     except DatasetError as error:
@@ -190,7 +190,7 @@ def claim(folder: Path, dataset: tuple[str, int], wanted: dict[str, Any]) -> Non
     meant = {"dataset": dataset[0], "dataset_seed": dataset[1], **wanted}
     if not path.exists() or not _has_frames(folder):
         write_text(path, json.dumps(meant, indent=1, allow_nan=False) + "\n")
-        return
+        return  # a new folder, or one whose run was cut off before its first frame
     held = InputFile(path, "give another folder, `--out FOLDER`").json()
     meant = json.loads(json.dumps(meant))
     if other := [name for name in {**meant, **held} if held.get(name) != meant.get(name)]:

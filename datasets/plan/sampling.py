@@ -201,7 +201,7 @@ def draw_samples(
                     raise RecipeError(f"rooms: {fault}") from error
                 refused |= dict.fromkeys(numbers, fault)
                 _require_some(refused, samples, table.samples)
-                continue
+                continue  # the others of the set are made
             makers = _Makers(recipe, table, room_id, room, first)
             for part in (numbers[:_PILOT], numbers[_PILOT:]):  # whether it is possible at all is known after a few
                 drawn, lost = makers.draw(part)
@@ -239,7 +239,7 @@ def have_own_rigs(recipe: Recipe, table: RandomTable) -> bool:
     if spread & {f"rig.{key}" for key in DRAWABLE}:
         return True
     if any(name.startswith("rig.") for name in drawn):
-        return False
+        return False  # choices of a few rigs, which samples share
     if not any(name.startswith(PREFIX) for name in drawn):
         return build_misalignment(recipe.misalignment) == Misalignment()
     return bool(spread & {PREFIX + key for key in MISALIGNMENT if key not in (*OF_REVOLVED, *_OF_STROKE)})

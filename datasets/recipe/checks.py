@@ -233,7 +233,7 @@ def _off_board(spot: Raw, laser: LaserTable, targets: Sequence[TargetTable]) -> 
     for axis, key in enumerate(("across_m", "up_m") if drawn else ()):
         table = distribution_of(spot.get(key, 0.0))
         if table is None:
-            continue
+            continue  # told by the table
         farthest = max(map(abs, table.support))
         left, name = min((free_margin_m(laser, target)[axis], target.name) for target in drawn)
         if left < 0.0:
@@ -248,7 +248,7 @@ def _off_wall(path: str, given: object, room: RoomTable | None) -> Iterator[Faul
     """Heights of rays below the floor or above the lamps."""
     table = distribution_of(given)
     if table is None or room is None:
-        return
+        return  # told by the tables
     (low, high), limit_m = table.support, ceiling_m(build_room(room, ()))
     if low <= 0.0 or high >= limit_m:
         text = f"reaches from {low:g} to {high:g} m, beyond floor or lamps"
@@ -274,7 +274,7 @@ def _sensor(frames: Raw) -> Iterator[Fault]:
     """Numbers of `[frames.sensor]` that a sensor does not take, that belong to a frame, or that are given twice."""
     numbers = frames.get("sensor")
     if not isinstance(numbers, dict):
-        return
+        return  # told by the table
     given = {key: value for key, value in numbers.items() if key not in (*SENSOR_OF_FRAME, *SENSOR_KEYS)}
     for key in numbers:
         if key in SENSOR_OF_FRAME:
@@ -289,7 +289,7 @@ def _sensor(frames: Raw) -> Iterator[Fault]:
             sensor(str(preset), **given)
         except SensorError as error:
             yield Fault("frames.sensor", str(error))
-            return
+            return  # the other presets would say the same
 
 
 def _distractors(draft: _Draft) -> Iterator[Fault]:
@@ -310,7 +310,7 @@ def _distractors(draft: _Draft) -> Iterator[Fault]:
 
 def _laser(laser: LaserTable | None) -> Iterator[Fault]:
     if laser is None:
-        return
+        return  # told by the table
     growing = laser.model_fields_set & {"diameter_base_m", "diameter_growth_m_per_m"}
     if laser.diameter_m is not None and growing:
         yield Fault("laser.diameter_m", f"given together with {', '.join(sorted(growing))}; give one or the other")
@@ -359,7 +359,7 @@ def _rig(draft: _Draft) -> Iterator[Fault]:
         except SceneError as error:
             yield rig_fault_of(error)
     if draft.rig is None or rig is None:
-        return
+        return  # told by the table
     if draft.laser is not None and rig.mirror.reflectance_table is not None:
         try:
             rig.mirror.band(draft.laser.wavelength_nm)
@@ -405,7 +405,7 @@ def _true_rig(
         reached = [(path, stroke_m, true_stroke_m(deviation, float(stroke_m))) for path, stroke_m in strokes]
     except SceneError as error:
         yield Fault("misalignment", by_keys(str(error)))
-        return
+        return  # what follows needs the rig
     if not rig.in_image():
         yield Fault("misalignment", "the mirror is outside of the image; take smaller deviations")
         return
@@ -432,7 +432,7 @@ def _height(table: RigTable, rig: Rig, room: Room) -> Fault | None:
     """Fault of a rig that leaves no room for the shortest stroke."""
     above_m = _top_m(rig, MIN_STROKE_M) - ceiling_m(room)
     if above_m < 0.0:
-        return None
+        return None  # it stays below the ceiling
     given = {key: getattr(table, key) for key in ("camera_height_m", "z_c_m")}
     if rig.mirror.radius_m is not None:
         given["radius_m"] = rig.mirror.radius_m

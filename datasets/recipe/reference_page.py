@@ -340,7 +340,7 @@ def _section(heading: str, model: type[BaseModel]) -> Iterator[str]:
         yield _NOTES[heading]
     if heading in DRAWN_FROM:
         yield _drawn(model, DRAWN_FROM[heading])
-        return
+        return  # its rows would be those of the other table again
     presets = list(RIGS) if model is RigTable else []
     headings = ["key", "unit", "allowed", *(f"preset `{name}`" for name in presets), "default", "meaning"]
     yield _line(headings)

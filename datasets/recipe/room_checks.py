@@ -27,7 +27,7 @@ def room_faults(raw: Raw) -> Iterator[Fault]:
             yield Fault(
                 "targets", "missing; add [[targets]] (boards with a laser spot), or [rooms] for generated rooms"
             )
-        return
+        return  # no rooms: nothing else to check
     if raw.get("targets"):
         yield Fault("targets", "given together with [rooms], whose rooms have no boards; remove [[targets]]")
     if "room" in raw:
@@ -121,7 +121,7 @@ def _heights(raw: Raw) -> Iterator[tuple[str, float]]:
 def _ray_height(raw: Raw) -> Iterator[Fault]:
     table = distribution_of(table_of(raw, "random", "spot").get("height_m"))
     if table is None:
-        return
+        return  # told by the table
     (low, high), limit_m = table.support, min((height for _, height in _heights(raw)), default=float("inf"))
     if low <= 0.0 or high >= limit_m:
         text = f"{low:g} m is" if low == high else f"reaches from {low:g} to {high:g} m,"
@@ -149,7 +149,7 @@ def _file_fault(path: str, one: PanoramaTable | GeometryTable, files: RoomFiles)
         digest = RoomFiles(files.folder).sha256(one.file)
     except RoomError as error:
         yield Fault(f"{path}.file", str(error))
-        return
+        return  # without the file there is no hash
     wanted = one.sha256 or files.digests.get(one.file, digest)
     if digest != wanted:
         text = f"is not that of {one.file}, which has {digest}"

@@ -113,7 +113,7 @@ class _Reader:
                 raise self.file.fault("is damaged: its nodes are no trees")
             self._seen.add(number)
             if self._is_hidden(node):
-                continue
+                continue  # what is below a hidden node is hidden, too
             transform = outer @ self._transform(node)
             if "mesh" in node:
                 mesh_parts += self._of_node(number, node, transform)
@@ -193,7 +193,7 @@ class _Reader:
         document, shown = self.document, printable_line(label, 60)
         mode = primitive.get("mode", _LIST)
         if mode in _WITHOUT_SURFACE:
-            return None
+            return None  # points and lines
         if mode not in (_LIST, _STRIP, _FAN):
             raise self.file.fault(f"has a primitive of mode {mode!s:.20} in '{shown}', which glTF does not know")
         if "KHR_draco_mesh_compression" in document.table(primitive, "extensions"):
@@ -207,13 +207,13 @@ class _Reader:
         points = self._morphed(primitive, document.array(attributes["POSITION"], 3), weights)
         triangles = self._triangles(primitive, mode, len(points))
         if not len(triangles):
-            return None
+            return None  # an empty primitive, which exporters leave
         self._count += len(triangles)
         check_count(self.file, self._count)
         material = self._material_of(primitive)
         triangles = self._visible(label, material, attributes, triangles, len(points))
         if not len(triangles):
-            return None
+            return None  # wholly transparent
         if np.linalg.det(transform[:3, :3]) < 0.0:
             triangles = triangles[:, ::-1]  # a mirrored node turns its triangles around
         paint, light = self._paints(label, attributes, triangles, material, len(points))
@@ -323,7 +323,7 @@ class _Reader:
 
     def _texture(self, owner: dict[str, Any], key: str) -> _Texture | None:
         if not owner.get(key):
-            return None
+            return None  # an empty table counts as none
         stated = self.document.table(owner, key)
         transform = self.document.table(self.document.table(stated, "extensions"), "KHR_texture_transform")
         uv_set = self.document.whole(transform if "texCoord" in transform else stated, "texCoord", 0, 100)

@@ -189,7 +189,7 @@ def _check_extent(settings: MeshSettings, parts: list[MeshPart]) -> None:
     high = np.max([corners_of(part).max(axis=(0, 1)) for part in parts], axis=0)
     extent = high - low
     if np.isfinite(extent).all() and extent.min() >= EXTENT_M[0] and extent.max() <= EXTENT_M[1]:
-        return
+        return  # a room's size: the unit is right
     assert settings.metres_per_unit is not None
     units = extent / settings.metres_per_unit
     fits = [

@@ -71,7 +71,7 @@ def _split_by_light(part: MeshPart) -> Iterator[MeshPart]:
     """Part whose emission is a texture, as triangles that shine and those that do not; any other part as it is."""
     if part.light is None or part.light.picture is None or part.light.uv is None:
         yield part
-        return
+        return  # one light for the whole part
     uv = part.light.uv
     places = np.concatenate([uv, 0.5 * (uv + np.roll(uv, -1, axis=1)), uv.mean(axis=1, keepdims=True)], axis=1)
     height, width = part.light.picture.shape[:2]
@@ -99,7 +99,7 @@ def _lamps(settings: MeshSettings, parts: list[MeshPart]) -> tuple[tuple[Rectang
     rectangles: list[tuple[float, Rectangle, int, NDArray[np.bool_]]] = []
     for number, part in enumerate(parts):
         if part.light is None or part.light.picture is not None:
-            continue
+            continue  # dark, or bright in places: no lamp
         radiance = as_vector(settings.emission_w_m2_sr * np.array(part.light.colour))
         for count, (chosen, pose, size) in enumerate(_rectangles(part), 1):
             name = f"{part.name} (lamp {count})"
@@ -137,7 +137,7 @@ def _rectangle_frame(corners: Array, index: NDArray[np.int64]) -> tuple[Pose, tu
     """
     own = [np.flatnonzero(~np.isin(index[k], index[1 - k])) for k in (0, 1)]
     if len(own[0]) != 1 or len(own[1]) != 1:
-        return None
+        return None  # two triangles that share no edge
     first = np.roll(corners[0], -int(own[0][0]), axis=0)
     along, up = first[1] - first[0], first[2] - first[0]
     a, b, normal = float(np.linalg.norm(along)), float(np.linalg.norm(up)), np.cross(along, up)
@@ -145,7 +145,7 @@ def _rectangle_frame(corners: Array, index: NDArray[np.int64]) -> tuple[Pose, tu
     off = float(np.linalg.norm(first[0] + along + up - corners[1][int(own[1][0])]))
     square = abs(float(along @ up)) <= _SQUARE * a * b and off <= _SQUARE * (a + b)
     if not square or float(normal @ other) <= 0.0:
-        return None
+        return None  # no rectangle, or folded
     x, z = along / a, normal / np.linalg.norm(normal)
     R = np.stack([x, np.cross(z, x), z], axis=1)
     return Pose("world", "shape", as_vector(first[0] + 0.5 * (along + up)), as_matrix(R)), (a, b)
@@ -305,7 +305,7 @@ def _one_sided(part: MeshPart) -> bool:
     count = int(index.max()) + 1
     forth, back = np.sort(edges @ [count, 1]), np.sort(edges @ [1, count])
     if len(forth) == 0 or not (np.array_equal(forth, back) and np.all(forth[1:] > forth[:-1])):
-        return False
+        return False  # an open edge, or one of three triangles: no solid
     a, b, c = np.moveaxis(corners, 1, 0)
     outwards = float(np.einsum("ti,ti->", a, np.cross(b, c))) > 0.0
     above = heights_on_vertical([part], _BESIDE_M)[0] > MIRROR_TOP_M

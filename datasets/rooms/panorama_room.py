@@ -261,7 +261,7 @@ def _atlas(settings: PanoramaSettings, picture: _Panorama, corners: Array) -> tu
         block = _blocks(picture, corners, texel_m)
         column, row, width, height = _packed(block.columns, block.rows)
         if 4 * width * height <= MOST_VALUES:
-            break
+            break  # it fits
         if texel_m > EXTENT_M[1]:
             raise RoomError(
                 f"the mesh has too many triangles ({len(corners)}) for the texels of a panorama: simplify it"

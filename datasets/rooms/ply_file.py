@@ -130,7 +130,7 @@ def _header(file: InputFile, data: bytes) -> tuple[str, list[_Element], list[str
     for line in shown.replace("\r", "\n").split("\n")[1:]:
         words = line.split()
         if not words or words[0] == "obj_info":
-            continue
+            continue  # an older name of comments
         if words[0] == "comment":
             if len(words) > 2 and words[1] == "TextureFile":
                 pictures.append(line.split(None, 2)[2].strip())

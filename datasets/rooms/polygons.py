@@ -92,7 +92,7 @@ def _turn(a: Array, b: Array, c: Array) -> Array:
 def _is_convex(flat: Array, size: float) -> bool:
     turns = _turn(np.roll(flat, 1, axis=0), flat, np.roll(flat, -1, axis=0))
     if (turns < -_FLAT * size).any():
-        return False
+        return False  # a corner turns the other way
     edges = np.roll(flat, -1, axis=0) - flat
     angle = np.arctan2(edges[:, 1], edges[:, 0])
     around = np.angle(np.exp(1j * (np.roll(angle, -1) - angle))).sum()
@@ -115,7 +115,7 @@ def _is_ear(flat: Array, left: list[int], k: int, size: float, cutting: Cutting)
     cutting.take(_TURN_COST)
     a, b, c = left[k - 1], left[k], left[(k + 1) % len(left)]
     if float(_turn(flat[a], flat[b], flat[c])) <= _FLAT * size:
-        return False
+        return False  # flat, or turned inwards: no ear
     cutting.take(len(left))
     others = flat[[p for p in left if p not in (a, b, c)]]
     corners = flat[[a, b, c]]

@@ -172,7 +172,7 @@ class LoadedScene:
 def _ambient(scene: LoadedScene) -> dict[str, RendererDifference]:
     ours = light_layer(scene.sample, scene.position)
     if not ours.any():
-        return {}
+        return {}  # a dark room
     height, width = ours.shape[:2]
     seed, sigma = seed_32("mitsuba", scene.sample.row.sample_id, scene.position), scene.camera.blur_sigma_px
     theirs = ndimage.gaussian_filter(
@@ -279,13 +279,13 @@ def _spot(scene: LoadedScene) -> dict[str, RendererDifference]:
     sample, camera = scene.sample, scene.camera
     row = sample.truth_row(scene.position)
     if not row.visible or row.light is None:
-        return {}
+        return {}  # no spot to compare
     u, v = camera.project(sample.rig.camera.rays(np.array([row.light.u_px, row.light.v_px])))
     half = int(np.ceil(_FINER * _half_px(scene)))
     low = np.floor(_FINER * (np.array([u, v]) + 0.5)).astype(int) - half
     side = 2 * half + 1
     if low.min() < 0 or np.any(low + side > _FINER * np.array([camera.width_px, camera.height_px])):
-        return {}
+        return {}  # the window leaves the image
     crop = (int(low[0]), int(low[1]), side, side)
     samples = max(1, round(np.sqrt(_SPOT_SAMPLES / side**2))) ** 2
     middle = (np.arange(side) + 0.5) / _FINER - 0.5

@@ -269,7 +269,7 @@ def _is_alive(process: int) -> bool:
     except PermissionError:  # somebody else's
         return True
     except (OSError, OverflowError):
-        return False
+        return False  # gone, or a number that no process has
     return True
 
 

@@ -74,7 +74,7 @@ def folder_for_work(path: Path, passing: Collection[str] = ()) -> Iterator[Path]
     made = []
     for folder in (path, *path.parents):  # innermost first
         if folder.exists():
-            break
+            break  # those below it are ours to remove
         made.append(folder)
     try:
         path.mkdir(parents=True, exist_ok=True)
@@ -135,7 +135,7 @@ def remove_tree(path: Path) -> None:
     with contextlib.suppress(OSError):
         if path.is_symlink():  # put in the folder's place
             path.unlink()
-            return
+            return  # never through a link
         top = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
         try:
             _empty(top)
@@ -150,7 +150,7 @@ def _empty(top: int) -> None:
     while not failed:
         folders = list(_without_files(top))
         if not folders:
-            return
+            return  # only files were left, and they are gone
         for name in folders:
             with contextlib.suppress(OSError):  # one that cannot be written can be neither moved nor emptied
                 os.chmod(name, stat.S_IRWXU, dir_fd=top)
@@ -213,7 +213,7 @@ def _remove_if_free(path: Path) -> None:
     status = path.lstat()
     is_folder = stat.S_ISDIR(status.st_mode)
     if status.st_uid != os.geteuid() or not (is_folder or stat.S_ISREG(status.st_mode)):
-        return
+        return  # another user's, or a pipe: not ours to open
     handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
     try:
         if _locked(handle) and _is_at(handle, path):

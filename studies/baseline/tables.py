@@ -194,7 +194,7 @@ def drawn_misalignment(rig: Rig, random: np.random.Generator) -> Misalignment:
         try:
             rig.perturbed(drawn)
         except SceneError:
-            continue
+            continue  # an impossible rig is drawn again
         return drawn
     raise SceneError(f"none of {_TRIES} drawn misalignments of the rig can exist: take a rig with less distortion")
 

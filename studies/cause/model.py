@@ -73,7 +73,7 @@ class Prior(Settings):
         if len(given) != 1:
             return "must have exactly one of normal, uniform, log_uniform, rayleigh"
         if self.rayleigh is not None:
-            return ""
+            return ""  # its one number is checked by its field
         low, high = getattr(self, given[0])
         if given[0] == "normal":
             return "" if high > 0.0 else f"normal = [{low:g}, {high:g}]: the sigma must be above 0"

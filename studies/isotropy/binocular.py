@@ -172,12 +172,12 @@ def gain(both: Binocular, light: Array, sensor: Sensor, draws: int) -> Gain | No
             camera = replace(both.rig.camera, cx_px=both.rig.camera.cx_px + du, cy_px=both.rig.camera.cy_px + dv)
             pair = flat_pair(sideways(replace(both.rig, camera=camera)), b, point, light)
             if pair is None:
-                return None
+                return None  # one of the cameras does not see it
             uv = fitted_px(pair, sensor, each, "study", "isotropy", "binocular", f"{D:g}", f"{b:g}", f"{du:g} {dv:g}")
             depth = depth_exact(pair.rig, b, uv[0], uv[1]).depth_m
             measured_pairs = np.isfinite(depth)
             if measured_pairs.sum() < _LEAST_FITS:
-                continue
+                continue  # too few fits for a variance
             by_rays = depth_exact(pair.rig, b, pair.uv_px[0], pair.uv_px[1], np.eye(2), np.eye(2)).sigma_m
             squares.append(
                 [

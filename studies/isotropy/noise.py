@@ -105,7 +105,7 @@ def flat_pair(rig: Rig, baseline_m: float, point_m: Array, background_electrons_
     views = (rig.at(0.0), rig.at(baseline_m))
     uv = np.array([image_of(view, point_m).uv_px for view in views])
     if not np.all(rig.camera.contains(uv)):
-        return None
+        return None  # one of the cameras does not see it
     lights = [_flat(view, point_m, background_electrons_per_s) for view in views]
     return BaselinePair("flat", rig, baseline_m, point_m, (lights[0], lights[1]), uv)
 

@@ -194,7 +194,7 @@ def answered(pair: Pair, methods: Sequence[str]) -> dict[str, tuple[Answer, floa
         method = METHODS[name]
         seen = pair if method.needs_off else alone
         if method.refusal(seen):
-            continue
+            continue  # it takes no such frames
         start = time.perf_counter()
         separate = answers.get("raw_maximum_likelihood") or answers.get("chain_fit")
         # the joint fit begins with the separate one, which is the costly part

@@ -57,7 +57,7 @@ def _panel(ax: Any, part: pl.DataFrame, factor: str, methods: Sequence[str]) -> 
     for i, method in enumerate(methods):
         curve = part.filter(pl.col("method") == method, pl.col("rms_px").is_not_nan()).sort("level")
         if curve.is_empty():
-            continue
+            continue  # it was not run on this preset
         x, y = curve["level"].to_numpy(), curve["rms_px"].to_numpy()
         ends = (curve[f"rms_px_{end}"].to_numpy() for end in ("low", "high"))
         low, high = (np.where(np.isfinite(end), np.abs(y - end), 0.0) for end in ends)

@@ -85,10 +85,10 @@ def elasticities(records: pl.DataFrame, rules: Rules) -> list[Elasticity]:
     for key, part in sorted(records.group_by("sample", "preset", "factor", "method"), key=lambda item: item[0]):
         sample, preset, factor, method = (str(x) for x in key)
         if factor == BASE:
-            continue
+            continue  # the base case has no slope
         span = around_base(sorted(part["level"].unique()), FACTORS[factor].base)
         if span is None:
-            continue
+            continue  # no level on both sides of the base
         estimate, bound = _slope(part, span, rules, (sample, preset, factor))
         rows.append(Elasticity(sample, preset, factor, method, *span, estimate, bound))
     return rows

@@ -297,7 +297,7 @@ def processed_stroke(
     rough = FilmPositions(ends.seen_px, np.tile(np.eye(2), (2, 1, 1)), np.zeros((2, 2, 2, 2)))
     start = _depth(bundle, rough, ends.offsets_m, np.zeros(2)) if rough.good.all() else None
     if start is None:
-        return None
+        return None  # one end shows no spot
     scale = ends.offsets_m[1] / film.plan.pair.nominal_stroke_m
     sensor = procedure.sensor or {}
     frames = film_frames(film, camera, camera, procedure.preset, rig=bundle.rig, stroke_scale=scale, **sensor)

@@ -195,7 +195,7 @@ def best_findings(found: Found, tolerance: str, depths_m: Sequence[float]) -> It
         best, lead = found[tolerance, depth], f"{tolerance}, D = {depth:g} m"
         if not math.isfinite(best.stroke_m):
             yield Finding(f"{lead}: no stroke, {', '.join(best.limits)}", None, unit="m")
-            continue
+            continue  # nothing to render
         yield Finding(f"{lead}: best stroke", best.stroke_m, unit="m")
         if best.limits:
             yield Finding(f"{lead}: limit of the stroke ({', '.join(best.limits)})", best.stroke_m, unit="m")
