@@ -16,7 +16,7 @@ import pytest
 from helpers.districts import DISTRICTS
 
 ROOT = Path(__file__).resolve().parent.parent
-PACKAGE = (*DISTRICTS, "phibench")
+PACKAGE = (*DISTRICTS, "phibench", "tools")
 MIRRORS = "SphereMirror|RevolvedMirror|FormedProfile|Profile"
 
 
@@ -89,8 +89,8 @@ USE_PRESET = """
 from phibench.cli.main import main
 from phibench.benchmark.isolation.easy_pairs import EasyPairs
 from phibench.datasets.frames.source import noise_draw
-from phibench.datasets.recipe.reference_page import recipe_page
 from phibench.datasets.recipe.tables import FramesTable
+from tools.reference_page import recipe_page
 print(EasyPairs("raw8").pair(0).down.max(), EasyPairs("bayer-raw").pair(0).down.max() > 255)
 print(FramesTable(presets=["raw8"]).presets, noise_draw("raw8", 0) > 2**64, "'raw8'" in recipe_page())
 main(["__complete", "score", "x", "--preset", "raw"])

@@ -5,18 +5,16 @@ from pathlib import Path
 
 import pytest
 
-from phibench.datasets.recipe import reference_page
 from phibench.datasets.recipe.build import build_rig
 from phibench.datasets.recipe.tables import RigTable
 from phibench.scenes.catalog import RIGS
+from tools import reference_page
 
-PAGE = (Path(reference_page.__file__).resolve().parents[1] / "RECIPE.md").read_text(encoding="utf-8")
+PAGE = (Path(reference_page.__file__).resolve().parents[1] / "datasets" / "RECIPE.md").read_text(encoding="utf-8")
 
 
 def test_the_page_is_the_generated_one() -> None:
-    assert reference_page.recipe_page() == PAGE, (
-        "run python -m phibench.datasets.recipe.reference_page > datasets/RECIPE.md"
-    )
+    assert reference_page.recipe_page() == PAGE, "run python -m tools.reference_page > datasets/RECIPE.md"
 
 
 @pytest.mark.parametrize("heading", reference_page.TABLES)
