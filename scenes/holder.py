@@ -195,9 +195,9 @@ LENGTHS = tuple(field.name for field in fields(Holder) if field.name.endswith("_
 """Names of the sizes that `fitted` may choose."""
 
 
-def prism_radius_m(radius_m: float, sides: int = SIDES) -> float:
+def prism_radius_m(radius_m: float) -> float:
     """Radius of the corners of a prism that has the mean width of a round rod."""
-    half = math.pi / sides
+    half = math.pi / SIDES
     return radius_m * half / math.sin(half)
 
 

@@ -100,13 +100,13 @@ def _ended() -> Iterator[tuple[int, int]]:
             yield pid, status
 
 
-def end_descendants(worker: int, seconds: float = KILL_SECONDS) -> None:
+def end_descendants(worker: int) -> None:
     """Kill all descendants of this process, whatever their sessions, and the worker's group; until none is left.
 
     Orphans become children of this process: whoever kills its children again and again reaches all. A look at them is
     faster than a process can start others, a look at all processes of a busy machine is not.
     """
-    own, end = os.getpid(), time.monotonic() + seconds
+    own, end = os.getpid(), time.monotonic() + KILL_SECONDS
     groups = {worker}
     while time.monotonic() < end:
         known = len(groups)

@@ -553,9 +553,9 @@ def _starred(name: str, value: Value, wide: bool) -> str:
     return f"{shown} {rest}".strip() if wide else shown
 
 
-def one_line(estimate: Estimate, factor: float = 1.0, digits: int = 3, significant: bool = False) -> str:
+def one_line(estimate: Estimate, factor: float = 1.0, digits: int = 3) -> str:
     """Value and interval on one line."""
-    return " ".join(part for part in cell_parts(estimate, factor, digits, significant) if part)
+    return " ".join(part for part in cell_parts(estimate, factor, digits) if part)
 
 
 def cell_parts(estimate: Estimate, factor: float, digits: int, significant: bool = False) -> tuple[str, str]:

@@ -28,7 +28,7 @@ _OUTLINE, _CURVE, _SPOT = (0, 255, 0), (255, 225, 0), (0, 225, 255)
 _JPEG_QUALITY = 85
 
 
-def write_measure_picture(path: Path, found: Measurement, title: str = "") -> Path:
+def write_measure_picture(path: Path, found: Measurement) -> Path:
     """Draw a measurement into a PNG, or a JPEG where the name ends so; written atomically.
 
     Raises
@@ -36,7 +36,7 @@ def write_measure_picture(path: Path, found: Measurement, title: str = "") -> Pa
     DatasetError
         If the file cannot be written.
     """
-    picture = draw_measurement(found, title)
+    picture = draw_measurement(found)
     buffer = io.BytesIO()
     if path.suffix.lower() in (".jpg", ".jpeg"):
         picture.save(buffer, format="JPEG", quality=_JPEG_QUALITY, subsampling=0)

@@ -6,7 +6,7 @@ PyAV is imported when it is needed: `pip install 'phibench[film]'`.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import partial
@@ -136,7 +136,6 @@ def write_videos(
     draws: int = 1,
     camera_seed: int = 0,
     container: str = ".mkv",
-    films: Sequence[str] | None = None,
     workers: int | None = None,
 ) -> list[Path]:
     """Write a video of every film and draw; videos that are there are kept.
@@ -151,7 +150,7 @@ def write_videos(
     opened, target = open_films(folder), Path(out)
     require_container(Path(f"film{container}"))
     jobs = []
-    for film in opened if films is None else [opened[name] for name in dict.fromkeys(films)]:
+    for film in opened:
         if film.info.window_px is not None:
             raise DatasetError(
                 f'{film.info.film} holds windows around the spot: give view = "full" in [film], or read it in Python'

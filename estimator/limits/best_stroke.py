@@ -174,7 +174,7 @@ def best_stroke(
     )
 
 
-def spot_bound(rig: Rig, card: SensorCard, room_e_per_s: tuple[float, float, float] = ROOM_E_PER_S) -> SpotSigma:
+def spot_bound(rig: Rig, card: SensorCard) -> SpotSigma:
     """Bound by the spot's electrons for a rig and a sensor, over a white wall.
 
     Parameters
@@ -183,14 +183,12 @@ def spot_bound(rig: Rig, card: SensorCard, room_e_per_s: tuple[float, float, flo
         Its blur half way out in the mirror's image.
     card : SensorCard
         Sensor whose noise counts.
-    room_e_per_s : 3 floats
-        The wall's electrons per second and pixel behind R, G, B.
     """
     centre = rig.camera.project(rig.sphere_in_camera_m)
     rim = rig.outline_px(4)[0]
     blur = spot_blur(rig, 0.4 * centre + 0.6 * rim)  # one place stands for all: defocus changes little over the mirror
     r, g, b = rig.camera.detector.laser_filter_response
-    room = [rate * card.exposure_s for rate in room_e_per_s]
+    room = [rate * card.exposure_s for rate in ROOM_E_PER_S]
     # behind the processing every flux costs a covariance of the codes; the bound is smooth enough for 9 of them
     fluxes = np.geomspace(100.0, 1e6, 25 if card.output == "raw" else 9)
     return spot_sigma(card, blur.round_px, room, (r, g, b), flux_e=tuple(fluxes.tolist()))

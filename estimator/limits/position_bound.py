@@ -290,9 +290,9 @@ def derivative_images(region: ExpectedRegion, unknown: Unknown = "flux+backgroun
     return np.stack(images)
 
 
-def phi_limit(view: View, uv_px: ArrayLike, limit: SpotLimit, convention: str = "ray") -> PhiEstimate:
+def phi_limit(view: View, uv_px: ArrayLike, limit: SpotLimit) -> PhiEstimate:
     """Phi at a pixel with the bound of its variance, g C g^T."""
-    return estimate_phi(convention, view, np.asarray(uv_px, float), limit.covariance_px2)
+    return estimate_phi("ray", view, np.asarray(uv_px, float), limit.covariance_px2)
 
 
 def depth_limit(

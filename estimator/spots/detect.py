@@ -352,12 +352,15 @@ def _detection(index: int | None, searched: _Searched, card: SensorCard) -> Dete
     return Detection((float(uv[0]), float(uv[1])), float(found.electrons[index]), float(found.z[index]))
 
 
-def parabola_peak(searched: _Searched, card: SensorCard, uv_px: Array, step_px: float = 0.5) -> Array:
+_PARABOLA_PX = 0.5  # between the places of the parabola
+
+
+def parabola_peak(searched: _Searched, card: SensorCard, uv_px: Array) -> Array:
     """Vertex of a parabola along u and one along v through A^2 / variance at 3 x 3 places, shape (2,).
 
     A^2 / variance is twice the gain of the log likelihood, so that on raw pixels the vertex is near its maximum.
     """
-    offsets = step_px * np.stack(np.meshgrid((-1, 0, 1), (-1, 0, 1)), -1).reshape(-1, 2)
+    offsets = _PARABOLA_PX * np.stack(np.meshgrid((-1, 0, 1), (-1, 0, 1)), -1).reshape(-1, 2)
     for _ in range(3):
         test = candidates_at(searched.on, searched.off, card, uv_px + offsets, searched.sigma_px)
         gain = (np.maximum(test.electrons, 0.0) / test.sigma_e) ** 2
@@ -366,7 +369,7 @@ def parabola_peak(searched: _Searched, card: SensorCard, uv_px: Array, step_px: 
             break
         uv_px = uv_px + offsets[best]
     grid = gain.reshape(3, 3)
-    return uv_px + step_px * np.array([_vertex(grid[1]), _vertex(grid[:, 1])])
+    return uv_px + _PARABOLA_PX * np.array([_vertex(grid[1]), _vertex(grid[:, 1])])
 
 
 def _vertex(values: Array) -> float:

@@ -61,7 +61,7 @@ def noise_of(card: SensorCard, pattern_known: bool = False) -> PixelNoise:
     if card.row_noise_e > 0.0 or not card.shot_noise:
         raise ValueError(
             f"sensor '{card.name}': row_noise_e = {card.row_noise_e:g}, shot_noise = {card.shot_noise}; independent "
-            "pixels need row_noise_e = 0 and shot noise: take processed_fisher with the covariance of the pixels"
+            "pixels need row_noise_e = 0 and shot noise; bounds and likelihoods of others are not known"
         )
     rounding_e2 = 1.0 / (12.0 * card.dn_per_e**2)  # uniform over one code of the converter
     fixed_e2 = 0.0 if pattern_known else card.dsnu_e**2

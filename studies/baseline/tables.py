@@ -61,9 +61,7 @@ class PowerLaw:
         return bool(self.low[i] <= exponent <= self.high[i])
 
 
-def fit_power_law(
-    y: Array, bases: Array, random: np.random.Generator, resamples: int = 2000, confidence: float = 0.95
-) -> PowerLaw:
+def fit_power_law(y: Array, bases: Array, random: np.random.Generator, resamples: int = 2000) -> PowerLaw:
     """Least squares on logarithms; intervals by the percentile bootstrap over cases.
 
     Parameters
@@ -71,7 +69,7 @@ def fit_power_law(
     y : shape (n,), above 0; other values are left out
     bases : shape (k, n), above 0
     random : Generator
-    resamples, confidence
+    resamples : int
     """
     good = np.isfinite(y) & (y > 0.0)
     logs = [np.log(x[good]) for x in (*bases, y)]
@@ -81,7 +79,6 @@ def fit_power_law(
         paired=True,
         vectorized=False,
         n_resamples=resamples,
-        confidence_level=confidence,
         method="percentile",
         rng=random,
     )

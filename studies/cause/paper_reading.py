@@ -70,14 +70,14 @@ class Experiments:
         return (self.table[:, None] == self.table) & (self.depth_m[:, None] == self.depth_m)
 
 
-def published_experiments(rounding_m: float = 0.01, rounding_table4_m: float = 0.001) -> Experiments:
+def published_experiments() -> Experiments:
     """The 25 published results; Table 4 is printed to the millimetre."""
     rows = load_published()
     table = np.array([int(row.experiment.removeprefix("table")) - 1 for row in rows])
     depth, stroke, estimate = (
         np.array([getattr(row, name) for row in rows]) for name in ("real_depth_m", "baseline_m", "estimated_depth_m")
     )
-    return Experiments(table, depth, stroke, estimate, np.where(table == TABLES - 1, rounding_table4_m, rounding_m))
+    return Experiments(table, depth, stroke, estimate, np.where(table == TABLES - 1, 0.001, 0.01))
 
 
 @dataclass(frozen=True)

@@ -182,10 +182,10 @@ def budget(rows: pl.DataFrame, rules: Rules | None = None, seed: int = 0) -> Bud
     return Budget(*numbers, measured, predicted, bound, closure, over, within, nominal)
 
 
-def budgets(rows: pl.DataFrame, by: str, rules: Rules | None = None) -> dict[str, Budget]:
+def budgets(rows: pl.DataFrame, by: str) -> dict[str, Budget]:
     """A budget for every value of a column, in the order of first appearance."""
     groups = rows.partition_by(by, maintain_order=True, as_dict=True)
-    return {str(key[0]): budget(group, rules) for key, group in groups.items()}
+    return {str(key[0]): budget(group) for key, group in groups.items()}
 
 
 def budget_table(rows: pl.DataFrame, wide: bool = False) -> TextTable:

@@ -17,7 +17,7 @@ as much: mosaic and JPEG blocks keep their phase, because regions begin at whole
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -84,7 +84,6 @@ def run_film_experiments(
     films: Films,
     calibration: Dataset,
     procedure: FilmProcedure,
-    names: Sequence[str] | None = None,
     told: Callable[[], None] = lambda: None,
 ) -> pl.DataFrame:
     """Errors of D of every film, camera and way: one row each, `COLUMNS`; `told` is called after every film.
@@ -96,7 +95,7 @@ def run_film_experiments(
     """
     rows: list[dict[str, Any]] = []
     known: dict[str, Bundle] = {}
-    for name in films.plans if names is None else names:
+    for name in films.plans:
         film = films[name]
         rig = film.plan.pair.rig
         if rig not in known:
