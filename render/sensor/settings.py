@@ -130,13 +130,8 @@ class Sensor(BaseModel):
         return _checked(self.name, {**self.model_dump(exclude_none=True), **changes})
 
 
-def preset_names() -> tuple[str, ...]:
-    """Names of the shipped presets."""
-    return tuple(_tables()["presets"])
-
-
 def pixel_presets() -> tuple[str, ...]:
-    """Names of those that end in pixels, as a camera's chain does."""
+    """Names of the shipped presets that end in pixels, as a camera's chain does: all but "ideal"."""
     return tuple(name for name, table in _tables()["presets"].items() if table["output"] != "electrons")
 
 

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 import scipy
 from helpers.oracles import alhazen_quartic, fermat_path, paper_cases, random_rig, random_spot, true_pixel
+from helpers.plane_depth import depth_in_plane
 
 from phibench.estimator.geometry.status import Status
-from phibench.estimator.geometry.triangulate import depth_exact, depth_in_plane
+from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.scenes.rig import Rig
 from phibench.scenes.validation import SceneError
 
