@@ -21,11 +21,11 @@ from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.frames.source import Frame
 from phibench.datasets.read import Dataset, Sample
 from phibench.datasets.store.files import write_text
+from phibench.render.optics.faces import IntArray
 from phibench.render.optics.ray_tracer import trace_pixels
 from phibench.render.optics.reflection_point import mirror_points, onward
 from phibench.render.sensor.processing import eight_bit
 from phibench.render.sensor.srgb import srgb_encoded
-from phibench.scenes.faces import IntArray
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import POSITIONS, View
 from phibench.scenes.shapes import Cuboid, Mesh, Prism, Rectangle, Shape, faces

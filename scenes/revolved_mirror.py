@@ -54,7 +54,8 @@ from numpy.typing import NDArray
 from phibench.scenes.camera import Camera
 from phibench.scenes.frames import Array, Pose
 from phibench.scenes.holder import Extent
-from phibench.scenes.mirror import HARMONICS, Form, Level, MetalName, MetalSurface, ReflectanceTable, added, known_metal
+from phibench.scenes.metals import MetalName, MetalSurface, ReflectanceTable, known_metal
+from phibench.scenes.mirror import HARMONICS, Form, Level, added
 from phibench.scenes.validation import SceneError, finite, positive, within
 
 ComplexArray = NDArray[np.complexfloating]

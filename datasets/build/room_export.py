@@ -34,9 +34,9 @@ from phibench.datasets.store import schema
 from phibench.datasets.store.checksums import held_room_files
 from phibench.datasets.store.files import require_writable, sha256, write_bytes
 from phibench.datasets.store.layers import write_exr
+from phibench.render.optics.faces import face_table
 from phibench.render.room.light_map import BakeSettings
 from phibench.scenes.catalog import default_rig
-from phibench.scenes.faces import face_table
 from phibench.scenes.frames import Vector
 from phibench.scenes.room import Room
 from phibench.scenes.validation import finite_vector, printable_line, within

@@ -20,13 +20,13 @@ from phibench.datasets.recipe.tables import (
     TargetTable,
 )
 from phibench.datasets.rooms.room_sources import NamedRoom, room_of
+from phibench.render.optics.faces import face_table
 from phibench.scenes.camera import Camera
 from phibench.scenes.catalog import BOARD_ALBEDO, RIGS, TargetBoard
-from phibench.scenes.faces import face_table
 from phibench.scenes.frames import Array, Pose, Vector, as_matrix, as_vector, rotation_xyz
 from phibench.scenes.holder import LENGTHS, Holder, fitted
 from phibench.scenes.laser import LaserSpot
-from phibench.scenes.mirror import ReflectanceTable
+from phibench.scenes.metals import ReflectanceTable
 from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.revolved_mirror import Profile, RevolvedMirror, cone
 from phibench.scenes.rig import Rig

@@ -41,7 +41,8 @@ from phibench.datasets.recipe.mirror_tables import (
 from phibench.datasets.recipe.room_tables import RoomsTable, RoomTable
 from phibench.render.sensor.settings import pixel_presets
 from phibench.scenes.catalog import BOARD_SIZE_M
-from phibench.scenes.mirror import OF_REVOLVED, MetalName
+from phibench.scenes.metals import MetalName
+from phibench.scenes.mirror import OF_REVOLVED
 from phibench.scenes.misalignment import PARAMETERS
 from phibench.scenes.random_streams import LARGEST_SEED
 

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from phibench.render.optics.faces import FaceTable, face_table
 from phibench.render.sensor.srgb import srgb_encoded
-from phibench.scenes.faces import FaceTable, face_table
 from phibench.scenes.frames import Array, Vector
 from phibench.scenes.room import Room
 from phibench.scenes.shapes import Shape

@@ -22,8 +22,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.polynomial.legendre import leggauss
 
+from phibench.render.optics.faces import FaceTable, IntArray
 from phibench.render.optics.room_tracer import RoomGeometry
-from phibench.scenes.faces import FaceTable, IntArray
 from phibench.scenes.frames import Array
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.textures import Bitmap, Checker

@@ -19,7 +19,7 @@ from functools import cached_property
 
 import numpy as np
 
-from phibench.scenes.faces import FaceTable, IntArray
+from phibench.render.optics.faces import FaceTable, IntArray
 from phibench.scenes.frames import Array, BoolArray
 
 CANDIDATE_MARGIN_M = 1e-5  # a hit in float32 errs by less: 30 m * 6e-8 * a few roundings

@@ -18,7 +18,7 @@ from functools import partial
 
 import numpy as np
 
-from phibench.scenes.faces import IntArray
+from phibench.render.optics.faces import IntArray
 from phibench.scenes.frames import Array
 from phibench.scenes.glass_tube import GlassTube
 from phibench.scenes.mirror import Form, Mirror, SphereMirror

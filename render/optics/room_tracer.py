@@ -1,7 +1,7 @@
 """Room tracer in float64: first plane face along rays, as the exact counterpart of the renderer's float32 hits.
 
-A room is the table of its plane faces (`scenes.faces`) and a tree of them (`face_tree`). What belongs to the room is
-made ready once and stays with the room; robot, carriage and holder are added for each view.
+A room is the table of its plane faces (`faces`) and a tree of them (`face_tree`). What belongs to the room is made
+ready once and stays with the room; robot, carriage and holder are added for each view.
 
 Rays are origins and unit directions, shape (N, 3), world frame, metres.
 """
@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from phibench.render.optics.face_tree import FaceTree, Rays
-from phibench.scenes.faces import FaceTable, IntArray, face_table, joined
+from phibench.render.optics.faces import FaceTable, IntArray, face_table, joined
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import View
 from phibench.scenes.room import Room

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from phibench.render.optics.faces import IntArray
 from phibench.render.optics.ray_tracer import trace_pixels
 from phibench.render.optics.reflection_point import MirrorPoints, Onward, mirror_points, onward
 from phibench.render.optics.room_tracer import (
@@ -25,7 +26,6 @@ from phibench.render.optics.room_tracer import (
     blocked_by,
     into_room,
 )
-from phibench.scenes.faces import IntArray
 from phibench.scenes.frames import Array
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.mirror import limb_points

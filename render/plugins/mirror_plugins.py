@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from phibench.render.plugins.plugin_tree import Plugin, Rgb, Triangles, Value
 from phibench.render.room.camera_plugin import MM_PER_M
 from phibench.scenes.frames import Array, Vector
-from phibench.scenes.mirror import MetalSurface
+from phibench.scenes.metals import MetalSurface
 from phibench.scenes.rig import View
 from phibench.scenes.room import MIRROR_NAME
 from phibench.scenes.validation import SceneError

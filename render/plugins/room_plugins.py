@@ -15,9 +15,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from phibench.render.optics.faces import face_table
 from phibench.render.plugins.plugin_tree import BitmapPlugin, Plugin, Rgb, Triangles, Value
 from phibench.render.room.camera_plugin import MM_PER_M
-from phibench.scenes.faces import face_table
 from phibench.scenes.frames import Array, Pose
 from phibench.scenes.rig import View
 from phibench.scenes.room import Room
@@ -112,7 +112,7 @@ def _emitting_size(shape: Rectangle) -> tuple[tuple[float, float], Pose]:
 
 
 def _faces_mesh(shape: Shape, index: int) -> Triangles:
-    """Mesh of a shape's faces, its corners placed on the texture as `scenes.faces` says."""
+    """Mesh of a shape's faces, its corners placed on the texture as `render.optics.faces` says."""
     own = shape if isinstance(shape, Mesh) else replace(shape, T_world_shape=Pose("world", "shape"))
     table = face_table([own])
     corners = table.corners_m.reshape(-1, 3)

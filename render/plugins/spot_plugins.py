@@ -19,11 +19,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from phibench.render.optics.beam_deposit import BEAM_REACH_M, deposit, transmittance
+from phibench.render.optics.faces import FaceTable, IntArray
 from phibench.render.optics.room_tracer import RoomGeometry, room_geometry
 from phibench.render.optics.truth import spot_truth
 from phibench.render.plugins.plugin_tree import BitmapPlugin, Plugin, Rgb, Value
 from phibench.render.plugins.room_plugins import diffuse, placed
-from phibench.scenes.faces import FaceTable, IntArray
 from phibench.scenes.frames import Array, Pose, Vector, as_matrix, as_vector
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.rig import View

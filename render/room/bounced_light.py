@@ -16,12 +16,12 @@ from typing import Any
 
 import numpy as np
 
+from phibench.render.optics.faces import IntArray
 from phibench.render.room.camera_plugin import MM_PER_M
 from phibench.render.room.subpixel_grid import points, shifts
 from phibench.render.room.surfaces import LookUp, Surfaces, aligned
 from phibench.render.room.texel_grid import TexelGrid
 from phibench.render.room.texel_points import Texels, covered_texels, nearest_free, transmitted, vector
-from phibench.scenes.faces import IntArray
 from phibench.scenes.frames import Array
 
 BOUNCE_TEXEL_M = 0.1

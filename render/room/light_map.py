@@ -29,6 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from phibench.render.optics.faces import IntArray, face_table
 from phibench.render.room.bounced_light import BrightTexels, bounced_light, finer, gathered, rays_by_area
 from phibench.render.room.lamp_light import direct_light, lamps_in_coats
 from phibench.render.room.mirror_intersection import mirror_body
@@ -37,7 +38,6 @@ from phibench.render.room.surfaces import Surfaces
 from phibench.render.room.texel_grid import TexelGrid
 from phibench.render.room.texel_points import Texels, covered_texels, nearest_free, spread_out
 from phibench.render.setup.variant import activate
-from phibench.scenes.faces import IntArray, face_table
 from phibench.scenes.frames import Array, BoolArray
 from phibench.scenes.rig import RobotPose, View
 from phibench.scenes.room import Room, Sun, chassis

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from phibench.render.room.camera_plugin import MM_PER_M, sensor_dict
 from phibench.render.room.mirror_intersection import mirror_intersection
 from phibench.render.room.surfaces import Surfaces, aligned
-from phibench.scenes.mirror import BandReflectance
+from phibench.scenes.metals import BandReflectance
 from phibench.scenes.rig import Rig, View
 
 

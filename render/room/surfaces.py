@@ -20,9 +20,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from phibench.render.optics.faces import FaceTable, IntArray
 from phibench.render.room.camera_plugin import MM_PER_M
 from phibench.render.room.texel_grid import TexelGrid
-from phibench.scenes.faces import FaceTable, IntArray
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import View
 from phibench.scenes.textures import Bitmap, Checker, Texture

@@ -13,7 +13,7 @@ from functools import cached_property
 
 import numpy as np
 
-from phibench.scenes.faces import FaceTable, IntArray
+from phibench.render.optics.faces import FaceTable, IntArray
 from phibench.scenes.frames import Array
 
 _ACROSS, _FINEST_M = 8.0, 0.05  # texels across a small face, and their least size

@@ -13,7 +13,7 @@ from phibench.cli.main import main
 from phibench.datasets.read import Sample, open_dataset
 from phibench.datasets.scene import scene_check
 from phibench.datasets.scene.scene_check import RendererDifference, ViewComparison, check_view, chosen_samples
-from phibench.scenes.mirror import ReflectanceTable
+from phibench.scenes.metals import ReflectanceTable
 
 
 @pytest.fixture(scope="module")

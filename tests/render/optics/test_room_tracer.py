@@ -9,10 +9,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from phibench.render.optics.faces import face_table
 from phibench.render.optics.room_tracer import RoomGeometry, blocked_by, first_hit, room_geometry
 from phibench.render.optics.truth import truth_layer
 from phibench.scenes.catalog import default_rig, lab
-from phibench.scenes.faces import face_table
 from phibench.scenes.frames import Pose, rotation_xyz
 from phibench.scenes.room import Room
 from phibench.scenes.shapes import Cuboid, Mesh, Prism, Shape, rectangle

@@ -15,11 +15,11 @@ from helpers.oracles import undistort_cv2
 from helpers.proof_rooms import MESHES, generated, of_mesh, of_panorama
 from helpers.snell import through
 
+from phibench.render.optics.faces import FaceTable
 from phibench.render.optics.room_tracer import room_geometry
 from phibench.render.optics.truth import truth_layer
 from phibench.render.room.ambient import view_surfaces
 from phibench.scenes.catalog import default_rig
-from phibench.scenes.faces import FaceTable
 from phibench.scenes.frames import Pose, rotation_xyz
 from phibench.scenes.glass_tube import GlassTube
 from phibench.scenes.holder import Holder, fitted

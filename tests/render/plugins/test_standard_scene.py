@@ -19,7 +19,8 @@ from phibench.render.setup.variant import activate
 from phibench.scenes.camera import Camera
 from phibench.scenes.catalog import c310_camera, default_rig, lab
 from phibench.scenes.frames import Pose, rotation_xyz
-from phibench.scenes.mirror import ReflectanceTable, SphereMirror
+from phibench.scenes.metals import ReflectanceTable
+from phibench.scenes.mirror import SphereMirror
 from phibench.scenes.rig import Rig
 from phibench.scenes.room import Room
 from phibench.scenes.shapes import rectangle

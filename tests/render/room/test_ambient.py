@@ -10,11 +10,11 @@ import pytest
 from helpers.oracles import TARGETS
 from helpers.path_ambient import path_trace
 
+from phibench.render.optics.faces import face_table
 from phibench.render.room.ambient import AmbientLayer, render_ambient
 from phibench.render.room.light_map import BakeSettings, LightMap, bake
 from phibench.render.room.texel_grid import TexelGrid
 from phibench.scenes.catalog import default_rig, lab
-from phibench.scenes.faces import face_table
 from phibench.scenes.frames import Pose, rotation_xyz
 from phibench.scenes.rig import Rig
 from phibench.scenes.room import Room

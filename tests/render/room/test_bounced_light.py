@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from phibench.render.optics.faces import face_table
 from phibench.render.room.bounced_light import BLOCK, BrightTexels, gathered, rays_by_area
 from phibench.render.room.lamp_light import whole_lamp
 from phibench.render.room.surfaces import Surfaces
@@ -12,7 +13,6 @@ from phibench.render.room.texel_grid import TexelGrid
 from phibench.render.room.texel_points import Texels
 from phibench.render.setup.variant import activate
 from phibench.scenes.catalog import default_rig
-from phibench.scenes.faces import face_table
 from phibench.scenes.shapes import rectangle
 from phibench.scenes.textures import Uniform
 

@@ -19,7 +19,8 @@ from phibench.render.optics.spot_layer import spot_layer
 from phibench.render.optics.truth import spot_truth
 from phibench.render.setup.variant import activate
 from phibench.scenes.laser import LaserSpot
-from phibench.scenes.mirror import ReflectanceTable, SphereMirror
+from phibench.scenes.metals import ReflectanceTable
+from phibench.scenes.mirror import SphereMirror
 from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.rig import Rig
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from phibench.datasets.recipe.build import ceiling_m
-from phibench.scenes.faces import FaceTable, face_table
+from phibench.render.optics.faces import FaceTable, face_table
 from phibench.scenes.room import Room, chassis
 from phibench.scenes.shapes import Cuboid, Mesh, Prism, Rectangle, cuboid
 from phibench.scenes.textures import Bitmap

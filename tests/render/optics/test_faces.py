@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from helpers.oracles import TARGETS
 
+from phibench.render.optics.faces import FaceTable, face_table
 from phibench.scenes.catalog import lab
-from phibench.scenes.faces import FaceTable, face_table
 from phibench.scenes.frames import Pose, rotation_xyz
 from phibench.scenes.rig import Rig
 from phibench.scenes.shapes import Cuboid, Mesh, Prism, faces, rectangle
