@@ -333,6 +333,7 @@ def _colour(shape: Shape) -> list[int]:
         albedo = 0.6 * albedo / max(float(albedo.max()), 1e-12) if shape.texture.is_radiance else albedo
     else:
         size = np.array(shape.size_m[:2]) if isinstance(shape, Rectangle | Cuboid | Prism) else np.ones(2)
+        # 256 places, even over the shape's face
         places = (np.stack(np.meshgrid(np.arange(16), np.arange(16)), axis=-1).reshape(-1, 2) + 0.5) / 16 - 0.5
         albedo = shape.texture.evaluate(places * size).mean(axis=0)
     return [int(c) for c in eight_bit(srgb_encoded(np.asarray(albedo, float)[:, None, None]))[0, 0]]

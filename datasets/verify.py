@@ -255,7 +255,7 @@ def _depth_faults(sample: Sample) -> Iterator[str]:
     x, y, _ = (math.fsum(values) / len(places) for values in zip(*places, strict=True))
     centre = sample.rig.at(0.0).sphere_centre_m
     expected = math.hypot(x - centre[0], y - centre[1])
-    if not same_number(row.light_depth_m, expected, 1e-9, 1e-9):
+    if not same_number(row.light_depth_m, expected, 1e-9, 1e-9):  # rounding of sums in another order
         yield f"{row.sample_id}: light_depth_m is {row.light_depth_m}, the places give {expected}"
 
 

@@ -311,6 +311,7 @@ class _Kernel:
             if not _KEPT_CAPABILITIES >> capability & 1:
                 self._library.prctl(_DROP_BOUND, capability, 0, 0, 0)
         kept = _KEPT_CAPABILITIES if os.geteuid() == 0 else 0
+        # version 3: twice 32 bits of effective, permitted, inheritable
         self._library.capset(struct.pack("=Ii", _CAPABILITIES_3, 0), struct.pack("=6I", kept, kept, 0, 0, 0, 0))
 
     def filter_calls(self) -> bool:
@@ -321,9 +322,10 @@ class _Kernel:
         lines = _filter(_NUMBERS[machine], _DENIED[machine], os.getppid())
         program = b"".join(struct.pack("=HBBI", *line) for line in lines)
         buffer = ctypes.create_string_buffer(program, len(program))
+        # struct sock_fprog; a line has 8 bytes
         header = struct.pack("@HP", len(program) // 8, ctypes.addressof(buffer))
         self._library.prctl(_SET_NO_NEW_PRIVS, 1, 0, 0, 0)
-        return int(self._library.prctl(_SET_SECCOMP, 2, header, 0, 0)) == 0
+        return int(self._library.prctl(_SET_SECCOMP, 2, header, 0, 0)) == 0  # 2: SECCOMP_MODE_FILTER
 
 
 # -- system calls that are denied ----------------------------------------------------------------------------------
@@ -396,7 +398,8 @@ def _filter(numbers: dict[str, int], denied: Sequence[int], supervisor: int) -> 
     local += [(_LOAD, 0, 0, _ARGUMENT + 8), (_AND, 0, 0, _TYPE), (_EQUAL, 0, 1, _SOCK_DGRAM), deny, allow]
     for name in ("socket", "socketpair"):
         lines += [(_EQUAL, 0, len(local), numbers[name]), *local]
-    address = _ARGUMENT + 4 * 8
+    address = _ARGUMENT + 4 * 8  # sendto(socket, buffer, length, flags, address, ...)
+    # 64 bits in two halves: both must be 0, so that no address is given
     plain = [line for half in (0, 4) for line in ((_LOAD, 0, 0, address + half), (_EQUAL, 1, 0, 0), deny)]
     lines += [(_EQUAL, 0, len(plain) + 1, numbers["sendto"]), *plain, allow]
     return [*lines, *_outward(numbers, supervisor), allow]

@@ -290,5 +290,6 @@ def _effective_number(found: Array, tried: Array, value: float) -> float:
     variance = m / (m - 1) * float(np.sum((found - value * tried) ** 2)) / images**2
     if variance == 0.0:
         return float(m)
+    # Korn and Graubard: samples, not images, are the degrees of freedom
     reduction = (scipy.stats.t.ppf(0.975, images - 1) / scipy.stats.t.ppf(0.975, m - 1)) ** 2 if images > m else 1.0
     return min(value * (1.0 - value) / variance * float(reduction), images)

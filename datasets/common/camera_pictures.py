@@ -197,7 +197,7 @@ def pgm_values(file: InputFile, data: bytes) -> NDArray[np.uint16]:
     DatasetError
         Of the file's own kind, if it is damaged; in one sentence.
     """
-    head = _PGM.match(data[:1000])
+    head = _PGM.match(data[:1000])  # a head with comments, and no search through the pixels
     # a million columns: no picture, and slow as a number
     if head is None or any(len(text) > 6 for text in head.groups()):
         raise file.fault("is not a picture of the format PGM")
@@ -209,7 +209,7 @@ def pgm_values(file: InputFile, data: bytes) -> NDArray[np.uint16]:
         with file.decoding("is a damaged PGM"):
             values = np.array(re.sub(rb"#[^\n]*", b"", body).split(), np.int64)
     else:
-        kind = np.dtype(np.uint8) if top < 256 else np.dtype(">u2")
+        kind = np.dtype(np.uint8) if top < 256 else np.dtype(">u2")  # netpbm: two bytes, the high one first
         values = np.frombuffer(body[: len(body) // kind.itemsize * kind.itemsize], kind)
     if len(values) != width * height or (data[:2] == b"P5" and len(body) != width * height * values.itemsize):
         raise file.fault(f"is a PGM of another size than the {width} x {height} pixels that it tells")

@@ -237,7 +237,7 @@ def _keys(scene: FilmScene, uv: Array, whole: bool) -> tuple[int, ...]:
             way = float(np.linalg.norm(uv.max(axis=0) - uv.min(axis=0)))
         else:
             end = parts[number + 1].start_s if number + 1 < len(parts) else scene.times.duration_s
-            times = np.linspace(part.start_s, max(end, part.start_s + 1e-3), _SAMPLES)
+            times = np.linspace(part.start_s, max(end, part.start_s + 1e-3), _SAMPLES)  # a part may have no length
             way = max(_way_px(one, times) for one in (_surroundings(scene) if whole else (_quiet(scene),)))
         apart = KEY_PX if part.leg is None else DRIVE_KEY_PX  # of a turn, all of the window moves alike
         counts.append(max(4, math.ceil(way / apart) + 1))
@@ -320,7 +320,7 @@ def _robot_lines(scene: FilmScene, up_m: float) -> tuple[Array, Array]:
     axis, top = view.sphere_centre_m, float(view.sphere_centre_m[2]) + rig.top_m
     reach = rig.mirror.bound_m if rig.holder is None else rig.holder.plate_m
     for z in _grid(_LEVELS_M[-1], top):
-        wide = reach if z > view.camera_centre_m[2] - 0.04 else 0.03
+        wide = reach if z > view.camera_centre_m[2] - 0.04 else 0.03  # the camera, and what it carries; the mast below
         lines += [((axis[0] - wide, axis[1], z), (axis[0] + wide, axis[1], z))]
         lines += [((axis[0], axis[1] - wide, z), (axis[0], axis[1] + wide, z))]
     ends = np.array(lines)

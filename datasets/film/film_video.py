@@ -104,8 +104,9 @@ def write_mp4(path: Path, pictures: Iterable[NDArray[np.uint8]], rate_hz: float)
         with av.open(str(temporary), "w", format="mp4") as container:
             stream: Any = None
             for picture in pictures:
-                even = picture[: picture.shape[0] // 2 * 2, : picture.shape[1] // 2 * 2]
+                even = picture[: picture.shape[0] // 2 * 2, : picture.shape[1] // 2 * 2]  # yuv420p halves both sides
                 if stream is None:
+                    # 29.97 Hz are 30000/1001
                     stream = container.add_stream("libx264", rate=Fraction(rate_hz).limit_denominator(1001))
                     stream.height, stream.width, stream.pix_fmt = *even.shape[:2], "yuv420p"
                     stream.options = {"crf": "18"}

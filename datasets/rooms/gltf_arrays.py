@@ -58,7 +58,7 @@ class GltfDocument:
         """Text and binary chunk of a .glb file."""
         chunks: dict[bytes, bytes] = {}
         at = 12  # after magic, version and length
-        while at + 8 <= len(data):
+        while at + 8 <= len(data):  # of a chunk, length and kind come first
             length, kind = int.from_bytes(data[at : at + 4], "little"), data[at + 4 : at + 8]
             if at + 8 + length > len(data):
                 raise self.file.fault("is damaged: it ends within a chunk")

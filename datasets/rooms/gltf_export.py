@@ -104,10 +104,10 @@ class GltfWriter:
             "buffers": [{"byteLength": len(self._data)}],
         }
         text = json.dumps(document, allow_nan=False).encode()
-        text += b" " * (-len(text) % 4)
+        text += b" " * (-len(text) % 4)  # glTF 2.0: a chunk ends at a multiple of four bytes, JSON with spaces
         body = struct.pack("<II", len(text), _JSON) + text
         body += struct.pack("<II", len(self._data), _BIN) + bytes(self._data)
-        return struct.pack("<III", _MAGIC, 2, 12 + len(body)) + body
+        return struct.pack("<III", _MAGIC, 2, 12 + len(body)) + body  # the length counts these 12 bytes, too
 
     def _material(self, name: str, table: FaceTable) -> int:
         """Material of a shape, whose faces share one texture."""

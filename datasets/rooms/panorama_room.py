@@ -68,7 +68,7 @@ def blank_room(settings: PanoramaSettings) -> Room:
 
     Geometry and the laser's albedo are those of `panorama_room`, so that spots can be planned.
     """
-    settings = replace(settings, texel_m=1.0)
+    settings = replace(settings, texel_m=1.0)  # an even light needs no fine texels
     return Room(settings.name, _box(settings, _Panorama(np.ones((16, 32, 3), np.float32), settings)))
 
 
@@ -132,7 +132,7 @@ class _Panorama:
         return np.stack([0.5 - azimuth / (2.0 * math.pi), 0.5 - elevation / math.pi], axis=-1)
 
 
-_QUARTERS = ((-0.25, -0.25), (-0.25, 0.25), (0.25, -0.25), (0.25, 0.25))
+_QUARTERS = ((-0.25, -0.25), (-0.25, 0.25), (0.25, -0.25), (0.25, 0.25))  # middles of a texel's quarters
 
 
 def _halved(light: Light) -> Light:

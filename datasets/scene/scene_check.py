@@ -313,7 +313,7 @@ def _half_px(scene: LoadedScene) -> float:
     """Half of a window that holds the spot's light without blur: by the spread of the layer's, less the blur's."""
     layer = scene.sample.spot(scene.position).electrons_per_s[0]
     rows, columns = layer.sum(axis=1), layer.sum(axis=0)
-    spread = max(_variance(rows), _variance(columns)) - scene.camera.blur_sigma_px**2 - 1.0 / 12.0
+    spread = max(_variance(rows), _variance(columns)) - scene.camera.blur_sigma_px**2 - 1.0 / 12.0  # and a pixel's own
     return _LEAST_PX + _SPREADS * float(np.sqrt(max(spread, 0.0)))
 
 

@@ -129,6 +129,7 @@ def calibrate(
     print(f"{result.write_picture(picture)}: the outline on the frame that fits worst, residuals enlarged")
     print(_LAB)
     print(f"\n{'parameter':18s} {'unit':4s} {'correction':>11s} {'sigma':>8s} {'prior sigma':>11s}")
+    # what changes no pixel has no row
     every = zip(PARAMETERS, result.bundle.values, result.prior_sigmas, has_effect(result.nominal), strict=True)
     for name, value, prior in (row[:3] for row in every if row[3]):
         unit = MISALIGNMENT[name].unit

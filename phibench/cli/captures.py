@@ -75,7 +75,7 @@ def measure(
     from phibench.datasets.common.errors import DatasetError
     from phibench.datasets.store.files import require_writable
 
-    whole = bool(pair.down and pair.up and pair.stroke_m is not None)
+    whole = bool(pair.down and pair.up and pair.stroke_m is not None)  # 0 m is told apart from none
     if (directory is None) != whole or (directory and (pair.down or pair.up or pair.stroke_m)):
         raise DatasetError("give --down, --up and --stroke-m, or a folder with pairs.csv instead of them")
     if out is not None:
@@ -177,7 +177,7 @@ def fit(frames: Path, *, out: Path, page: Path | None = None) -> int:
     from phibench.datasets.frames.sensor_file import write_sensor_file
     from phibench.datasets.store.files import require_writable
 
-    for target in filter(None, (out, page)):
+    for target in filter(None, (out, page)):  # before the minutes of the fit
         require_writable(target)
     if page is not None:
         require_page(page)

@@ -82,6 +82,7 @@ def _files(begun: str, suffix: str) -> Iterator[str]:
     """Files with a suffix in the folder of what is typed, and in folders whose names begin so, as they are typed."""
     typed = begun[: begun.rfind("/") + 1]
     folder, word = Path(typed or "."), begun[len(typed) :]
+    # folders below take long, and only a word narrows them
     patterns = (f"*{suffix}", f"*/*{suffix}") if word else (f"*{suffix}",)
     names = {path.relative_to(folder).as_posix() for pattern in patterns for path in folder.glob(pattern)}
     shown = sorted(name for name in names if name.startswith(word) and not name.startswith("."))

@@ -421,8 +421,9 @@ def export(
     from phibench.benchmark.export.pair_rows import ExportRequest
 
     options = drawing.options(preset, {})
-    scored = to == "frames" and not options.given
+    scored = to == "frames" and not options.given  # other sensors and numbers are not those of any score
     shares = (splits.split_by, splits.validation, splits.test, splits.pairs_per_shard)
+    # as methods are scored on it
     off = scored_with_laser_off(directory) if laser_off is None and scored else bool(laser_off)
     request = ExportRequest(to, options, drawing.draws, off, *shares, samples=drawing.sample, scored=scored)
     done = export_pairs(directory, request, out, workers=drawing.workers)
@@ -578,9 +579,9 @@ def panorama(
 
     grid = PanoramaGrid(width, *(math.radians(each) for each in elevation_deg))
     dataset = open_finished(directory)
-    (chosen,) = dataset.chosen(["0" if view.sample is None else view.sample])
+    (chosen,) = dataset.chosen(["0" if view.sample is None else view.sample])  # the first, where none is named
     require_writable(out)
-    distance = FAR_M if distance_m is None else distance_m
+    distance = FAR_M if distance_m is None else distance_m  # of what is far, by direction alone
     result = unroll(chosen, view.position, grid, by, distance, view.picture(chosen))
     save_png(out, result.pixels)
     print(

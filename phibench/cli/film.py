@@ -209,7 +209,7 @@ def track(
             print(head)  # not before a film that can be searched
         head = ""
         for row in rows:
-            missed += row.fault != ""
+            missed += row.fault != ""  # for the exit code: the other films are tracked all the same
             if row.fault:
                 print(f"{one.info.film:32s} {row.target:12s} {row.fault}")
                 continue
@@ -300,7 +300,7 @@ class RobotOptions:
         from phibench.scenes.rig import Rig
         from phibench.scenes.validation import within
 
-        nominal, covariance = Rig(), None
+        nominal, covariance = Rig(), None  # None: the rig is known exactly
         if self.calibration is not None:
             if self.as_built is not None:
                 raise DatasetError("--calibration and --as-built: both say how well the rig is known; give one of them")
@@ -372,6 +372,7 @@ def run(
     setup = robot.setup()
     known, isolations = setup.rig_covariance is not None, set[str]()
     if ".py" in policy:
+        # it must not look rooms up
         limits, hidden = RunLimits(seconds=seconds), [robot.rooms] if robot.rooms is not None else []
         running = run_foreign(
             setup,
@@ -396,7 +397,7 @@ def run(
     if out is not None:
         write_atomic(out, episode_frame(rows).write_parquet)
         print(f"{out}: {len(rows)} rows")
-    return 1 if any(row.outcome == LOST for row in rows) else 0
+    return 1 if any(row.outcome == LOST for row in rows) else 0  # LOST: the policy failed, not its episode
 
 
 @loop.command(name="show")

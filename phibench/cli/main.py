@@ -208,7 +208,7 @@ def main(tokens: Sequence[str] | None = None) -> int:
         if os.environ.get(TRACEBACK):
             raise
         print(f"phibench: {_confession(error)}", file=sys.stderr)
-        return 3
+        return 3  # neither done nor the user's fault
 
 
 class _Stopped(KeyboardInterrupt):
@@ -302,6 +302,7 @@ def _lacks_memory(error: Exception) -> bool:
 def _sentence(error: Exception) -> str:
     """Message of an error, which any terminal can show; an operating system's without its number."""
     text = str(error)
+    # without the number of the error, which helps nobody
     if isinstance(error, OSError) and error.strerror and type(error).__module__ == "builtins":
         text = f"{error.strerror}: {error.filename}" if error.filename else str(error.strerror)
     if _lacks_memory(error):
@@ -319,7 +320,7 @@ def _confession(error: Exception) -> str:
 
     frames = traceback.extract_tb(error.__traceback__)
     place = f"{Path(frames[-1].filename).name}:{frames[-1].lineno}" if frames else "?"
-    text = printable_line(f"{type(error).__name__}: {error}", 300)
+    text = printable_line(f"{type(error).__name__}: {error}", 300)  # an error may quote a whole file
     return (
         f"{text} ({place}). This is a fault of phibench: please report it with the file that you gave; "
         f"{TRACEBACK}=1 shows where"

@@ -106,7 +106,7 @@ def _table() -> Table:
             table.add_row(method.name, origin, takes, method.description)
         else:
             table.add_row(method.name, f"{origin}: not installed", takes, method.description, style="dim")
-    for point in installed():
+    for point in installed():  # a package that is not imported: what it takes is not known
         owner = point.value if point.dist is None else f"{point.dist.name} {point.dist.version}"
         table.add_row(point.name, owner, "", point.value)
     return table

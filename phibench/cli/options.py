@@ -44,7 +44,7 @@ def number(_kind: object, tokens: Sequence[Token]) -> float:
     try:
         return float(text)
     except ValueError:
-        other = text.replace(",", ".")
+        other = text.replace(",", ".")  # a decimal comma
         hint = f"; write {other}" if text.count(",") == 1 and other.replace(".", "", 1).isdigit() else ""
         raise ValueError(f"{text!r} is not a number{hint}") from None
 
@@ -186,7 +186,7 @@ def answer_to_old_spelling(tokens: Sequence[str]) -> str:
     for old, new in OLD_COMMANDS.items():
         if _begins(tokens, old):
             return f"`phibench {old}` is now `phibench {new}`; `phibench {new.split(' --')[0]} --help` has its options"
-    given = {token.partition("=")[0] for token in tokens}
+    given = {token.partition("=")[0] for token in tokens}  # --option=value
     for (command, option), new in OLD_OPTIONS.items():
         if _begins(tokens, command) and option in given:
             return f"`phibench {command} {option}` is now {new}"

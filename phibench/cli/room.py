@@ -102,8 +102,8 @@ def from_mirror_ball(
 
     stated = ball_of.stated
     require_suffix(out)
-    require_writable(out)
-    table = panorama_table(out, point_m, box_m, surroundings_m)
+    require_writable(out)  # before the work, so that nothing is lost
+    table = panorama_table(out, point_m, box_m, surroundings_m)  # checks the numbers before the photograph is read
     light = read_linear(photo, None if sensor is None else read_sensor_file(sensor))
     ball = find_ball(light, stated)
     u, v, radius = ball.circle_px
@@ -226,7 +226,7 @@ def export(
     from phibench.datasets.scene.scene_export import export_scene
     from phibench.scenes.rig import POSITIONS
 
-    (chosen,) = open_finished(directory).chosen(["0" if sample is None else sample])
+    (chosen,) = open_finished(directory).chosen(["0" if sample is None else sample])  # the first, where none is named
     done = export_scene(chosen, out, POSITIONS if position is None else (position,))
     for loss in done.losses:
         print(f"not carried: {loss}")

@@ -183,12 +183,14 @@ def compare(first: Path, second: Path, *, bootstrap_seed: BootstrapSeed = 0, out
 
     form, differences = output.form, compare_scores(first, second, _seed(bootstrap_seed))
     a, b = read_score(first), read_score(second)
+    # stdout holds the table alone where a program may read it
     print_comparison(differences, _distinct(first, a), _distinct(second, b), form, output.wide)
     lines = sys.stdout if form == "terminal" else sys.stderr
     for note in filter(None, (note_on_pairs(a, b, str(first), str(second)), note_on_code(a, b))):
         print(f"note: {note}", file=lines)
     if small := note_on_size(differences, a.rules, min(a.samples, b.samples)):
         print(small, file=lines)
+    # an empty table says less
     elif all(item.better in ("no difference shown", "too few samples") for item in differences):
         print("No metric shows a difference: see docs/scoring.md, Paired comparison, for the test.", file=lines)
     return 0
@@ -251,7 +253,7 @@ def results(
     from phibench.benchmark.scores.results_page import read_parts, results_document, results_page, write_results
 
     parts = read_parts(files, against, rank, _seed(bootstrap_seed))
-    for path in write_results(parts, out, html, rank):
+    for path in write_results(parts, out, html, rank):  # files first: they are wanted even where the pipe is closed
         print(f"written: {path}", file=sys.stderr)
     if json:
         print(dumps(results_document(parts), allow_nan=False))
@@ -265,11 +267,12 @@ def _files(out: Path | None, cards: Sequence[MethodCard]) -> list[Path | None]:
     from phibench.datasets.common.errors import DatasetError
 
     if out is None:
-        return [None] * len(cards)
+        return [None] * len(cards)  # nothing is kept
     if out.suffix != ".json":
         raise DatasetError(f"--out {out}: a score is a JSON file; give a name that ends in .json")
     if len(cards) == 1:
         return [out]
+    # of a reference such as my_phi.py:extract, a colon is no letter of a file's name
     names = ["".join(c if c.isalnum() or c in "-_." else "-" for c in card.name) for card in cards]
     if len(set(names)) != len(names):
         twice = next(name for name in names if names.count(name) > 1)

@@ -104,7 +104,7 @@ def open_(public: Path, *, truth: Path, submission: Path, out: Path | None = Non
         if out.suffix != ".json":
             raise DatasetError(f"--out {out}: a score is a JSON file; give a name that ends in .json")
         require_writable(out)
-    opened = unseal_set(public, truth, submission)
+    opened = unseal_set(public, truth, submission)  # checks the hash of the truth before any score
     if opened.pairs.note:
         print(f"note: {opened.pairs.note}", file=sys.stderr)
     print(f"seal {opened.seal.id}: the truth is the sealed one, the submission has each of {opened.seal.pairs} pairs")

@@ -144,6 +144,7 @@ def _experiments(directory: Path, procedure: Procedure, rig: tuple[str, ...], wi
 
     if out is not None:
         require_writable(out)
+    # a line for each rig: each takes minutes
     rows = run_experiments(open_finished(directory), procedure, rig or None, lambda name: print(f"{name} is measured"))
     if out is not None:
         write_rows(rows, out)

@@ -156,6 +156,7 @@ class Arena:
             azimuth, height = rng.uniform(-math.pi, math.pi), rng.uniform(0.2, 1.1)
             ahead = np.array([math.cos(azimuth), math.sin(azimuth), 0.0])
             hit = self._first_hit(np.array([0.0, 0.0, height]), ahead, distances_m[1])
+            # 0.5: at most 60 degrees off the surface's normal
             if hit is None or hit[0] < distances_m[0] or hit[1] @ ahead > -0.5:
                 continue
             way = np.arange(0.0, hit[0] - stand_off_m + 0.05, 0.05)  # 5 cm: an eighth of what is kept free beside it
@@ -172,7 +173,7 @@ class Arena:
             azimuth, rise = rng.uniform(-math.pi, math.pi), rng.uniform(-0.2, 0.5)
             d = np.array([math.cos(azimuth) * math.cos(rise), math.sin(azimuth) * math.cos(rise), math.sin(rise)])
             hit = self._first_hit(np.array([0.0, 0.0, 0.8]), d, 8.0)
-            if hit is not None and hit[0] > 1.0:
+            if hit is not None and hit[0] > 1.0:  # nothing right beside the robot
                 return Target(np.array([0.0, 0.0, 0.8]) + hit[0] * d, hit[1])
         raise SceneError(f"room {self.name}: no surface within 8 m; take a room with walls")
 
@@ -223,11 +224,11 @@ def plain_arena(*stream: Name) -> Arena:
     rng = generator(*stream, "plain arena")
     size, heading = rng.uniform((5.0, 5.0), (9.0, 9.0)), rng.uniform(-math.pi, math.pi)
     place = rng.uniform(0.3, 0.7, 2) * size
-    rows = [(0.5 * size[0], y, 0.5 * size[0], 0.01, 1.4) for y in (0.0, size[1])]
+    rows = [(0.5 * size[0], y, 0.5 * size[0], 0.01, 1.4) for y in (0.0, size[1])]  # half sizes: walls 2.8 m high
     rows += [(x, 0.5 * size[1], 0.01, 0.5 * size[1], 1.4) for x in (0.0, size[0])]
     for _ in range(int(rng.integers(2, 7))):
         half, at = rng.uniform((0.2, 0.15), (0.6, 0.4)), rng.uniform((0.5, 0.5), size - 0.5)
-        if np.hypot(*(at - place)) > 1.4:
+        if np.hypot(*(at - place)) > 1.4:  # the robot's own place stays free
             rows.append((*at, *half, rng.uniform(0.2, 1.0)))
     x, y, a, b, c = np.array(rows).T
     turn = np.array([[math.cos(heading), math.sin(heading)], [-math.sin(heading), math.cos(heading)]])

@@ -317,7 +317,7 @@ class GreedyInformation(SearchingPolicy):
         steps = 4
         if abs(way) > 0.2 * task.reach_m:
             each = way / steps / (1.0 - self.known.vehicle.slip)
-            frames = max(abs(way) / fastest / task.step_s / steps, 1.0)
+            frames = max(abs(way) / fastest / task.step_s / steps, 1.0)  # of a quarter of the way, whose noise averages
             for _ in range(steps):
                 belief.predict(each, each, task.step_s)
                 belief.imagine(here, noise / frames)
@@ -329,7 +329,7 @@ class GreedyInformation(SearchingPolicy):
         if way_m == 0.0:
             return from_m
         to_m = from_m + way_m if from_m + way_m <= self.known.task.stroke_m else from_m - way_m
-        frames = max(way_m / _STROKE_SPEED / self.known.task.step_s / 3.0, 1.0)
+        frames = max(way_m / _STROKE_SPEED / self.known.task.step_s / 3.0, 1.0)  # of a third of the stroke
         for share in (1 / 3, 2 / 3, 1.0):
             belief.predict(0.0, 0.0, 0.0)
             belief.imagine(from_m + share * (to_m - from_m), noise / frames)

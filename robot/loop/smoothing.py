@@ -104,8 +104,9 @@ class SmoothedBelief(Belief):
         x, q = np.zeros(n), prior.q
         x[:5] = first.azimuth_rad, first.rise + stroke_m * q, q, vehicle.slip, vehicle.skid
         self._prior, self._precision = x.copy(), np.zeros(n)
+        # a vehicle may be exact: 1e-12 keeps its weight finite
         self._precision[[SLIP, SKID]] = 1.0 / (np.array([vehicle.slip_sigma, vehicle.skid_sigma]) ** 2 + 1e-12)
-        self._precision[self._deviations] = 1.0
+        self._precision[self._deviations] = 1.0  # the rig's deviations are counted in their standard deviations
         self._P = np.zeros((n, n))
         self._latest: tuple[tuple[Direction, float, Stance | None, float, int], FrameHistory] | None = None
         self._x, self._middle = x, x[self._deviations]

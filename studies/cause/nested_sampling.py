@@ -65,7 +65,7 @@ def pooled(runs: Sequence[Posterior], *names: Name) -> Posterior:
     from each run in proportion to its evidence.
     """
     if len(runs) == 1:
-        return runs[0]
+        return runs[0]  # its draws as they are
     logs, own = (np.array([getattr(run, name) for run in runs]) for name in ("log_evidence", "log_evidence_error"))
     # relative to the largest: the exponential of a log evidence itself may leave the range of doubles
     weights = np.exp(logs - logs.max())

@@ -402,6 +402,7 @@ def grid_of(table: int, points: int = 40) -> Experiments:
         return np.asarray(values.min() + np.ptp(values) * ends)
 
     depth, stroke = along(own.depth_m), along(own.stroke_m)
+    # as Table 4: to the millimetre
     return Experiments(np.full(points, table), depth, stroke, depth, np.full(points, 1e-3))
 
 

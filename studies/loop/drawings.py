@@ -183,6 +183,7 @@ def _boxes(ax: Axes, arena: Arena) -> None:
 
     boxes: Boxes = arena.floor
     for centre, axes, half in zip(boxes.centre_m, boxes.axes, boxes.half_m, strict=True):
+        # walls are thin: drawn 4 cm wide
         outline = centre[:2] + (_CORNERS * np.maximum(half[:2], 0.02)) @ axes[:2, :2].T
         ax.add_patch(Polygon(outline, facecolor="#bbbbbb", edgecolor="#888888", linewidth=0.4))
 

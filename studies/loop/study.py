@@ -196,7 +196,7 @@ def interval(values: Sequence[float] | Array, statistic: Callable[..., Any] = np
     if len(x) < _FEWEST:
         return (float(statistic(x)) if len(x) else math.nan, math.nan, math.nan)
     value = float(statistic(x))
-    if np.ptp(x) == 0.0:
+    if np.ptp(x) == 0.0:  # equal values: nothing to draw anew
         return value, value, value
     ends = scipy.stats.bootstrap(
         (x,), statistic, n_resamples=2000, method="percentile", rng=generator(STREAM, "bootstrap")
@@ -248,7 +248,7 @@ def _findings(runs: Runs, main: dict[Condition, ConditionSummary], base: Sequenc
     for condition, found in main.items():
         where = f"{condition.group} {condition.name}"
         share = Finding.ranged(f"reached, {where}", found.reached, "%", 100.0)
-        yield share.judged(">=", 95.0) if where == "policy paper" else share
+        yield share.judged(">=", 95.0) if where == "policy paper" else share  # the others are compared, not required
         yield Finding.ranged(f"time, {where}", found.time_s, "s")
         yield Finding.ranged(f"way, {where}", found.driven_m, "m")
         yield Finding.ranged(f"strokes, {where}", found.strokes, "1")

@@ -174,7 +174,7 @@ def _rigs(settings: MirrorSettings) -> dict[str, Rig]:
         If a mirror cannot be, or numbers are not in order.
     """
     first, last, step = settings.curve_m
-    if not 0.2 <= first < last <= 20.0 or not 0.0 < step <= last - first:
+    if not 0.2 <= first < last <= 20.0 or not 0.0 < step <= last - first:  # distances as in `_Metres`
         raise DatasetError(f"curve_m = {list(settings.curve_m)}: must be first < last, 0.2 to 20 m, and a step above 0")
     for name in ("blurs_px", "depths_m", "misaligned_m", "azimuths_deg", "viewpoints_deg"):
         values = getattr(settings, name)

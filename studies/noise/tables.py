@@ -100,6 +100,7 @@ def around_base(levels: Sequence[float], base: float) -> tuple[float, float] | N
     if base <= 0.0:
         low, high = (positive[0], positive[-1]) if positive else (0.0, 0.0)
     else:
+        # the base itself, despite rounding, is no neighbour
         low = max((x for x in positive if x < base * (1.0 - 1e-9)), default=base)
         high = min((x for x in positive if x > base * (1.0 + 1e-9)), default=base)
     return (low, high) if high > low else None
@@ -295,6 +296,7 @@ def _where(row: dict[str, Any]) -> str:
 def _levels(table: pl.DataFrame, sample: str, preset: str) -> list[dict[str, Any]]:
     """Rows of the reference method: the base case once, and every level that is not the base's."""
     rows = table.filter(_case(sample, preset), pl.col("method") == REFERENCE[preset]).iter_rows(named=True)
+    # the base's level, despite rounding
     return [r for r in rows if r["factor"] == BASE or abs(r["level"] - FACTORS[r["factor"]].base) > 1e-9]
 
 

@@ -51,7 +51,7 @@ COLUMNS = (
 """The last three: standard deviations of D from pixels and encoder alone, of these frames and, for a raw film, of as
 many frames in two bursts at the ends of its stroke; errors of D by one standard deviation of each independent part of
 the calibration, a list."""
-WITHIN = 1.959963984540054
+WITHIN = 1.959963984540054  # 95 % of a normal distribution
 _DRAWS = 4000  # of `closure_interval`: its ends are good to 1 %
 
 
@@ -252,7 +252,7 @@ def resting_frames(film: Film) -> tuple[list[int], list[int]]:
     inner = times.frame_s[:, None] + half * np.linspace(-1.0, 1.0, 9)  # instants of a frame, its rows included
     at = scene.carriage.position_m(inner)
     stops = (scene.carriage.stops_m[0], scene.carriage.stops_m[-1])
-    first, last = (np.flatnonzero(np.all(np.abs(at - stop) < 1e-9, axis=1)).tolist() for stop in stops)
+    first, last = (np.flatnonzero(np.all(np.abs(at - stop) < 1e-9, axis=1)).tolist() for stop in stops)  # rounding
     return first, last
 
 

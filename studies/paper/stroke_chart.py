@@ -226,6 +226,7 @@ def _shade_causes(ax: Axes, best: BestStroke) -> None:
 def _set_ticks(ax: Axes, first: float, last: float) -> None:
     from matplotlib.ticker import FuncFormatter, NullFormatter
 
+    # ends count, despite rounding
     ax.set_xticks([x for x in _TICKS if first <= 1.001 * x <= 1.01 * last] or [first, last])
     for axis in (ax.xaxis, ax.yaxis):
         axis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))

@@ -216,6 +216,7 @@ def growth_findings(found: Found, depth_m: float, tolerances: Sequence[str], lon
 def growth(best: BestStroke, longest_m: float) -> float:
     """Predicted error at the longest stroke over the smallest up to there."""
     curve = best.curve
+    # the longest itself counts, despite rounding
     within = (curve.strokes_m <= longest_m * (1.0 + 1e-9)) & np.isfinite(curve.allowed_sigma_m)
     sigma = curve.allowed_sigma_m[within]
     return float(sigma[-1] / sigma.min()) if sigma.size else math.nan
