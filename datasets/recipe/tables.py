@@ -237,7 +237,10 @@ class AmbientTable(Table):
         description="noise of the room's light in the mirror: below a quarter of the sensor's, or below a half",
     )
     cells_per_pixel: int = Field(
-        default=2, ge=2, le=32, description="cells along a pixel's side; two samples each, more where noise asks for it"
+        default=2,
+        ge=2,
+        le=32,
+        description="cells along a pixel's side where the image has detail; more samples where noise asks",
     )
     texel_m: float = Field(default=0.05, ge=0.01, le=2.0, description="size of the light map's texels")
     indirect_texel_m: float = Field(

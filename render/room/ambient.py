@@ -32,7 +32,7 @@ from phibench.scenes.room import Room
 
 ROUNDS = 8  # of refinement at most; three or four do
 _OVERLAP_PX = 16  # refinement looks at neighbours
-_BAND_CELLS = 1 << 22  # cells at a time, 150 MB
+_BAND_CELLS = 1 << 22  # cells at a time
 
 
 @dataclass(frozen=True)

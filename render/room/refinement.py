@@ -1,284 +1,348 @@
-"""Adaptive refinement of the film: the choice of cells that are sampled again, and their number of strata.
+"""Adaptive sampling of the film: which pixels are cut into cells, and how many samples each cell gets.
 
-A cell is sampled on n x n strata, twice; half the difference, squared, is its variance. An edge through the cell leaves
+1. Each pixel gets one sample that decides and counts for nothing (a scout). Where the contrast of the scouts around is
+   low, two samples of the whole pixel do. Other pixels are cut into cells, each with two samples a and b.
+2. Cells in the mirror whose surroundings are not even are sampled again on n x n strata. By the samples b around a cell
+   n is chosen for its half a, and by a for b.
+3. Where the noise that is then found is above its budget, the cells around are sampled again, more finely.
+
+**Bias.** A mean is biased if its own samples decide whether they are kept: what all of them miss would stay missed. In
+1 and 2 no sample decides on itself. Scouts are dropped. Half a has n(b) strata, with n fixed before a is drawn, and any
+number of strata has the right expectation; so has a, and b likewise, exactly. 3 judges by the halves themselves. It is
+left with the few pixels in which 1 and 2 saw nothing; all cells around are replaced, whatever they had met.
+
+**Noise.** Half the difference of a cell's halves, squared, is the variance of their mean. An edge through a cell leaves
 spread / (2 n^3), with `spread` the variance of single samples: about n strata are crossed, and each counts for 1/n^2.
 Once cells are refined, the larger of the two is taken: stopping by a cell's own estimate alone would flatter it.
+
+An edge of contrast c that cuts cells at random leaves single samples a variance of c^2 / 6. It is seen in the 3 x 3
+cells around, which are cut in one of three columns: c^2 / 18 for each. A gradient g leaves g^2 / 12, and 3 x 3 cells
+see twice g: c^2 / 18 is nearly three times as much, and strata gain more there.
 """
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
+from phibench.render.room.film_cells import (
+    NEAR_PX,
+    Box,
+    Cells,
+    allowed_of_sum,
+    any_cell,
+    bounds,
+    cell_plane,
+    contrast,
+    cut_in,
+    extreme,
+    fold,
+    grown,
+    inner,
+    mean_of_nine,
+    means_of_cells,
+    moved,
+    of_rank,
+    reach_px,
+    share_of_cell,
+    strips_of,
+    sum_of_colours,
+    taps_of_pixels,
+    variance_of,
+)
 from phibench.render.room.noise_budget import allowed_per_s2, excess, is_full
-from phibench.render.room.subpixel_grid import CellSampler, Crop, FilmGrid, Samples, Stack
+from phibench.render.room.subpixel_grid import RIM_PX, CellSampler, Crop, Stack
 
-_TILE_PX = 48
-_SIDES = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)  # strata along a cell; few values, few kernel launches
-_NEAR_PX = 3  # an edge that both samples of a cell missed shows in a cell not far away
+_SIDES = np.array([1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128], dtype=np.int32)  # strata along a cell
+_NEXT_SIDE = _SIDES[np.searchsorted(_SIDES, np.arange(_SIDES[-1] + 1))]
 _GROWTH = 8.0  # of the strata along a side, in one round
-_BLIND = (16.0, 500.0)  # excess from which a cell's first refinement has 4 and 6 strata along a side, 2 below
+_LAMP_SIDE = 2  # strata at first where a lamp's part is computed
 _SMALL = 0.1  # a cell below this part of its allowance is not what keeps a pixel above its budget
-_WIDE_SIGMAS = 2.5  # cells of a lamp 20 times as bright as a full pixel count for pixels as far away
-_SURELY = 2.0  # by two samples a pixel at the edge of a lamp may look full that is not
+_SURELY = 2.0  # by few samples a pixel at the edge of a lamp may look full that is not
 _AIM = 0.7  # of the allowed variance
-_AGAIN = 1000  # first stream of cells that are sampled again by chance; rounds are fewer than 500
-
-
-@dataclass
-class Cells:
-    """A window's cells and the pixels made of them; changed in place while they are refined.
-
-    Attributes
-    ----------
-    grid : FilmGrid
-    numbers : array, shape (rows, columns), uint32
-    side : array, shape (rows, columns), int32
-        Strata along a side.
-    mean, variance : arrays, shape (3, rows, columns), float32
-        Of the cells, electrons/s per square pixel and its square.
-    pixels : list of two arrays, shape (3, height, width), float32
-        Mean and variance of the pixels.
-    tight : array, shape (height, width)
-        Smallest allowed variance of the pixels around, sum of the colours.
-    suspected : array, shape (height, width)
-        Excess of the pixels by what may have been missed; 0 from the second round on.
-    mirrored : bool array, shape (height, width)
-        Pixels that see the mirror.
-    budget : float
-        Largest allowed error by noise, one of `noise_budget.BUDGETS`.
-    lamps : array, shape (rows, columns), int32
-        Lamp whose part of each cell is computed, -1 for none.
-    """
-
-    grid: FilmGrid
-    numbers: NDArray[np.uint32]
-    side: NDArray[np.int32]
-    mean: Stack
-    variance: Stack
-    pixels: tuple[Stack, Stack]
-    tight: Stack
-    suspected: Stack
-    mirrored: NDArray[np.bool_]
-    budget: float
-    lamps: NDArray[np.int32]
+_EVEN = 1.0 / 16.0  # of the allowed variance: a whole pixel's sample, that counts at its centre, moves no edge then
+_OUTSIDE = 16.0  # beyond the mirror, where no spot is located, it may be so many times as much
+_CUT = 1.0 / 18.0  # variance of single samples over their squared contrast
+_TRUE = 0.4  # of the variance that contrast foretells: strata are even, and most edges are short
+_SCOUT, _FIRST, _AGAIN = 0, 1, 1000  # streams: two for each turn from each of the last two on; turns are fewer than 500
 
 
 def render_refined(film: CellSampler, window: Crop, rounds: int, budget: float) -> tuple[Stack, Stack]:
-    """Pixels of a window and their variance, shape (3, height, width) each.
+    """Pixels of a window and their variance, shape (3, height, width) each; without rounds those of the first pass."""
+    cells = first_pass(film, window, budget)
+    height, width = window[3], window[2]
+    box = bounds(inner(cells.grid, cells.mirrored)) if rounds else None
+    if box is not None:
+        _second_pass(film, cells, box, budget)
+    pixels = np.empty((2, 3, height, width), dtype=np.float32)
+    fold(cells, pixels, slice(0, height), slice(0, width))
+    for turn in range(1, rounds + 1):
+        if box is None:
+            break
+        box = refine(film, cells, pixels, box, budget, turn)
+    return pixels[0], pixels[1]
 
-    All cells get two samples. Those that see the mirror, and the few around them, are then refined.
+
+# Scouts, and the first two samples.
+
+
+def first_pass(film: CellSampler, window: Crop, budget: float) -> Cells:
+    """Scouts of all pixels, then two samples of each pixel or of its cells."""
+    grid, squares = film.grid, film.grid.squares(window)
+    light, mirrored, met = _scouted(film, squares)
+    total = sum_of_colours(light)
+    allowed = allowed_of_sum(mean_of_nine(total.mean(axis=0)), grid, budget)
+    share = float(np.sum(taps_of_pixels(grid) ** 2) ** 2)
+    high, low = total.max(axis=0), total.min(axis=0)
+    around = extreme(np.maximum, high, 1) - extreme(np.minimum, low, 1)
+    uneven = (0.5 * share * _CUT) * np.square(around) / allowed
+    inside = grown(mirrored, NEAR_PX)
+    full = ~grown(~_all_full(light), reach_px(grid))
+    cut = uneven > np.where(inside, np.float32(_EVEN), np.float32(_EVEN * _OUTSIDE))
+    own = (slice(RIM_PX, -RIM_PX), slice(RIM_PX, -RIM_PX))
+    cells = Cells.uncut(grid, squares[own], mirrored[own].copy(), full[own], (high - low)[own])
+    cells.met[:] = met[own]
+    new, matters = cut[own], (inside & ~full)[own]
+    while new.any():
+        _cut(film, cells, *np.nonzero(new))
+        new = matters & grown(cells.met >= 0, reach_px(grid)) & (cells.rank < 0)
+    _sample_whole(film, cells, np.flatnonzero(cells.rank < 0))
+    cells.lamps = _lamps_near(film, cells)
+    return cells
+
+
+def _scouted(film: CellSampler, squares: NDArray[np.uint32]) -> tuple[Stack, NDArray[np.bool_], NDArray[np.int32]]:
+    """Light of scouts, shape (3, n, rows, columns); pixels that see the mirror; brightest lamp met, -1 for none."""
+    numbers = film.grid.scouts_of(squares.ravel())
+    shape = (numbers.shape[0] ** 2, *squares.shape)
+    found = film.sample_once(numbers.ravel(), _SCOUT, film.grid.scouts)
+    met = np.full(squares.shape, -1, dtype=np.int32)
+    if film.lamps is not None:
+        met[:] = film.lamps.lamp(found.patch).reshape(shape).max(axis=0)
+    return found.electrons_per_s.reshape(3, *shape), np.asarray(found.mirrored.reshape(shape).any(axis=0)), met
+
+
+def _sample_whole(film: CellSampler, cells: Cells, chosen: NDArray[np.intp]) -> None:
+    """Two samples of whole pixels, given by flat indices."""
+    numbers = cells.squares.ravel()[chosen]
+    a, b = (film.sample_once(numbers, _FIRST + half, 1) for half in (0, 1))
+    for k in range(3):
+        one, other = a.electrons_per_s[k], b.electrons_per_s[k]
+        cells.whole[0][k].ravel()[chosen] = 0.5 * (one + other)
+        cells.whole[1][k].ravel()[chosen] = (0.5 * (one - other)) ** 2
+    cells.mirrored.ravel()[chosen] |= a.mirrored | b.mirrored
+
+
+def _cut(film: CellSampler, cells: Cells, row: NDArray[np.intp], column: NDArray[np.intp]) -> None:
+    """Cut pixels into cells with two samples."""
+    first = cells.numbers.shape[2]
+    cells.rank[row, column] = first + np.arange(len(row))
+    numbers = cells.grid.cells_of(cells.squares[row, column])
+    shape = numbers.shape
+    found = [film.sample_once(numbers.ravel(), _FIRST + half) for half in (0, 1)]
+    for half, one in enumerate(found):
+        cells.halves[half] = _longer(cells.halves[half], one.electrons_per_s.reshape(3, *shape))
+        cells.side[half] = _longer(cells.side[half], np.ones(shape, dtype=np.int32))
+        cells.mirrored[row, column] |= any_cell(one.mirrored.reshape(shape))
+        if film.lamps is not None:
+            met = film.lamps.lamp(one.patch).reshape(shape).max(axis=(0, 1))
+            cells.met[row, column] = np.maximum(cells.met[row, column], met)
+    cells.numbers = _longer(cells.numbers, numbers)
+    cells.edges = _longer(cells.edges, np.zeros((3, *shape), dtype=np.float32))
+    cells.lamps = _longer(cells.lamps, np.full(shape, -1, dtype=np.int32))
+
+
+def _longer(values: NDArray[Any], more: NDArray[Any]) -> NDArray[Any]:
+    """Values of pixels that are cut, and those of more; cells of new pixels stand last."""
+    return more if not values.size else np.concatenate([values, more], axis=-1)
+
+
+def _lamps_near(film: CellSampler, cells: Cells) -> NDArray[np.int32]:
+    """Brightest lamp that samples within the blur's reach met, for each cell that is cut, -1 for none.
+
+    None either where its part cannot be computed, or where a sample in reach met the outline of that lamp but not the
+    lamp. What a hidden lamp would cover
+    is noise, of few and large errors: the halves of a cell agree by chance on a wrong mean.
     """
-    grid, numbers = film.grid, film.grid.numbers(window)
-    a, b = (film.sample_once(numbers.ravel(), half) for half in (0, 1))
-    mean, variance = (plane.reshape(3, *numbers.shape) for plane in _estimate(a, b))
-    pixels = grid.pixels(mean), grid.pixels(variance, power=2)
-    mirrored = grid.inner((a.mirrored | b.mirrored).reshape(numbers.shape))
-    if rounds and mirrored.any():
-        box = _around(mirrored)
-        part = tuple(slice(s.start * grid.cells, (s.stop + 2 * grid.margin_px) * grid.cells) for s in box)
-        halves = [half.electrons_per_s.sum(axis=0).reshape(numbers.shape)[part] for half in (a, b)]
-        own = [np.ascontiguousarray(plane[:, *part]) for plane in (mean, variance)]  # changed in place
-        inner = (np.ascontiguousarray(pixels[0][:, *box]), np.ascontiguousarray(pixels[1][:, *box]))
-        own_numbers = numbers[part].copy()
-        lamps = _lamps_near(film, own_numbers, [half.patch.reshape(numbers.shape)[part] for half in (a, b)])
-        cells = _cells(grid, own_numbers, own, inner, halves, mirrored[box], budget, lamps)
-        del a, b, mean, variance, halves  # 200 MB that the rounds have no use for
-        for turn in range(1, rounds + 1):
-            if not refine(film, cells, turn):
-                break
-        for plane, refined in zip(pixels, cells.pixels, strict=True):
-            plane[:, *box] = refined
-    return pixels
+    shape = cells.numbers.shape
+    if film.lamps is None or not cells.numbers.size:
+        return np.full(shape, -1, dtype=np.int32)
+    cut = cells.rank >= 0
+    lamp = extreme(np.maximum, cells.met, reach_px(cells.grid))
+    lamp[~cut] = -1
+    near = np.flatnonzero(lamp >= 0)
+    if near.size:
+        numbers = cells.numbers[:, :, cells.rank.ravel()[near]]
+        which = np.broadcast_to(lamp.ravel()[near], numbers.shape).ravel()
+        hidden = np.zeros(lamp.shape, dtype=bool)
+        behind = (film.hidden(numbers.ravel(), _FIRST + half, which) for half in (0, 1))
+        hidden.ravel()[near] = any_cell(np.logical_or(*behind).reshape(numbers.shape))
+        lamp[grown(hidden, reach_px(cells.grid))] = -1
+    by_pixel = np.empty(shape[2], dtype=np.int32)
+    by_pixel[cells.rank[cut]] = lamp[cut]
+    result = np.broadcast_to(by_pixel, shape).copy()
+    places = np.flatnonzero(result >= 0)
+    known = film.knows(cells.numbers.ravel()[places], result.ravel()[places]) if places.size else places > 0
+    result.ravel()[places[~known]] = -1
+    return result
 
 
-def _around(marked: NDArray[np.bool_]) -> tuple[slice, slice]:
-    """Rows and columns of the pixels that are marked, and of their neighbours."""
-    lines = (np.flatnonzero(marked.any(axis=axis)) for axis in (1, 0))
-    (top, bottom), (left, right) = ((line[0], line[-1] + 1) for line in lines)
-    height, width = marked.shape
-    return (
-        slice(max(top - _NEAR_PX, 0), min(bottom + _NEAR_PX, height)),
-        slice(max(left - _NEAR_PX, 0), min(right + _NEAR_PX, width)),
-    )
+# Second pass: strata of each half by the samples of the other.
 
 
-def _cells(
-    grid: FilmGrid,
-    numbers: NDArray[np.uint32],
-    estimate: list[Stack],
-    pixels: tuple[Stack, Stack],
-    halves: list[Stack],
-    mirrored: NDArray[np.bool_],
-    budget: float,
-    lamps: NDArray[np.int32],
-) -> Cells:
-    """Cells after their first two samples: mean and variance; `halves` are the samples' sums over the colours."""
-    mean, variance = estimate
-    allowed = allowed_per_s2(pixels[0], grid.blur_sigma_px, budget).sum(axis=0)
-    tight = ndimage.minimum_filter(allowed, size=_NEAR_PX, mode="nearest")
-    full = ndimage.minimum_filter(
-        is_full(pixels[0] / _SURELY).all(axis=0), size=2 * _reach_px(grid) + 1, mode="nearest"
-    )
-    suspected = np.where(full, np.float32(0.0), _suspected(grid, *halves) / allowed)
-    side = np.ones(numbers.shape, dtype=np.int32)
-    return Cells(grid, numbers, side, mean, variance, pixels, tight, suspected, mirrored, budget, lamps)
+def _second_pass(film: CellSampler, cells: Cells, box: Box, budget: float) -> None:
+    """Sample cells in the mirror again; `box` are rows and columns of the window that show it."""
+    m = cells.grid.margin_px
+    part = (slice(box[0].start, box[0].stop + 2 * m), slice(box[1].start, box[1].stop + 2 * m))
+    inside = grown(cells.mirrored[part], 1)
+    wanted = [_strata(cells, half, part, inside, budget) for half in (1, 0)]
+    computed = (cells.lamps >= 0) & ((wanted[0] > 1) | (wanted[1] > 1))
+    for half, side in enumerate(wanted):
+        side[computed] = _LAMP_SIDE
+        chosen = np.flatnonzero(side > 1)
+        _sample_half(film, cells, half, chosen, side.ravel()[chosen], _FIRST + 2 + half)
+    _without_hidden_lamps(film, cells, 1)
 
 
-def refine(film: CellSampler, cells: Cells, turn: int) -> bool:
-    """Sample cells near pixels that are over their budget again; False if there are none.
+def _strata(cells: Cells, half: int, part: Box, inside: NDArray[np.bool_], budget: float) -> NDArray[np.int32]:
+    """Strata along a side that cells need by one half, shape (n, n, N); 1 where `inside`, a part of pixels, is not."""
+    grid, n, m = cells.grid, cells.grid.cells, cells.grid.margin_px
+    row, column, rank = cut_in(cells, part)
+    own = sum_of_colours(cells.halves[half])[None]
+    plane = cell_plane(grid, sum_of_colours(cells.whole[0][:, *part])[None], row, column, of_rank(own, rank))[0]
+    seen = np.repeat(np.repeat(cells.contrast[part], n, axis=0), n, axis=1)
+    variance: Stack = np.float32(0.5 * _TRUE * _CUT) * np.square(np.maximum(contrast(plane), seen))
+    allowed = allowed_of_sum(mean_of_nine(means_of_cells(plane, n)), grid, budget)
+    tight = extreme(np.minimum, allowed, 1)
+    near, middle = np.zeros(allowed.shape, dtype=np.float32), (slice(m, -m), slice(m, -m))
+    near[middle] = grid.pixels(variance[None], power=2)[0] / allowed[middle]
+    near[cells.full[part]] = 0.0
+    near = extreme(np.maximum, near, reach_px(grid))
+    here = inside[row, column] & (near[row, column] > _AIM)
+    row, column, rank = row[here], column[here], rank[here]
+    strata = np.ones(cells.numbers.shape, dtype=np.int32)
+    for i in range(n):
+        for j in range(n):
+            ratio = share_of_cell(grid) * variance[row * n + i, column * n + j] / tight[row, column]
+            wanted = _next_side(np.cbrt(np.minimum(ratio, near[row, column]) / _AIM))
+            strata[i, j, rank] = np.where(cells.lamps[i, j, rank] >= 0, _LAMP_SIDE, wanted)
+    return strata
+
+
+def _next_side(wanted: Stack) -> NDArray[np.int32]:
+    """Numbers of strata along a side that are at least what is wanted."""
+    return _NEXT_SIDE[np.ceil(np.minimum(wanted, np.float32(_SIDES[-1]))).astype(np.int32)]
+
+
+def _sample_half(
+    film: CellSampler, cells: Cells, half: int, chosen: NDArray[np.intp], side: NDArray[np.int32], stream: int
+) -> None:
+    """Replace one half of some cells (flat indices) by new samples."""
+    if not chosen.size:
+        return
+    numbers, lamps = cells.numbers.ravel()[chosen], cells.lamps.ravel()[chosen]
+    values, edges = cells.halves[half].reshape(3, -1), cells.edges.reshape(3, -1)
+    for part, near in ((lamps < 0, None), (lamps >= 0, lamps[lamps >= 0])):
+        if part.any():
+            found = film.sample(numbers[part], side[part], stream, near)
+            least = 0.25 * found.spread / side[part].astype(np.float32) ** 3
+            for k, where in ((k, chosen[part]) for k in range(3)):
+                values[k][where] = found.electrons_per_s[k]
+                edges[k][where] = least[k] if half == 0 else edges[k][where] + least[k]
+    cells.side[half].ravel()[chosen] = side
+
+
+def _without_hidden_lamps(film: CellSampler, cells: Cells, turn: int) -> NDArray[np.bool_]:
+    """Sample cells again by chance around those whose mean is negative: no cell that sees its lamp has such a mean.
+
+    The samples are new ones: those that told of it have met more of what hides the lamp than others. Pixels, of the
+    shape of `rank`, that have changed are true.
+    """
+    around = np.zeros(cells.rank.shape, dtype=bool)
+    computed = np.flatnonzero(cells.lamps >= 0)
+    a, b = (half.reshape(3, -1)[:, computed] for half in cells.halves)
+    below = ((a + b) < 0.0).any(axis=0)
+    if not below.any():
+        return around
+    negative = np.zeros(cells.lamps.shape, dtype=bool)
+    negative.ravel()[computed[below]] = True
+    cut = cells.rank >= 0
+    around[cut] = any_cell(negative)[cells.rank[cut]]
+    around = grown(around, reach_px(cells.grid)) & cut
+    again = np.zeros_like(negative)
+    again[:, :, cells.rank[around]] = (cells.lamps >= 0)[:, :, cells.rank[around]]
+    cells.lamps[:, :, cells.rank[around]] = -1
+    side = np.maximum(*cells.side)
+    chosen = np.flatnonzero(again & (side > 1))
+    for half in (0, 1):
+        _sample_half(film, cells, half, chosen, side.ravel()[chosen], _AGAIN + 2 * turn + half)
+    return around
+
+
+# Rounds: by the noise that was found.
+
+
+def refine(film: CellSampler, cells: Cells, pixels: Stack, box: Box, budget: float, turn: int) -> Box | None:
+    """Sample cells near pixels that are over their budget again; where pixels have changed, None if nowhere.
 
     Parameters
     ----------
+    pixels : array, shape (2, 3, height, width)
+        Mean and variance; what changes is folded again.
+    box : rows and columns of the window
+        Where pixels have changed since they were looked at.
     turn : int, from 1
         Which round this is: each has its own random streams.
     """
-    over = np.where(cells.mirrored, excess(*cells.pixels, cells.grid.blur_sigma_px, cells.budget), np.float32(0.0))
-    near = ndimage.maximum_filter(over, size=_NEAR_PX, mode="nearest")
-    near = np.where(cells.mirrored, np.maximum(near, cells.suspected), near)
-    if not np.any(near > 1.0):
-        return False
-    chosen, pixel = cells.grid.cells_of(near > 1.0)
-    near, tight = near.ravel()[pixel], cells.tight.ravel()[pixel]
-    wanted = _wanted(cells, chosen, near, tight)
-    more = wanted > cells.side.ravel()[chosen]
-    if more.any():
-        _sample_again(film, cells, chosen[more], wanted[more], turn)
-        _update(cells, chosen[more])
-    cells.suspected[:] = 0.0
-    return True
-
-
-def _suspected(grid: FilmGrid, a: Stack, b: Stack) -> Stack:
-    """Variance of pixels, shape (height, width), if every cell were cut by whatever edge is near.
-
-    Two samples may both miss what cuts a cell. If only the cells that hit it were refined, misses would stay and bias
-    the mean; so what is refined first must not depend on a cell's own luck. An edge of contrast c that cuts cells at
-    random leaves c^2 / 12; it is seen in the 3 x 3 pixels around, of which about a half of the cells are not cut.
-    """
-    edge, n = grid.margin_px * grid.cells, grid.cells
-    rows, columns = a.shape[0] - 2 * edge, a.shape[1] - 2 * edge
-    blocks = [half[edge : edge + rows, edge : edge + columns].reshape(rows // n, n, columns // n, n) for half in (a, b)]
-    bright = np.maximum(*(block.max(axis=(1, 3)) for block in blocks))
-    dark = np.minimum(*(block.min(axis=(1, 3)) for block in blocks))
-    contrast = ndimage.maximum_filter(bright, _NEAR_PX) - ndimage.minimum_filter(dark, _NEAR_PX)
-    return np.asarray(contrast**2 * np.float32(_share(grid) / 24.0))
-
-
-def _reach_px(grid: FilmGrid) -> int:
-    """Pixels from a pixel to the farthest cells that count for it."""
-    return math.ceil(_WIDE_SIGMAS * grid.blur_sigma_px)
-
-
-def _share(grid: FilmGrid) -> float:
-    """Part of a cell's variance that is a pixel's, if all cells have the same."""
-    return float(np.sum(grid.taps**2) ** 2)
-
-
-def _wanted(cells: Cells, chosen: NDArray[np.intp], near: Stack, tight: Stack) -> NDArray[np.int32]:
-    """Strata of cells, by their own share of the variance and by what was found around, whichever asks for less.
-
-    Little is known of a cell with two samples: it gets more by the excess around it, whatever it seems to need, so that
-    the corner of a lamp that is in it is found.
-    """
-    side = cells.side.ravel()[chosen]
-    ratio = _share(cells.grid) * cells.variance.reshape(3, -1)[:, chosen].sum(axis=0) / tight
+    grid, m = cells.grid, cells.grid.margin_px
+    over = excess(pixels[0][:, *box], pixels[1][:, *box], grid.blur_sigma_px, budget)
+    over[~inner(grid, cells.mirrored)[box]] = 0.0
+    found = bounds(over > 1.0)
+    if found is None:
+        return None
+    part = moved(found, box[0].start, box[1].start)
+    around = np.pad(over[found], m)  # the blur's margin belongs to the window's border
+    near, close = (extreme(np.maximum, around, reach) for reach in (reach_px(grid), 1))
+    allowed = sum_of_colours(allowed_per_s2(pixels[0][:, *part], grid.blur_sigma_px, budget))
+    tight = extreme(np.minimum, np.pad(allowed, m, mode="edge"), 1)
+    chosen = near > 1.0
+    row, column = (place + one.start for place, one in zip(np.nonzero(chosen), part, strict=True))
+    new = (cells.rank[row, column] < 0) & ((close[chosen] > 1.0) | (_of_whole(cells, row, column) > tight[chosen]))
+    if new.any():
+        _cut(film, cells, row[new], column[new])
+    cut = cells.rank[row, column] >= 0
+    rank, near, close, tight = cells.rank[row, column][cut], near[chosen][cut], close[chosen][cut], tight[chosen][cut]
+    side = np.maximum(*(one[:, :, rank] for one in cells.side))
+    ratio = share_of_cell(grid) * sum_of_colours(variance_of(cells, rank)) / tight
     growth = np.clip(np.cbrt(np.minimum(ratio, near) / _AIM), 1.2, _GROWTH)
-    aim = np.where(ratio > _SMALL, np.ceil(side * growth), side)
-    informed = np.array(_SIDES)[np.searchsorted(_SIDES, np.minimum(aim, _SIDES[-1]))]
-    blind = np.select([near < _BLIND[0], near < _BLIND[1]], [2, 4], 6)
-    return np.where(side == 1, blind, informed).astype(np.int32)
+    wanted = np.where(ratio > _SMALL, _next_side(side * growth), side)
+    # little is known of a cell with two samples: it gets more, whatever it seems to need
+    wanted = np.where((side == 1) & (close > 1.0), np.maximum(wanted, 2), wanted)
+    more = wanted > side
+    n = grid.cells
+    places = np.arange(n * n).reshape(n, n, 1) * cells.numbers.shape[2] + rank
+    for half in (0, 1):
+        _sample_half(film, cells, half, places[more], wanted[more], _FIRST + 2 + 2 * turn + half)
+    changed = _without_hidden_lamps(film, cells, turn + 1)
+    changed[row, column] = True
+    strips = list(strips_of(grid, changed))
+    for strip in strips:
+        fold(cells, pixels, *strip)
+    return (
+        slice(min(rows.start for rows, _ in strips), max(rows.stop for rows, _ in strips)),
+        slice(min(columns.start for _, columns in strips), max(columns.stop for _, columns in strips)),
+    )
 
 
-def _sample_again(
-    film: CellSampler, cells: Cells, chosen: NDArray[np.intp], side: NDArray[np.int32], turn: int
-) -> None:
-    """Replace what is known of some cells (flat indices) by new samples."""
-    lamps = cells.lamps.ravel()[chosen]
-    for part, near in ((lamps < 0, None), (lamps >= 0, lamps[lamps >= 0])):
-        if part.any():
-            numbers = cells.numbers.ravel()[chosen[part]]
-            halves = (film.sample(numbers, side[part], 2 * turn + half, near) for half in (0, 1))
-            _replace(cells, chosen[part], side[part], *halves)
-    _without_hidden_lamps(film, cells, turn)
+def _of_whole(cells: Cells, row: NDArray[np.intp], column: NDArray[np.intp]) -> Stack:
+    """Share of a pixel's variance that whole pixels have, sum of the colours, as if all around were alike."""
+    share = float(np.sum(taps_of_pixels(cells.grid) ** 2) ** 2)
+    return np.float32(share / _SMALL) * sum_of_colours(cells.whole[1][:, row, column])
 
 
-def _without_hidden_lamps(film: CellSampler, cells: Cells, turn: int) -> None:
-    """Sample cells again by chance around those whose mean is negative: no cell that sees its lamp has such a mean.
-
-    The samples are new ones: those that told of it have met more of what hides the lamp than others.
-    """
-    computed = (cells.side > 1) & (cells.lamps >= 0)
-    negative = computed & (cells.mean.min(axis=0) < 0.0)
-    if not negative.any():
-        return
-    around = _in_reach(cells.grid, negative)
-    again = np.flatnonzero(around & computed)
-    cells.lamps[around] = -1
-    side = cells.side.ravel()[again]
-    streams = (_AGAIN + 2 * turn + half for half in (0, 1))
-    halves = (film.sample(cells.numbers.ravel()[again], side, stream, None) for stream in streams)
-    _replace(cells, again, side, *halves)
-    _update(cells, again)
-
-
-def _replace(cells: Cells, chosen: NDArray[np.intp], side: NDArray[np.int32], a: Samples, b: Samples) -> None:
-    """Set mean and variance of cells by two halves."""
-    mean, variance = _estimate(a, b)
-    edges = (0.25 * (a.spread + b.spread)) / side.astype(np.float32) ** 3
-    cells.mean.reshape(3, -1)[:, chosen] = mean
-    cells.variance.reshape(3, -1)[:, chosen] = np.maximum(variance, edges)
-    cells.side.ravel()[chosen] = side
-
-
-def _lamps_near(film: CellSampler, numbers: NDArray[np.uint32], patches: list[NDArray[np.uint32]]) -> NDArray[np.int32]:
-    """Brightest lamp that samples of cells within the blur's reach met, shape (rows, columns), -1 for none.
-
-    None either where a sample in reach met the outline of that lamp but not the lamp. What a hidden lamp would cover
-    is noise, of few and large errors: the halves of a cell agree by chance on a wrong mean.
-    """
-    if film.lamps is None:
-        return np.full(patches[0].shape, -1, dtype=np.int32)
-    seen = np.maximum(*(film.lamps.lamp(patch) for patch in patches))
-    lamps = np.asarray(ndimage.maximum_filter(seen, size=2 * _reach_cells(film.grid) + 1, mode="nearest"))
-    near = np.flatnonzero(lamps >= 0)
-    if near.size:
-        chosen = numbers.ravel()[near], lamps.ravel()[near]
-        hidden = np.zeros(lamps.shape, dtype=bool)
-        hidden.ravel()[near] = film.hidden(chosen[0], 0, chosen[1]) | film.hidden(chosen[0], 1, chosen[1])
-        lamps[_in_reach(film.grid, hidden)] = -1
-    return lamps
-
-
-def _reach_cells(grid: FilmGrid) -> int:
-    return grid.cells * _reach_px(grid)
-
-
-def _in_reach(grid: FilmGrid, cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Cells within the blur's reach of some."""
-    return np.asarray(ndimage.maximum_filter(cells, size=2 * _reach_cells(grid) + 1, mode="nearest"))
-
-
-def _estimate(a: Samples, b: Samples) -> tuple[Stack, Stack]:
-    """Mean of two independent halves and its variance."""
-    return 0.5 * (a.electrons_per_s + b.electrons_per_s), (0.5 * (a.electrons_per_s - b.electrons_per_s)) ** 2
-
-
-def _update(cells: Cells, changed: NDArray[np.intp]) -> None:
-    """Fold the tiles that some cells (flat indices) belong to."""
-    grid = cells.grid
-    mark = np.zeros(cells.numbers.shape, dtype=bool)
-    mark.ravel()[changed] = True
-    height, width = cells.mirrored.shape
-    span = 2 * grid.margin_px
-    for v in range(0, height, _TILE_PX):
-        for u in range(0, width, _TILE_PX):
-            v1, u1 = min(v + _TILE_PX, height), min(u + _TILE_PX, width)
-            part = (slice(v * grid.cells, (v1 + span) * grid.cells), slice(u * grid.cells, (u1 + span) * grid.cells))
-            if mark[part].any():
-                cells.pixels[0][:, v:v1, u:u1] = grid.pixels(cells.mean[:, *part])
-                cells.pixels[1][:, v:v1, u:u1] = grid.pixels(cells.variance[:, *part], power=2)
+def _all_full(light: Stack) -> NDArray[np.bool_]:
+    """Pixels of which all three colours are surely full, shape (rows, columns), by scouts (3, n, rows, columns)."""
+    full = is_full(light / np.float32(_SURELY))
+    return np.asarray((full[0] & full[1] & full[2]).all(axis=0))

@@ -344,6 +344,11 @@ class LampOutlines:
             valid &= (dr.abs(s) < most) & (dr.abs(t) < most)
         corners = [square(p - a, q - b) for p, q in ((-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0))]
         (xs, xt), (ys, yt) = (square(*one) for one in tilt)
+        # a lamp's outline that no point of the lens brings into the square: one point tells all
+        reach = [dr.abs(j) + dr.abs(k) + dr.sqrt(x * x + y * y) for j, k, x, y in zip(*slopes, strict=True)]
+        apart = (dr.abs(a) > 1.0 + reach[0]) | (dr.abs(b) > 1.0 + reach[1])
+        within = (dr.abs(a) < 1.0 - reach[0]) & (dr.abs(b) < 1.0 - reach[1])
+        points = dr.select(apart | within, 1, points)
 
         first, angle0 = mi.Float64(turn[0]), 2.0 * math.pi * mi.Float64(turn[1])
 

@@ -21,7 +21,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
 from scipy.special import ndtr
 
 from phibench.render.room.shading import LampOutlines, Look
@@ -31,6 +30,8 @@ from phibench.scenes.validation import SceneError
 
 MOST_CELLS = 2**32 - 1
 _TAIL_SIGMAS = 5.0  # 6e-7 of the light is beyond
+_SCOUTS = 1 << 19  # of an image, at least
+RIM_PX = 3  # around all that reaches a window: what is decided there looks as far
 Stack = NDArray[np.float32]
 Crop = tuple[int, int, int, int]
 
@@ -104,36 +105,79 @@ class FilmGrid:
 
     def pixels(self, cells: Stack, power: int = 1) -> Stack:
         """Pixels (n, height, width) of cells (n, rows, columns), with weights to a power: 2 for variances."""
-        down, across = (_fold(self, length, power) for length in cells.shape[1:])
-        return np.stack([(across @ np.ascontiguousarray((down @ plane).T)).T for plane in cells])
+        return _across(self, _down(self, cells, power), power)
 
-    def inner(self, cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """True where any cell inside a pixel's own square is true, shape (height, width)."""
-        edge, n = self.margin_px * self.cells, self.cells
-        core = cells[edge : cells.shape[0] - edge, edge : cells.shape[1] - edge]
-        return np.asarray(core.reshape(core.shape[0] // n, n, core.shape[1] // n, n).any(axis=(1, 3)))
+    def squares(self, window: Crop) -> NDArray[np.uint32]:
+        """Numbers of whole pixels of a window and `RIM_PX` more around it than its blur asks for."""
+        u0, v0, width, height = window
+        span = 2 * (self.margin_px + RIM_PX)
+        rows, columns = np.arange(v0, v0 + height + span), np.arange(u0, u0 + width + span)
+        return (rows[:, None] * self.square_columns + columns).astype(np.uint32)
 
-    def cells_of(self, pixels: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Flat indices of the cells of some pixels (height, width), and of each one's pixel.
+    @property
+    def square_columns(self) -> int:
+        """Whole pixels in a row of the grid of `squares`."""
+        return self.width_px + 2 * (self.margin_px + RIM_PX)
 
-        The margin belongs to the pixels of the border.
-        """
-        (height, width), m, n = pixels.shape, self.margin_px, self.cells
-        row, column = np.nonzero(np.pad(pixels, m, mode="edge"))
-        inside = np.clip(row - m, 0, height - 1) * width + np.clip(column - m, 0, width - 1)
-        cell = (np.arange(n)[:, None] * (width + 2 * m) * n + np.arange(n)).ravel()
-        corner = (row * (width + 2 * m) * n + column) * n
-        return (corner[:, None] + cell).ravel(), np.repeat(inside, n * n)
+    @cached_property
+    def scouts(self) -> int:
+        """Parts of a pixel's side with a scout each: a small image's pixels hide more than a large one's."""
+        return max(1, round(math.sqrt(_SCOUTS / (self.width_px * self.height_px))))
+
+    def scouts_of(self, squares: NDArray[np.uint32]) -> NDArray[np.uint32]:
+        """Numbers of the parts of whole pixels, shape (scouts, scouts, n)."""
+        row, column = np.divmod(squares, np.uint32(self.square_columns))
+        return _parts(row, column, self.scouts, self.square_columns * self.scouts)
+
+    def cells_of(self, squares: NDArray[np.uint32]) -> NDArray[np.uint32]:
+        """Numbers of the cells of whole pixels, shape (cells, cells, n); none of them lies in the rim."""
+        row, column = (part - RIM_PX for part in np.divmod(squares, np.uint32(self.square_columns)))
+        return _parts(row, column, self.cells, self.columns)
 
 
-@lru_cache(maxsize=32)
-def _fold(grid: FilmGrid, cells: int, power: int) -> Any:
+def _parts(row: NDArray[np.uint32], column: NDArray[np.uint32], n: int, columns: int) -> NDArray[np.uint32]:
+    """Numbers of n x n parts of squares, in a grid that has so many columns of parts."""
+    corner = (row.astype(np.int64) * columns + column) * n
+    place = np.arange(n)[:, None] * columns + np.arange(n)
+    return (corner + place[..., None]).astype(np.uint32)
+
+
+_BLOCK_PX = 16  # pixels whose weights are one dense matrix: three times as fast as a sparse one
+
+
+@lru_cache(maxsize=64)
+def _fold(grid: FilmGrid, pixels: int, power: int) -> Stack:
     """Matrix (pixels, cells along an axis) of the weights."""
     taps, step = grid.taps**power, grid.cells
-    pixels = (cells - len(taps)) // step + 1
-    columns = (np.arange(pixels)[:, None] * step + np.arange(len(taps))).ravel()
-    starts = np.arange(pixels + 1) * len(taps)
-    return sparse.csr_array((np.tile(taps, pixels), columns, starts), shape=(pixels, cells))
+    matrix = np.zeros((pixels, (pixels - 1) * step + len(taps)), dtype=np.float32)
+    for k in range(pixels):
+        matrix[k, k * step : k * step + len(taps)] = taps
+    return matrix
+
+
+def _down(grid: FilmGrid, cells: Stack, power: int) -> Stack:
+    """Pixels along the rows' axis: (n, rows, columns) to (n, height, columns)."""
+    count, rows, columns = cells.shape
+    height = rows // grid.cells - 2 * grid.margin_px
+    result = np.empty((count, height, columns), dtype=np.float32)
+    for first in range(0, height, _BLOCK_PX):
+        weights = _fold(grid, min(_BLOCK_PX, height - first), power)
+        start = first * grid.cells
+        np.matmul(weights, cells[:, start : start + weights.shape[1]], out=result[:, first : first + len(weights)])
+    return result
+
+
+def _across(grid: FilmGrid, lines: Stack, power: int) -> Stack:
+    """Pixels along the other axis: (n, height, columns) to (n, height, width)."""
+    count, height, columns = lines.shape
+    width = columns // grid.cells - 2 * grid.margin_px
+    result = np.empty((count, height, width), dtype=np.float32)
+    for first in range(0, width, _BLOCK_PX):
+        weights = _fold(grid, min(_BLOCK_PX, width - first), power)
+        start = first * grid.cells
+        part = lines[:, :, start : start + weights.shape[1]]
+        np.matmul(part, weights.T, out=result[:, :, first : first + len(weights)])
+    return result
 
 
 # Kronecker sequences inside Dr.Jit kernels.
@@ -147,6 +191,7 @@ def golden_steps(dimensions: int) -> tuple[float, ...]:
     return tuple(root ** -(d + 1) for d in range(dimensions))
 
 
+_GOLDEN = 0x9E3779B9  # between the keys of pairs of dimensions: far from those of other streams
 _ROUNDS = 12  # of the Tiny Encryption Algorithm; with Mitsuba's usual 4, neighbouring lanes correlate by 0.48
 
 
@@ -154,6 +199,13 @@ def shifts(mi: ModuleType, lanes: Any, dimensions: int, seed: Any) -> list[Any]:
     """One uniform shift per lane for each dimension; `seed`, an integer or a Dr.Jit one, from a named stream."""
     keys = [mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(d), _ROUNDS)[1] for d in range(dimensions)]
     return [_uniform(mi, mi.sample_tea_32(lanes, key, _ROUNDS)[1]) for key in keys]
+
+
+def paired_shifts(mi: ModuleType, lanes: Any, dimensions: int, seed: Any) -> list[Any]:
+    """The same by a quarter of the hashes, which take a third of a view's time; `seed` must be a hash itself."""
+    keys = [mi.UInt32(seed) + mi.UInt32(pair * _GOLDEN % 2**32) for pair in range((dimensions + 1) // 2)]
+    words = [word for key in keys for word in mi.sample_tea_32(lanes, key, _ROUNDS)]
+    return [_uniform(mi, word) for word in words[:dimensions]]
 
 
 def points(mi: ModuleType, shift: list[Any], index: Any) -> list[Any]:
@@ -212,26 +264,26 @@ class CellSampler:
         self._mi, self._look, self.grid, self._seed, self.lamps = mi, look, grid, seed, lamps
         self._dimensions = 4 if look.view.rig.mirror.roughness_alpha == 0.0 else 6
 
-    def sample_once(self, numbers: NDArray[np.uint32], stream: int) -> Samples:
-        """Sample cells, shape (n,), with one point each."""
-        return _joined([self._once(part, stream) for part in np.split(numbers, _starts(len(numbers)))])
+    def sample_once(self, numbers: NDArray[np.uint32], stream: int, parts: int = 0) -> Samples:
+        """Sample cells, shape (n,), with one point each; or `parts` of a pixel's side, 1 for `FilmGrid.squares`."""
+        return _joined([self._once(part, stream, parts) for part in np.split(numbers, _starts(len(numbers)))])
 
-    def _once(self, numbers: NDArray[np.uint32], stream: int) -> Samples:
+    def _once(self, numbers: NDArray[np.uint32], stream: int, parts: int) -> Samples:
         import drjit as dr
 
-        value, mirrored, patch, _ = self._first(numbers, stream)
+        value, mirrored, patch, _ = self._first(numbers, stream, parts)
         dr.eval(value, mirrored, patch)
         none = np.zeros((3, 0), dtype=np.float32)
         return Samples(_planes(value), none, np.array(mirrored, dtype=bool), np.array(patch, dtype=np.uint32))
 
-    def _first(self, numbers: NDArray[np.uint32], stream: int) -> tuple[Any, Any, Any, Any]:
+    def _first(self, numbers: NDArray[np.uint32], stream: int, parts: int = 0) -> tuple[Any, Any, Any, Any]:
         """Light, mirror, patch and ray of the one point of each cell, as `Look.electrons` gives them."""
         import drjit as dr
 
         mi = self._mi
         lanes = mi.UInt32(aligned(numbers, np.uint32))
-        x = shifts(mi, lanes, self._dimensions, dr.opaque(mi.UInt32, self._key(stream)))
-        corner, h = self._corner(lanes)
+        x = paired_shifts(mi, lanes, self._dimensions, dr.opaque(mi.UInt32, self._key(stream)))
+        corner, h = self._corner(lanes, parts)
         u, v = (start + mi.Float64(value) * h for start, value in zip(corner, x[:2], strict=True))
         return self._look.electrons(u, v, x[2:])
 
@@ -240,6 +292,10 @@ class CellSampler:
         starts = _starts(len(numbers))
         parts = zip(np.split(numbers, starts), np.split(lamp, starts), strict=True)
         return np.concatenate([self._hidden(some, stream, near) for some, near in parts])
+
+    def knows(self, numbers: NDArray[np.uint32], lamp: NDArray[np.int32]) -> NDArray[np.bool_]:
+        """True where the part of cells, shape (n,), that a lamp covers can be computed."""
+        return np.asarray(self._shares(numbers, np.zeros(len(numbers), dtype=np.int32), 0, lamp)[0].max(axis=0) > 0.0)
 
     def _hidden(self, numbers: NDArray[np.uint32], stream: int, lamp: NDArray[np.int32]) -> NDArray[np.bool_]:
         import drjit as dr
@@ -273,7 +329,7 @@ class CellSampler:
             mi.UInt32(aligned(values, np.uint32)) for values in (numbers[cell], side[cell], start, stop)
         )
         m = dr.maximum(m, 1)  # lanes beyond the last have none, and are divided by nonetheless
-        shift = shifts(mi, lanes, self._dimensions, dr.opaque(mi.UInt32, key))
+        shift = paired_shifts(mi, lanes, self._dimensions, dr.opaque(mi.UInt32, key))
         corner, h = self._corner(lanes)
         if lamp is not None:
             light, part = self._shares(numbers, side, key, lamp)
@@ -320,7 +376,7 @@ class CellSampler:
         corner, h = self._corner(lanes)
         h = h / n
         middle = [low + (mi.Float64(k) + 0.5) * h for low, k in zip(corner, (column, row), strict=True)]
-        turn = shifts(mi, lanes * (n * n) + row * n + column, 2, dr.opaque(mi.UInt32, key))
+        turn = paired_shifts(mi, lanes * (n * n) + row * n + column, 2, dr.opaque(mi.UInt32, key))
         which = mi.Int32(aligned(np.repeat(lamp, n * n), np.int32))
         light, part = self.lamps.share(middle, 0.5 * h, points, turn, which)
         dr.eval(light, part)
@@ -328,13 +384,14 @@ class CellSampler:
         known = (lights.sum(axis=0) > 0.0).all(axis=1)
         return np.where(known, lights.mean(axis=2), np.float32(0.0)), np.array(part).reshape(-1, n * n).mean(axis=1)
 
-    def _corner(self, lanes: Any) -> tuple[list[Any], Any]:
-        """Corner (u, v) of cells and their side, float64 pixels; opaque: one kernel for all cameras."""
+    def _corner(self, lanes: Any, parts: int = 0) -> tuple[list[Any], Any]:
+        """Corner (u, v) of cells, or parts of pixels, and their side, float64 pixels; opaque: one kernel for all."""
         import drjit as dr
 
         mi, grid = self._mi, self.grid
-        columns = dr.opaque(mi.UInt32, grid.columns)
-        h, start = (dr.opaque(mi.Float64, value) for value in (1.0 / grid.cells, -0.5 - grid.margin_px))
+        columns = dr.opaque(mi.UInt32, grid.square_columns * parts if parts else grid.columns)
+        edge = grid.margin_px + (RIM_PX if parts else 0)
+        h, start = (dr.opaque(mi.Float64, value) for value in (1.0 / (parts or grid.cells), -0.5 - edge))
         return [mi.Float64(place) * h + start for place in (lanes % columns, lanes // columns)], h
 
     def _key(self, stream: int) -> int:

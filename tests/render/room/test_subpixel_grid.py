@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from helpers.oracles import TARGETS
 from helpers.path_ambient import path_trace
+from scipy import ndimage
 from scipy.special import ndtr
 
 from phibench.render.optics.room_tracer import room_geometry
@@ -28,8 +29,15 @@ from phibench.render.room.noise_budget import (
     phi_gradient,
     webcam,
 )
-from phibench.render.room.refinement import _cells
-from phibench.render.room.subpixel_grid import CellSampler, FilmGrid, Samples, _chunks, golden_steps, shifts
+from phibench.render.room.subpixel_grid import (
+    CellSampler,
+    FilmGrid,
+    Samples,
+    _chunks,
+    golden_steps,
+    paired_shifts,
+    shifts,
+)
 from phibench.render.setup.variant import activate
 from phibench.scenes.catalog import default_rig, lab
 from phibench.scenes.laser import LaserSpot, beam_diameter_m
@@ -91,8 +99,9 @@ def test_weights_keep_the_light() -> None:
         assert FilmGrid(32, 32, sigma, 2).taps.sum() == pytest.approx(1.0, abs=3e-6)
 
 
-def test_shifts_of_neighbouring_lanes_are_independent() -> None:
-    """Correlation of 2^18 pairs scatters by 1/512; 5 sigma for 24 comparisons (false alarm 1e-5).
+@pytest.mark.parametrize("shifts", [shifts, paired_shifts])
+def test_shifts_of_neighbouring_lanes_are_independent(shifts) -> None:
+    """Correlation of 2^18 pairs scatters by 1/512; 5 sigma for 42 comparisons (false alarm 2e-5).
 
     With the usual four rounds of the hash neighbours correlate by 0.48, which this rejects.
     """
@@ -102,11 +111,15 @@ def test_shifts_of_neighbouring_lanes_are_independent() -> None:
     lanes = dr.arange(mi.UInt32, 1 << 18)
     checked = 0
     for seed in (0, 1, 12345):
-        for values in (np.array(shift) for shift in shifts(mi, lanes, 4, seed)):
+        found = [np.array(shift) for shift in shifts(mi, lanes, 4, seed)]
+        for one, other in itertools.combinations(found, 2):
+            assert abs(np.corrcoef(one, other)[0, 1]) < 5.0 / 512.0
+            checked += 1
+        for values in found:
             for lag in (1, 2):
                 assert abs(np.corrcoef(values[:-lag], values[lag:])[0, 1]) < 5.0 / 512.0
                 checked += 1
-    assert checked == 24
+    assert checked == 42
     weak = np.array(mi.sample_tea_32(lanes, mi.UInt32(1), 4)[0] >> 8)
     assert np.corrcoef(weak[:-1], weak[1:])[0, 1] > 0.3
 
@@ -231,7 +244,9 @@ def test_a_lamp_that_something_hides_is_left_to_chance(monkeypatch: pytest.Monke
     assert least >= 0.0
     assert over < 0.005
     monkeypatch.setattr(CellSampler, "hidden", lambda self, numbers, stream, lamp: np.zeros(len(numbers), dtype=bool))
-    monkeypatch.setattr(refinement, "_without_hidden_lamps", lambda film, cells, turn: None)
+    monkeypatch.setattr(
+        refinement, "_without_hidden_lamps", lambda film, cells, turn: np.zeros(cells.rank.shape, dtype=bool)
+    )
     assert found()[1] > 0.02
 
 
@@ -291,37 +306,6 @@ def test_pixels_that_look_full_by_chance_are_refined(
     assert np.mean(np.concatenate(off) > 3.0) < 1e-3
 
 
-def test_cells_that_count_for_a_pixel_below_full_are_refined() -> None:
-    """A lamp's outline two pixels off a pixel below full, all around it full: what two samples give is not kept.
-
-    A cell counts for pixels two away with some 2 %, as much as the whole pixel if the lamp is bright.
-    """
-    grid = FilmGrid(40, 9, RIG.camera.blur_sigma_px, 1)
-    numbers = grid.numbers((0, 0, 40, 9))
-    lamp = 100.0 * webcam().full_well_e / webcam().exposure_s
-    column = np.arange(numbers.shape[1]) - grid.margin_px
-    one, other = (np.tile(np.where(column < last, 1e-3, 1.0) * lamp, (9 + 2 * grid.margin_px, 1)) for last in (20, 21))
-    mean = np.repeat(0.5 * (one + other)[None], 3, axis=0).astype(np.float32)
-    pixels = grid.pixels(mean), np.zeros((3, 9, 40), dtype=np.float32)
-    full = is_full(pixels[0] / 2.0).all(axis=(0, 1))
-    first = int(np.argmax(full))
-    assert not full[:first].any()
-    assert full[first:].all()
-    cells = _cells(
-        grid,
-        numbers,
-        [mean, np.zeros_like(mean)],
-        pixels,
-        [3.0 * half.astype(np.float32) for half in (one, other)],
-        np.ones((9, 40), dtype=bool),
-        BUDGET,
-        np.full(numbers.shape, -1, dtype=np.int32),
-    )
-    print(first, np.flatnonzero(cells.suspected[4] > 1.0))
-    assert np.all(cells.suspected[:, first : first + 2] > 1.0)
-    assert np.all(cells.suspected[:, first + 2 :] <= 1.0)
-
-
 def _excess(mean: np.ndarray, variance: np.ndarray) -> np.ndarray:
     return excess(mean.astype(np.float32), variance.astype(np.float32), RIG.camera.blur_sigma_px)
 
@@ -343,6 +327,33 @@ def test_refinement_does_not_shift_the_mean(light: LightMap, repeated: tuple[np.
     error = raw.std(axis=0, ddof=1) / np.sqrt(SEEDS)
     assert np.all(np.abs(repeated[0].mean(axis=(0, 2, 3)) - raw.mean(axis=0)) < 5.0 * error)
     assert np.all(error < 1e-3 * raw.mean(axis=0))
+
+
+@pytest.mark.slow
+def test_refinement_moves_no_edge_and_no_lamp(light: LightMap, outline: tuple[np.ndarray, np.ndarray]) -> None:
+    """Strips along edges and along a lamp, mean over 64 seeds, within 0.05 % of even sampling, 4096 samples a pixel.
+
+    Samples that decide whether they are kept would keep misses: what they cost is the largest where few cells hold a
+    bright lamp. One that samples found only within their own pixel was 0.09 % too dark.
+    """
+    surfaces = view_surfaces(VIEW, ROOM)
+    film = view_film(VIEW, ROOM, light, SETTINGS, 2, 0, surfaces)
+    middle = int(outline[0][len(outline[0]) // 3])
+    fine = FilmGrid.of(RIG.camera, 1)
+    u, v = (place - fine.margin_px for place in (middle % fine.columns, middle // fine.columns))
+    for window in ((716, 440, 48, 48), (u - 24, v - 24, 48, 48)):
+        numbers = film.grid.numbers(window)
+        side = np.full(numbers.size, 16, dtype=np.int32)
+        runs = [film.sample(numbers.ravel(), side, 100 + k, None).electrons_per_s for k in range(4)]
+        even = film.grid.pixels(np.mean(runs, axis=0, dtype=np.float32).reshape(3, *numbers.shape)).astype(float)
+        layers = [render_ambient(VIEW, ROOM, light, SETTINGS, 2, seed, window, surfaces=surfaces) for seed in range(64)]
+        ours = np.mean([layer.electrons_per_s for layer in layers], axis=0, dtype=float)
+        contrast = ndimage.maximum_filter(even[1], 5) - ndimage.minimum_filter(even[1], 5)
+        strip = (contrast > 0.3 * even[1]) & ~is_full(even.astype(np.float32)).any(axis=0)
+        off = ours[:, strip].sum(axis=1) / even[:, strip].sum(axis=1) - 1.0
+        print(strip.sum(), off)
+        assert strip.sum() > 200
+        assert np.abs(off).max() < 5e-4
 
 
 def test_phi_noise_of_a_spot_is_what_repeated_rendering_moves_it_by(light: LightMap) -> None:
@@ -382,7 +393,8 @@ def test_a_window_has_the_pixels_of_the_whole_image(light: LightMap) -> None:
     view = dataclasses.replace(RIG, camera=small).at(0.425)
     whole = render_ambient(view, ROOM, light, SETTINGS, 2, 7, rounds=0)
     part = render_ambient(view, ROOM, light, SETTINGS, 2, 7, (30, 20, 24, 16), rounds=0)
-    assert np.array_equal(part.electrons_per_s, whole.electrons_per_s[:, 20:36, 30:54])
+    # BLAS adds 400 products of float32 in another order
+    np.testing.assert_allclose(part.electrons_per_s, whole.electrons_per_s[:, 20:36, 30:54], rtol=1e-5)
 
 
 def test_a_rough_mirror_blurs_the_room_as_path_tracing_does(light: LightMap) -> None:
