@@ -156,6 +156,8 @@ def filmed(shared: SharedFolder, name: str, changes: dict[str, str], alone: bool
 
     `alone`: without vibration and other lights.
     """
+    from helpers.remembered_spots import SPOTS
+
     from phibench.datasets.film.film_make import make_films
 
     def make(out: Path) -> None:
@@ -164,7 +166,9 @@ def filmed(shared: SharedFolder, name: str, changes: dict[str, str], alone: bool
             assert old in text
             text = text.replace(old, new)
         recipe.write_text(text.split("[[film.vibration]]")[0] if alone else text, encoding="utf-8")
-        make_films(recipe, out, 1)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("phibench.datasets.film.film_task.frame_spots", SPOTS)
+            make_films(recipe, out, 1)
 
     return shared.made(name, make)
 

@@ -5,7 +5,7 @@ Corners lie in a plane, or nearly. The triangles have the polygon's corners and 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +28,7 @@ class CuttingError(ValueError):
 class Cutting:
     """Rest of `MOST_CUTTING`: one for each file."""
 
-    left: int = MOST_CUTTING
+    left: int = field(default_factory=lambda: MOST_CUTTING)
 
     def take(self, corners: int) -> None:
         """Count corners that are looked at."""

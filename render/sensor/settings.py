@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import itertools
 import tomllib
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -151,7 +152,12 @@ def sensor(preset: str = "mjpeg", **changes: Any) -> Sensor:
 
 
 def _tables() -> dict[str, Any]:
-    return tomllib.loads(PRESETS_FILE.read_text(encoding="utf-8"))
+    return _read(PRESETS_FILE)
+
+
+@cache
+def _read(path: Path) -> dict[str, Any]:
+    return tomllib.loads(path.read_text(encoding="utf-8"))
 
 
 def _checked(name: str, raw: dict[str, Any]) -> Sensor:

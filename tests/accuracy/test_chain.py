@@ -48,8 +48,13 @@ LIMITS = {"srgb8": (1.10, 0.9, 1.1), "yuyv": (1.10, 0.95, 1.05), "mjpeg": (1.20,
 NAMES = [f"{s.output}{'-spared' if s is SPARING else ''}-{e:g}-{b:g}" for s, _, e, b in CELLS]
 
 
-def checked(cell: tuple[Sensor, float, float, float], positions: int, cameras: int, sigmas: float) -> None:
-    """rms / bound and the pull's standard deviation within the targets, widened by `sigmas` standard errors."""
+def checked(
+    cell: tuple[Sensor, float, float, float], positions: int, cameras: int, sigmas: float, noticed: float = 1.4
+) -> None:
+    """rms / bound and the pull's standard deviation within the targets, widened by `sigmas` standard errors.
+
+    What is `noticed` times as bad is rejected.
+    """
     s, sigma_px, collected_e, background_e = cell
     ratio_limit, low, high = LIMITS[s.output]
     draws = drawn(s, sigma_px, collected_e, background_e, positions, cameras)
@@ -66,14 +71,20 @@ def checked(cell: tuple[Sensor, float, float, float], positions: int, cameras: i
     assert ratio * (1.0 - sigmas * error) <= ratio_limit
     assert ratio >= 1.0 - 5.0 * error  # nothing is better than the bound
     assert low - sigmas * error <= pull <= high + sigmas * error
-    # what is 40 % worse is rejected
-    assert 1.4 * ratio * (1.0 - sigmas * error) > ratio_limit
+    assert noticed * ratio * (1.0 - sigmas * error) > ratio_limit
 
 
-@pytest.mark.parametrize("cell", [CELLS[1], CELLS[13]], ids=[NAMES[1], NAMES[13]])
-def test_accuracy_of_the_chain_in_short(cell: tuple[Sensor, float, float, float]) -> None:
-    """160 draws: a standard error of 4 %; at the true ratio of 1.02 and three of them the chance to fail is 1e-4."""
-    checked(cell, 16, 10, 3.0)
+@pytest.mark.parametrize(
+    ("cell", "cameras", "noticed"),
+    [(CELLS[1], 10, 1.4), (CELLS[13], 4, 1.7), pytest.param(CELLS[13], 10, 1.4, marks=pytest.mark.slow)],
+    ids=[NAMES[1], NAMES[13], f"{NAMES[13]}-longer"],
+)
+def test_accuracy_of_the_chain_in_short(cell: tuple[Sensor, float, float, float], cameras: int, noticed: float) -> None:
+    """160 draws: a standard error of 4 %; at the true ratio of 1.02 and three of them the chance to fail is 1e-4.
+
+    A fit to MJPEG takes a tenth of a second: 64 draws, a standard error of 6 %, notice what is 70 % worse.
+    """
+    checked(cell, 16, cameras, 3.0, noticed)
 
 
 @pytest.mark.slow

@@ -27,6 +27,7 @@ from phibench.calibration.sensor_fit.capture_folder import read_header
 from phibench.datasets.common.camera_pictures import read_camera_picture
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import InputFile
+from phibench.datasets.rooms import polygons
 from phibench.datasets.rooms.mesh_files import read_mesh
 from phibench.datasets.rooms.panorama_files import read_light
 from phibench.datasets.rooms.room_files import RoomFiles, checked_data
@@ -131,9 +132,13 @@ def test_many_parts_do_not_carry_all_vertices_each(tmp_path: Path) -> None:
     assert part.vertices[part.triangles[0]].tolist() == [[1999, 0, 0], [1999, 1, 0], [1999, 0, 1]]
 
 
+@pytest.mark.parametrize("part", [20, pytest.param(1, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("form", ["obj", "ply"])
-def test_polygons_of_ten_thousand_corners(form: str, tmp_path: Path) -> None:
-    """A comb: each tooth is looked at against all others."""
+def test_polygons_of_ten_thousand_corners(
+    form: str, part: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A comb: each tooth is looked at against all others. Time goes with the corners that may be looked at."""
+    monkeypatch.setattr(polygons, "MOST_CUTTING", polygons.MOST_CUTTING // part)
     count = 10_000
     points = [(k, 0.0 if k % 2 else 1.0 + k % 7, 0.0) for k in range(count - 1)] + [(0.5 * count, -5.0, 0.0)]
     if form == "obj":

@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 
 import pytest
-from helpers.processes import left_of, living
+from helpers.processes import left_of, living, wait_for
 
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.parallel import ONE_THREAD, parallel_map
@@ -18,9 +18,11 @@ from phibench.datasets.common.parallel import ONE_THREAD, parallel_map
 Python = Callable[..., subprocess.CompletedProcess[str]]
 
 
-def late(item: int) -> tuple[int, int]:
-    """Early items take longest."""
-    time.sleep(0.2 * (3 - item) if item < 3 else 0.0)
+def late(mark: Path, item: int) -> tuple[int, int]:
+    """The first item ends when there is a mark."""
+    if item == 0:
+        wait_for(mark)
+    (mark.parent / str(item)).touch()
     return item, os.getpid()
 
 
@@ -34,7 +36,7 @@ def threads(_item: int) -> list[str | None]:
 
 def begun(folder: Path, item: int) -> int:
     (folder / str(item)).touch()
-    time.sleep(0.1)
+    time.sleep(0.3)  # so that 15 times as long passes before 30 have begun
     return 1 // item
 
 
@@ -44,20 +46,26 @@ def death(item: int) -> int:
     return item
 
 
-def test_results_keep_the_order_and_come_from_workers() -> None:
-    found = list(parallel_map(late, range(5), 2))
+def test_results_keep_the_order_and_come_from_workers(tmp_path: Path) -> None:
+    found = list(parallel_map(partial(late, tmp_path / "4"), range(5), 2))
     assert [item for item, _ in found] == [0, 1, 2, 3, 4]
     assert os.getpid() not in {pid for _, pid in found}
 
 
-def test_results_come_early_when_order_does_not_matter() -> None:
-    found = [item for item, _ in parallel_map(late, range(5), 2, in_order=False)]
-    assert sorted(found) == [0, 1, 2, 3, 4] != found
+def test_results_come_early_when_order_does_not_matter(tmp_path: Path) -> None:
+    found = []
+    for item, _ in parallel_map(partial(late, tmp_path / "seen"), range(5), 2, in_order=False):
+        found.append(item)
+        (tmp_path / "seen").touch()
+    assert sorted(found) == [0, 1, 2, 3, 4]
+    assert found[0] != 0
 
 
 @pytest.mark.parametrize(("workers", "items"), [(1, [3, 4]), (4, [3]), (4, [])])
-def test_one_worker_or_item_needs_no_process(workers: int, items: list[int]) -> None:
-    assert list(parallel_map(late, items, workers)) == [(item, os.getpid()) for item in items]
+def test_one_worker_or_item_needs_no_process(workers: int, items: list[int], tmp_path: Path) -> None:
+    assert list(parallel_map(partial(late, tmp_path / "none"), items, workers)) == [
+        (item, os.getpid()) for item in items
+    ]
 
 
 @pytest.mark.parametrize("workers", [1, 2])
@@ -93,10 +101,10 @@ def test_ctrl_c_ends_quietly(tmp_path: Path) -> None:
     """An interrupt reaches all processes of the terminal's group, the workers too."""
     script = tmp_path / "main.py"
     script.write_text(
-        "import sys, time\nfrom phibench.datasets.common.parallel import parallel_map\n"
+        "import sys, time\nfrom pathlib import Path\nfrom phibench.datasets.common.parallel import parallel_map\n"
+        "def works(number):\n    Path(__file__).with_name(str(number)).touch()\n    time.sleep(60.0)\n"
         "if __name__ == '__main__':\n"
-        "    try:\n        print('ready', flush=True)\n"
-        "        list(parallel_map(time.sleep, [0.0, 0.0, 60.0, 60.0], 2))\n"
+        "    try:\n        list(parallel_map(works, range(4), 2))\n"
         "    except KeyboardInterrupt:\n        sys.exit(130)\n"
     )
     child = subprocess.Popen(
@@ -106,9 +114,8 @@ def test_ctrl_c_ends_quietly(tmp_path: Path) -> None:
         text=True,
         start_new_session=True,
     )
-    assert child.stdout is not None
-    assert child.stdout.readline() == "ready\n"
-    time.sleep(2.0)  # workers start
+    for number in range(2):
+        wait_for(tmp_path / str(number))
     os.killpg(child.pid, signal.SIGINT)
     _, errors = child.communicate(timeout=20.0)
     assert (child.returncode, errors) == (130, "")

@@ -11,6 +11,8 @@ import numpy as np
 import trimesh
 from PIL import Image
 
+from phibench.datasets.rooms.mesh_parts import MeshPart
+
 SIZE = (6.0, 5.0, 2.8)
 """Of the room in x, y and height, metres; the origin is in the middle of its floor."""
 FLOOR_PICTURE = np.random.default_rng(4).integers(0, 256, (50, 60, 3), dtype=np.uint8)
@@ -122,3 +124,17 @@ def write_ply(path: Path, colours: bool = True) -> Path:
     mesh = trimesh.Trimesh(points, faces, vertex_colors=tints if colours else None, process=False)
     path.write_bytes(mesh.export(file_type="ply"))
     return path
+
+
+def area(parts: tuple[MeshPart, ...] | list[MeshPart]) -> float:
+    """Of all triangles of a mesh, m^2."""
+    corners = np.concatenate([part.vertices[part.triangles] for part in parts])
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return float(0.5 * np.linalg.norm(cross, axis=1).sum())
+
+
+def normals(part: MeshPart) -> np.ndarray:
+    """Unit normals of the triangles, shape (n, 3)."""
+    a, b, c = np.moveaxis(part.vertices[part.triangles], 1, 0)
+    cross = np.cross(b - a, c - a)
+    return cross / np.linalg.norm(cross, axis=1, keepdims=True)

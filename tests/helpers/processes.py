@@ -5,7 +5,7 @@ import io
 import os
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from rich.console import Console
@@ -51,11 +51,16 @@ def processes_under(folder: Path) -> Iterator[int]:
                 yield int(entry.name)
 
 
-def wait_for(path: Path, seconds: float = 60.0) -> None:
+def wait_until(done: Callable[[], object], what: str, seconds: float = 60.0) -> None:
+    """Wait for an event; the seconds only end a test that would wait for ever."""
     deadline = time.monotonic() + seconds
-    while not path.exists():
-        assert time.monotonic() < deadline, f"{path} did not appear"
-        time.sleep(0.05)
+    while not done():
+        assert time.monotonic() < deadline, f"{what} did not come"
+        time.sleep(0.02)
+
+
+def wait_for(path: Path, seconds: float = 60.0) -> None:
+    wait_until(path.exists, str(path), seconds)
 
 
 @contextlib.contextmanager

@@ -118,8 +118,9 @@ def test_a_preset_added_to_the_table_works_or_is_refused(
         phibench.open_dataset(tiny_dataset).pairs("dim-light")
     with pytest.raises(DatasetError, match="preset 'dim-light' has no image file"):
         ExportRequest("frames", FrameOptions("dim-light"))
-    with pytest.raises(ValueError, match="no easy pairs for preset 'dim-raw'"):
-        phibench.EasyPairs("dim-raw")
+    assert phibench.EasyPairs("dim-raw").pair(0).down.dtype == np.uint16
+    with pytest.raises(ValueError, match="no easy pairs for preset 'dim-light'"):
+        phibench.EasyPairs("dim-light")
     text = f'{recipe_text("paper")}\n[frames]\npresets = ["dim-raw"]\n'
     with pytest.raises(DatasetError, match=r"frames\.presets\[0\]: 'dim-raw' is not allowed; give one of"):
         parse_recipe(text)

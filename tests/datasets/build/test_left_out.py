@@ -409,7 +409,7 @@ def test_a_recipe_of_experiments_may_leave_samples_out(tmp_path: Path, monkeypat
     def certified(view: Any, spot: Any, *rest: Any) -> Any:
         found = certify(view, spot, *rest)
         bad = spot == plan.spots[first.spot]
-        return replace(found, flux_difference=1.0, passed=False) if bad else found
+        return replace(found, chief_difference_px=0.01, passed=False) if bad else found
 
     monkeypatch.setattr(spot_task, "certify", certified)
     out = make_inline(SMALLEST, tmp_path / "out", leave_out_refused=True)

@@ -10,6 +10,7 @@ import numpy as np
 import polars
 import pytest
 from conftest import ROOT
+from helpers.remembered_spots import SPOTS, RememberedSpots
 
 from phibench.datasets.common.errors import DatasetError, RecipeError
 from phibench.datasets.film import film_room, film_task
@@ -146,6 +147,7 @@ def test_a_killed_run_goes_on_and_gives_the_same_bytes(film_windows: Path, tmp_p
         raise KeyboardInterrupt
 
     real = film_room.write_view
+    monkeypatch.setattr(film_task, "frame_spots", RememberedSpots())  # of this test alone: computed again once
     with monkeypatch.context() as patch:
         patch.setattr(film_room, "write_view", lambda *a: killed() if len(calls) == 2 else (calls.append(1), real(*a)))
         with pytest.raises(KeyboardInterrupt):
@@ -175,7 +177,8 @@ def test_a_killed_run_goes_on_and_gives_the_same_bytes(film_windows: Path, tmp_p
         assert theirs[name] == data, name
 
 
-def test_damage_is_found_and_mended(film_windows: Path, tmp_path: Path) -> None:
+def test_damage_is_found_and_mended(film_windows: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(film_task, "frame_spots", SPOTS)
     out = tmp_path / "films"
     shutil.copytree(film_windows, out)
     assert verify(out) == []
@@ -191,8 +194,11 @@ def test_damage_is_found_and_mended(film_windows: Path, tmp_path: Path) -> None:
     assert verify(out) == []
 
 
-def test_a_key_view_that_was_changed_under_its_own_header_is_rendered_again(film_windows: Path, tmp_path: Path) -> None:
+def test_a_key_view_that_was_changed_under_its_own_header_is_rendered_again(
+    film_windows: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The header has the right key and the right sums of the changed pixels; the hash in the journal is another."""
+    monkeypatch.setattr(film_task, "frame_spots", SPOTS)
     out = tmp_path / "films"
     shutil.copytree(film_windows, out)
     folder = film_of(out).folder

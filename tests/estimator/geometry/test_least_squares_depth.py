@@ -26,13 +26,13 @@ def test_exact_pixels_of_misaligned_rigs_give_the_exact_depth() -> None:
     """Rounding of pixels, 1e-13, times at most 2 m per pixel and some sums."""
     rng = np.random.default_rng(5)
     checked = 0
-    for _ in range(60):
+    for _ in range(24):
         rig, spot, h = random_rig(rng), random_spot(rng), rng.uniform(0.1, 1.4)
         result = depth_general(rig, h, true_pixel(rig, 0.0, spot), true_pixel(rig, h, spot), C1, C2)
         assert abs(result.depth_m / depth_of(rig, spot) - 1.0) < 1e-9
         assert result.chi2 < 1e-12
         checked += 1
-    assert checked == 60
+    assert checked == 24
 
 
 def test_against_minimisation_in_pixels() -> None:

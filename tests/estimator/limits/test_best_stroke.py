@@ -59,6 +59,12 @@ SAME = SpotSigma((1.0, 1e9), (0.05, 0.05))
 OPEN = without_limits(Surroundings())
 
 
+@pytest.fixture(scope="module")
+def preset_spot() -> SpotSigma:
+    """The bound that `best_stroke` makes by itself: a second and more for each call."""
+    return spot_bound(RIG, sensor_card("mjpeg"))
+
+
 # -- flux ---------------------------------------------------------------------------------------------------------
 
 
@@ -311,17 +317,17 @@ def test_what_cannot_be_seen_has_no_stroke() -> None:
     assert math.isnan(above.stroke_m)
     assert set(above.limits) <= {NO_IMAGE, MIRROR_EDGE}
     assert all(map(math.isnan, above.near()))
-    behind = best_stroke(0.6, around=Surroundings(heights_m=(0.02,)), spot=SAME)
+    behind = best_stroke(0.6, around=Surroundings(heights_m=(0.02,)), spot=SAME, covariance_rig=EXACT)
     assert math.isnan(behind.stroke_m)
     assert any(limit.startswith(f"{OCCLUDED} robot") for limit in behind.limits)
     small = replace(RIG, camera=replace(RIG.camera, height_px=400, cy_px=199.5))
-    cut = best_stroke(2.2, small, spot=SAME)
+    cut = best_stroke(2.2, small, spot=SAME, covariance_rig=EXACT)
     assert cut.limits == (IMAGE_EDGE,)
 
 
-def test_strokes_whose_error_is_unknown_have_a_cause() -> None:
+def test_strokes_whose_error_is_unknown_have_a_cause(preset_spot: SpotSigma) -> None:
     """At 0.2 m and 1 mW a spot has more electrons than the bound's table; a free stroke has a finite error."""
-    near = best_stroke(0.2)
+    near = best_stroke(0.2, spot=preset_spot, covariance_rig=EXACT)
     assert math.isnan(near.stroke_m)
     assert TOO_BRIGHT in near.limits
     assert all(near.limits)
@@ -332,7 +338,7 @@ def test_strokes_whose_error_is_unknown_have_a_cause() -> None:
     assert full.limits == (NO_BOUND,)
     checked = 0
     for depth_m in (0.2, 0.4, 0.8, 2.0):
-        curve = best_stroke(depth_m, covariance_rig=EXACT).curve
+        curve = best_stroke(depth_m, spot=preset_spot, covariance_rig=EXACT).curve
         free = np.array([cause == FREE for cause in curve.causes])
         assert np.isfinite(curve.sigma_m[free]).all()
         checked += int(free.sum())
@@ -384,7 +390,14 @@ def test_bad_numbers_end_in_a_sentence(call: object, words: tuple[str, ...]) -> 
     assert all(word in str(caught.value) for word in words)
 
 
-def test_default_spot_is_that_of_the_preset() -> None:
+def test_default_spot_is_that_of_the_preset_and_the_default_rig_is_put_together_by_hand(
+    preset_spot: SpotSigma,
+) -> None:
+    by_hand = np.diag(prior_sigmas() ** 2)
+    found = best_stroke(2.0, strokes_m=(0.4, 0.5))
+    given = best_stroke(2.0, strokes_m=(0.4, 0.5), spot=preset_spot, covariance_rig=by_hand)
+    assert (found.stroke_m, found.sigma_m) == (given.stroke_m, given.sigma_m)
     card = sensor_card("bayer-raw")
-    given = best_stroke(2.0, card=card, spot=spot_bound(RIG, card))
-    assert best_stroke(2.0, card=card).stroke_m == given.stroke_m
+    raw = best_stroke(2.0, card=card, covariance_rig=EXACT, strokes_m=(0.4, 0.5))
+    of_raw = best_stroke(2.0, card=card, spot=spot_bound(RIG, card), covariance_rig=EXACT, strokes_m=(0.4, 0.5))
+    assert raw.sigma_m == of_raw.sigma_m
