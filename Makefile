@@ -41,7 +41,7 @@ help:
 	@echo "make dataset    render $(RECIPE) into $(OUT); installs what renders, in .venv"
 	@echo "make setup      make .venv with everything in it, and make sure of LLVM"
 	@echo "make bench      $(SAMPLES) samples of bench-dev, all built-in methods on them, a report, in out/"
-	@echo "make studies    the eight studies, reduced, and a report on them, in out/studies"
+	@echo "make studies    all studies, reduced, and a report on them, in out/studies"
 	@echo "make studies-full  the same in full (hours), published to docs/studies"
 	@echo "make test       the tests, without the slow ones"
 	@echo "make test-base  the tests of scoring and geometry without Mitsuba, with any PYTHON=python3.13"

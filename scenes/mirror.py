@@ -219,10 +219,6 @@ class Mirror(Protocol):
         """Radius of the sphere that the mirror is, but for its form; None for other surfaces."""
 
     @property
-    def vertex_m(self) -> float:
-        """Height of the vertex over the frame's origin."""
-
-    @property
     def bound_m(self) -> float:
         """No point of the surface is farther from the origin than this."""
 
@@ -328,11 +324,6 @@ class SphereMirror(MetalSurface):
     def bound_m(self) -> float:
         """No point of the surface is farther from the centre than this; the radius of a perfect sphere."""
         return self.radius_m if self.form is None else self.radius_m + self.form.bound_m
-
-    @property
-    def vertex_m(self) -> float:
-        """Height of the lowest point of the sphere, over its centre."""
-        return -self.radius_m
 
     @property
     def has_axes(self) -> bool:

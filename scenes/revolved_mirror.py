@@ -471,7 +471,6 @@ class RevolvedMirror(MetalSurface):
     form_radius_m: float = 0.0
 
     radius_m: ClassVar[None] = None
-    vertex_m: ClassVar[float] = 0.0
     has_axes: ClassVar[bool] = True
     has_rim: ClassVar[bool] = True
 

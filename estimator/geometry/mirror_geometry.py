@@ -26,6 +26,9 @@ from phibench.scenes.revolved_mirror import FormedProfile, Heights, Profile, Rev
 from phibench.scenes.rig import Rig, View
 from phibench.scenes.validation import SceneError
 
+Changes = Mapping[str, tuple[Array | float, Array]]
+"""By parameter: of a level function's value, and of its gradient in world axes."""
+
 
 @dataclass(frozen=True)
 class Hit:
@@ -70,11 +73,8 @@ class MirrorGeometry(Protocol):
     def paper_gradient(self, phi1_rad: Array, phi2_rad: Array, stroke_m: float) -> Array:
         """Derivative of D by (phi1, phi2), shape (..., 2)."""
 
-    def changing_level(self, P: Array) -> Level:
-        """Level function at P, mirror's frame, in the scale of `level_changes`."""
-
-    def level_changes(self, P: Array, axes: Array) -> Mapping[str, tuple[Array | float, Array]]:
-        """Changes of its value, and of its gradient in world axes, at P (3,), by the mirror's own parameters."""
+    def changing_level(self, P: Array, axes: Array) -> tuple[Level, Changes]:
+        """Level function at P (3,), mirror's frame, and its changes by the mirror's own parameters."""
 
 
 def geometry_of(mirror: Mirror) -> MirrorGeometry:
@@ -164,13 +164,10 @@ class _Round:
     def paper_gradient(self, phi1_rad: Array, phi2_rad: Array, stroke_m: float) -> Array:
         return paper_gradient(phi1_rad, phi2_rad, stroke_m, self.mirror.radius_m)
 
-    def changing_level(self, P: Array) -> Level:
-        return self.mirror.level(P)
-
-    def level_changes(self, P: Array, axes: Array) -> Mapping[str, tuple[Array | float, Array]]:
+    def changing_level(self, P: Array, axes: Array) -> tuple[Level, Changes]:
         values, gradients = gradients_by_parameter(P)
         by_form = zip(HARMONICS, zip(-values, -gradients @ axes.T, strict=True), strict=True)
-        return {**dict(by_form), "radius_m": (-1.0, np.zeros(3))}
+        return self.mirror.level(P), {**dict(by_form), "radius_m": (-1.0, np.zeros(3))}
 
 
 def _unit(vector: Array) -> Array:
@@ -308,12 +305,10 @@ class _Revolved:
     def paper_gradient(self, phi1_rad: Array, phi2_rad: Array, stroke_m: float) -> Array:
         return revolved_gradient(phi1_rad, phi2_rad, stroke_m, self.mirror.profile)
 
-    def changing_level(self, P: Array) -> Level:
-        return height_level(self.mirror.surface, P)
-
-    def level_changes(self, P: Array, axes: Array) -> Mapping[str, tuple[Array | float, Array]]:
-        changes = _height_changes(self.mirror, P)
-        return {name: (value, axes @ gradient) for name, (value, gradient) in changes.items()}
+    def changing_level(self, P: Array, axes: Array) -> tuple[Level, Changes]:
+        changes = _height_changes(self.mirror, P).items()
+        world = {name: (value, axes @ gradient) for name, (value, gradient) in changes}
+        return height_level(self.mirror.surface, P), world
 
 
 @lru_cache(maxsize=64)

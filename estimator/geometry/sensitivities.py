@@ -129,9 +129,9 @@ def _ray_changes(view: View, uv_px: Array) -> tuple[Array, Array]:
 def _surface_changes(view: View, P: Array) -> tuple[Level, Array, Array]:
     """Level function g of the mirror, world axes about its centre, at P, shape (3,), and dg/dp, d(grad g)/dp at P."""
     axes, geometry = view.form_axes, geometry_of(view.rig.mirror)
-    at = geometry.changing_level(P @ axes)
+    at, changes = geometry.changing_level(P @ axes, axes)
     g1, gradient1 = np.zeros(len(PARAMETERS)), np.zeros((len(PARAMETERS), 3))
-    for name, (value, gradient) in geometry.level_changes(P @ axes, axes).items():
+    for name, (value, gradient) in changes.items():
         g1[PARAMETERS.index(name)], gradient1[PARAMETERS.index(name)] = value, gradient
     return Level(at.value_m, axes @ at.gradient, axes @ at.hessian_per_m @ axes.T), g1, gradient1
 

@@ -85,7 +85,8 @@ def meridian(rig: Rig) -> Meridian:
     with np.errstate(divide="ignore"):  # a ray straight down meets the axis nowhere
         above = place[:, 2] - place[:, 0] * d[:, 2] / d[:, 0]
     seen = (ray.status == Status.OK) & np.isfinite(per_px)
-    return Meridian(radius[seen], theta[seen], 1.0 / per_px[seen], (above - rig.mirror.vertex_m)[seen])
+    # places count from the vertex: a sphere's frame has its origin in the centre
+    return Meridian(radius[seen], theta[seen], 1.0 / per_px[seen], (above + (rig.mirror.radius_m or 0.0))[seen])
 
 
 @dataclass(frozen=True)
