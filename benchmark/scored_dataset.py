@@ -18,7 +18,7 @@ from phibench.datasets.frames.sensor_file import SensorFile
 from phibench.datasets.store.pair_files import is_frames_set
 
 if TYPE_CHECKING:
-    from phibench.benchmark.pair_sets.dataset_pairs import DatasetPairs
+    from phibench.benchmark.pair_sets.dataset_pairs import DatasetPairs, Track
 
 
 class ScoredDataset(read.Dataset):
@@ -32,6 +32,7 @@ class ScoredDataset(read.Dataset):
         hints: bool = True,
         boxes_px: int | None = None,
         sensor: SensorFile | None = None,
+        track: Track | None = None,
     ) -> DatasetPairs:
         """Pairs with their truths: the same numbers and bytes as in `phibench score` with the same options.
 
@@ -49,6 +50,8 @@ class ScoredDataset(read.Dataset):
             Side of a box for every pair, pixels.
         sensor : SensorFile, optional
             Numbers of a measured camera.
+        track : "localise", "find" or "depth", optional
+            Boxes as that track shows them.
 
         Raises
         ------
@@ -57,7 +60,8 @@ class ScoredDataset(read.Dataset):
         """
         from phibench.benchmark.pair_sets.dataset_pairs import dataset_pairs
 
-        return dataset_pairs(self, preset, draws, hints=hints, boxes_px=boxes_px, sensor=sensor)
+        pairs = dataset_pairs(self, preset, draws, hints=hints, boxes_px=boxes_px, sensor=sensor)
+        return pairs if track is None else pairs.of_track(track)
 
 
 def open_dataset(folder: str | Path) -> ScoredDataset | FramesSet:

@@ -17,8 +17,8 @@ import polars as pl
 from pydantic import BaseModel, ConfigDict
 from rich.console import Console
 
-from phibench.benchmark.scores import figures
-from phibench.benchmark.scores.figures import EmbeddedFigure
+from phibench.benchmark.reports import figures
+from phibench.benchmark.reports.figures import EmbeddedFigure
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import SETTINGS_BYTES, InputFile
 from phibench.datasets.read import Dataset, open_finished

@@ -19,7 +19,7 @@ import polars as pl
 from pydantic import Field
 from rich.console import Console
 
-from phibench.benchmark.scores.report import Section
+from phibench.benchmark.reports.report import Section
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import FileName, InputFile
 from phibench.datasets.common.progress import progress_console

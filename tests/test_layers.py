@@ -59,10 +59,10 @@ benchmark/release
 benchmark/isolation
 benchmark/pair_sets
 benchmark/scores
+benchmark/reports
 benchmark/scored_dataset
 benchmark/sealed
 benchmark/export
-benchmark/demo
 robot/film
 robot/loop
 studies/paper

@@ -1,4 +1,4 @@
-"""Pairs of a data set with their exact answers and Cramer-Rao bounds; the same pairs through a calibration.
+"""Pairs of a data set with their exact answers and Cramer-Rao bounds, and the tracks in which they are shown.
 
 The bound of a spot counts room, dark current and distractors as background: one unknown level per filter. Pixels are
 (u, v), integers at pixel centres; covariances are px^2, shape (2, 2), of (u, v).
@@ -9,34 +9,32 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 
-from phibench.calibration.rig.file import Calibration, CalibrationError
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.exposures.expected import ExpectedRegion, expected_of_light
 from phibench.datasets.exposures.pair_draws import CachedSample, FrameCounts, PairDraw, pair_draws, search_boxes
 from phibench.datasets.frames.sensor_card import SensorCard, card_of
 from phibench.datasets.frames.sensor_file import SensorFile
 from phibench.datasets.frames.source import FrameSource, PositionLight
-from phibench.datasets.read import Dataset, Sample, open_dataset
+from phibench.datasets.read import Dataset, open_dataset
 from phibench.datasets.store import schema
 from phibench.datasets.store.files import sha256
 from phibench.datasets.store.pair_files import LEAST_BOX_PX
 from phibench.datasets.store.provenance import provenance
 from phibench.datasets.store.short_form import ShortForm
-from phibench.estimator.geometry.rig_parameters import stroke_of
 from phibench.estimator.interface import Pair
 from phibench.estimator.limits.off_frame_bound import on_off_limit, processed_on_off_limit
 from phibench.estimator.limits.position_bound import SpotLimit, spot_limit
 from phibench.estimator.limits.processed_bound import chain_limit
 from phibench.estimator.limits.spot_snr import processed_snr, raw_snr
 from phibench.estimator.methods.draw_pairs import DrawnPairs
-from phibench.estimator.pair_set import Distraction, ImageTruth, PairSet, PairTruth, tell_answered, truth_folders
+from phibench.estimator.pair_set import Distraction, ImageTruth, PairTruth
 from phibench.estimator.spots.gaussian_spot import SpotBlur
 from phibench.estimator.spots.image_planes import PROCESSED
 from phibench.estimator.spots.spot_prediction import spot_blur
@@ -53,9 +51,21 @@ TASK_VERSION = 6
 4: a missed pair counts as the best constant depth would; a sealed set shows each sample once.
 """
 
+Track = Literal["localise", "find", "depth"]
+TRACKS: tuple[Track, ...] = get_args(Track)
+BOX_PX, BOX_MARGIN_PX = 64, 16
+"""Side of the boxes of `localise`, and how far the spot's centre is from their edges at least."""
 
 _OF_THE_SPOT = 0.01  # of its brightest pixel: dimmer pixels are not the spot's
 _FLUX = 2  # place of the flux among the unknowns of a Fisher matrix
+
+
+def tracks_of(pair_set: Mapping[str, Any]) -> tuple[Track, ...]:
+    """Tracks that a pair set belongs to, by its document: whole frames are those of `find` and of `depth`."""
+    if pair_set.get("track") == "localise":
+        return ("localise",)
+    whole = pair_set.get("hinted", 1) == 0 and pair_set.get("boxes_px") is None
+    return ("find", "depth") if whole else ()
 
 
 class DatasetPairs(DrawnPairs, ShortForm):
@@ -72,6 +82,8 @@ class DatasetPairs(DrawnPairs, ShortForm):
         Of the pairs, for the record.
     count_frames : bool
         Bounds count frames on and off of single ones, too.
+    track : str
+        Track that boxes were chosen for; "" if none was.
     """
 
     def __init__(
@@ -81,9 +93,10 @@ class DatasetPairs(DrawnPairs, ShortForm):
         boxes_px: int | None = None,
         sensor: SensorFile | None = None,
         count_frames: bool = False,
+        track: str = "",
     ) -> None:
         super().__init__(dataset, pair_draws)
-        self._boxes_px, self._sensor, self._count_frames = boxes_px, sensor, count_frames
+        self._boxes_px, self._sensor, self._count_frames, self._track = boxes_px, sensor, count_frames, track
 
     def _shown(self) -> dict[str, Any]:
         return {
@@ -94,7 +107,17 @@ class DatasetPairs(DrawnPairs, ShortForm):
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle without rows and layers: another process opens the data set itself."""
-        return _reopened, (self.dataset.folder, self.pair_draws, self._boxes_px, self._sensor, self._count_frames)
+        others = self._boxes_px, self._sensor, self._count_frames, self._track
+        return _reopened, (self.dataset.folder, self.pair_draws, *others)
+
+    def of_track(self, track: Track) -> DatasetPairs:
+        """The same pairs as a track shows them: in boxes of its own, or as whole frames."""
+        boxes: dict[str, Any] = {}
+        if track == "localise":
+            samples = {draw.sample_id: self.dataset[draw.sample_id] for draw in self.pair_draws}
+            boxes = {name: search_boxes(sample, BOX_PX, BOX_MARGIN_PX) for name, sample in samples.items()}
+        draws = tuple(replace(draw, boxes=boxes.get(draw.sample_id)) for draw in self.pair_draws)
+        return DatasetPairs(self.dataset, draws, BOX_PX if boxes else None, self._sensor, self._count_frames, track)
 
     def truth(self, number: int) -> PairTruth:
         """The exact answer, with the bounds of the image and of the raw pixels behind it."""
@@ -163,6 +186,7 @@ class DatasetPairs(DrawnPairs, ShortForm):
             "presets": sorted({draw.preset for draw in self.pair_draws}),
             "hinted": sum(draw.boxes is not None for draw in self.pair_draws),
             "boxes_px": self._boxes_px,
+            "track": self._track,
             "seed": self.dataset.recipe.dataset.seed,
             "recipe_sha256": info.recipe_sha256,
             "dataset_sha256": sha256(listed) if listed.is_file() else None,
@@ -410,99 +434,3 @@ def _peak_e(region: ExpectedRegion) -> float:
 def _information(limit: SpotLimit, flux_e: float) -> float:
     """Information of an image about a spot's relative flux, place and room known."""
     return float(flux_e**2 * limit.fisher[_FLUX, _FLUX])
-
-
-# -- with a calibration ------------------------------------------------------------------------------------------------
-
-
-class CalibratedPairs:
-    """A pair set whose nominal rig and stroke are those of a calibration.
-
-    Parameters
-    ----------
-    pairs : PairSet
-        All of one true rig: see `of_calibration`.
-    calibration : Calibration
-    """
-
-    def __init__(self, pairs: PairSet, calibration: Calibration) -> None:
-        self.pairs, self.calibration = pairs, calibration
-        self.folders = truth_folders(pairs)
-        self._covariance = np.array(calibration.covariance)
-        self._covariance.flags.writeable = False
-
-    def __len__(self) -> int:
-        return len(self.pairs)
-
-    def pair(self, number: int) -> Pair:
-        """Images of a pair, with the calibrated rig and its covariance."""
-        seen = self.pairs.pair(number)
-        return replace(
-            seen,
-            rig=self.calibration.rig,
-            stroke_m=self._stroke_m(seen.stroke_m),
-            calibration_covariance=self._covariance,
-        )
-
-    def answered(self, number: int) -> bool:
-        """Tell the set that all methods have answered a pair."""
-        return tell_answered(self.pairs, number)
-
-    def truth(self, number: int) -> PairTruth:
-        """The exact answer."""
-        truth = self.pairs.truth(number)
-        nominal_m = truth.stroke_m if truth.nominal_stroke_m is None else truth.nominal_stroke_m
-        return replace(
-            truth,
-            nominal_rig=self.calibration.rig,
-            nominal_stroke_m=self._stroke_m(nominal_m),
-            calibration_covariance=self._covariance,
-        )
-
-    def document(self) -> dict[str, Any]:
-        """Provenance of the set, with the calibration's hash."""
-        made_from = self.calibration.made_from
-        return {**self.pairs.document(), "calibration": self.calibration.sha256, "calibrated_from": made_from}
-
-    def _stroke_m(self, nominal_m: float) -> float:
-        return float(stroke_of(np.array(nominal_m), self.calibration.values))
-
-
-def of_calibration(dataset: Dataset, calibration: Calibration) -> Dataset:
-    """The samples of a data set that a calibration is for: those of the rig that it was made from.
-
-    Raises
-    ------
-    CalibrationError
-        If the nominal rig of a sample is not the one that the calibration started from, or the samples have several
-        true rigs and the calibration was made from none of them.
-    """
-    for sample in dataset:
-        if sample.nominal_rig != calibration.nominal:
-            raise CalibrationError(
-                f"the calibration did not start from the nominal rig of sample {sample.row.sample_id}; "
-                "calibrate with samples of this data set"
-            )
-    rigs = {row.rig for row in dataset.rows}
-    if len(rigs) == 1 and not _of_another(dataset, calibration):
-        return dataset
-    own = _samples_of_its_rig(dataset, calibration)
-    if not own:
-        raise CalibrationError(
-            f"{dataset.folder} has {len(rigs)} true rig{'s' * (len(rigs) > 1)} and the calibration was made from none "
-            "of them; calibrate with samples of this data set"
-        )
-    return replace(dataset, rows=tuple(sample.row for sample in own))
-
-
-def _of_another(dataset: Dataset, calibration: Calibration) -> bool:
-    """Tell whether the calibration names another data set as its source."""
-    return calibration.made_from.get("dataset", dataset.info.name) != dataset.info.name
-
-
-def _samples_of_its_rig(dataset: Dataset, calibration: Calibration) -> list[Sample]:
-    if _of_another(dataset, calibration):
-        return []  # it says nothing of these rigs
-    made_from = set(calibration.made_from.get("samples", ()))
-    rigs = {row.rig for row in dataset.rows if row.sample_id in made_from}
-    return [sample for sample in dataset if sample.row.rig in rigs]

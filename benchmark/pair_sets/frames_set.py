@@ -19,10 +19,11 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from phibench.benchmark.pair_sets.dataset_pairs import TASK_VERSION, DatasetPairs
+from phibench.benchmark.pair_sets.dataset_pairs import BOX_MARGIN_PX, BOX_PX, TASK_VERSION, DatasetPairs, Track
 from phibench.benchmark.pair_sets.truth_file import truth_document, truth_of
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import SETTINGS_BYTES, InputFile, Name
+from phibench.datasets.exposures.pair_draws import search_box
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.datasets.store.documents import from_json
 from phibench.datasets.store.files import sha256
@@ -73,6 +74,8 @@ class FramesSet(ShortForm):
         Of the pairs in the files; all by default. They are numbered from 0 here.
     hints : bool
         Show the boxes of pairs that have some.
+    track : str
+        "localise" shows boxes of its own, any other none; "" shows what the pairs have.
 
     Raises
     ------
@@ -80,19 +83,21 @@ class FramesSet(ShortForm):
         If it is no frames set, of another task version, incomplete, or changed; in one sentence.
     """
 
-    def __init__(self, folder: str | Path, numbers: Sequence[int] | None = None, hints: bool = True) -> None:
+    def __init__(
+        self, folder: str | Path, numbers: Sequence[int] | None = None, hints: bool = True, track: str = ""
+    ) -> None:
         self.folder = Path(folder)
         self.info = _read_info(self.folder)
         self._files = PairFiles(self.folder, FramesRow, self.info.pairs, (FRAMES_SET,))
         self._numbers = tuple(range(self.info.pairs) if numbers is None else numbers)
-        self._hints = hints
+        self._hints, self._track = hints and not track, track
 
     def _shown(self) -> dict[str, Any]:
         return {"folder": self.folder, "data set": self.info.name, "pairs": len(self), "preset": self.preset}
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle without rows: another process opens the set itself."""
-        return FramesSet, (self.folder, self._numbers, self._hints)
+        return FramesSet, (self.folder, self._numbers, self._hints, self._track)
 
     @property
     def preset(self) -> str:
@@ -114,7 +119,26 @@ class FramesSet(ShortForm):
     def pair(self, number: int) -> Pair:
         """Images of a pair, with what a user knows of the rig."""
         read = replace(pair_of_files(self._files, self._place(number)), number=number)
+        if self._track == "localise":
+            down, up = self._boxes(self.truth(number))
+            return replace(read, box_down=down, box_up=up)
         return read if self._hints else replace(read, box_down=None, box_up=None)
+
+    def _boxes(self, truth: PairTruth) -> tuple[Box, Box]:
+        """Boxes of the track `localise`: those that the data set behind the frames has for this sample."""
+        names, camera = (self.info.name, self.info.seed, truth.sample_id), truth.true_rig.camera
+        regions = []
+        for position, spot in (("down", truth.down), ("up", truth.up)):
+            size = camera.width_px, camera.height_px
+            has_place = all(-0.5 <= x <= n - 0.5 for x, n in zip(spot.axis_px, size, strict=True))
+            light = spot.uv_px if has_place else None
+            regions.append(search_box(names, position, light, camera, BOX_PX, BOX_MARGIN_PX))
+        down, up = (Box(r.u0_px, r.v0_px, r.u1_px - r.u0_px, r.v1_px - r.v0_px) for r in regions)
+        return down, up
+
+    def of_track(self, track: Track) -> FramesSet:
+        """The same pairs as a track shows them."""
+        return FramesSet(self.folder, self._numbers, True, track)
 
     def truth(self, number: int) -> PairTruth:
         """Exact answer for a pair, with its bounds.
@@ -129,7 +153,9 @@ class FramesSet(ShortForm):
             read = truth_of(self._files.row(place).truth)
         except DatasetError as error:
             raise DatasetError(f"{self.folder / PAIRS} line {place + 1}: {error}; download the set again") from error
-        return replace(read, number=number, hinted=read.hinted and self._hints)
+        localised = self._track == "localise"
+        box_px2 = float(BOX_PX**2) if localised else read.box_px2
+        return replace(read, number=number, hinted=localised or (read.hinted and self._hints), box_px2=box_px2)
 
     def number_of(self, sample_id: str, draw: int = 0, preset: str | None = None) -> int:
         """Number of the pair of a sample in a draw of the noise, as scores name it.
@@ -189,8 +215,9 @@ class FramesSet(ShortForm):
             "pairs": len(self),
             "samples": len({row.sample_id for row in rows}),
             "presets": [self.preset],
-            "hinted": sum(row.hinted for row in rows) if self._hints else 0,
-            "boxes_px": None,
+            "hinted": len(rows) if self._track == "localise" else sum(row.hinted for row in rows) if self._hints else 0,
+            "boxes_px": BOX_PX if self._track == "localise" else None,
+            "track": self._track,
             "seed": self.info.seed,
             "recipe_sha256": self.info.recipe_sha256,
             "dataset_sha256": self.info.dataset_sha256,

@@ -1,22 +1,30 @@
-"""Pairs that are scored: of a data set, of a frames set or of real pictures, as options choose them."""
+"""Pairs that are scored: of a data set, of frames or of real pictures, as options choose them, or calibrated."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TypedDict
+from typing import Any, TypedDict
 
-from phibench.benchmark.pair_sets.dataset_pairs import TASK_VERSION, CalibratedPairs, dataset_pairs, of_calibration
+import numpy as np
+
+from phibench.benchmark.pair_sets.dataset_pairs import (
+    TASK_VERSION,
+    Track,
+    dataset_pairs,
+)
 from phibench.benchmark.pair_sets.frames_set import FramesSet
 from phibench.calibration.captures.imported_set import ImportedSet, imported_pairs, is_imported, open_imported
 from phibench.calibration.captures.spot_shape import with_shape
-from phibench.calibration.rig.file import read_calibration
+from phibench.calibration.rig.file import Calibration, CalibrationError, read_calibration
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.exposures.pair_draws import FrameCounts
 from phibench.datasets.frames.sensor_file import read_sensor_file
-from phibench.datasets.read import Dataset, open_finished
+from phibench.datasets.read import Dataset, Sample, open_finished
 from phibench.datasets.store.pair_files import is_frames_set
-from phibench.estimator.pair_set import PairSet
+from phibench.estimator.geometry.rig_parameters import stroke_of
+from phibench.estimator.interface import Pair
+from phibench.estimator.pair_set import PairSet, PairTruth, tell_answered, truth_folders
 
 
 @dataclass(frozen=True)
@@ -35,6 +43,13 @@ class PairChoice:
         Sensor file, whose numbers go before the recipe's and the preset's.
     frames : (on, off), optional
         Frames of each position with the laser on and off.
+    track : str, optional
+        "localise" gives every pair boxes of its own, "find" and "depth" take all away.
+
+    Raises
+    ------
+    DatasetError
+        If a track is given together with boxes or without hints.
     """
 
     preset: str | None = None
@@ -45,6 +60,11 @@ class PairChoice:
     calibration: str | Path | None = None
     sensor: str | Path | None = None
     frames: tuple[int, int] | None = None
+    track: Track | None = None
+
+    def __post_init__(self) -> None:
+        if self.track is not None and not (self.hints and self.boxes_px is None):
+            raise DatasetError(f"--track {self.track} says which boxes there are: leave --boxes and --no-hints out")
 
 
 class ChoiceKeywords(TypedDict, total=False):
@@ -57,6 +77,7 @@ class ChoiceKeywords(TypedDict, total=False):
     calibration: str | Path | None
     sensor: str | Path | None
     frames: tuple[int, int] | None
+    track: Track | None
 
 
 def open_scored(folder: str | Path) -> Dataset | ImportedSet | FramesSet:
@@ -80,8 +101,11 @@ def wanted_pairs(dataset: Dataset | ImportedSet | FramesSet, choice: PairChoice)
                 f"{dataset.folder} holds frames that are drawn: leave --calibration, --boxes, --sensor and --frames "
                 "out, or score the data set that it comes from"
             )
-        return dataset.pairs(choice.preset, choice.draws, pairs=choice.pairs, hints=choice.hints)
+        chosen = dataset.pairs(choice.preset, choice.draws, pairs=choice.pairs, hints=choice.hints)
+        return chosen if choice.track is None else chosen.of_track(choice.track)
     if isinstance(dataset, ImportedSet):
+        if choice.track == "localise":
+            raise DatasetError(f"{dataset.folder} holds pictures whose spots nobody has measured: leave --track out")
         if any(option is not None for option in (choice.boxes_px, choice.sensor, choice.frames)):
             raise DatasetError(
                 f"{dataset.folder} holds pictures: their boxes are not known, and sensor and frames are those of the "
@@ -91,10 +115,10 @@ def wanted_pairs(dataset: Dataset | ImportedSet | FramesSet, choice: PairChoice)
     camera = None if choice.sensor is None else read_sensor_file(choice.sensor)
     counts = None if choice.frames is None else frame_counts(*choice.frames)
     taken = (choice.preset, choice.draws, choice.pairs, choice.hints, choice.boxes_px, camera, counts)
-    if choice.calibration is None:
-        return dataset_pairs(dataset, *taken)
-    read = read_calibration(choice.calibration)
-    return CalibratedPairs(dataset_pairs(of_calibration(dataset, read), *taken), read)
+    read = None if choice.calibration is None else read_calibration(choice.calibration)
+    pairs = dataset_pairs(dataset if read is None else of_calibration(dataset, read), *taken)
+    pairs = pairs if choice.track is None else pairs.of_track(choice.track)
+    return pairs if read is None else CalibratedPairs(pairs, read)
 
 
 MOST_FRAMES = 100
@@ -124,3 +148,96 @@ def _real_pairs(imported: ImportedSet, choice: PairChoice) -> PairSet:
     if choice.calibration is None:
         return pairs
     return CalibratedPairs(pairs, with_shape(read_calibration(choice.calibration, imported.rig)))
+
+
+class CalibratedPairs:
+    """A pair set whose nominal rig and stroke are those of a calibration.
+
+    Parameters
+    ----------
+    pairs : PairSet
+        All of one true rig: see `of_calibration`.
+    calibration : Calibration
+    """
+
+    def __init__(self, pairs: PairSet, calibration: Calibration) -> None:
+        self.pairs, self.calibration = pairs, calibration
+        self.folders = truth_folders(pairs)
+        self._covariance = np.array(calibration.covariance)
+        self._covariance.flags.writeable = False
+
+    def __len__(self) -> int:
+        return len(self.pairs)
+
+    def pair(self, number: int) -> Pair:
+        """Images of a pair, with the calibrated rig and its covariance."""
+        seen = self.pairs.pair(number)
+        return replace(
+            seen,
+            rig=self.calibration.rig,
+            stroke_m=self._stroke_m(seen.stroke_m),
+            calibration_covariance=self._covariance,
+        )
+
+    def answered(self, number: int) -> bool:
+        """Tell the set that all methods have answered a pair."""
+        return tell_answered(self.pairs, number)
+
+    def truth(self, number: int) -> PairTruth:
+        """The exact answer."""
+        truth = self.pairs.truth(number)
+        nominal_m = truth.stroke_m if truth.nominal_stroke_m is None else truth.nominal_stroke_m
+        return replace(
+            truth,
+            nominal_rig=self.calibration.rig,
+            nominal_stroke_m=self._stroke_m(nominal_m),
+            calibration_covariance=self._covariance,
+        )
+
+    def document(self) -> dict[str, Any]:
+        """Provenance of the set, with the calibration's hash."""
+        made_from = self.calibration.made_from
+        return {**self.pairs.document(), "calibration": self.calibration.sha256, "calibrated_from": made_from}
+
+    def _stroke_m(self, nominal_m: float) -> float:
+        return float(stroke_of(np.array(nominal_m), self.calibration.values))
+
+
+def of_calibration(dataset: Dataset, calibration: Calibration) -> Dataset:
+    """The samples of a data set that a calibration is for: those of the rig that it was made from.
+
+    Raises
+    ------
+    CalibrationError
+        If the nominal rig of a sample is not the one that the calibration started from, or the samples have several
+        true rigs and the calibration was made from none of them.
+    """
+    for sample in dataset:
+        if sample.nominal_rig != calibration.nominal:
+            raise CalibrationError(
+                f"the calibration did not start from the nominal rig of sample {sample.row.sample_id}; "
+                "calibrate with samples of this data set"
+            )
+    rigs = {row.rig for row in dataset.rows}
+    if len(rigs) == 1 and not _of_another(dataset, calibration):
+        return dataset
+    own = _samples_of_its_rig(dataset, calibration)
+    if not own:
+        raise CalibrationError(
+            f"{dataset.folder} has {len(rigs)} true rig{'s' * (len(rigs) > 1)} and the calibration was made from none "
+            "of them; calibrate with samples of this data set"
+        )
+    return replace(dataset, rows=tuple(sample.row for sample in own))
+
+
+def _of_another(dataset: Dataset, calibration: Calibration) -> bool:
+    """Tell whether the calibration names another data set as its source."""
+    return calibration.made_from.get("dataset", dataset.info.name) != dataset.info.name
+
+
+def _samples_of_its_rig(dataset: Dataset, calibration: Calibration) -> list[Sample]:
+    if _of_another(dataset, calibration):
+        return []
+    made_from = set(calibration.made_from.get("samples", ()))
+    rigs = {row.rig for row in dataset.rows if row.sample_id in made_from}
+    return [sample for sample in dataset if sample.row.rig in rigs]

@@ -35,7 +35,7 @@ from phibench.estimator.limits.beyond_images import excesses
 from phibench.scenes.validation import printable_line
 
 KIND: Literal["phibench score"] = "phibench score"
-VERSION = 5
+VERSION = 6
 SCORER = "phibench.benchmark.scores.score"
 """Module whose code, with all that it imports, is behind a score."""
 

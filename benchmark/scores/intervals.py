@@ -78,7 +78,18 @@ class Clusters:
 
 def mean_of(clusters: Clusters, values: Array) -> Statistic:
     """Mean over records."""
-    table = clusters.sums(values, np.ones_like(values))
+    return ratio_of(clusters, values, np.ones_like(values))
+
+
+def geometric_of(clusters: Clusters, logarithms: Array) -> Statistic:
+    """Geometric mean over records."""
+    mean = mean_of(clusters, logarithms)
+    return lambda weights: np.exp(mean(weights))
+
+
+def ratio_of(clusters: Clusters, above: Array, below: Array) -> Statistic:
+    """Ratio of two sums."""
+    table = clusters.sums(above, below)
     return lambda weights: _ratio(weights @ table)
 
 
@@ -90,8 +101,8 @@ def rms_of(clusters: Clusters, squares: Array) -> Statistic:
 
 def rms_ratio_of(clusters: Clusters, above: Array, below: Array) -> Statistic:
     """Root of the ratio of two sums of squares; infinite where only the lower one is 0."""
-    table = clusters.sums(above, below)
-    return lambda weights: np.sqrt(_ratio(weights @ table))
+    ratio = ratio_of(clusters, above, below)
+    return lambda weights: np.sqrt(ratio(weights))
 
 
 def best_constant_of(clusters: Clusters, inverse: Array) -> Statistic:

@@ -27,12 +27,15 @@ from phibench.benchmark.scores.intervals import (
     best_constant_of,
     deviation_of,
     estimates,
+    geometric_of,
     mean_of,
     quantile_of,
     rate,
+    ratio_of,
     rms_of,
     rms_ratio_of,
 )
+from phibench.benchmark.scores.track_columns import LOCALISED, track_columns
 from phibench.scenes.frames import Array
 from phibench.scenes.random_streams import Name, generator
 
@@ -41,7 +44,20 @@ FAR_SIGMAS = 5.0
 LEAST_FOR_P95 = 50
 """Samples below which a 95th percentile has no interval."""
 Better = Literal["lower", "higher", "none"]
-Kind = Literal["rate", "mean", "rms", "rms of each", "median", "p95", "efficiency", "deviation", "rank", "constant"]
+Kind = Literal[
+    "rate",
+    "mean",
+    "rms",
+    "rms of each",
+    "median",
+    "p95",
+    "efficiency",
+    "deviation",
+    "rank",
+    "constant",
+    "geometric",
+    "ratio",
+]
 _DOWN, _DETECTED = pl.col("image") == "down", pl.col("detected")
 _FOUND = _DOWN & pl.col("depth_found")
 # where the bound is not small against what counts as found, the cut at `match_px` makes errors smaller than the bound
@@ -74,16 +90,20 @@ FAMILIES: dict[str, pl.Expr] = {
     "placed": pl.col("visible") & pl.col("counted_px").is_not_null(),
     "ranked phi": pl.col("rank_phi2_rad2").is_not_null(),
     "claimed": pl.col("visible") & pl.col("mahalanobis2").is_not_null(),
+    "localised": LOCALISED,
+    "localised pair": LOCALISED & pl.col("perfect_pair_log").is_not_null(),
+    "empty": ~pl.col("visible"),
+    "interval": _FOUND & pl.col("interval_score").is_not_null(),
 }
 """Which records enter a metric; those of pairs take each pair once, by its row "down"."""
 
 _RELATIVE = ("depth_relative", "depth_counted", "root_bound_depth", "rank_depth2", "inverse_depth", "root_pair_depth")
 CHOSEN = (
     *("bound", "raw bound", "phi bound", "depth bound", "pair bound", "pair phi bound", "pair depth bound"),
-    *("pull", "depth pull", "claimed"),
+    *("pull", "depth pull", "claimed", "interval"),
 )
 """Families whose records a method chooses by what it answers and claims: their metrics are given with their share."""
-OF_PAIRS = ("any pair", "pair", "depth", "depth bound", "depth pull", "timed", "pair depth bound")
+OF_PAIRS = ("any pair", "pair", "depth", "depth bound", "depth pull", "timed", "pair depth bound", "interval")
 
 WHY_EMPTY = {
     "detected": "no spot detected",
@@ -107,6 +127,10 @@ WHY_EMPTY = {
     "placed": "no visible spot whose place is known",
     "ranked phi": "no image whose phi is known",
     "claimed": "no covariance claimed",
+    "localised": "no visible spot has a bound below 1 px",
+    "localised pair": "no visible spot has a bound below 1 px, and one of its pair",
+    "empty": "every image shows the spot",
+    "interval": "no uncertainty of depth claimed",
 }
 """Why a metric has no value, by family."""
 
@@ -122,7 +146,8 @@ class Metric:
     columns : of the records; "mean" and "rate" take one, "median" and "p95" one by its absolute value, "rms" the root
         of the mean of the sum of squares, "rms of each" of the mean of all squares, "deviation" is about each column's
         mean, "efficiency" divides: variances, then errors; "rank" is the root of a sum of squares by a number of spots;
-        "constant" is the relative rms error of the best constant, of inverse values
+        "constant" is the relative rms error of the best constant, of inverse values; "geometric" is the exponential of
+        the mean of a logarithm, "ratio" that of two sums
     unit : str
     better : "lower", "higher" or "none"
     text : what it is
@@ -266,6 +291,34 @@ METRICS: dict[str, Metric] = {
     "beyond_5_sigma": Metric(
         "claimed", "rate", ("beyond_5",), "1", "lower", "answers beyond 5 claimed sigma, those beyond 3 px too"
     ),
+    "localise": Metric(
+        "localised", "geometric", ("localise_log",), "1", "lower", "error / bound, geometric mean; none counts 3 px"
+    ),
+    "median_localise": Metric("localised", "median", ("localise_ratio",), "1", "lower", "error / bound, median"),
+    "p95_localise": Metric("localised", "p95", ("localise_ratio",), "1", "lower", "error / bound, 95th percentile"),
+    "perfect_localise": Metric(
+        "localised", "geometric", ("perfect_image_log",), "1", "none", "error / bound of a perfect method for one image"
+    ),
+    "perfect_localise_pair": Metric(
+        "localised pair", "geometric", ("perfect_pair_log",), "1", "none", "the same for both images as one point"
+    ),
+    "find": Metric(
+        "image", "ratio", ("detected", "visible_or_false"), "1", "higher", "Jaccard index: found / (visible + false)"
+    ),
+    "false_per_empty": Metric(
+        "empty", "rate", ("false_detection",), "1", "lower", "images without the spot that have an answer"
+    ),
+    "average_recall": Metric(
+        "pair", "mean", ("depth_recall",), "1", "higher", "D within 0.5, 1, 2, 5, 10 and 20 %, mean share of them"
+    ),
+    "interval_score": Metric(
+        "interval",
+        "mean",
+        ("interval_score",),
+        "1",
+        "lower",
+        "95 % interval score / 3.92 sigma of the bound",
+    ),
 }
 
 PAIR_TWINS = {
@@ -303,7 +356,7 @@ class MetricEstimate:
 
 def prepared(records: pl.DataFrame) -> pl.DataFrame:
     """Records with what the metrics take besides: roots of the bounds, samples as numbers, which bounds are sharp."""
-    return records.with_columns(
+    return track_columns(records).with_columns(
         root_bound_px=pl.col("bound_px2").sqrt(),
         root_bound_depth=pl.col("bound_depth_m2").sqrt() / pl.col("depth_m"),
         root_pair_px=pl.col("pair_bound_px2").sqrt(),
@@ -420,6 +473,8 @@ STATISTICS: dict[str, Callable[[Clusters, list[Array]], Statistic]] = {
     "deviation": lambda clusters, x: deviation_of(clusters, *x),
     "rank": lambda clusters, x: rms_ratio_of(clusters, x[0], x[1]),
     "constant": lambda clusters, x: best_constant_of(clusters, x[0]),
+    "geometric": lambda clusters, x: geometric_of(clusters, x[0]),
+    "ratio": lambda clusters, x: ratio_of(clusters, x[0], x[1]),
 }
 
 

@@ -103,6 +103,9 @@ COLUMNS: dict[str, str] = {
     "raw_bound_vv_px2": "variance of v",
     "bound_phi_rad2": "variance of phi at the bound",
     "pair_bound_px2": "as bound_px2, of both images together: one point of the room",
+    "pair_bound_uu_px2": "that bound itself: variance of u",
+    "pair_bound_uv_px2": "covariance of u and v",
+    "pair_bound_vv_px2": "variance of v",
     "pair_bound_phi_rad2": "variance of phi at that bound",
     "rank_phi2_rad2": "square that the rank by phi sums: error (of outline: of phi_ray), missed and false",
     "pair_visible": "both spots are visible",
@@ -359,6 +362,7 @@ def _joint_columns(
     )
     for position, uv, C in zip(POSITIONS, (xy1, xy2), (joint.down_px2, joint.up_px2), strict=True):
         images[position]["pair_bound_px2"] = np.trace(C, axis1=1, axis2=2)
+        images[position] |= _parts("pair_bound", C)
         images[position]["pair_bound_phi_rad2"] = phi_variance(nominal, uv, C)
     for place, position in enumerate(POSITIONS):
         for name in ("possible_spot_px2", "possible_spot_chi2", "possible_spot_phi_rad2"):

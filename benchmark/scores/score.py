@@ -1,15 +1,11 @@
 """Benchmark of methods on a pair set: run them, compare with the truth, name causes, keep the worst images.
 
-`score_methods` is for methods that are run, `score_outcomes` for answers that are there. `bench` runs every built-in
-or registered method on every preset of a data set that it takes, and writes one report.
+`score_methods` is for methods that are run, `score_outcomes` for answers that are there.
 """
 
 from __future__ import annotations
 
-import os
-import sys
 import time
-import webbrowser
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
@@ -20,11 +16,17 @@ import polars as pl
 from rich.console import Console
 
 from phibench.benchmark.isolation.pairs_ahead import PairsAhead
-from phibench.benchmark.isolation.resolve import MethodError, RunLimits, code_of_function, installed, resolve
+from phibench.benchmark.isolation.resolve import MethodError, RunLimits, code_of_function, resolve
 from phibench.benchmark.isolation.runner import Harness, Ran, asked_here, function_name, ran_here
-from phibench.benchmark.pair_sets.dataset_pairs import CalibratedPairs, DatasetPairs
+from phibench.benchmark.pair_sets.dataset_pairs import DatasetPairs
 from phibench.benchmark.pair_sets.frames_set import FramesSet
-from phibench.benchmark.pair_sets.wanted_pairs import ChoiceKeywords, PairChoice, open_scored, wanted_pairs
+from phibench.benchmark.pair_sets.wanted_pairs import (
+    CalibratedPairs,
+    ChoiceKeywords,
+    PairChoice,
+    open_scored,
+    wanted_pairs,
+)
 from phibench.benchmark.scores.answer_errors import Rules
 from phibench.benchmark.scores.causes import with_causes
 from phibench.benchmark.scores.document import (
@@ -37,18 +39,15 @@ from phibench.benchmark.scores.document import (
     write_score,
 )
 from phibench.benchmark.scores.records import in_order, missed_relative, record_table, with_missed
-from phibench.benchmark.scores.report import time_section, write_report
 from phibench.benchmark.scores.score_tables import score_table, text_of
 from phibench.benchmark.scores.worst_images import worst, worst_of, worst_records
-from phibench.calibration.captures.imported_set import ImportedSet
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.progress import Steps, progress_console
 from phibench.datasets.read import Dataset
 from phibench.datasets.store.files import require_writable
 from phibench.datasets.store.short_form import ShortForm
-from phibench.estimator.interface import Box, Method, Outcome
+from phibench.estimator.interface import Method, Outcome
 from phibench.estimator.methods.fit_at_truth import KeptFits
-from phibench.estimator.methods.registry import METHODS, BuiltIn
 from phibench.estimator.pair_set import CachedPairs, PairSet, truth_folders
 
 Ask = Callable[[PairSet, Sequence[int]], Iterable[tuple[Outcome, ...]]]
@@ -285,7 +284,7 @@ def score(
     console : Console, optional
         Where progress goes; by default the standard error.
     **choice
-        Fields of `PairChoice` but the preset: draws, pairs, hints, boxes_px, calibration, sensor, frames.
+        Fields of `PairChoice` but the preset: draws, pairs, hints, boxes_px, calibration, sensor, frames, track.
 
     Returns
     -------
@@ -340,74 +339,6 @@ def saved_each(scores: Sequence[Scored], files: Sequence[Path]) -> list[Scored]:
         told = f"{len(written)} of {len(files)} scores are written" if written else "no score is written"
         raise DatasetError(f"{'; '.join(faults)}; {told}")
     return written
-
-
-PRESETS = ("bayer-raw", "srgb8", "mjpeg")
-"""Of a data set whose recipe has no `[frames]`."""
-REPORT = "report.html"
-_PROBE_BOX = Box(0, 0, 16, 16)  # a method that needs boxes takes the pairs that have some
-
-
-@dataclass(frozen=True)
-class Benched:
-    """Files of a run: the report and the scores. `notes` says which methods were left out, and why."""
-
-    report: Path
-    scores: tuple[Path, ...]
-    notes: tuple[str, ...]
-
-
-def bench(
-    folder: str | Path,
-    out: str | Path,
-    methods: Sequence[str] | None = None,
-    workers: int = 1,
-    pairs: int | None = None,
-    console: Console | None = None,
-    calibration: str | Path | None = None,
-    limits: RunLimits | None = None,
-) -> Benched:
-    """Run built-in methods and those of installed packages on all presets of a data set; write scores and a report.
-
-    Parameters
-    ----------
-    folder : finished data set
-    out : folder for `<preset>-<method>.json` and `report.html`
-    methods : names of methods that are built in or registered by a package; all by default
-    workers : pairs that are worked on at a time
-    pairs : the first so many of each preset; all by default
-    console : where progress goes; by default the standard error
-    calibration : file of `phibench calibrate`; the pairs are then those of its rig, with its numbers
-    limits : limits of every method for one pair
-
-    Raises
-    ------
-    DatasetError
-        If the data set will not do, or a method is unknown.
-    """
-    dataset, out = open_scored(folder), Path(out)
-    console = console or progress_console()
-    chosen = _chosen(list(dict.fromkeys([*METHODS, *(point.name for point in installed())])), methods)
-    if out.resolve() == dataset.folder.resolve() or dataset.folder.resolve() in out.resolve().parents:
-        raise DatasetError(f"{out} lies inside the data set, whose files are signed; give a folder outside, --out")
-    require_writable(out / REPORT)
-    scores, notes, times = [], [], dict[str, dict[str, float]]()
-    for preset in _presets(dataset):
-        taken = wanted_pairs(dataset, PairChoice(preset, pairs=pairs, calibration=calibration))
-        # what a package's method takes is known to nobody: it is asked, and its answers say so
-        refusals = {name: refusal(METHODS[name], taken) if name in METHODS else "" for name in chosen}
-        notes += [f"{name} is left out on {preset}: {why}" for name, why in refusals.items() if why]
-        names = [name for name, why in refusals.items() if not why]
-        stages: dict[str, float] = {}
-        paths = [out / f"{preset}-{name}.json" for name in names]
-        with records_kept(paths):
-            done = run_and_score(names, taken, workers, console, preset, limits=limits, stages=stages)
-        times[preset] = {stage: seconds / len(taken) for stage, seconds in stages.items()}
-        saved_each(done, paths)
-        scores += paths
-    if not scores:
-        raise DatasetError(f"none of {', '.join(chosen)} takes a preset of {folder}: give another --method")
-    return Benched(write_report(scores, out / REPORT, [time_section(times)]), tuple(scores), tuple(notes))
 
 
 def run_and_score(
@@ -475,32 +406,3 @@ def ran_with(scored: Scored, ran: Ran) -> Scored:
     """The score with packages and files of its method."""
     card = scored.document.method.model_copy(update=vars(ran))
     return replace(scored, document=scored.document.model_copy(update={"method": card}))
-
-
-def refusal(method: BuiltIn, pairs: PairSet) -> str:
-    """Reason for which a built-in method cannot take the pairs of a preset; "" if it can."""
-    return method.refusal(replace(pairs.pair(0), box_down=_PROBE_BOX, box_up=_PROBE_BOX))
-
-
-def show(page: Path) -> bool:
-    """Open a page in a browser, where somebody sits before one; return whether it was opened."""
-    display = sys.platform in ("darwin", "win32") or any(
-        os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY")
-    )
-    return sys.stdout.isatty() and display and webbrowser.open(page.resolve().as_uri())
-
-
-def _presets(dataset: Dataset | ImportedSet | FramesSet) -> tuple[str, ...]:
-    if isinstance(dataset, ImportedSet | FramesSet):
-        return (dataset.preset,)
-    frames = dataset.recipe.frames
-    return PRESETS if frames is None else frames.presets
-
-
-def _chosen(known: Sequence[str], wanted: Sequence[str] | None) -> list[str]:
-    names = list(known) if wanted is None else list(dict.fromkeys(wanted))
-    if strange := [name for name in names if name not in known]:
-        raise DatasetError(
-            f"no method '{strange[0]}' is built in or registered by a package; known: {', '.join(known)}"
-        )
-    return names

@@ -27,6 +27,7 @@ from phibench.datasets.recipe.tables import FramesTable
 from phibench.datasets.store.layers import SpotWindow
 from phibench.datasets.store.schema import ManifestRow
 from phibench.render.sensor.light import Region
+from phibench.scenes.camera import Camera
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.random_streams import generator
 from phibench.scenes.rig import POSITIONS, Rig, View
@@ -149,31 +150,50 @@ def _boxes(sample: Sample, frames: FramesTable) -> tuple[Region, Region] | None:
     return search_boxes(sample, frames.hint_box_px) if hinted else None
 
 
-def search_boxes(sample: Sample, side_px: int) -> tuple[Region, Region]:
+def search_boxes(sample: Sample, side_px: int, margin_px: int = BOX_MARGIN_PX) -> tuple[Region, Region]:
     """Boxes for both images of a sample, drawn from streams of its own: their centres tell nothing of the spot."""
-    down, up = (_box(sample, position, side_px) for position in POSITIONS)
-    return down, up
+    camera, boxes = sample.rig.camera, []
+    for position in POSITIONS:
+        row = sample.truth_row(position)
+        light = (row.centre.u_px, row.centre.v_px) if has_place(row, (camera.height_px, camera.width_px)) else None
+        boxes.append(search_box(sample.stream_names, position, light, camera, side_px, margin_px))
+    return boxes[0], boxes[1]
 
 
-def _box(sample: Sample, position: str, side_px: int) -> Region:
-    """Box that holds the centre of the spot's light anywhere alike, as far as the image has room for it."""
-    camera, row = sample.rig.camera, sample.truth_row(position)
+def search_box(
+    names: tuple[str, int, str],
+    position: str,
+    light_px: tuple[float, float] | None,
+    camera: Camera,
+    side_px: int,
+    margin_px: int,
+) -> Region:
+    """Box that holds the centre of a spot's light anywhere alike, as far as the image has room for it.
+
+    Parameters
+    ----------
+    names : data set, its seed, sample id
+    position : "down" or "up"
+    light_px : (u, v), or None where there is none in the image: the box is anywhere
+    camera : Camera
+    side_px, margin_px : int
+        Side of the box, and how far the light is from its edges at least.
+    """
     sizes = camera.width_px, camera.height_px
-    random = sample_stream(sample.stream_names, "box", position)
-    light = row.centre
-    place = (light.u_px, light.v_px) if has_place(row, (camera.height_px, camera.width_px)) else (None, None)
-    u, v = (_start(random, centre, side_px, size) for centre, size in zip(place, sizes, strict=True))
+    random = sample_stream(names, "box", position)
+    places = (None, None) if light_px is None else light_px
+    u, v = (_start(random, place, side_px, margin_px, size) for place, size in zip(places, sizes, strict=True))
     return Region(u, v, u + min(side_px, sizes[0]), v + min(side_px, sizes[1]))
 
 
-def _start(random: np.random.Generator, centre_px: float | None, side_px: int, size_px: int) -> int:
+def _start(random: np.random.Generator, centre_px: float | None, side_px: int, margin_px: int, size_px: int) -> int:
     """First pixel of a box along one axis, in an image of `size_px` pixels."""
     last = max(size_px - side_px, 0)
     if centre_px is None:
         return int(random.integers(0, last + 1))
     # the light is at least the margin from the box's edges, which lie half a pixel beyond its outer pixels
-    low = int(np.ceil(centre_px + BOX_MARGIN_PX + 0.5 - side_px))
-    high = int(np.floor(centre_px - BOX_MARGIN_PX + 0.5))
+    low = int(np.ceil(centre_px + margin_px + 0.5 - side_px))
+    high = int(np.floor(centre_px - margin_px + 0.5))
     low, high = (min(max(edge, 0), last) for edge in (low, high))
     return int(random.integers(low, high + 1))
 

@@ -90,6 +90,8 @@ class ChoiceOptions:
         Sensor file of `phibench sensor fit`: its numbers stand for the recipe's and the preset's.
     frames
         Frames of each position with the laser on and with it off, such as 6 6; one of each by default.
+    track
+        localise: every pair in boxes of 64 pixels; find or depth: whole frames (docs/scoring.md).
     """
 
     preset: OwnOrPreset = None
@@ -100,6 +102,7 @@ class ChoiceOptions:
     calibration: Path | None = None
     sensor: Path | None = None
     frames: Annotated[tuple[Whole, Whole] | None, Parameter(negative="")] = None
+    track: Literal["localise", "find", "depth"] | None = None
 
     def of(self, directory: Path) -> PairSet:
         """Pairs of a data set, of frames or of pictures.
@@ -111,7 +114,7 @@ class ChoiceOptions:
         """
         from phibench.benchmark.pair_sets.wanted_pairs import PairChoice, open_scored, wanted_pairs
 
-        known = self.calibration, self.sensor, self.frames
+        known = self.calibration, self.sensor, self.frames, self.track
         choice = PairChoice(self.preset, self.draws, self.pairs, self.hints, self.boxes, *known)
         return wanted_pairs(open_scored(directory), choice)
 
@@ -213,7 +216,7 @@ def report(
     study
         Folders that `phibench study` wrote.
     """
-    from phibench.benchmark.scores.report import write_report
+    from phibench.benchmark.reports.report import write_report
     from phibench.studies.run import section
 
     print(write_report(files, out, [section(folder) for folder in study], rank))
@@ -250,7 +253,7 @@ def results(
     """
     from json import dumps
 
-    from phibench.benchmark.scores.results_page import read_parts, results_document, results_page, write_results
+    from phibench.benchmark.reports.results_page import read_parts, results_document, results_page, write_results
 
     parts = read_parts(files, against, rank, _seed(bootstrap_seed))
     for path in write_results(parts, out, html, rank):  # files first: they are wanted even where the pipe is closed
@@ -300,6 +303,7 @@ def bench(
     pairs: Whole | None = None,
     workers: PairsAtOnce = 1,
     calibration: Path | None = None,
+    track: Annotated[list[Literal["localise", "find", "depth"]] | None, Parameter(negative="")] = None,
     limits: Limits = LIMITS,
 ) -> int:
     """Run built-in and registered methods on every preset of a data set and write scores and a report.
@@ -314,11 +318,15 @@ def bench(
         Only the first so many of each preset.
     calibration
         File of `phibench calibrate`: only its rig's pairs, with the calibrated rig and stroke.
+    track
+        Tracks that are run, by default all: find and depth are one run on whole frames. May be given several times.
     """
-    from phibench.benchmark.scores.score import bench as run_bench
-    from phibench.benchmark.scores.score import show
+    from phibench.benchmark.reports.bench import bench as run_bench
+    from phibench.benchmark.reports.bench import show
 
-    done = run_bench(directory, out, method, workers, pairs, calibration=calibration, limits=limits.of_run)
+    done = run_bench(
+        directory, out, method, workers, pairs, calibration=calibration, limits=limits.of_run, tracks=track
+    )
     for note in done.notes:
         print(f"note: {note}", file=sys.stderr)
     print(f"{done.report}: the report on {len(done.scores)} scores")

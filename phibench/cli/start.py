@@ -37,8 +37,8 @@ def demo(*, out: Path = Path("phibench-demo")) -> int:
     out
         Folder to write: pairs, example, scores, and report.html. An example that you have changed is scored again.
     """
-    from phibench.benchmark.demo import demo as run_demo
-    from phibench.benchmark.scores.score import show
+    from phibench.benchmark.reports.bench import demo as run_demo
+    from phibench.benchmark.reports.bench import show
     from phibench.benchmark.scores.score_tables import score_table, text_of
 
     done = run_demo(out)

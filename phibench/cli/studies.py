@@ -102,7 +102,7 @@ def paper(
 
 
 def _tables(directory: Path, calibration: Path | None, wide: bool, out: Path | None) -> int:
-    from phibench.benchmark.pair_sets.dataset_pairs import of_calibration
+    from phibench.benchmark.pair_sets.wanted_pairs import of_calibration
     from phibench.benchmark.scores.score_tables import show_grid, table_console
     from phibench.calibration.rig.file import read_calibration
     from phibench.datasets.read import open_finished

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from phibench.benchmark.scores.figures import COLOURS, LINES, STYLE, encoded, styled
+from phibench.benchmark.reports.figures import COLOURS, LINES, STYLE, encoded, styled
 from phibench.benchmark.scores.score_tables import TextTable
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.store.files import write_bytes

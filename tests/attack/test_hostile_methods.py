@@ -22,9 +22,9 @@ from helpers.sandbox_pairs import SmallPairs, method_file
 
 from phibench.benchmark.isolation.resolve import RunLimits
 from phibench.benchmark.isolation.runner import run_method
+from phibench.benchmark.reports.report import write_report
 from phibench.benchmark.scores.answer_errors import Rules
 from phibench.benchmark.scores.document import MethodCard
-from phibench.benchmark.scores.report import write_report
 from phibench.benchmark.scores.score import Scored, saved, score_outcomes
 from phibench.benchmark.scores.score_tables import print_scores
 from phibench.estimator.interface import Outcome

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from phibench.benchmark.demo import EXAMPLE, FRAMES, METHODS, REPORT, SHIPPED
 from phibench.benchmark.pair_sets.frames_set import FramesSet
+from phibench.benchmark.reports.bench import DEMO_METHODS, EXAMPLE, FRAMES, REPORT, SHIPPED
 from phibench.cli.main import main
 
 
@@ -29,7 +29,7 @@ def test_the_demo_writes_one_page_and_scores_a_changed_example(tmp_path: Path, c
     out = tmp_path / "demo"
     assert main(["demo", "--out", str(out)]) == 0
     shown = capsys.readouterr().out
-    assert all(name in shown for name in (*METHODS, "extract", f"{out / REPORT}"))
+    assert all(name in shown for name in (*DEMO_METHODS, "extract", f"{out / REPORT}"))
     page = (out / REPORT).read_text(encoding="utf-8")
     assert "chain_fit" in page
     assert len(FramesSet(out / FRAMES)) == 5

@@ -24,13 +24,13 @@ from helpers.valid_files import TEXT, Kind, changed, compact, digest, png, publi
 from PIL import Image
 from rich.console import Console
 
-from phibench.benchmark.demo import SHIPPED
 from phibench.benchmark.export import export_make
 from phibench.benchmark.export.pair_rows import ExportRequest
 from phibench.benchmark.pair_sets.frames_set import FramesSet
 from phibench.benchmark.release import release_make
 from phibench.benchmark.release.benchmark import PARTS
 from phibench.benchmark.release.release_make import ReleaseRequest
+from phibench.benchmark.reports.bench import SHIPPED
 from phibench.benchmark.scores.document import EncodedPicture, ScoreDocument
 from phibench.benchmark.sealed import rebuilt_score, score_check
 from phibench.calibration.captures import imported_set

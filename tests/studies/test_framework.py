@@ -12,7 +12,7 @@ import pytest
 from pydantic import Field
 from rich.console import Console
 
-from phibench.benchmark.scores.report import write_report
+from phibench.benchmark.reports.report import write_report
 from phibench.cli.main import main
 from phibench.datasets.common.errors import DatasetError
 from phibench.studies.findings import Finding, findings_table, markdown_table, number

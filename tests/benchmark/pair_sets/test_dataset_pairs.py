@@ -6,8 +6,10 @@ import base64
 import io
 import json
 import math
+import pickle
 from dataclasses import fields, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import polars as pl
@@ -15,7 +17,17 @@ import pytest
 from helpers.bench_samples import hidden, with_tables
 from PIL import Image
 
-from phibench.benchmark.pair_sets.dataset_pairs import DatasetPairs, SpotInImage, dataset_pairs, spot_bounds
+from phibench.benchmark.pair_sets.dataset_pairs import (
+    BOX_MARGIN_PX,
+    BOX_PX,
+    DatasetPairs,
+    SpotInImage,
+    dataset_pairs,
+    spot_bounds,
+    tracks_of,
+)
+from phibench.benchmark.pair_sets.wanted_pairs import PairChoice
+from phibench.benchmark.scored_dataset import open_dataset as scored_dataset
 from phibench.benchmark.scores.worst_images import worst
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.exposures.expected import expected_of_light, expected_region
@@ -355,3 +367,33 @@ def test_the_document_says_where_it_comes_from(pairs: DatasetPairs) -> None:
     assert json.loads(json.dumps(document, allow_nan=False)) == document
     assert (document["name"], document["pairs"], document["samples"], document["sealed"]) == ("tinybench", 9, 3, False)
     assert document["presets"] == ["bayer-raw", "mjpeg", "srgb8"]
+
+
+def test_tracks_show_boxes_of_their_own_or_whole_frames(bench_dataset: Path, tmp_path: Path) -> None:
+    """The spot lies in the middle half of the box, in layers and in frames alike; other tracks have no box."""
+    dataset = scored_dataset(bench_dataset)
+    localised = dataset.pairs("mjpeg", track="localise")
+    inside = 0
+    for pair, truth in localised:
+        for box, spot in ((pair.box_down, truth.down), (pair.box_up, truth.up)):
+            assert box is not None
+            assert (box.width_px, box.height_px) == (BOX_PX, BOX_PX)
+            if truth.hinted and spot.visible:
+                # between pixel edges; near the image's edge the box has no room
+                u, v = spot.uv_px[0] - box.u0_px + 0.5, spot.uv_px[1] - box.v0_px + 0.5
+                inside += BOX_MARGIN_PX <= u <= BOX_PX - BOX_MARGIN_PX and BOX_MARGIN_PX <= v <= BOX_PX - BOX_MARGIN_PX
+    assert inside >= len(localised)
+    assert tracks_of(localised.document()) == ("localise",)
+    for track in ("find", "depth"):
+        whole = dataset.pairs("mjpeg", track=track)
+        assert all(pair.box_down is None and pair.box_up is None for pair, _ in whole)
+        assert tracks_of(whole.document()) == ("find", "depth")
+    again = pickle.loads(pickle.dumps(localised))
+    assert again.pair(0).box_down == localised.pair(0).box_down
+    assert again.document()["track"] == "localise"
+
+
+@pytest.mark.parametrize("more", [{"hints": False}, {"boxes_px": 32}])
+def test_a_track_leaves_no_other_boxes(more: dict[str, Any]) -> None:
+    with pytest.raises(DatasetError, match="--track localise says which boxes there are"):
+        PairChoice("mjpeg", track="localise", **more)

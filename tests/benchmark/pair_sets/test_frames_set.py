@@ -12,6 +12,7 @@ import pytest
 import phibench
 from phibench.benchmark.export.export_make import export
 from phibench.benchmark.export.pair_rows import ExportRequest
+from phibench.benchmark.pair_sets.dataset_pairs import tracks_of
 from phibench.benchmark.pair_sets.frames_set import FramesSet
 from phibench.benchmark.scored_dataset import ScoredDataset
 from phibench.benchmark.scores.score import score
@@ -63,6 +64,20 @@ def test_a_score_has_the_same_records(frames: FramesSet, tiny_dataset: Path, tmp
     there = score(tiny_dataset, "red_centroid", frames.preset, draws=2, out=tmp_path / "b.json")
     assert here.records.drop("seconds").equals(there.records.drop("seconds"))
     assert main(["compare", str(tmp_path / "a.json"), str(tmp_path / "b.json")]) == 0
+
+
+def test_tracks_have_the_boxes_of_the_layers(frames: FramesSet, tiny_dataset: Path) -> None:
+    drawn = phibench.open_dataset(tiny_dataset).pairs(frames.preset, frames.info.draws, track="localise")
+    localised = frames.of_track("localise")
+    assert len(localised) == len(drawn) > 0
+    for pair, truth in localised:
+        other = drawn.pair(drawn.number_of(truth.sample_id, truth.draw))
+        assert (pair.box_down, pair.box_up) == (other.box_down, other.box_up)
+        assert truth.hinted
+    assert tracks_of(localised.document()) == ("localise",)
+    whole = frames.of_track("depth")
+    assert all(pair.box_down is None for pair, _ in whole)
+    assert tracks_of(whole.document()) == ("find", "depth")
 
 
 def test_a_part_of_the_set(frames: FramesSet) -> None:

@@ -12,8 +12,8 @@ import pytest
 import scipy
 from helpers.bench_cases import RIG, Cases, cases
 
-from phibench.benchmark.pair_sets.dataset_pairs import CalibratedPairs, of_calibration
-from phibench.benchmark.scores import score as scoring
+from phibench.benchmark.pair_sets.wanted_pairs import CalibratedPairs, of_calibration
+from phibench.benchmark.reports import bench as benching
 from phibench.benchmark.scores.answer_errors import Rules
 from phibench.benchmark.scores.metrics import measure, prepared
 from phibench.benchmark.scores.records import records
@@ -213,7 +213,7 @@ def test_score_prints_the_general_row(misaligned: Dataset, tmp_path: Path, capsy
 def test_methods_are_scored_with_a_calibration(
     misaligned: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(scoring, "write_report", lambda *_: tmp_path)  # thirty figures
+    monkeypatch.setattr(benching, "write_report", lambda *_: tmp_path)  # thirty figures
     nominal = misaligned.samples[0].nominal_rig
     file = written(tmp_path / "c.json", truth_of_rig(misaligned), nominal)
     common = ("score", misaligned.folder, "--method", "detect", "--preset", "bayer-raw")

@@ -14,10 +14,7 @@ import pytest
 from helpers.bench_cases import Cases, cases, change, constant, outcomes, sampler, shifted, silent, truth_itself
 from PIL import Image
 
-from phibench.benchmark.scores.answer_errors import Rules
-from phibench.benchmark.scores.causes import CAUSES
-from phibench.benchmark.scores.document import Flag, MethodCard, write_score
-from phibench.benchmark.scores.figures import (
+from phibench.benchmark.reports.figures import (
     EmbeddedFigure,
     cause_bars,
     error_panels,
@@ -25,8 +22,11 @@ from phibench.benchmark.scores.figures import (
     plain_number,
     pull_histogram,
 )
-from phibench.benchmark.scores.report import Section, report_html, time_section, verdict, write_report
-from phibench.benchmark.scores.results_page import read_parts
+from phibench.benchmark.reports.report import Section, report_html, time_section, verdict, write_report
+from phibench.benchmark.reports.results_page import read_parts
+from phibench.benchmark.scores.answer_errors import Rules
+from phibench.benchmark.scores.causes import CAUSES
+from phibench.benchmark.scores.document import Flag, MethodCard, write_score
 from phibench.benchmark.scores.score import score_outcomes
 from phibench.cli import main as cli
 from phibench.datasets.common.errors import DatasetError
@@ -118,7 +118,7 @@ def test_pictures_have_words_and_tables_have_heads(html):
     assert all(len(attributes["alt"]) > 60 for attributes in figures)
     shown = [attributes for attributes in page.of("svg") if "aria-hidden" not in attributes]
     assert all(attributes.get("role") == "img" and attributes.get("aria-label") for attributes in shown)
-    assert len(shown) == 30 + 9  # ten crops and three frames of each method
+    assert len(shown) == 60 + 9  # ten crops, each without and with marks, and three frames of each method
     assert len(page.of("caption")) == len(page.of("table")) >= 5
     assert all(attributes.get("scope") in ("row", "col") for attributes in page.of("th"))
     assert page.of("html")[0]["lang"] == "en-GB"

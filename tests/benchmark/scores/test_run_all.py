@@ -17,10 +17,11 @@ from phibench.benchmark.isolation import resolve as resolving
 from phibench.benchmark.isolation.process import MethodProcess
 from phibench.benchmark.isolation.resolve import GROUP, MethodError, RunLimits, resolve
 from phibench.benchmark.isolation.runner import Harness
-from phibench.benchmark.pair_sets.dataset_pairs import dataset_pairs
-from phibench.benchmark.scores import score as scoring
+from phibench.benchmark.pair_sets.dataset_pairs import TRACKS, dataset_pairs, tracks_of
+from phibench.benchmark.reports import bench as benching
+from phibench.benchmark.reports.bench import bench
 from phibench.benchmark.scores.document import read_score
-from phibench.benchmark.scores.score import bench, score
+from phibench.benchmark.scores.score import score
 from phibench.cli import main as cli
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.read import open_finished
@@ -33,15 +34,23 @@ from phibench.estimator.spots.detect import detect
 def test_the_benchmark_runs_what_accepts_each_preset(bench_dataset: Path, tmp_path: Path) -> None:
     names = ["red_centroid", "raw_maximum_likelihood"]
     done = bench(bench_dataset, tmp_path / "out", names, workers=2, pairs=2, console=quiet())
-    stems = ["bayer-raw-red_centroid", "bayer-raw-raw_maximum_likelihood", "srgb8-red_centroid", "mjpeg-red_centroid"]
-    assert [path.stem for path in done.scores] == stems
-    assert len(done.notes) == 2
+    raw = [f"bayer-raw-{name}{track}" for track in ("", "-localise") for name in names]
+    others = [f"{preset}-red_centroid{track}" for preset in ("srgb8", "mjpeg") for track in ("", "-localise")]
+    assert [path.stem for path in done.scores] == [*raw, *others]
+    assert len(done.notes) == 4
     assert all("takes mono-raw, bayer-raw, not" in note or "takes bayer-raw, mono-raw" in note for note in done.notes)
     documents = [read_score(path) for path in done.scores]
-    assert [document.pairs for document in documents] == [2, 2, 2, 2]
-    assert "raw_maximum_likelihood" in done.report.read_text()
+    assert [document.pairs for document in documents] == [2] * 8
+    tracks = [tracks_of(document.pair_set) for document in documents]
+    assert tracks == [track for own in (2, 1, 1) for track in [("find", "depth")] * own + [("localise",)] * own]
+    page = done.report.read_text()
+    assert all(f"Track {track}" in page for track in TRACKS)
+    assert "raw_maximum_likelihood" in page
     # one method alone on the same pairs answers the same: the harness keeps them apart
-    one, other = score(bench_dataset, names[0], "bayer-raw", pairs=2, console=quiet()).document, documents[0]
+    one, other = (
+        score(bench_dataset, names[0], "bayer-raw", pairs=2, track="find", console=quiet()).document,
+        documents[0],
+    )
     assert one.metrics["rms_px"] == other.metrics["rms_px"]
     assert one.worst == other.worst
 
@@ -53,9 +62,9 @@ def test_registered_methods_run_beside_built_in_ones(
     theirs = EntryPoint("theirs", "phibench.estimator.methods.simple:detected_spots", GROUP)
     monkeypatch.setattr(resolving, "entry_points", lambda group: [theirs])
     # all presets and the report's thirty figures are those of the test above
-    monkeypatch.setattr(scoring, "_presets", lambda _: ["bayer-raw", "mjpeg"])
-    monkeypatch.setattr(scoring, "write_report", lambda *_: tmp_path)
-    done = bench(bench_dataset, tmp_path / "out", ["theirs", "detect"], pairs=1, console=quiet())
+    monkeypatch.setattr(benching, "_presets", lambda _: ["bayer-raw", "mjpeg"])
+    monkeypatch.setattr(benching, "write_report", lambda *_: tmp_path)
+    done = bench(bench_dataset, tmp_path / "out", ["theirs", "detect"], pairs=1, console=quiet(), tracks=["depth"])
     documents = {path.stem: read_score(path) for path in done.scores}
     presets = {stem.removesuffix("-theirs") for stem in documents if stem.endswith("-theirs")}
     assert presets == {"bayer-raw", "mjpeg"}

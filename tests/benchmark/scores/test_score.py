@@ -226,8 +226,8 @@ def test_crops_hold_the_spot_and_end_with_the_image():
         ("[]", "does not hold a JSON object"),
         ('{"kind": "other"}', "is no score"),
         ('{"kind": "phibench score", "version": 99}', "has version 99"),
-        ('{"kind": "phibench score", "version": 4}', "has version 4, this program reads 5: score again"),
-        ('{"kind": "phibench score", "version": 5}', "method"),
+        ('{"kind": "phibench score", "version": 5}', "has version 5, this program reads 6: score again"),
+        ('{"kind": "phibench score", "version": 6}', "method"),
     ],
 )
 def test_a_file_that_is_no_score(tmp_path, text, words):

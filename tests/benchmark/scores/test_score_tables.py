@@ -9,12 +9,12 @@ import json
 import pytest
 from helpers.bench_cases import cases, constant, outcomes, sampler, shifted, silent
 
+from phibench.benchmark.reports.report import report_html, verdict
 from phibench.benchmark.scores.answer_errors import Rules
 from phibench.benchmark.scores.causes import KINDS
 from phibench.benchmark.scores.compare import compare_records
 from phibench.benchmark.scores.document import MethodCard
 from phibench.benchmark.scores.metrics import METRICS
-from phibench.benchmark.scores.report import report_html, verdict
 from phibench.benchmark.scores.score import isolated, score_outcomes
 from phibench.benchmark.scores.score_tables import (
     HEADS,

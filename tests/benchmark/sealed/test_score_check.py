@@ -154,7 +154,7 @@ def test_another_version_is_one_sentence(honest: Path, tmp_path: Path, capsys: p
     path.write_text(json.dumps({**json.loads(honest.read_text()), "version": 2}))
     assert cli.main(["submission", "check", str(path)]) == 2
     said = capsys.readouterr().err.strip()
-    assert "has version 2, this program reads 5: score again" in said
+    assert "has version 2, this program reads 6: score again" in said
     assert "\n" not in said
     path.write_text(honest.read_text())
     with pytest.raises(DatasetError, match="missing: it belongs to"):

@@ -16,6 +16,8 @@ from typing import Any
 
 import polars as pl
 
+from phibench.benchmark.reports.report import Section, report_html, tracks_section
+from phibench.benchmark.reports.track_tables import track_tables
 from phibench.benchmark.scores.answer_errors import Rules
 from phibench.benchmark.scores.compare import (
     Difference,
@@ -26,7 +28,6 @@ from phibench.benchmark.scores.compare import (
 )
 from phibench.benchmark.scores.document import ScoreDocument, StratumScore, read_records, read_score
 from phibench.benchmark.scores.metrics import METRICS, applies
-from phibench.benchmark.scores.report import Section, report_html
 from phibench.benchmark.scores.score_tables import (
     DIGITS,
     FLAGGED,
@@ -254,11 +255,18 @@ def results_page(parts: Sequence[ScoreGroup], by: str = "phi") -> str:
     """The page in Markdown."""
     text = [_INTRODUCTION, _LEGEND.format(quantity={"phi": "phi", "depth": "D"}[by])]
     text.append("## What was scored\n\n" + "\n".join(_sources(parts)) + "\n")
+    if tables := track_tables(_every(parts)):
+        text.append("## Tracks\n")
+        text += [_titled(table) for table in tables]
     for part in parts:
         text.append(f"## {markdown_text(part.title)}\n")
         text += [_titled(grid) for grid in grids(part)]
         text += ["".join(f"{_item(note)}\n" for note in part.notes)] * bool(part.notes)
     return "\n".join(text)
+
+
+def _every(parts: Sequence[ScoreGroup]) -> list[ScoreDocument]:
+    return [score for part in parts for score in part.scores]
 
 
 def _titled(grid: TextTable) -> str:
@@ -292,6 +300,7 @@ def results_html(parts: Sequence[ScoreGroup], by: str = "phi") -> str:
         f"Methods are ordered by the rank of {by if by == 'phi' else 'D'}.",
     )
     sections = [Section("What was scored", intro, (), ((_SOURCE_HEADS, *_source_rows(parts)),), ("",))]
+    sections += [section] if (section := tracks_section(_every(parts))) else []
     for part in parts:
         made = grids(part)
         tables = tuple((grid.heads, *grid.rows) for grid in made)

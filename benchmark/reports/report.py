@@ -15,10 +15,7 @@ from typing import Any
 import polars as pl
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-from phibench.benchmark.scores.causes import CAUSES, KINDS
-from phibench.benchmark.scores.compare import note_on_others, same_pairs
-from phibench.benchmark.scores.document import EncodedPicture, ScoreDocument, read_records, read_score
-from phibench.benchmark.scores.figures import (
+from phibench.benchmark.reports.figures import (
     EmbeddedFigure,
     cause_bars,
     error_maps,
@@ -28,6 +25,10 @@ from phibench.benchmark.scores.figures import (
     pull_histogram,
     radius_panels,
 )
+from phibench.benchmark.reports.track_tables import track_tables
+from phibench.benchmark.scores.causes import CAUSES, KINDS
+from phibench.benchmark.scores.compare import note_on_others, same_pairs
+from phibench.benchmark.scores.document import EncodedPicture, ScoreDocument, read_records, read_score
 from phibench.benchmark.scores.metrics import METRICS, RANKS, applies
 from phibench.benchmark.scores.score_tables import (
     FULL_OF_FALSE,
@@ -80,6 +81,19 @@ class Section:
     pictures: tuple[EmbeddedFigure, ...] = ()
     tables: tuple[tuple[tuple[str, ...], ...], ...] = ()
     captions: tuple[str, ...] = ()
+
+
+def tracks_section(documents: Sequence[ScoreDocument]) -> Section | None:
+    """Section with the tables of all tracks; None where no score belongs to one."""
+    tables = track_tables(documents)
+    if not tables:
+        return None
+    words = (
+        "localise: spots with a bound below 1 px, in boxes of 64 px. find and depth: whole frames.",
+        tables[0].note,
+    )
+    cells = tuple((table.heads, *table.rows) for table in tables)
+    return Section("Tracks", words, (), cells, tuple(table.title for table in tables))
 
 
 def time_section(times: Mapping[str, Mapping[str, float]]) -> Section:
@@ -218,7 +232,8 @@ def report_html(
     environment.filters["json"] = lambda value: json.dumps(value, indent=1)
     every = [document for document, _ in scores]
     rankings = [_ranking(number, group, every, by) for number, group in enumerate(_groups(scores), 1)]
-    return environment.get_template(_TEMPLATE).render(rankings=rankings, sections=sections, title=title)
+    front = [section] if (section := tracks_section(every)) else []
+    return environment.get_template(_TEMPLATE).render(rankings=rankings, front=front, sections=sections, title=title)
 
 
 def _groups(scores: Sequence[tuple[ScoreDocument, pl.DataFrame]]) -> list[list[tuple[ScoreDocument, pl.DataFrame]]]:

@@ -1,0 +1,120 @@
+"""Tables of the tracks: one row per method, one column per preset, the track's number with its interval.
+
+They come first in a report and in results. What a method knows of the rig stands beside its name: whoever is given a
+calibration does not compete with whoever is not.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from phibench.benchmark.pair_sets.dataset_pairs import TRACKS, Track, tracks_of
+from phibench.benchmark.scores.document import ScoreDocument
+from phibench.benchmark.scores.metrics import METRICS
+from phibench.benchmark.scores.score_tables import FLAGGED, TextTable, shown_parts
+
+
+@dataclass(frozen=True)
+class TrackNumbers:
+    """Numbers of a track: `ranks` orders the methods, those `beside` it tell more of them.
+
+    `perfect` are metrics of the pairs alone, by the name of their row.
+    """
+
+    title: str
+    ranks: str
+    beside: tuple[str, ...]
+    perfect: Mapping[str, str]
+
+
+NUMBERS: dict[Track, TrackNumbers] = {
+    "localise": TrackNumbers(
+        "Track localise: error over bound, geometric mean, lower is better",
+        "localise",
+        ("median_localise", "p95_localise"),
+        {"perfect, one image": "perfect_localise", "perfect, both images": "perfect_localise_pair"},
+    ),
+    "find": TrackNumbers(
+        "Track find: Jaccard index at 3 px, higher is better",
+        "find",
+        ("detection_rate", "false_rate", "false_per_empty"),
+        {},
+    ),
+    "depth": TrackNumbers(
+        "Track depth: average recall of D within 0.5 to 20 %, higher is better",
+        "average_recall",
+        ("depth_rate", "median_depth_relative", "interval_score"),
+        {},
+    ),
+}
+
+
+def track_tables(documents: Sequence[ScoreDocument]) -> list[TextTable]:
+    """Tables of all tracks that some score belongs to: method by preset, then the numbers beside it."""
+    tables = []
+    for track in TRACKS:
+        own = [document for document in documents if track in tracks_of(document.pair_set)]
+        if own:
+            tables += [_by_preset(track, own), _beside(track, own)]
+    return tables
+
+
+def rig_known(document: ScoreDocument) -> str:
+    """Rig that a method is given: "nominal" or "calibrated"."""
+    return "calibrated" if document.pair_set.get("calibration") else "nominal"
+
+
+def _preset(document: ScoreDocument) -> str:
+    return ", ".join(document.pair_set.get("presets", ())) or "pairs"
+
+
+def _by_preset(track: Track, documents: Sequence[ScoreDocument]) -> TextTable:
+    numbers = NUMBERS[track]
+    presets = list(dict.fromkeys(map(_preset, documents)))
+    rows: dict[tuple[str, str], dict[str, ScoreDocument]] = {}
+    for document in documents:
+        name = f"{document.method.name}{FLAGGED if document.flags else ''}"
+        rows.setdefault((name, rig_known(document)), {})[_preset(document)] = document
+    order = sorted(rows.items(), key=lambda row: _mean_place(row[1], documents, track))
+    made = [(*key, *(_cell(numbers.ranks, own.get(preset)) for preset in presets)) for key, own in order]
+    firsts = {preset: next(one for one in documents if _preset(one) == preset) for preset in presets}
+    for name, metric in numbers.perfect.items():
+        made.append((name, "", *(_cell(metric, firsts[preset]) for preset in presets)))
+    note = "Ordered by the mean place over presets. Overlapping intervals settle no order: use `phibench compare`."
+    return TextTable(numbers.title, ("method", "rig", *presets), tuple(made), "ll" + "r" * len(presets), note)
+
+
+def _mean_place(own: Mapping[str, ScoreDocument], documents: Sequence[ScoreDocument], track: Track) -> float:
+    """Mean over presets of the number of methods that are better; a preset that a method lacks tells nothing."""
+    places = []
+    for preset, document in own.items():
+        others = [_key(other, track) for other in documents if _preset(other) == preset]
+        places.append(sum(other < _key(document, track) for other in others))
+    return sum(places) / len(places)
+
+
+def _key(document: ScoreDocument, track: Track) -> float:
+    """Number that is smaller for the better method; infinite where there is none."""
+    name = NUMBERS[track].ranks
+    value = document.metrics[name].value
+    if value is None:
+        return math.inf
+    return value if METRICS[name].better == "lower" else -value
+
+
+def _beside(track: Track, documents: Sequence[ScoreDocument]) -> TextTable:
+    names = NUMBERS[track].beside
+    order = sorted(documents, key=lambda one: (_preset(one), _key(one, track)))
+    rows = [(_preset(one), one.method.name, *(_cell(name, one) for name in names)) for one in order]
+    heads = [f"{METRICS[name].text} / {METRICS[name].shown[1]}".removesuffix(" / 1") for name in names]
+    return TextTable(f"Beside it, {track}", ("preset", "method", *heads), tuple(rows), "ll" + "r" * len(names))
+
+
+def _cell(name: str, document: ScoreDocument | None) -> str:
+    """Value and interval; a star in place of the reason why there is no interval."""
+    if document is None:
+        return ""
+    value, interval = shown_parts(name, document.metrics[name])
+    return f"{value} *" if interval.startswith("(") else f"{value} {interval}".strip()
