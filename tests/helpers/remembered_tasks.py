@@ -1,7 +1,8 @@
 """Tasks that a test process has done before: their files and results, by the task's name and key.
 
 A task is a pure function of its key, which `test_two_runs_are_byte_identical_whatever_the_number_of_workers` and the
-tests of workers and kills show by rendering again. Tests of journals, orders, refusals and repairs need not.
+tests of workers and kills show by rendering again. Tests of journals, orders, refusals and repairs need not. The same
+holds for the answers that `verify` computes again.
 What a test has patched is code that no key knows: an answer holds only where all modules are as they were.
 """
 
@@ -20,6 +21,7 @@ _CODE = re.compile(
 )
 _MOST_BYTES = 200_000_000
 _KEPT: dict[tuple[str, str, int], tuple[Made, dict[str, bytes]]] = {}
+_ANSWERS: dict[tuple[Any, ...], Any] = {}
 _STATES: list[list[Any]] = []  # they hold what they name, so that no address is given twice
 
 
@@ -32,6 +34,18 @@ def _state() -> int:
             return number
     _STATES.append(held)
     return len(_STATES) - 1
+
+
+def remembered_answer(*asked: Any) -> Any:
+    """`answer_spot` that is computed once for each view, spot and room: `verify` asks for what was just made."""
+    from phibench.datasets.build import spot_task
+
+    key = (_state(), *asked)
+    if key not in _ANSWERS:
+        answer = spot_task.answer_spot(*asked)
+        _ANSWERS[(_state(), *asked)] = answer  # after it: it may have imported modules
+        return answer
+    return _ANSWERS[key]
 
 
 @dataclass(frozen=True)
