@@ -193,8 +193,10 @@ def _cells(row: ManifestRow, group: str) -> tuple[str, ...]:
 
 
 def _strip(sample: Sample) -> Picture:
-    parts = [part for position in POSITIONS for part in _pictures(sample, position)]
-    strip = np.concatenate([np.pad(part, ((0, _height(parts) - len(part)), (0, 4), (0, 0))) for part in parts], axis=1)
+    parts = [picture for position in POSITIONS for picture in _pictures(sample, position)]
+    strip = np.concatenate(
+        [np.pad(picture, ((0, _height(parts) - len(picture)), (0, 4), (0, 0))) for picture in parts], axis=1
+    )
     image = Image.fromarray(np.pad(strip, ((_CAPTION_PX, 4), (0, 0), (0, 0))))
     row = sample.row
     caption = f"{row.sample_id}   D = {row.centre_depth_m:.3f} m   h = {row.stroke_m:.3f} m   left: down, right: up"
@@ -203,7 +205,7 @@ def _strip(sample: Sample) -> Picture:
 
 
 def _height(parts: list[Picture]) -> int:
-    return max(len(part) for part in parts)
+    return max(len(picture) for picture in parts)
 
 
 def _pictures(sample: Sample, position: str) -> tuple[Picture, Picture]:

@@ -225,8 +225,8 @@ class CachedPairs:
         with self._lock:
             if number not in self._made:
                 while self._answered:
-                    part, answered = self._answered.popleft()
-                    part._truth(answered)
+                    pairs, answered = self._answered.popleft()
+                    pairs._truth(answered)
                 self._made[number] = self._pairs.pair(number)
             return self._made[number]
 

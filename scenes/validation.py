@@ -147,7 +147,7 @@ def structural_faults(model: type[BaseModel], raw: object) -> list[Fault]:
 
 def _untagged(details: ErrorDetails) -> ErrorDetails:
     """Return the same without the tags of unions in the location; they stand in angle brackets."""
-    return {**details, "loc": tuple(part for part in details["loc"] if not str(part).startswith("<"))}
+    return {**details, "loc": tuple(key for key in details["loc"] if not str(key).startswith("<"))}
 
 
 def _follows(details: ErrorDetails) -> bool:
@@ -168,7 +168,7 @@ def _merged(schema: Schema, found: list[ErrorDetails]) -> list[ErrorDetails]:
 
 def path_text(location: Sequence[str | int]) -> str:
     """Path of a key as people write it, such as ``targets[2].depth_m``."""
-    parts = (f"[{part}]" if isinstance(part, int) else f".{part}" for part in location)
+    parts = (f"[{key}]" if isinstance(key, int) else f".{key}" for key in location)
     return "".join(parts).removeprefix(".") or "recipe"
 
 
@@ -192,8 +192,8 @@ def _fault(schema: Schema, details: ErrorDetails) -> Fault:
 def schema_node(schema: Schema, location: Location) -> Schema:
     """Return the part of a JSON schema that describes one key, references and optional values resolved."""
     node = _resolve(schema, schema)
-    for part in location:
-        inner = _entry(node, part) if isinstance(part, int) else _value(node, part)
+    for key in location:
+        inner = _entry(node, key) if isinstance(key, int) else _value(node, key)
         description = inner.get("description")
         node = _resolve(schema, inner)
         node = {**node, "description": description} if description else node

@@ -47,14 +47,14 @@ def cut_region(uv_px: Sequence[tuple[float, float]], size: tuple[int, int], marg
 def cut_rig(rig: Rig, region: Region) -> Rig:
     """The rig with a sensor that has the region's pixels only."""
     camera, (height, width) = rig.camera, region.shape
-    part = replace(
+    cut = replace(
         camera,
         width_px=width,
         height_px=height,
         cx_px=camera.cx_px - region.u0_px,
         cy_px=camera.cy_px - region.v0_px,
     )
-    return replace(rig, camera=part)
+    return replace(rig, camera=cut)
 
 
 @dataclass(frozen=True)

@@ -49,7 +49,7 @@ def plain(value: Any, depth: int = 0) -> Any:
     if isinstance(value, str):
         return value[: 8 * _MOST]
     if isinstance(value, (list, tuple)):
-        return [plain(part, depth + 1) for part in value] if _is_small(value, depth) else {"type": described(value)}
+        return [plain(x, depth + 1) for x in value] if _is_small(value, depth) else {"type": described(value)}
     shape = getattr(value, "shape", ())
     if not isinstance(shape, tuple) or len(shape) > _DEEPEST or math.prod(shape) > _MOST:
         return {"type": described(value)}

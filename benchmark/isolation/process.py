@@ -108,12 +108,12 @@ class OutputTail:
             if self._ended:
                 return
             try:
-                part = os.read(self._pipe.fileno(), _KEPT_BYTES)
+                data = os.read(self._pipe.fileno(), _KEPT_BYTES)
             except BlockingIOError:  # nothing more was printed
                 return
-            self._ended = not part
-            self._count += len(part)
-            self._tail = (self._tail + part)[-_KEPT_BYTES:]
+            self._ended = not data
+            self._count += len(data)
+            self._tail = (self._tail + data)[-_KEPT_BYTES:]
 
 
 def last_lines(text: str) -> str:
@@ -161,7 +161,7 @@ def environment(folder: str, inherited: Mapping[str, str]) -> dict[str, str]:
         The parent's environment.
     """
     kept = {name: value for name, value in inherited.items() if _KEPT.fullmatch(name)}
-    paths = [str(Path(part).absolute()) for part in inherited.get("PYTHONPATH", "").split(os.pathsep) if part]
+    paths = [str(Path(place).absolute()) for place in inherited.get("PYTHONPATH", "").split(os.pathsep) if place]
     if paths:
         kept["PYTHONPATH"] = os.pathsep.join(paths)
     python = {"PYTHONDONTWRITEBYTECODE": "1", "PYTHONUNBUFFERED": "1"}  # what it prints is read before it dies

@@ -101,15 +101,15 @@ class Connection:
             # 0 would mean not to wait
             self._socket.settimeout(None if end is None else max(end - time.monotonic(), 1e-6))
             try:
-                part = self._socket.recv(missing)
+                data = self._socket.recv(missing)
             except TimeoutError:
                 raise
             except OSError as error:
                 raise TransportError(str(error)) from error
-            if not part:
+            if not data:
                 raise TransportError("the other side is gone")
-            parts.append(part)
-            missing -= len(part)
+            parts.append(data)
+            missing -= len(data)
         return b"".join(parts)
 
 
@@ -144,9 +144,9 @@ class MemoryFile:
 
     def write(self, parts: list[memoryview]) -> list[int]:
         """Write parts one after the other; where each begins, and where the last ends."""
-        starts = np.cumsum([0] + [aligned(part.nbytes) for part in parts]).tolist()
-        for part, start in zip(parts, starts, strict=False):
-            self._space[start : start + part.nbytes] = part
+        starts = np.cumsum([0] + [aligned(view.nbytes) for view in parts]).tolist()
+        for view, start in zip(parts, starts, strict=False):
+            self._space[start : start + view.nbytes] = view
         return list(starts)
 
     def close(self) -> None:

@@ -239,7 +239,7 @@ def has_open_marks(score: ScoreDocument) -> bool:
 
 def _points(score: ScoreDocument, by: str, metric: str) -> list[tuple[float, Value]]:
     """Values above 0 of a metric over strata, which a logarithmic axis can show."""
-    parts = [(x, part.metrics[metric]) for x, part in _strata(score, by) if metric in part.metrics]
+    parts = [(x, stratum.metrics[metric]) for x, stratum in _strata(score, by) if metric in stratum.metrics]
     return [(x, value) for x, value in parts if (value.value or 0.0) > 0.0]
 
 
@@ -254,7 +254,7 @@ def _bars(values: Sequence[Value], factor: float) -> Array:
 def _bound(axes: Axes, scores: Named, by: str, metric: str, factor: float) -> None:
     """The bound over the images that the first method with one has found."""
     for score in scores.values():
-        parts = [(x, part.metrics[metric].value) for x, part in _strata(score, by) if metric in part.metrics]
+        parts = [(x, stratum.metrics[metric].value) for x, stratum in _strata(score, by) if metric in stratum.metrics]
         shown = [(x, factor * value) for x, value in parts if value]
         if shown:
             axes.plot(*zip(*shown, strict=True), color="black", linewidth=2.0, linestyle=(0, (1, 1)), label="bound")
@@ -263,7 +263,7 @@ def _bound(axes: Axes, scores: Named, by: str, metric: str, factor: float) -> No
 
 def _strata(score: ScoreDocument, by: str) -> list[tuple[float, StratumScore]]:
     """Strata with the mean of what they are by."""
-    return [(part.mean, part) for part in score.strata if part.by == by and part.mean is not None]
+    return [(stratum.mean, stratum) for stratum in score.strata if stratum.by == by and stratum.mean is not None]
 
 
 def _scale(tables: Tables) -> LogNorm:

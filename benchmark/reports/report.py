@@ -103,10 +103,10 @@ def time_section(times: Mapping[str, Mapping[str, float]]) -> Section:
     ----------
     times : preset to stage to CPU-seconds a pair
     """
-    stages = list(dict.fromkeys(stage for part in times.values() for stage in part))
+    stages = list(dict.fromkeys(stage for seconds in times.values() for stage in seconds))
     heads = ("stage", *(f"{preset} / ms" for preset in times))
-    rows = [(stage, *(_milliseconds(part.get(stage)) for part in times.values())) for stage in stages]
-    total = ("all", *(_milliseconds(sum(part.values())) for part in times.values()))
+    rows = [(stage, *(_milliseconds(seconds.get(stage)) for seconds in times.values())) for stage in stages]
+    total = ("all", *(_milliseconds(sum(seconds.values())) for seconds in times.values()))
     words = (
         "CPU time of one pair, the mean over all pairs of a preset. Frames are drawn once for all methods; built-in "
         "methods share the search for the spot, and joint_fit begins with the fits of each image.",

@@ -101,9 +101,9 @@ class Case:
         """
         u, v = (int(x) for x in np.floor(uv_px))
         rows, columns = (slice(max(x - before, 0), max(x + after + 1, 0)) for x in (v, u))
-        part = self._planes(getattr(self.pair, self.position), rows, columns)
+        planes = self._planes(getattr(self.pair, self.position), rows, columns)
         off = getattr(self.pair, f"{self.position}_off")
-        return part - self._planes(off, rows, columns) if less_off and off is not None else part
+        return planes - self._planes(off, rows, columns) if less_off and off is not None else planes
 
     def _planes(self, image: Any, rows: slice, columns: slice) -> Array:
         planes = np.asarray(rgb_codes(image[rows, columns], self.pair.card, (columns.start, 0)), float)
@@ -312,13 +312,13 @@ def _is_peak_of_difference(case: Case, uv_px: Array) -> bool:
 
 def _is_lamp(case: Case, uv_px: Array, spot_level: float) -> bool:
     """Tell whether the light at a position is clipped, or in raw pixels thrice the spot's, black level included."""
-    part, card = case.region(uv_px, 1, 2), case.pair.card
-    if not part.size:
+    region, card = case.region(uv_px, 1, 2), case.pair.card
+    if not region.size:
         return False  # outside of the image
     top = float(card.top_dn) if card.output == "raw" else 255.0
-    if part.max(axis=-1).mean() >= _CLIPPED * top:
+    if region.max(axis=-1).mean() >= _CLIPPED * top:
         return True
-    return card.output == "raw" and float(part.sum(axis=-1).mean()) > _LAMP_TO_SPOT * spot_level > 0.0
+    return card.output == "raw" and float(region.sum(axis=-1).mean()) > _LAMP_TO_SPOT * spot_level > 0.0
 
 
 def _margin_px(rig: Rig) -> float:
@@ -327,8 +327,8 @@ def _margin_px(rig: Rig) -> float:
 
 def _level(case: Case, uv_px: Array, less_off: bool) -> float:
     """Mean of the 4 x 4 pixels around a position, all planes added; -inf outside the image."""
-    part = case.region(uv_px, 1, 2, less_off)
-    return float(part.sum(axis=-1).mean()) if part.size else -np.inf
+    region = case.region(uv_px, 1, 2, less_off)
+    return float(region.sum(axis=-1).mean()) if region.size else -np.inf
 
 
 def _stands_out(case: Case) -> bool:

@@ -207,11 +207,11 @@ def record_table(truths: Sequence[PairTruth], outcomes: Sequence[Outcome], rules
         # a calibration goes with its rig; its array is one object for all pairs, or rows that are equal stay apart
         index.setdefault((truth.nominal_rig, truth.true_rig, id(truth.calibration_covariance)), []).append(i)
     parts = [
-        part
+        of_rig
         for (nominal, true, _), rows in index.items()
-        for part in _of_rigs(nominal, true, [truths[i] for i in rows], [outcomes[i] for i in rows], rules)
+        for of_rig in _of_rigs(nominal, true, [truths[i] for i in rows], [outcomes[i] for i in rows], rules)
     ]
-    columns = {name: _joined([part[name] for part in parts]) for name in parts[0]}
+    columns = {name: _joined([of_rig[name] for of_rig in parts]) for name in parts[0]}
     table = pl.DataFrame(columns, schema_overrides=_TYPES).sort("number", pl.col("image") == "up")
     return table.with_columns(pl.col(pl.Float64).fill_nan(None)).select(*COLUMNS)
 

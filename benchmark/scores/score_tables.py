@@ -555,7 +555,7 @@ def _starred(name: str, value: Value, wide: bool) -> str:
 
 def one_line(estimate: Estimate, factor: float = 1.0, digits: int = 3) -> str:
     """Value and interval on one line."""
-    return " ".join(part for part in cell_parts(estimate, factor, digits) if part)
+    return " ".join(word for word in cell_parts(estimate, factor, digits) if word)
 
 
 def cell_parts(estimate: Estimate, factor: float, digits: int, significant: bool = False) -> tuple[str, str]:

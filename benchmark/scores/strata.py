@@ -83,10 +83,10 @@ def strata(records: pl.DataFrame) -> Iterator[Stratum]:
         yield from _by_edges(by, table)
     for by, column in _VALUES.items():
         for value in table[column].drop_nulls().unique().sort():
-            part = table.filter(pl.col(column) == value)
-            if len(part) == len(table):
+            rows = table.filter(pl.col(column) == value)
+            if len(rows) == len(table):
                 continue  # the whole again
-            yield Stratum(by, str(value), None, None, None, part, None if by in _OF_IMAGES else part)
+            yield Stratum(by, str(value), None, None, None, rows, None if by in _OF_IMAGES else rows)
 
 
 def light_shift() -> pl.Expr:

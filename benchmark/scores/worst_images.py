@@ -65,9 +65,9 @@ def crop(image: NDArray[Any], uv_px: Array, side_px: int = CROP_PX) -> tuple[NDA
     """
     u, v = (int(x) for x in np.floor(uv_px + 0.5) - side_px // 2)
     u0, v0 = max(u, 0), max(v, 0)
-    part = np.asarray(image[v0 : max(v + side_px, 0), u0 : max(u + side_px, 0)], float)
-    low, high = (part.min(), part.max()) if part.size else (0.0, 1.0)
-    return np.round(255.0 * (part - low) / max(high - low, 1e-9)).astype(np.uint8), (u0, v0)  # an even crop is black
+    pixels = np.asarray(image[v0 : max(v + side_px, 0), u0 : max(u + side_px, 0)], float)
+    low, high = (pixels.min(), pixels.max()) if pixels.size else (0.0, 1.0)
+    return np.round(255.0 * (pixels - low) / max(high - low, 1e-9)).astype(np.uint8), (u0, v0)  # an even crop is black
 
 
 def half_size(image: NDArray[Any], card: SensorCard) -> NDArray[np.uint8]:

@@ -227,7 +227,7 @@ def _arrays(table: pl.DataFrame, *names: str) -> Array:
 
 def _matrices(table: pl.DataFrame, name: str) -> Array:
     """Symmetric matrices of (u, v) of the columns NAME_uu_px2, _uv, _vv, shape (n, 2, 2)."""
-    return _arrays(table, *(f"{name}_{part}_px2" for part in ("uu", "uv", "uv", "vv"))).reshape(-1, 2, 2)
+    return _arrays(table, *(f"{name}_{entry}_px2" for entry in ("uu", "uv", "uv", "vv"))).reshape(-1, 2, 2)
 
 
 @dataclass(frozen=True)

@@ -119,11 +119,11 @@ def _beyond(found: _Found) -> str:
 
 def _numbers(text: str, at: int, count: int) -> tuple[float, ...]:
     """Numbers that follow a place of a text, after the head of a matrix: rows, cols, dt, type ids, brackets."""
-    part = text[at : at + _MANY]
-    head = re.search(r"data\s*[\"']?\s*:|<data>", part) if count > 2 else None
-    if head is not None and "[" not in part[: head.start()]:  # of a matrix with a head; else of the next one
-        part = part[head.end() :]
-    list_ = re.match(rf"[\s:>\"'=\[\(,\-]*?((?:[\[\(,\s\-]*{_NUMBER}[\]\),]*\s*)+)", part)
+    piece = text[at : at + _MANY]
+    head = re.search(r"data\s*[\"']?\s*:|<data>", piece) if count > 2 else None
+    if head is not None and "[" not in piece[: head.start()]:  # of a matrix with a head; else of the next one
+        piece = piece[head.end() :]
+    list_ = re.match(rf"[\s:>\"'=\[\(,\-]*?((?:[\[\(,\s\-]*{_NUMBER}[\]\),]*\s*)+)", piece)
     if list_ is None:
         return ()
     return tuple(float(x) for x in re.findall(_NUMBER, re.sub(r"(?m)^\s*-\s+", " ", list_[1])))[:count]

@@ -309,9 +309,9 @@ def _without(
 
 def _cut(pixels: Image, du: int, dv: int) -> Image:
     """Pixels without the first `du` columns and `dv` rows, and without as many at the end as keep the size even."""
-    part = pixels[dv : pixels.shape[0] - dv, du : pixels.shape[1] - du].copy()
-    part.flags.writeable = False
-    return part
+    inner = pixels[dv : pixels.shape[0] - dv, du : pixels.shape[1] - du].copy()
+    inner.flags.writeable = False
+    return inner
 
 
 def _rig_at(rig: Rig, du: int, dv: int) -> Rig:

@@ -266,11 +266,11 @@ def shift_px(one: Image, other: Image) -> tuple[float, float] | None:
         math.sqrt(float(np.sum(a**2) * np.sum(b**2))), 1e-30
     )
     most, (v0, u0) = _MOST_PX // block, (a.shape[0] // 2, a.shape[1] // 2)
-    part = correlation[v0 - most : v0 + most + 1, u0 - most : u0 + most + 1]
-    v, u = np.unravel_index(int(np.argmax(part)), part.shape)
-    if part[v, u] < _CLEAR or min(v, u) == 0 or v == part.shape[0] - 1 or u == part.shape[1] - 1:
+    around = correlation[v0 - most : v0 + most + 1, u0 - most : u0 + most + 1]
+    v, u = np.unravel_index(int(np.argmax(around)), around.shape)
+    if around[v, u] < _CLEAR or min(v, u) == 0 or v == around.shape[0] - 1 or u == around.shape[1] - 1:
         return None
-    dv, du = (_vertex(part[v - 1 : v + 2, u]), _vertex(part[v, u - 1 : u + 2]))
+    dv, du = (_vertex(around[v - 1 : v + 2, u]), _vertex(around[v, u - 1 : u + 2]))
     return block * (float(u) - most + du), block * (float(v) - most + dv)
 
 

@@ -152,13 +152,13 @@ def fit_shape(images: Sequence[SpotPicture], prior: SpotShape) -> SpotShape:
         found = [
             _linear(*one, values, theta) for one, theta in zip(zip(images, outputs, strict=True), thetas, strict=True)
         ]
-        scores, informations = _together([part for part in found if part is not None])
+        scores, informations = _together([window_fit for window_fit in found if window_fit is not None])
         if not len(scores):
             return prior
         normal = weight + informations.sum(axis=0)
         step = np.linalg.solve(normal, weight @ (prior.values - values) + scores.sum(axis=0))
         new = np.clip(values + np.clip(step, -np.array(_LONGEST), _LONGEST), _LOW, _HIGH)
-        thetas = [None if part is None else part.advanced(new - values) for part in found]
+        thetas = [None if window_fit is None else window_fit.advanced(new - values) for window_fit in found]
         small, values = np.sqrt(step @ normal @ step) < _REST, new
         if small:
             break

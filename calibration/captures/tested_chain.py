@@ -139,14 +139,14 @@ def jpeg_behind(pixels: Image) -> tuple[int, Subsampling] | None:
     quality = comb_quality(pixels)
     if quality is None:
         return None
-    part = _middle(pixels)[:512, :512]
-    part = np.ascontiguousarray(part[: part.shape[0] // 16 * 16, : part.shape[1] // 16 * 16])
+    corner = _middle(pixels)[:512, :512]
+    corner = np.ascontiguousarray(corner[: corner.shape[0] // 16 * 16, : corner.shape[1] // 16 * 16])
     off: dict[Subsampling, float] = {}
     samplings: tuple[Subsampling, ...] = ("4:2:0", "4:2:2", "4:4:4")
     for sampling in samplings:
         card = replace(sensor_card("mjpeg"), jpeg_quality=quality, jpeg_subsampling=sampling)
-        again = through_jpeg(part, card)
-        off[sampling] = float(np.sqrt(np.mean((again.astype(float) - part) ** 2)))
+        again = through_jpeg(corner, card)
+        off[sampling] = float(np.sqrt(np.mean((again.astype(float) - corner) ** 2)))
     best = min(off, key=lambda sampling: off[sampling])
     return (quality, best) if off[best] < _SAME_CODES else None
 
@@ -280,11 +280,11 @@ def _spot_phase(on: Array, off: Array) -> Phase | str | None:
     if match[v, u] < _SPOT_SIGMAS * max(scatter, 1e-9):  # noise-free pictures scatter by nothing
         return None
     v0, u0 = (max(2 * int(x) - 4, 0) for x in (v, u))
-    part = light[v0 : v0 + 10, u0 : u0 + 10]
+    window = light[v0 : v0 + 10, u0 : u0 + 10]
     wide = light[max(v0 - 10, 0) : v0 + 20, max(u0 - 10, 0) : u0 + 20]
     places = {}
     for du, dv in PATTERNS:  # red at (u + du, v + dv) even; v0 and u0 are even
-        places[du, dv] = float((part[dv::2, du::2] - np.median(wide[dv::2, du::2])).sum())
+        places[du, dv] = float((window[dv::2, du::2] - np.median(wide[dv::2, du::2])).sum())
     first, second, *_, last = sorted(places, key=lambda place: -places[place])
     if places[first] > _RED_RATIO * places[second]:
         return first

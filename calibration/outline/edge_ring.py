@@ -144,8 +144,8 @@ class EdgeRing:
         """Values of a table (TURNS, distances) on a curve, shape (TURNS,); 0 beyond the reach."""
         x = (distance_px - self.distances_px[0]) / self.step_px
         i = np.clip(x.astype(np.intp), 0, len(self.distances_px) - 2)
-        part, rows = x - i, np.arange(TURNS)
-        value = table[rows, i] * (1.0 - part) + table[rows, i + 1] * part
+        fraction, rows = x - i, np.arange(TURNS)
+        value = table[rows, i] * (1.0 - fraction) + table[rows, i + 1] * fraction
         return np.asarray(np.where((x < 0.0) | (x > len(self.distances_px) - 1), 0.0, value))
 
     def contrast(self, curve: Array) -> float:

@@ -194,7 +194,7 @@ def _luma_taps(parity: int, share: Array, card: SensorCard) -> Iterable[Tap]:
         there = (parity // 2 + dv) % 2 * 2 + (parity + du) % 2
         for i in range(3):
             sums = _BILINEAR[there][i] if card.mosaic == "bayer" else _OWN
-            yield from (Tap(weight * part * float(share[i]), i, du + a, dv + b) for part, a, b in sums)
+            yield from (Tap(weight * of_sum * float(share[i]), i, du + a, dv + b) for of_sum, a, b in sums)
 
 
 def _sharpening(amount: float) -> Iterable[tuple[float, int, int]]:
@@ -257,8 +257,8 @@ class Limb:
         # the last row has a next one no more
         at = np.clip((d_px - self.d_px[0]) / STEP_PX, 0.0, len(self.d_px) - 1.001)
         row = at.astype(np.intp)
-        rows, part = self.rows[filter_index], (at - row)[..., None]
-        return np.asarray(rows[row] * (1.0 - part) + rows[row + 1] * part)
+        rows, fraction = self.rows[filter_index], (at - row)[..., None]
+        return np.asarray(rows[row] * (1.0 - fraction) + rows[row + 1] * fraction)
 
 
 def limb_angle_rad(s: Array, radius_m: float) -> float:

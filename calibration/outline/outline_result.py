@@ -120,9 +120,9 @@ def mean_outline(outlines: Sequence[Outline]) -> PoseMeasurement:
 
 def mean_measured(parts: Sequence[PoseMeasurement]) -> PoseMeasurement:
     """Weighted mean of vectors; their scatter widens the covariance where it is larger than they claim."""
-    weights = np.array([np.linalg.inv(part.covariance) for part in parts])
+    weights = np.array([np.linalg.inv(measurement.covariance) for measurement in parts])
     covariance = np.linalg.inv(weights.sum(axis=0))
-    values = np.array([part.value for part in parts])
+    values = np.array([measurement.value for measurement in parts])
     mean = covariance @ np.einsum("kij,kj->i", weights, values)
     off = values - mean
     degrees = values.shape[1] * (len(parts) - 1)
@@ -182,10 +182,10 @@ def require_unlit(full: BoolArray, outline_px: Array, most: float) -> None:
     u, v = (np.rint(middle[k] + reach * away[:, k, None]).astype(np.intp) for k in (0, 1))
     seen = (u >= 0) & (v >= 0) & (u < full.shape[1]) & (v < full.shape[0])
     lit = (full[np.clip(v, 0, full.shape[0] - 1), np.clip(u, 0, full.shape[1] - 1)] & seen).sum(axis=1) >= _FEWEST_FULL
-    part = float(lit[seen.any(axis=1)].mean()) if seen.any() else 0.0
-    if part > most:
+    share = float(lit[seen.any(axis=1)].mean()) if seen.any() else 0.0
+    if share > most:
         raise ImageError(
-            f"lamps fill the pixels along {100.0 * part:.0f} % of the mirror's outline: where the limb is cannot be "
+            f"lamps fill the pixels along {100.0 * share:.0f} % of the mirror's outline: where the limb is cannot be "
             "seen there; take the picture with a shorter exposure, or switch lamps off"
         )
 

@@ -46,8 +46,8 @@ class EdgeLight:
         table = self.tables[filter_index]
         at = np.clip((d_px - distances_px()[0]) / STEP_PX, 0.0, len(table) - 1.001)
         row = at.astype(np.intp)
-        part = (at - row)[:, None]
-        return np.asarray(table[row] * (1.0 - part) + table[row + 1] * part)
+        fraction = (at - row)[:, None]
+        return np.asarray(table[row] * (1.0 - fraction) + table[row + 1] * fraction)
 
 
 def rim_light(rig: Rig, contour: Contour, blur_px2: float) -> EdgeLight:

@@ -378,7 +378,7 @@ def _undetermined(covariance: Array, names: Sequence[str]) -> tuple[WeakDirectio
     weak = [i for i in np.argsort(-size) if size[i] > _WEAK]
     # 4 % of a direction's length: less does not help a reader
     parts = [{n: float(x) for n, x in zip(names, vectors[:, i], strict=True) if abs(x) > 0.2} for i in weak]
-    return tuple(WeakDirection(part, float(np.sqrt(size[i]))) for part, i in zip(parts, weak, strict=True))
+    return tuple(WeakDirection(shares, float(np.sqrt(size[i]))) for shares, i in zip(parts, weak, strict=True))
 
 
 # -- outline and vertical of a true rig, as the nominal one gives them -------------------------------------------------

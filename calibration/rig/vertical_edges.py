@@ -71,7 +71,7 @@ class Unwrapped:
 def unwrapped(picture: Array, circle: Circle) -> Unwrapped:
     """Unwrap a picture, shape (H, W), about the circle of an outline."""
     centre, radius_px = np.array(circle[:2]), circle[2]
-    low, high = (part * radius_px for part in RADII)
+    low, high = (share * radius_px for share in RADII)
     columns = int(2.0 * np.pi * 0.5 * (low + high) / _STEP_PX)
     r, azimuth = np.arange(low, high), np.arange(columns) * (2.0 * np.pi / columns)
     u, v = centre[0] + np.outer(r, np.cos(azimuth)), centre[1] + np.outer(r, np.sin(azimuth))
@@ -170,9 +170,9 @@ def _steepest(across: Array, row: Rows, near: Array, reach_px: float) -> tuple[A
     k = np.arange(row.size)
     a, b, c = values[k, inner - 1], values[k, inner], values[k, inner + 1]
     with np.errstate(all="ignore"):
-        part = 0.5 * (a - c) / (a - 2.0 * b + c)
-    column = columns[k, inner] + part
-    column[(best != inner) | (np.abs(part) > 1.0)] = np.nan
+        shift = 0.5 * (a - c) / (a - 2.0 * b + c)
+    column = columns[k, inner] + shift
+    column[(best != inner) | (np.abs(shift) > 1.0)] = np.nan
     return column, b
 
 

@@ -109,8 +109,8 @@ def _groups(file: InputFile, lines: list[_Line]) -> Iterator[tuple[FrameGroup, b
 
 
 def _picture(file: InputFile, line: _Line) -> Path:
-    parts = [part for part in re.split(r"[\\/]+", line.values[0]) if part != "."]
-    if not all(parts) or ".." in parts or any(":" in part for part in parts):
+    parts = [word for word in re.split(r"[\\/]+", line.values[0]) if word != "."]
+    if not all(parts) or ".." in parts or any(":" in word for word in parts):
         raise file.fault(f"line {line.number}: a picture's name is relative and below the descriptor")
     return file.path.parent.joinpath(*parts)
 

@@ -119,8 +119,8 @@ def _levels(capture: Capture, group: FrameGroup, top: int) -> list[_Level]:
     if group.name.startswith("exposure/"):
         light = (group.seconds or 0.0, "seconds")
     return [
-        _Level(group.name, site, block_sums(part, top).jackknife(), light, group.seconds)
-        for site, part in _sites(_frames(capture, group, top), capture.kind)
+        _Level(group.name, site, block_sums(pixels, top).jackknife(), light, group.seconds)
+        for site, pixels in _sites(_frames(capture, group, top), capture.kind)
     ]
 
 

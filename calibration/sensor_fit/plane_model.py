@@ -265,12 +265,12 @@ def _correlated(one: Spectra, two: Spectra, variances: Array, halved: bool = Fal
 
     Shape (side, side), mean over the places of a sample. Samples of chroma of "yuyv" lie on even columns.
     """
-    part = 0.25
+    weight = 0.25
     if halved:
         # of an answer times (1 + (-1)^column) / 2
-        part, one = 0.5, 0.5 * (one + np.roll(one, _SIDE // 2, axis=-1))
+        weight, one = 0.5, 0.5 * (one + np.roll(one, _SIDE // 2, axis=-1))
     spectrum = (variances[:, None, None] * np.conj(one) * two).sum(axis=0)
-    return np.asarray(part * np.fft.ifft2(spectrum).real)
+    return np.asarray(weight * np.fft.ifft2(spectrum).real)
 
 
 @lru_cache(maxsize=1)

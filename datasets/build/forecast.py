@@ -125,11 +125,11 @@ def _light(plan: Plan) -> Light:
     Only the first room of each kind is made and looked up: it takes a while. So "cached" is said where there is no
     other room with light.
     """
-    lit = [(part, room) for part, room in _first_rooms(plan) if room.lit]
+    lit = [(share, room) for share, room in _first_rooms(plan) if room.lit]
     if not lit:
         return "none"
     settings = bake_settings(plan.recipe.ambient)
-    is_all = round(sum(part for part, _ in lit) * len(plan.rooms)) == len(lit)
+    is_all = round(sum(share for share, _ in lit) * len(plan.rooms)) == len(lit)
     cached = is_all and all(is_cached(plan.rig.at(0.0), room, settings) for _, room in lit)
     return "cached" if cached else "baked"
 
@@ -146,7 +146,7 @@ def _seconds(plan: Plan, megapixels: float, bakes: bool) -> dict[str, float]:
 
 def _bake_s(plan: Plan) -> float:
     """Seconds of a light map, the mean over the rooms of a plan; the first of a kind stands for all of it."""
-    return sum(part * _room_s(plan, room) for part, room in _first_rooms(plan))
+    return sum(share * _room_s(plan, room) for share, room in _first_rooms(plan))
 
 
 def _room_s(plan: Plan, room: Room) -> float:
@@ -184,7 +184,7 @@ def _first_rooms(plan: Plan) -> Iterator[tuple[float, Room]]:
 def _texels(plan: Plan) -> float:
     """Texels of a light map, the mean over the rooms of a plan."""
     size = plan.recipe.ambient.texel_m
-    return sum(part * texel_count(room, size) for part, room in _first_rooms(plan) if room.lit)
+    return sum(share * texel_count(room, size) for share, room in _first_rooms(plan) if room.lit)
 
 
 def megabytes(count: int) -> str:

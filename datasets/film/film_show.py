@@ -64,8 +64,8 @@ def _colours(frame: FilmFrame) -> Picture:
 def _inset(film: Film, frame: FilmFrame, colours: Picture) -> Image.Image:
     row = film.table.row(frame.frame, named=True)
     box = Region.around(row["row_u_px"], row["row_v_px"], film.plan.size, min(_INSET_PX, *film.plan.size))
-    part = Image.fromarray(colours[box.slices(frame.region)])
-    enlarged = part.resize((box.shape[1] * _ZOOM, box.shape[0] * _ZOOM), Image.Resampling.NEAREST)
+    cutout = Image.fromarray(colours[box.slices(frame.region)])
+    enlarged = cutout.resize((box.shape[1] * _ZOOM, box.shape[0] * _ZOOM), Image.Resampling.NEAREST)
     _marks(enlarged, film, frame, box, _ZOOM)
     ImageDraw.Draw(enlarged).rectangle((0, 0, enlarged.width - 1, enlarged.height - 1), outline=_YELLOW)
     return enlarged

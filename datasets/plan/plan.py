@@ -155,9 +155,9 @@ class Plan:
         """
         if not causes:
             return self
-        part = _of_pairs(self, tuple(pair for pair in self.pairs if pair.sample_id not in causes))
+        shorter = _of_pairs(self, tuple(pair for pair in self.pairs if pair.sample_id not in causes))
         return replace(
-            part,
+            shorter,
             refused={name: reason for name, reason in self.refused.items() if name not in causes},
             left_out=self.left_out | {name: causes[name] for name in self.sample_ids if name in causes},
         )

@@ -203,8 +203,8 @@ def draw_samples(
                 _require_some(refused, samples, table.samples)
                 continue  # the others of the set are made
             makers = _Makers(recipe, table, room_id, room, first)
-            for part in (numbers[:_PILOT], numbers[_PILOT:]):  # whether it is possible at all is known after a few
-                drawn, lost = makers.draw(part)
+            for batch in (numbers[:_PILOT], numbers[_PILOT:]):  # whether it is possible at all is known after a few
+                drawn, lost = makers.draw(batch)
                 samples |= {sample.number: sample for sample in drawn}
                 refused |= lost
                 _require_some(refused, samples, table.samples)

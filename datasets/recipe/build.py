@@ -329,8 +329,8 @@ def _axis_distance_m(triangles_m: Array) -> Array:
     """Distances of the origin from triangles of the plane, shape (N,), for corners (N, 3, 2)."""
     side = np.roll(triangles_m, -1, axis=1) - triangles_m
     squared = np.maximum(np.einsum("nki,nki->nk", side, side), 1e-300)  # a side without a length
-    part = np.clip(-np.einsum("nki,nki->nk", triangles_m, side) / squared, 0.0, 1.0)
-    nearest = np.linalg.norm(triangles_m + part[..., None] * side, axis=-1).min(axis=1)
+    share = np.clip(-np.einsum("nki,nki->nk", triangles_m, side) / squared, 0.0, 1.0)
+    nearest = np.linalg.norm(triangles_m + share[..., None] * side, axis=-1).min(axis=1)
     turn = triangles_m[..., 0] * side[..., 1] - triangles_m[..., 1] * side[..., 0]
     inside = ((turn > 0.0).all(axis=1)) | ((turn < 0.0).all(axis=1))
     return np.where(inside, 0.0, nearest)

@@ -137,10 +137,10 @@ def _hdr(file: InputFile, data: bytes) -> Light:
     exposure = _exposure(file, head)
     light = np.empty((rows, columns, 3), np.float32)
     for start in range(0, rows, _ROWS):
-        part = coded[start : start + _ROWS]
+        lines = coded[start : start + _ROWS]
         # RGBE: 128 of the exponent, 8 of the mantissa's bits
-        scale = np.exp2(part[..., 3].astype(np.int32) - 136.0) * (part[..., 3] > 0)
-        light[start : start + _ROWS] = part[..., :3] * (scale / exposure)[..., None]
+        scale = np.exp2(lines[..., 3].astype(np.int32) - 136.0) * (lines[..., 3] > 0)
+        light[start : start + _ROWS] = lines[..., :3] * (scale / exposure)[..., None]
     return light
 
 

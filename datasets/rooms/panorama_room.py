@@ -102,8 +102,8 @@ class _Panorama:
         """Radiance, shape (N, 3), of texels at centres, shape (N, 3), with sides x and y, shape (N, 3)."""
         result = np.empty((len(centres_m), 3), np.float32)
         for start in range(0, len(centres_m), _AT_ONCE):
-            part = slice(start, start + _AT_ONCE)
-            result[part] = self._mean(centres_m[part] - self.point, x_m[part], y_m[part])
+            rows = slice(start, start + _AT_ONCE)
+            result[rows] = self._mean(centres_m[rows] - self.point, x_m[rows], y_m[rows])
         return result
 
     def _mean(self, centres: Array, x: Array, y: Array) -> NDArray[np.float32]:

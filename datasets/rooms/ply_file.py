@@ -182,8 +182,8 @@ class _AsciiBody:
         """Next element."""
         if not any(p.count_kind for p in element.properties):
             width = len(element.properties)
-            part = self._take(width * element.count).reshape(element.count, width)
-            return {p.name: part[:, k] for k, p in enumerate(element.properties)}
+            values = self._take(width * element.count).reshape(element.count, width)
+            return {p.name: values[:, k] for k, p in enumerate(element.properties)}
         columns: dict[str, list[Any]] = {p.name: [] for p in element.properties}
         for _ in range(element.count):
             for p in element.properties:
@@ -194,11 +194,11 @@ class _AsciiBody:
         return dict(columns)
 
     def _take(self, count: int) -> Array:
-        part = self.numbers[self.at : self.at + count]
-        if len(part) != count:
+        values = self.numbers[self.at : self.at + count]
+        if len(values) != count:
             raise damaged(self.file)
         self.at += count
-        return part
+        return values
 
 
 class _BinaryBody:

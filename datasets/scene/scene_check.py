@@ -198,10 +198,10 @@ def _ratios(theirs: Array, ours: Array, free: NDArray[np.bool_], side: int) -> I
     for v in range(0, ours.shape[0] - side + 1, side):
         for u in range(0, ours.shape[1] - side + 1, side):
             square = slice(v, v + side), slice(u, u + side)
-            part = ours[square][free[square]]
-            level = part.mean(axis=-1)
-            if 2 * len(part) >= side**2 and 0.0 < level.max() <= _EVEN * np.median(level):
-                yield float((theirs[square][free[square]].mean(axis=0) / part.mean(axis=0)).mean())
+            pixels = ours[square][free[square]]
+            level = pixels.mean(axis=-1)
+            if 2 * len(pixels) >= side**2 and 0.0 < level.max() <= _EVEN * np.median(level):
+                yield float((theirs[square][free[square]].mean(axis=0) / pixels.mean(axis=0)).mean())
 
 
 def _free(scene: LoadedScene, ours: Array) -> dict[str, NDArray[np.bool_]]:

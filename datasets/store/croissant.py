@@ -172,11 +172,11 @@ def dataset_croissant(info: DatasetInfo, types: Mapping[str, str], hashes: Mappi
     types : columns of `manifest.parquet` with their types
     hashes : SHA-256 by file
     """
-    part = f", part {info.shard}" if info.shard else ""
+    shard = f", part {info.shard}" if info.shard else ""
     left_out = f"Left out, because refused: {counted((len(info.left_out), 'pair'))}. " if info.left_out else ""
     about = (
         "Layers of light of a laser spot in a mirror, seen by a camera that moves up by the stroke between two images, "
-        f"with the exact truth of every pixel and spot{part}: "
+        f"with the exact truth of every pixel and spot{shard}: "
         f"{counted((info.samples, 'pair'), (info.rigs, 'rig'), (info.rooms, 'room'))}. "
         f"{left_out}phibench draws frames of any exposure and noise from them."
     )

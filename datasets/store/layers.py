@@ -244,8 +244,8 @@ class SpotWindow(ShortForm):
         v0, v1 = max(self.v0_px, 0), min(self.v0_px + rows, height)
         u0, u1 = max(self.u0_px, 0), min(self.u0_px + columns, width)
         if v0 < v1 and u0 < u1:
-            part = self.electrons_per_s[:, v0 - self.v0_px : v1 - self.v0_px, u0 - self.u0_px : u1 - self.u0_px]
-            image[:, v0:v1, u0:u1] += gain * part
+            electrons = self.electrons_per_s[:, v0 - self.v0_px : v1 - self.v0_px, u0 - self.u0_px : u1 - self.u0_px]
+            image[:, v0:v1, u0:u1] += gain * electrons
 
 
 def write_ambient(path: Path, planes: NDArray[Any], variance: NDArray[Any], header: Mapping[str, Any]) -> Path:

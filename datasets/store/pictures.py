@@ -112,10 +112,10 @@ def crop(frame: NDArray[Any], spot: SpotPlace) -> NDArray[Any]:
     if corner is not None:
         (u0, v0), (height, width) = corner, frame.shape[1:]
         rows, columns = (slice(max(x, 0), max(min(x + CROP_PX, n), 0)) for x, n in ((v0, height), (u0, width)))
-        part = frame[:, rows, columns]
-        if part.size:
+        pixels = frame[:, rows, columns]
+        if pixels.size:
             v, u = rows.start - v0, columns.start - u0
-            result[:, v : v + part.shape[1], u : u + part.shape[2]] = part
+            result[:, v : v + pixels.shape[1], u : u + pixels.shape[2]] = pixels
     return result
 
 

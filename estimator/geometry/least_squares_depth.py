@@ -171,9 +171,9 @@ def nominal_depth(
     claimed = np.isfinite(general.sigma_m)
     # equal weights where there is no claim: the calibration's part is then that of round spots of one size
     unclaimed = _calibration_sigma_m(rig, stroke_m, uv_px, calibration)
-    part = np.hypot(general.sigma_calibration_m, general.sigma_stroke_m)
+    rig_sigma_m = np.hypot(general.sigma_calibration_m, general.sigma_stroke_m)
     return NominalDepth(
-        np.where(claimed, general.depth_m, plain.depth_m), general.sigma_m, np.where(claimed, part, unclaimed)
+        np.where(claimed, general.depth_m, plain.depth_m), general.sigma_m, np.where(claimed, rig_sigma_m, unclaimed)
     )
 
 

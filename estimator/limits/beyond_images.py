@@ -172,10 +172,10 @@ def _tried(records: pl.DataFrame) -> Iterator[Excess]:
     yield _of_errors("positions", "all pairs", pairs["possible_position_chi2"].to_numpy(), 3)
     yield from _by_thirds("D", "pairs", depth, deep["possible_depth_m2"].to_numpy(), 1)
     images = {name: _found_images(records, name) for name in ("down", "up")}
-    for name, part in images.items():
-        size = part["possible_spot_px2"].to_numpy()
-        yield from _by_thirds("positions", f"{name} images", part["possible_spot_chi2"].to_numpy(), size, 2)
-        yield from _by_thirds("phi", f"{name} images", part["spot_phi_chi2"].to_numpy(), size, 1)
+    for name, rows in images.items():
+        size = rows["possible_spot_px2"].to_numpy()
+        yield from _by_thirds("positions", f"{name} images", rows["possible_spot_chi2"].to_numpy(), size, 2)
+        yield from _by_thirds("phi", f"{name} images", rows["spot_phi_chi2"].to_numpy(), size, 1)
     both = pl.concat(images.values())
     yield _of_exact("positions", both, "possible_spot_chi2", float(scipy.stats.chi2.ppf(EXACT / 2.0, 2)))
     yield _of_exact("phi", both, "spot_phi_chi2", float(scipy.stats.chi2.ppf(EXACT / 2.0, 1)))

@@ -128,7 +128,7 @@ class StrokeCurve:
     def sigma_m(self) -> Array:
         """All parts together: their squares add up."""
         parts = (self.sigma_spot_m, self.sigma_calibration_m, self.sigma_stroke_m, self.sigma_higher_order_m)
-        return np.asarray(np.sqrt(sum(part**2 for part in parts)))
+        return np.asarray(np.sqrt(sum(error_m**2 for error_m in parts)))
 
     @property
     def allowed_sigma_m(self) -> Array:
@@ -155,7 +155,7 @@ def stroke_curve(
     down, up = (image.uv_px for image in images)
     depth = depth_general(rig, h[:, None], down, up, C_down, C_up, covariance_rig, np.asarray(stroke_sigma_m))
     parts = (depth.sigma_spot_m, depth.sigma_calibration_m, depth.sigma_stroke_m)
-    of_spot, of_rig, of_stroke = (np.sqrt(np.mean(part**2, axis=-1)) for part in parts)
+    of_spot, of_rig, of_stroke = (np.sqrt(np.mean(errors_m**2, axis=-1)) for errors_m in parts)
     even = beyond_first_order_m(rig, h, points, C_down, C_up, covariance_rig, stroke_sigma_m)
     curve = StrokeCurve(h, of_spot, of_rig, of_stroke, even, causes(rig, points, images[0], images[1], h, around))
     return replace(curve, causes=_with_unknown(curve, spot, electrons[0], electrons[1]))

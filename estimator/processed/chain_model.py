@@ -380,5 +380,5 @@ def _rounding(shape: tuple[int, int], subsampling: str, of_rgb: float) -> Array:
     of_codes = of_rgb * np.sum(YCC_FROM_RGB**2, axis=1)
     # mean square of rounding to whole numbers: halves err by 0, 1/2; quarters by 0, 1/4, 1/2, 1/4
     average = {1: 0.0, 2: 0.125, 4: 0.094}[n]
-    chroma = [(part + _ROUNDING) / n + average for part in of_codes[1:]]
-    return np.concatenate([np.full(count, of_codes[0] + _ROUNDING), *(np.full(count // n, part) for part in chroma)])
+    chroma = [(code + _ROUNDING) / n + average for code in of_codes[1:]]
+    return np.concatenate([np.full(count, of_codes[0] + _ROUNDING), *(np.full(count // n, code) for code in chroma)])

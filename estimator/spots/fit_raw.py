@@ -143,7 +143,7 @@ def fit_law(
     data = spot_data(regions, law, blur, model)
     parts = [np.arange(i, min(i + AT_ONCE, len(data))) for i in range(0, len(data), AT_ONCE)]
     near = None if near_px is None else np.broadcast_to(np.asarray(near_px, float), (len(data), 2))
-    fits = [_fit(data.rows(part), None if near is None else near[part]) for part in parts]
+    fits = [_fit(data.rows(rows), None if near is None else near[rows]) for rows in parts]
     if not fits:
         return _nothing(data.pixels.levels.shape[1])
     return SpotFit(*(np.concatenate([getattr(fit, f.name) for fit in fits]) for f in fields(SpotFit)))

@@ -174,15 +174,15 @@ def colour_planes(image: Image, card: SensorCard, box: Box) -> ColourPlanes:
     ValueError
         If the card's output is "electrons", or the image has another shape than it says.
     """
-    part = image[box.slices]
-    if part.shape[2:] != {"raw": (), "srgb8": (3,), "yuyv": (2,), "mjpeg": (3,)}.get(card.output) or part.ndim < 2:
+    pixels = image[box.slices]
+    if pixels.shape[2:] != {"raw": (), "srgb8": (3,), "yuyv": (2,), "mjpeg": (3,)}.get(card.output) or pixels.ndim < 2:
         raise ValueError(
             f"an image of the shape {image.shape} for the output '{card.output}': raw needs (H, W), srgb8 and mjpeg "
             "need (H, W, 3), yuyv needs (H, W, 2)"
         )
     if card.output == "raw":
-        return _raw(part, card, box)
-    return _developed(rgb_picture(part, card, (box.u0_px, box.v0_px)), card, box)
+        return _raw(pixels, card, box)
+    return _developed(rgb_picture(pixels, card, (box.u0_px, box.v0_px)), card, box)
 
 
 def blur_of(card: SensorCard, sigma_px: float) -> float:

@@ -290,7 +290,7 @@ def _best_chroma(
 
 
 def _chosen(index: tuple[NDArray[np.int64], ...], which: BoolArray) -> tuple[NDArray[np.int64], ...]:
-    return tuple(part[which] for part in index)
+    return tuple(indices[which] for indices in index)
 
 
 def _in_blocks(planes: Array) -> Array:

@@ -238,11 +238,11 @@ def find_spot(on: Array, off: Array | None = None, region: Region | None = None)
     red = np.asarray(on[0] if off is None else on[0] - off[0], float)
     height, width = red.shape
     u0, v0, u1, v1 = region if region is not None else (0, 0, width, height)
-    part = red[v0:v1, u0:u1]
-    if part.size == 0 or not np.isfinite(part).all():
-        return _nowhere((u0, v0, u1, v1), Status.NO_SPOT if part.size == 0 else Status.NOT_FINITE)
-    row, column = np.unravel_index(int(np.argmax(part)), part.shape)
-    u, v, peak = u0 + int(column), v0 + int(row), float(part[row, column])
+    inside = red[v0:v1, u0:u1]
+    if inside.size == 0 or not np.isfinite(inside).all():
+        return _nowhere((u0, v0, u1, v1), Status.NO_SPOT if inside.size == 0 else Status.NOT_FINITE)
+    row, column = np.unravel_index(int(np.argmax(inside)), inside.shape)
+    u, v, peak = u0 + int(column), v0 + int(row), float(inside[row, column])
     if peak <= 0.0:
         return _nowhere((u0, v0, u1, v1), Status.NO_SPOT)
     window, status = _grow(red, u, v, EMPTY * peak)
@@ -276,11 +276,11 @@ def _region(window: list[int]) -> Region:
 
 def _centroid_in(red: Array, window: Region) -> SpotPosition:
     u0, v0, u1, v1 = window
-    part = red[v0:v1, u0:u1]
-    flux = float(part.sum())
+    inside = red[v0:v1, u0:u1]
+    flux = float(inside.sum())
     # moments about the window's corner, so that large pixel numbers cost no digits
-    du = float(part.sum(axis=0) @ np.arange(u1 - u0)) / flux
-    dv = float(part.sum(axis=1) @ np.arange(v1 - v0)) / flux
+    du = float(inside.sum(axis=0) @ np.arange(u1 - u0)) / flux
+    dv = float(inside.sum(axis=1) @ np.arange(v1 - v0)) / flux
     return SpotPosition(np.array([u0 + du, v0 + dv]), flux, window, Status.OK)
 
 

@@ -185,7 +185,7 @@ class SmoothedBelief(Belief):
                 self._frames = replace(self._frames, rays=rays)
             rows = self._with_priors(self._x, self._rows(self._x, self._frames))
             factor = np.asarray(np.linalg.cholesky(rows.C), float)
-            r, J = (solve_triangular(factor, part, lower=True) for part in (rows.r, rows.J))
+            r, J = (solve_triangular(factor, matrix, lower=True) for matrix in (rows.r, rows.J))
             hessian = J.T @ J + np.diag(self._precision)
             step = -np.linalg.solve(hessian, J.T @ r + self._precision * (self._x - self._prior))
             P = np.linalg.inv(hessian)

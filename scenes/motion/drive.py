@@ -189,8 +189,8 @@ class Drive:
         net, gross = np.zeros((*times.shape, 2)), np.zeros((*times.shape, 2))
         for leg, profile in zip(self.legs, self.profiles, strict=True):
             if leg.drives:
-                part = profile.state(times)[0][..., None] / profile.end_m * self._tracks_m(leg)
-                net, gross = net + part, gross + np.abs(part)
+                share = profile.state(times)[0][..., None] / profile.end_m * self._tracks_m(leg)
+                net, gross = net + share, gross + np.abs(share)
         return net, gross
 
     def readings_m(self, times_s: Array, *names: Name) -> Array:

@@ -128,5 +128,5 @@ class BlinkCode:
         position = (times_s - self.start_s) / self.bit_s
         whole = np.floor(position).astype(int)
         rounds, number = np.divmod(whole, len(self.bits))
-        part = (position - whole) * self.bit_s
-        return rounds * passed[-1] + passed[number] + part * self._values[number]
+        fraction = (position - whole) * self.bit_s
+        return rounds * passed[-1] + passed[number] + fraction * self._values[number]

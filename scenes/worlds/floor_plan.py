@@ -143,8 +143,8 @@ def floor_plan(properties: RoomProperties) -> FloorPlan:
     if not p.l_shape or min(cut) < 0.5:
         cut = (0.0, 0.0)
     robot = [
-        _ROBOT_MARGIN_M + part * (side - 2.0 * _ROBOT_MARGIN_M)
-        for part, side in zip((p.robot_x, p.robot_y), sides, strict=True)
+        _ROBOT_MARGIN_M + share * (side - 2.0 * _ROBOT_MARGIN_M)
+        for share, side in zip((p.robot_x, p.robot_y), sides, strict=True)
     ]
     if cut[0] > 0.0 and all(at > side - c - _ROBOT_MARGIN_M for at, side, c in zip(robot, sides, cut, strict=True)):
         robot[0] = p.length_m - robot[0]  # into the part that is left

@@ -312,8 +312,8 @@ def hazard(rng: np.random.Generator, shape: Shape2) -> Array:
     if rng.random() < 0.4:
         pair = np.array([[0.5, 0.04, 0.04, 0.6], [0.75, 0.75, 0.72, 0.76]])
     wave = np.mod((x + y) / 8.0, 1.0)
-    part = np.clip(4.0 * (np.abs(wave - 0.5) - 0.25) + 0.5, 0.0, 1.0)
-    return shaded(mixed(pair, 0, 1, part), 1.0 + 0.12 * fractal(rng, shape, 0.9))
+    share = np.clip(4.0 * (np.abs(wave - 0.5) - 0.25) + 0.5, 0.0, 1.0)
+    return shaded(mixed(pair, 0, 1, share), 1.0 + 0.12 * fractal(rng, shape, 0.9))
 
 
 def screen(rng: np.random.Generator, shape: Shape2) -> Array:

@@ -225,7 +225,7 @@ def drawn_errors(
 ) -> dict[str, Array]:
     """Errors of D, shape (count, n), metres, in every sense of phi, of an aligned reader of drawn rigs."""
     pictures = [seen(rig, drawn_misalignment(rig, random), points_m, strokes_m) for _ in range(count)]
-    down, up, true = (np.stack(part) for part in zip(*pictures, strict=True))
+    down, up, true = (np.stack(rows) for rows in zip(*pictures, strict=True))
     return {sense: estimates(sense, rig, strokes_m, down, up) - true for sense in SENSES}
 
 

@@ -69,7 +69,7 @@ def measured(rig: Rig, points_m: Array, stroke_m: float, edge_px: float, azimuth
 def shown(rig: Rig, points_m: Array, offset_m: float, edge_px: float) -> BoolArray:
     """Places whose image lies inside the mirror's and the camera's, shape (n,); the robot is not asked."""
     parts = np.array_split(points_m, max(len(points_m) // _CHUNK, 1))
-    return np.concatenate([_shown(rig, part, offset_m, edge_px) for part in parts])
+    return np.concatenate([_shown(rig, points, offset_m, edge_px) for points in parts])
 
 
 def _shown(rig: Rig, points_m: Array, offset_m: float, edge_px: float) -> BoolArray:

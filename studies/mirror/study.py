@@ -158,7 +158,7 @@ def run(settings: MirrorSettings, datasets: StudyDatasets) -> StudyResult:
             "costs": cost_frame(compared),
             "map": map_frame(compared),
         },
-        tuple(row for part in _FINDINGS for row in part(compared, settings)),
+        tuple(row for findings_of in _FINDINGS for row in findings_of(compared, settings)),
         (comparison_drawing(compared, settings),),
         shown,
         _notes(settings),

@@ -65,7 +65,7 @@ from phibench.studies.misalignment.tables import (
 
 
 def _tuples(value: object) -> object:
-    return tuple(_tuples(part) for part in value) if isinstance(value, list) else value
+    return tuple(_tuples(item) for item in value) if isinstance(value, list) else value
 
 
 Distance = Annotated[float, Field(gt=0.1, le=20.0)]

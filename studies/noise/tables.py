@@ -73,8 +73,8 @@ def with_levels(records: pl.DataFrame, levels: Mapping[str, Sequence[float]]) ->
 def table_of(records: pl.DataFrame, rules: Rules) -> pl.DataFrame:
     """One row per case and method: every metric with its interval, scatter and bias of the position apart."""
     rows = [
-        {**dict(zip(CASE, key, strict=True)), **_row(part, rules, key)}
-        for key, part in sorted(records.group_by(*CASE), key=lambda item: tuple(map(str, item[0])))
+        {**dict(zip(CASE, key, strict=True)), **_row(group, rules, key)}
+        for key, group in sorted(records.group_by(*CASE), key=lambda item: tuple(map(str, item[0])))
     ]
     return pl.DataFrame(rows, infer_schema_length=None).sort(*CASE)
 
@@ -82,14 +82,14 @@ def table_of(records: pl.DataFrame, rules: Rules) -> pl.DataFrame:
 def elasticities(records: pl.DataFrame, rules: Rules) -> list[Elasticity]:
     """Elasticities of every method on every factor that has levels on one side of the base, or on both."""
     rows = []
-    for key, part in sorted(records.group_by("sample", "preset", "factor", "method"), key=lambda item: item[0]):
+    for key, group in sorted(records.group_by("sample", "preset", "factor", "method"), key=lambda item: item[0]):
         sample, preset, factor, method = (str(x) for x in key)
         if factor == BASE:
             continue  # the base case has no slope
-        span = around_base(sorted(part["level"].unique()), FACTORS[factor].base)
+        span = around_base(sorted(group["level"].unique()), FACTORS[factor].base)
         if span is None:
             continue  # no level on both sides of the base
-        estimate, bound = _slope(part, span, rules, (sample, preset, factor))
+        estimate, bound = _slope(group, span, rules, (sample, preset, factor))
         rows.append(Elasticity(sample, preset, factor, method, *span, estimate, bound))
     return rows
 

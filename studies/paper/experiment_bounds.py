@@ -192,7 +192,7 @@ def budget_table(rows: pl.DataFrame, wide: bool = False) -> TextTable:
     """Budgets per experiment, of all rows, and of those whose bound is at most 1 % of D; `wide` adds the intervals."""
     ratios = ("predicted\n/ measured", "measured\n/ bound", "within\n95 %", "nominal\nrig")
     heads = ("rows", "n\nof all", "measured", "predicted", "bound", *ratios)
-    body = tuple((name, *_cells(budget(part), wide)) for name, part in _parts(rows))
+    body = tuple((name, *_cells(budget(own), wide)) for name, own in _parts(rows))
     confidence = "; 95 % intervals over samples" if wide else ""
     note = "" if wide else "95 % intervals: --wide."
     return TextTable(f"Relative errors of D in %{confidence}", heads, body, "L" + "r" * (len(heads) - 1), note)
@@ -217,9 +217,9 @@ def _parts(rows: pl.DataFrame) -> Iterator[tuple[str, pl.DataFrame]]:
 
 def _cells(one: Budget, wide: bool) -> list[str]:
     """Cells of a row; values alone unless it is `wide`."""
-    part = slice(None if wide else 1)
+    shown = slice(None if wide else 1)
     measured, closure, over_bound, within = (
-        " ".join(list(filter(None, cell_parts(estimate, factor, digits)))[part])
+        " ".join(list(filter(None, cell_parts(estimate, factor, digits)))[shown])
         for estimate, factor, digits in (
             (one.measured, 100.0, 3),
             (one.closure, 1.0, 2),

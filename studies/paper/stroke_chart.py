@@ -151,7 +151,7 @@ def _verdict(loss: Loss) -> str:
 def best_lines(best: BestStroke) -> list[str]:
     """Sentences on the best stroke: what it is, what its error consists of, and what limits it."""
     parts = (best.sigma_spot_m, best.sigma_calibration_m, best.sigma_stroke_m, best.sigma_higher_order_m)
-    spot, rig, stroke, beyond = (f"{1e3 * part:.2g} mm" for part in parts)
+    spot, rig, stroke, beyond = (f"{1e3 * error_m:.2g} mm" for error_m in parts)
     low, high = best.near(0.05)
     share = 100.0 * best.sigma_m / best.depth_m
     lines = [
