@@ -11,6 +11,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
+from phibench.datasets.common.shown_text import table_lines
+
 Row = tuple[str, ...]
 Relation = Literal["", "<=", ">=", "=", "!="]
 Verdict = Literal["", "met", "missed", "undecided", "favoured", "disfavoured"]
@@ -114,8 +116,8 @@ def findings_table(findings: Iterable[Finding]) -> tuple[Row, ...]:
 
 def markdown_table(rows: Sequence[Row]) -> str:
     """Lines of a Markdown table; the first row is the heads."""
-    head, *body = rows
-    return "\n".join(map(_markdown_line, (head, ("---",) * len(head), *body)))
+    head, *body = ([cell.replace("|", "\\|") for cell in row] for row in rows)
+    return "\n".join(table_lines(head, body, [" --- "] * len(head)))
 
 
 def print_table(rows: Sequence[Row]) -> None:
@@ -130,7 +132,3 @@ def print_table(rows: Sequence[Row]) -> None:
     for row in body:
         table.add_row(*row)
     Console(markup=False, emoji=False).print(table)
-
-
-def _markdown_line(cells: Row) -> str:
-    return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"

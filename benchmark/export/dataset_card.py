@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from phibench.benchmark.export.containers import FOLDER, hugging_face_features
 from phibench.benchmark.export.pair_rows import INDEX, POSITION_FIELDS, SPLITS, ExportRequest
-from phibench.datasets.common.shown_text import markdown_text
+from phibench.datasets.common.shown_text import markdown_text, table_lines
 from phibench.datasets.frames.frame_files import VALUES, FrameRow
 from phibench.datasets.read import Dataset
 from phibench.datasets.store.croissant import (
@@ -101,14 +101,15 @@ def card(dataset: Dataset, request: ExportRequest, table: DataFrame) -> str:
     lines = ["---", *_header(dataset, request, table), "---", "", f"# {name}, {request.frames.preset}", ""]
     lines += [_description(dataset, request, table), "", *_reading(request), "", "## Splits", ""]
     by = {"both": "rig or room", "rig": "rig", "room": "room"}[request.split_by]
-    lines += [f"No two splits share a {by}, and draws of one pair stay together.", "", "| split | pairs |", "|---|---|"]
-    lines += [f"| {name} | {int((table['split'] == name).sum())} |" for name in SPLITS]
+    lines += [f"No two splits share a {by}, and draws of one pair stay together.", ""]
+    lines += table_lines(("split", "pairs"), [(name, f"{int((table['split'] == name).sum())}") for name in SPLITS])
     values = VALUES[request.frames.sensor().output]
     if request.frames.region is not None:
         values = f"{values.removesuffix(', in a JPEG')}, in a PNG"
-    lines += ["", "## Columns", "", f"Images: {values}.", "", "| column | meaning |", "|---|---|"]
+    lines += ["", "## Columns", "", f"Images: {values}.", ""]
     texts = column_texts(request)
-    lines += [f"| `{name}` | {texts.get(name, 'drawn by the recipe')} |" for name in table.columns]
+    meanings = [(f"`{name}`", texts.get(name, "drawn by the recipe")) for name in table.columns]
+    lines += table_lines(("column", "meaning"), meanings)
     lines += ["", f"{_PIXELS} `rigs.jsonl` has the numbers of every rig by the"]
     lines += ["ids in `rig` and `nominal_rig`, `rooms.jsonl` those of every room, `recipe.toml` the recipe.", ""]
     return "\n".join([*lines, "## Licence", "", f"[CC BY 4.0]({LICENSE_URL}).", ""])

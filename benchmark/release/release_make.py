@@ -42,6 +42,7 @@ from phibench.datasets.build.tasks import BuildTask, Made
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import InputFile
 from phibench.datasets.common.progress import progress_console
+from phibench.datasets.common.shown_text import table_lines
 from phibench.datasets.film.film_forecast import films_forecast
 from phibench.datasets.film.film_make import make_films
 from phibench.datasets.film.film_plan import film_plans
@@ -425,11 +426,10 @@ def _card(title: str, manifest: Manifest) -> str:
     lines = ["---", "license: cc-by-4.0", f"pretty_name: {title}", "---", "", f"# {title}", ""]
     lines += [f"Version {VERSION} of the benchmark of phibench, made with phibench {manifest.phibench}.", ""]
     lines += ["    phibench fetch NAME --from PLACE-OF-THIS-FOLDER --out FOLDER", ""]
-    lines += ["| name | content | samples | files | unpacked | archives |", "|---|---|---|---|---|---|"]
     kinds = {"pairs": "pairs with truth", "sealed": "pairs, truth sealed", "films": "films with truth"}
-    for name, part in sorted(manifest.parts.items()):
-        size = megabytes(part.size)
-        lines.append(
-            f"| `{name}` | {kinds[part.kind]} | {part.count_text} | {part.files} | {size} | {len(part.archives)} |"
-        )
+    rows = [
+        (f"`{name}`", kinds[one.kind], one.count_text, f"{one.files}", megabytes(one.size), f"{len(one.archives)}")
+        for name, one in sorted(manifest.parts.items())
+    ]
+    lines += table_lines(("name", "content", "samples", "files", "unpacked", "archives"), rows)
     return "\n".join([*lines, "", f"Licence: [CC BY 4.0]({LICENSE_URL}).", ""])

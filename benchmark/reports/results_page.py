@@ -43,7 +43,7 @@ from phibench.benchmark.scores.score_tables import (
     shown_parts,
 )
 from phibench.datasets.common.errors import DatasetError
-from phibench.datasets.common.shown_text import markdown_cell, markdown_text
+from phibench.datasets.common.shown_text import markdown_cell, markdown_text, table_lines
 from phibench.datasets.store.files import write_text
 
 AGAINST = "chain_fit"
@@ -285,11 +285,8 @@ def _item(note: str) -> str:
 _SOURCE_HEADS = ("preset", "data set", "pairs", "samples", "task", "hash of the data set", "scored by")
 
 
-def _sources(parts: Sequence[ScoreGroup]) -> Iterator[str]:
-    yield f"| {' | '.join(_SOURCE_HEADS)} |"
-    yield "|---" * len(_SOURCE_HEADS) + "|"
-    for row in _source_rows(parts):
-        yield f"| {' | '.join(map(markdown_cell, row))} |"
+def _sources(parts: Sequence[ScoreGroup]) -> list[str]:
+    return table_lines(_SOURCE_HEADS, [tuple(map(markdown_cell, row)) for row in _source_rows(parts)])
 
 
 def results_html(parts: Sequence[ScoreGroup], by: str = "phi") -> str:

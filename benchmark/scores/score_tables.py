@@ -27,7 +27,7 @@ from phibench.benchmark.scores.compare import Difference
 from phibench.benchmark.scores.document import PairRange, ScoreDocument, Value
 from phibench.benchmark.scores.intervals import Estimate
 from phibench.benchmark.scores.metrics import CHOSEN, METRICS, RANKS, applies
-from phibench.datasets.common.shown_text import csv_text, latex_text, markdown_cell, markdown_text
+from phibench.datasets.common.shown_text import csv_text, latex_text, markdown_cell, markdown_text, table_lines
 from phibench.estimator.methods.registry import REFUSED
 from phibench.scenes.validation import printable_line
 
@@ -437,8 +437,9 @@ def text_of(grid: TextTable) -> str:
 
 def markdown(grid: TextTable) -> str:
     """Table in Markdown, a line of text before it."""
-    marks = ["--:" if kind == "r" else ":--" for kind in grid.columns]
-    lines = [_row(grid.heads), _row(marks), *map(_row, grid.rows)]
+    marks = [" --: " if kind == "r" else " :-- " for kind in grid.columns]
+    heads, *rows = (tuple(map(markdown_cell, row)) for row in (grid.heads, *grid.rows))
+    lines = table_lines(heads, rows, marks)
     note = ("", markdown_text(grid.note)) if grid.note else ()
     return "\n".join((f"{markdown_text(grid.title)}\n", *lines, *note)) + "\n"
 
@@ -511,10 +512,6 @@ def _csv(heads: list[str], rows: Sequence[Sequence[object]]) -> str:
         [heads, *(["" if x is None else csv_text(x) if isinstance(x, str) else x for x in row] for row in rows)]
     )
     return buffer.getvalue()
-
-
-def _row(cells: Sequence[str]) -> str:
-    return "| " + " | ".join(map(markdown_cell, cells)) + " |"
 
 
 # -- numbers -------------------------------------------------------------------------------------------------------

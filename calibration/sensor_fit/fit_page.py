@@ -12,7 +12,7 @@ import numpy as np
 from phibench.calibration.sensor_fit.capture_folder import CaptureError
 from phibench.calibration.sensor_fit.fit import SensorFit
 from phibench.calibration.sensor_fit.tone_curve import encoded_by
-from phibench.datasets.common.shown_text import html_text, markdown_cell, markdown_text
+from phibench.datasets.common.shown_text import html_text, markdown_cell, markdown_text, table_lines
 from phibench.datasets.store.files import write_bytes, write_text
 
 if TYPE_CHECKING:
@@ -40,8 +40,8 @@ def write_page(path: Path, found: SensorFit) -> Path:
     plot = _plots(found)
     if path.suffix.lower() == ".md":
         source = (f"* {markdown_text(line)}" for line in _source_lines(found))
-        lines = ["# Sensor fit", "", *source, "", "| number | value | sigma |", "|---|---|---|"]
-        lines += [f"| {' | '.join(map(markdown_cell, row))} |" for row in rows]
+        lines = ["# Sensor fit", "", *source, ""]
+        lines += table_lines(("number", "value", "sigma"), [tuple(map(markdown_cell, row)) for row in rows])
         lines += ["", *(f"* {markdown_text(said)}" for said in remarks_of(found))]
         if plot is not None:
             picture = path.with_suffix(".png")

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import html
 import re
+from collections.abc import Iterable, Sequence
 
 from phibench.scenes.validation import printable_line
 
@@ -68,3 +69,9 @@ def csv_text(text: str) -> str:
     """Text for a cell of CSV: spreadsheets take one that begins with =, +, - or @ for a formula, so it gets a quote."""
     line = printable_line(text, _MOST)
     return f"'{line}" if _FORMULA.match(line) else line
+
+
+def table_lines(heads: Sequence[str], rows: Iterable[Sequence[str]], marks: Sequence[str] = ()) -> list[str]:
+    """Lines of a Markdown table, whose cells are Markdown already; `marks` stand below the heads, such as " --: "."""
+    lines = [f"| {' | '.join(cells)} |" for cells in (heads, *rows)]
+    return [lines[0], f"|{'|'.join(marks or ['---'] * len(heads))}|", *lines[1:]]

@@ -37,7 +37,6 @@ MEAN_IRRADIANCE_W_M2 = 1.0
 """Pi times the mean radiance of all directions, mean of the three bands, unless a scale is stated: about 300 lx."""
 _RAYS = 32  # all around from the camera, to see whether it is inside
 _INSIDE = 0.75  # part of the rays from the camera that must meet the mesh: a window or a door may be open
-_FILLED = 0.98  # of an atlas, at best: shelves leave gaps
 _AT_ONCE = 1 << 16  # texels
 
 

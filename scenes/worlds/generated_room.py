@@ -39,7 +39,7 @@ MOST_PATCHES = 3200  # faces of a room: the bake's grids and the time of a ray g
 _FEWEST_PATCHES = 30  # of a piece of furniture, but for boxes
 _TRIES = 25  # random places for a piece; what does not fit is left out
 _FURNITURE_PATCHES, _WALL_PATCHES, _NEAR_PATCHES, _FLOOR_PATCHES = 1050, 330, 220, 180  # of subjects
-_DAYLIGHT_K, _SUN_K, _SCREEN_K = 6500.0, 5500.0, 6500.0  # D65; the direct sun; a screen's usual white
+_SUN_K, _SCREEN_K = 5500.0, 6500.0  # the direct sun; a screen's usual white
 _DESK_LUMEN = 400.0  # of a small lamp
 _FLOORS = {
     "office": ("plain_carpet", "floor_tiles", "planks", "terrazzo", "parquet"),

@@ -224,8 +224,6 @@ MATERIALS: Mapping[str, Material] = MappingProxyType(
     }
 )
 
-_SHELL = ("floor", "wall", "ceiling")
-
 
 @dataclass
 class MaterialSet:

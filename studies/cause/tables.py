@@ -162,7 +162,6 @@ SIGMAS = 2.0  # how many errors a difference must exceed that by
 ENOUGH = 3  # samplings whose scatter is an error
 FLOOR = 1.5  # of the error of a log evidence of fewer samplings
 Verdict = Literal["favoured", "disfavoured", "undecided"]
-RULE = f"decided is what exceeds odds of 10 to 1 ({DECIDED:.1f}) by twice its error"
 
 
 def evidence_error(measured: float, repeats: int) -> float:
