@@ -133,7 +133,7 @@ def test_node_count_is_sufficient(monkeypatch: pytest.MonkeyPatch) -> None:
     """Doubling all node counts changes no pixel by more than 1e-4 of the peak and the flux by less than 1e-6."""
     from phibench.render.optics import spot_samples
 
-    coarse = [(view, spot, spot_layer(view, spot, ())) for view, spot in _cases(3, 10)]
+    coarse = [(view, spot, spot_layer(view, spot, ())) for view, spot in _cases(3, 7)]
     nodes = spot_samples.disc_nodes
     monkeypatch.setattr(spot_samples, "disc_nodes", lambda profile, smoothness: nodes(profile, 2.0 * smoothness + 2.0))
     checked = 0
@@ -145,7 +145,7 @@ def test_node_count_is_sufficient(monkeypatch: pytest.MonkeyPatch) -> None:
         assert np.abs(a - b).max() <= 1e-4 * b.max()
         assert layer.total_electrons_per_s[0] == pytest.approx(fine.total_electrons_per_s[0], rel=1e-6)
         checked += 1
-    assert checked > 6
+    assert checked > 4
 
 
 def _embed(layer, u0: int, v0: int, size: int) -> np.ndarray:

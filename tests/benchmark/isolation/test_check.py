@@ -324,7 +324,8 @@ def test_the_check_has_pairs_without_boxes(tmp_path: Path) -> None:
     ],
 )
 def test_failures_name_the_users_own_line(tmp_path: Path, body: str, words: str) -> None:
-    check = check_method(method_file(tmp_path, body), limits=RunLimits(seconds=2.0), count=2)
+    limits = RunLimits(seconds=2.0 if "sleep" in body else 60.0)  # the machine may do other things
+    check = check_method(method_file(tmp_path, body), limits=limits, count=2)
     assert len(check.faults) == 1
     assert words in check.faults[0]
     assert check.notes == ("0 of 2 pairs answered",)
