@@ -19,7 +19,7 @@ import polars as pl
 from rich.console import Console
 
 from phibench.benchmark.isolation.resolve import RunLimits
-from phibench.benchmark.pair_sets.dataset_pairs import TASK_VERSION, DatasetPairs, dataset_pairs
+from phibench.benchmark.pair_sets.dataset_pairs import BOX_PX, TASK_VERSION, TRACKS, DatasetPairs, dataset_pairs
 from phibench.benchmark.scores.answer_errors import Rules, usable_covariance, whitened
 from phibench.benchmark.scores.document import (
     ScoreDocument,
@@ -126,8 +126,11 @@ def _of_document(document: ScoreDocument) -> Iterator[str]:
     for name, value in asdict(Rules()).items():
         if document.rules.get(name) != float(value):
             yield f"rules.{name} is {document.rules.get(name)}, and results are by {value:g}: score by the usual rules"
+    track = pair_set.get("track")
+    if track not in ("", None, *TRACKS):
+        yield f"pair_set.track is {track!r}: there are {', '.join(TRACKS)}; score again"
     for name in ("boxes_px", "frames", "sensor_sha256", "calibration"):
-        if pair_set.get(name) is not None:
+        if pair_set.get(name) is not None and (name, track, pair_set[name]) != ("boxes_px", "localise", BOX_PX):
             yield f"pair_set.{name} is {pair_set[name]}: results are of the data set's own pairs, score without it"
     if document.seed != 0:
         yield f"seed is {document.seed}: intervals of results are of the bootstrap seed 0"
@@ -244,6 +247,7 @@ def _built_again(document: ScoreDocument, table: pl.DataFrame, data: Path, conso
         return _Again((f"pair_set.dataset_sha256 is not that of {data}: give the data set that was scored",))
     presets = table["preset"].unique().to_list()
     pairs = dataset_pairs(dataset, presets[0] if len(presets) == 1 else None)
+    pairs = pairs.of_track(track) if (track := document.pair_set.get("track")) in TRACKS else pairs
     if len(pairs) != document.pairs:
         told = f"the data set has {len(pairs)} of {', '.join(presets)}"
         return _Again((f"pairs is {document.pairs}, and {told}: score all of them",))

@@ -12,7 +12,7 @@ import polars as pl
 import pytest
 from helpers.processes import quiet
 
-from phibench.benchmark.pair_sets.dataset_pairs import dataset_pairs
+from phibench.benchmark.pair_sets.dataset_pairs import Track, dataset_pairs
 from phibench.benchmark.scores.answer_errors import Rules
 from phibench.benchmark.scores.document import MethodCard, ScoreDocument, read_records, read_score, write_score
 from phibench.benchmark.scores.score import isolated, saved, score, score_outcomes
@@ -63,6 +63,25 @@ def test_an_honest_score_has_no_fault(honest: Path, bench_dataset: Path, capsys:
     document = json.loads(capsys.readouterr().out)  # the document and nothing else
     assert (document["valid"], document["faults"], document["pairs"]) == (True, [], 3)
     assert len([text for text in document["unchecked"] if not text.startswith("code_sha256")]) == 4
+
+
+@pytest.mark.parametrize("track", ["localise", "find"])
+def test_a_score_of_a_track_is_built_again_as_that_track(bench_dataset: Path, tmp_path: Path, track: Track) -> None:
+    """Boxes are the track's: called another one, the records' hints and the pair set are told."""
+    pairs = dataset_pairs(open_finished(bench_dataset), "bayer-raw").of_track(track)
+    answers = [Outcome(number, Answer(*2 * (Spot.missing("-"),)), 0.01) for number in range(len(pairs))]
+    scored = score_outcomes(CARD, pairs, answers, Rules())
+    path = tmp_path / "mine.json"
+    saved(isolated(scored, "isolated: read its own folder and the packages only, without network"), path)
+    assert check_score(path, bench_dataset).faults == ()
+    document = read_score(path)
+    other = {"localise": "find", "find": "localise"}[track]
+    changed = document.model_copy(update={"pair_set": {**document.pair_set, "track": other}})
+    write_score(path, changed, read_records(path, document))
+    assert any("hinted" in fault for fault in check_score(path, bench_dataset).faults)
+    unknown = document.model_copy(update={"pair_set": {**document.pair_set, "track": "guess"}})
+    write_score(path, unknown, read_records(path, document))
+    assert any("pair_set.track is 'guess'" in fault for fault in check_score(path).faults)
 
 
 def _with_metric(document: ScoreDocument) -> dict[str, Any]:
