@@ -311,7 +311,8 @@ class Sample(ShortForm):
 
     def truth(self, position: str) -> dict[str, NDArray[Any]]:
         """Truth of every pixel centre: planes of shape (H, W), NaN where there is nothing (see FORMAT.md)."""
-        return read_truth(self.dataset.folder / self.truth_row(position).view_truth_file, **self._view(position))
+        path = self.dataset.folder / self.truth_row(position).view_truth_file
+        return read_truth(path, self.view(position), **self._view(position))
 
     def spot(self, position: str) -> SpotWindow:
         """Spot layer; an empty window where no light of the spot reaches the image."""

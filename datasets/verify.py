@@ -375,7 +375,8 @@ def _truth_faults(dataset: Dataset, pose: PoseInfo, shape: tuple[int, int]) -> I
     from phibench.render.optics.room_tracer import room_geometry
     from phibench.render.optics.truth import truth_layer
 
-    stored, view = read_truth(dataset.folder / pose.files["truth"]), dataset.rigs[pose.rig].at(pose.offset_m)
+    view = dataset.rigs[pose.rig].at(pose.offset_m)
+    stored = read_truth(dataset.folder / pose.files["truth"], view)
     expected = truth_layer(view, room_geometry(dataset.rooms[pose.room], view))
     for name, plane in stored.items():
         if plane.shape != shape:

@@ -38,8 +38,8 @@ Light = Literal["baked", "cached", "none"]
 
 # Seconds.
 START_S = 7.0  # workers, Mitsuba in each, first kernels, hashes
-VIEW_S = 0.5
-VIEW_S_PER_MEGAPIXEL = 3.5  # refinement, truth, encoding, fsync
+VIEW_S = 0.3
+VIEW_S_PER_MEGAPIXEL = 1.0  # refinement, truth, encoding, fsync
 VIEW_S_PER_MEGASAMPLE = 0.1  # look-ups in the light map, a million of them
 BAKE_S_PER_MEGATEXEL = 20.0  # grids, filters
 _TRIANGLES = (0.05, -0.15)  # seconds per million rays: slope by log2 of the room's triangles, and at one triangle
@@ -51,9 +51,9 @@ _PROBE_CPU_S = 0.042  # of `_probe` on the machine above
 _TRUST_S = 2.0  # the first guess weighs as much as tasks that should take this long
 
 # Bytes.
-_AMBIENT_BYTES_PX = 24.0  # six noisy float32 planes do not compress
-_TRUTH_BYTES_PX = 13.5  # ten float32 planes; what is outside the mirror compresses to nothing
-_PREVIEW_BYTES_PX = 2.8  # PNG of 8 bits a colour
+_AMBIENT_BYTES_PX = 5.0  # six planes of halves; those of a small image compress less
+_TRUTH_BYTES_PX = 6.8  # six float32 planes; what is outside the mirror compresses to nothing
+_PREVIEW_BYTES_PX = 2.0  # PNG of 8 bits a colour
 _SPOT_BYTES = 8192
 _TEXEL_BYTES = 25.0  # six float32 and a bool
 _RESERVE = 1.1  # of a disc that is too small one learns too late

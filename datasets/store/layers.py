@@ -4,9 +4,10 @@ Three kinds of files: ambient (the room), spot (the laser spot alone) and truth 
 pixel). One function writes them all, and one reads them.
 
 OpenEXR's Python module (3.5) writes wrong pixels for arrays that are not C-contiguous, reads truncated files without
-raising, and keeps header floats as float32. Therefore planes are forced to C-contiguous native float32, and the
-compression is lossless ZIP. Exact parameters travel in one JSON string (attribute `phibench`), with a CRC-32 per plane
-which is checked on reading.
+raising, and keeps header floats as float32. Therefore planes are forced to C-contiguous native float32 or half, and the
+compression is lossless: ZIP, or PIZ for halves, which takes half of ZIP's time there. Every program reads both; HTJ2K
+and ZSTD would halve the files, but few programs read them (Mitsuba 3.9 does not). Exact parameters travel in one JSON
+string (attribute `phibench`), with a CRC-32 per plane which is checked on reading.
 
 Planes have the shape (H, W); stacks (3, h, w) hold R, G, B. FORMAT.md lists names and units.
 """
@@ -15,6 +16,7 @@ from __future__ import annotations
 
 import errno
 import json
+import math
 import os
 import zlib
 from collections.abc import Mapping
@@ -29,8 +31,10 @@ from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import PICTURE_PIXELS, InputFile, quiet_terminal
 from phibench.datasets.store.files import require_file, write_atomic
 from phibench.datasets.store.short_form import ShortForm
+from phibench.render.optics.truth import angle_planes
 from phibench.scenes.camera import FILTERS, LARGEST_SIDE_PX
 from phibench.scenes.frames import Array
+from phibench.scenes.rig import View
 from phibench.scenes.validation import printable_line
 
 ATTRIBUTE = "phibench"
@@ -61,7 +65,7 @@ def write_exr(
     header: Mapping[str, Any],
     origin_px: tuple[int, int] = (0, 0),
     *,
-    compressed: bool = True,
+    half: bool = False,
 ) -> Path:
     """Write named planes of one shape (H, W) as float32, without loss, atomically.
 
@@ -74,21 +78,22 @@ def write_exr(
         Anything that JSON can hold; floats survive exactly.
     origin_px : (u0, v0)
         Image pixel of the first column and row.
-    compressed : bool
-        Noisy planes shrink by 4 % only, and ZIP takes as long as rendering them.
+    half : bool
+        Write float16 instead; a finite value beyond 65504 is refused.
 
     Raises
     ------
     DatasetError
         If the planes are none, not two-dimensional, empty, of several shapes or beyond float32.
     """
-    arrays = {name: _float32(name, plane) for name, plane in planes.items()}
+    kind = np.float16 if half else np.float32
+    arrays = {name: _real(name, plane, kind) for name, plane in planes.items()}
     _check_shapes(arrays)
     sums = {name: zlib.crc32(array.data) for name, array in arrays.items()}
     text = json.dumps({"header": dict(header), "crc32": sums}, allow_nan=False)
 
     def write(temporary: Path) -> None:
-        _write(temporary, arrays, text, origin_px, compressed)
+        _write(temporary, arrays, text, origin_px, half)
         try:
             read_exr(temporary)  # checks every pixel before the file gets its name
         except DatasetError as error:
@@ -131,14 +136,14 @@ def _check_size(path: Path, header: dict[str, Any]) -> None:
         raise DatasetError(f"{path} is damaged: it says that it has {width} x {height} pixels")
 
 
-def _write(path: Path, planes: dict[str, Plane], text: str, origin_px: tuple[int, int], compressed: bool) -> None:
+def _write(path: Path, planes: dict[str, NDArray[Any]], text: str, origin_px: tuple[int, int], half: bool) -> None:
     import OpenEXR
 
     height, width = next(iter(planes.values())).shape
     low = np.array(origin_px, np.int32)
     window = (low, low + np.array([width - 1, height - 1], np.int32))
     header = {
-        "compression": OpenEXR.ZIP_COMPRESSION if compressed else OpenEXR.NO_COMPRESSION,
+        "compression": OpenEXR.PIZ_COMPRESSION if half else OpenEXR.ZIP_COMPRESSION,
         "type": OpenEXR.scanlineimage,
         "dataWindow": window,
         "displayWindow": window,
@@ -173,21 +178,24 @@ def _content(path: Path, header: dict[str, Any], planes: dict[str, Plane]) -> Ex
     if {name: zlib.crc32(np.ascontiguousarray(plane).data) for name, plane in planes.items()} != document.get("crc32"):
         raise DatasetError(f"{path} is damaged: its pixels do not have the checksums of its header")
     u0, v0 = (int(x) for x in header["dataWindow"][0])
-    return Exr(planes, document["header"], (u0, v0))
+    return Exr(
+        {name: plane.astype(np.float32, copy=False) for name, plane in planes.items()}, document["header"], (u0, v0)
+    )
 
 
-def _float32(name: str, plane: ArrayLike) -> Plane:
+def _real(name: str, plane: ArrayLike, kind: type[np.floating]) -> NDArray[Any]:
     array = np.asarray(plane)
     if array.dtype.kind not in "fiub":
         raise DatasetError(f"plane '{name}' has type {array.dtype}: real numbers are needed")
     with np.errstate(over="ignore"):
-        result = np.ascontiguousarray(array, dtype=np.float32)
+        result = np.ascontiguousarray(array, dtype=kind)
     if np.any(np.isinf(result) & np.isfinite(array)):
-        raise DatasetError(f"plane '{name}' has a finite value beyond float32 (3.4e38)")
+        largest = "float32 (3.4e38)" if kind is np.float32 else "float16 (65504)"
+        raise DatasetError(f"plane '{name}' has a finite value beyond {largest}")
     return result
 
 
-def _check_shapes(arrays: dict[str, Plane]) -> None:
+def _check_shapes(arrays: dict[str, NDArray[Any]]) -> None:
     shapes = {array.shape for array in arrays.values()}
     if len(shapes) != 1:
         raise DatasetError(f"planes of one shape are needed, not of {len(shapes)}: {sorted(shapes)}")
@@ -198,11 +206,10 @@ def _check_shapes(arrays: dict[str, Plane]) -> None:
 
 # Layers: their planes, and what their headers say.
 
-TRUTH_PLANES = (
-    *("x_m", "y_m", "z_m", "depth_m", "path_m"),
-    *("phi_ray_rad", "phi_normal_rad", "phi_incidence_rad", "azimuth_rad", "object_id"),
-)
-AMBIENT_PLANES = (*FILTERS, *(f"var.{name}" for name in FILTERS))
+TRUTH_PLANES = ("x_m", "y_m", "z_m", "depth_m", "path_m", "object_id")
+"""Planes of a file; the angles at the mirror follow from the rig and the pixel, and `read_truth` computes them."""
+AMBIENT_PLANES = (*FILTERS, *(f"sd.{name}" for name in FILTERS))
+_SD_BITS = 4  # of a standard deviation's fraction: 3 %, which is less than is known of it
 SPOT_STACKS = {"electrons_per_s": "", "du_electrons_per_s_px": "du.", "dv_electrons_per_s_px": "dv."}
 """Arrays of a spot layer, shape (3, h, w), and the prefix of their planes: R, G, B, du.R, ..."""
 SPOT_PLANES = tuple(prefix + name for prefix in SPOT_STACKS.values() for name in FILTERS)
@@ -249,22 +256,48 @@ class SpotWindow(ShortForm):
 
 
 def write_ambient(path: Path, planes: NDArray[Any], variance: NDArray[Any], header: Mapping[str, Any]) -> Path:
-    """Write an ambient layer and its variance, shape (3, H, W) each: planes R, G, B, var.R, var.G, var.B."""
-    header = {"kind": "ambient", "unit": "electrons/s", **header}
-    named = dict(zip(AMBIENT_PLANES, (*planes, *variance), strict=True))
-    return write_exr(path, named, header, compressed=not np.any(variance))
+    """Write an ambient layer and its variance, shape (3, H, W) each, as halves: planes R, G, B, sd.R, sd.G, sd.B.
+
+    A half rounds by 2^-11 at most: 0.05 of the sensor's noise of a pixel that is almost full (12 000 electrons), and
+    less of others. Values are divided by a power of two, `scale` in the header.
+    """
+    with np.errstate(invalid="ignore"):
+        noise = np.sqrt(variance)
+    largest = max(float(np.max(planes, initial=0.0)), float(np.nanmax(noise, initial=0.0)))
+    scale = 2.0 ** math.ceil(math.log2(largest / 32768.0)) if 0.0 < largest < math.inf else 1.0
+    halves = (np.asarray(planes / scale, dtype=np.float16), _coarse(np.asarray(noise / scale, dtype=np.float16)))
+    header = {"kind": "ambient", "unit": "electrons/s", **header, "scale": scale}
+    return write_exr(path, dict(zip(AMBIENT_PLANES, np.concatenate(halves), strict=True)), header, half=True)
+
+
+def _coarse(halves: NDArray[np.float16]) -> NDArray[np.float16]:
+    """Finite halves, rounded to the bits of a standard deviation: they shrink to half of their size."""
+    step = np.uint16(1 << (10 - _SD_BITS))
+    rounded = ((halves.view(np.uint16) + step // 2) // step * step).view(np.float16)
+    return np.where(np.isfinite(halves), rounded, halves)
 
 
 def read_ambient(path: Path, **owner: str) -> NDArray[np.float32]:
     """Read an ambient layer, shape (3, H, W), electrons per second; `owner` as in `read_layer`."""
-    file = read_layer(path, "ambient", AMBIENT_PLANES, **owner)
-    return np.stack([file.planes[name] for name in FILTERS])
+    file = read_layer(path, "ambient", FILTERS, **owner)
+    return _scaled(path, file, "")
 
 
 def read_ambient_variance(path: Path, **owner: str) -> NDArray[np.float32]:
     """Read the variance of an ambient layer, shape (3, H, W), (electrons per second) squared; `owner` likewise."""
-    file = read_layer(path, "ambient", AMBIENT_PLANES, **owner)
-    return np.stack([file.planes["var." + name] for name in FILTERS])
+    file = read_layer(path, "ambient", FILTERS, **owner)
+    if "var.R" in file.planes:  # before version 8
+        return _scaled(path, file, "var.")
+    if missing := [name for name in AMBIENT_PLANES if name not in file.planes]:
+        raise DatasetError(f"{path} lacks the planes {', '.join(missing)}")
+    return np.square(_scaled(path, file, "sd."))
+
+
+def _scaled(path: Path, file: Exr, prefix: str) -> NDArray[np.float32]:
+    scale = file.header.get("scale", 1.0)
+    if not isinstance(scale, float | int) or not 0.0 < scale < math.inf:
+        raise DatasetError(f"{path} has the scale {printable_line(str(scale), 60)} instead of a number above 0")
+    return np.stack([file.planes[prefix + name] for name in FILTERS]) * np.float32(scale)
 
 
 def write_truth(path: Path, planes: Mapping[str, Array], header: Mapping[str, Any]) -> Path:
@@ -272,12 +305,18 @@ def write_truth(path: Path, planes: Mapping[str, Array], header: Mapping[str, An
     return write_exr(path, {name: planes[name] for name in TRUTH_PLANES}, {"kind": "truth", **header})
 
 
-def read_truth(path: Path, **owner: str) -> dict[str, NDArray[Any]]:
-    """Read a truth layer: float64 planes (H, W) with NaN where there is nothing; `object_id` int32, -1 there."""
+def read_truth(path: Path, view: View, **owner: str) -> dict[str, NDArray[Any]]:
+    """Read a truth layer of a view: float64 planes (H, W) with NaN where there is nothing; `object_id` int32, -1 there.
+
+    The planes are `truth.TRUTH_PLANES`. Angles are computed in double, also where an older file holds them.
+    """
     file = read_layer(path, "truth", TRUTH_PLANES, **owner)
-    planes: dict[str, NDArray[Any]] = {name: file.planes[name].astype(float) for name in TRUTH_PLANES}
-    planes["object_id"] = planes["object_id"].astype(np.int32)
-    return planes
+    planes: dict[str, NDArray[Any]] = {name: file.planes[name].astype(float) for name in TRUTH_PLANES[:-1]}
+    ids = file.planes["object_id"].astype(np.int32)
+    camera = view.rig.camera
+    if ids.shape != (camera.height_px, camera.width_px):
+        raise DatasetError(f"{path} has {ids.shape} pixels instead of {(camera.height_px, camera.width_px)}")
+    return {**planes, **angle_planes(view, ids >= 0), "object_id": ids}
 
 
 def write_spot(path: Path, layer: SpotWindow, header: Mapping[str, Any]) -> Path:

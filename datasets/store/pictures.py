@@ -42,7 +42,7 @@ def display_exposure_s(planes: NDArray[Any], detector: Detector) -> float:
 
 def to_srgb(planes: NDArray[Any], detector: Detector, exposure: float) -> Picture:
     """8-bit sRGB picture, shape (H, W, 3), of a layer, shape (3, H, W), electrons per second."""
-    return eight_bit(srgb_encoded(_balanced(planes, detector) * exposure))
+    return eight_bit(srgb_encoded(_balanced(planes, detector) * np.float32(exposure)))
 
 
 def halved(planes: NDArray[Any]) -> NDArray[Any]:
@@ -64,17 +64,16 @@ def save_png(path: Path, picture: Picture) -> Path:
         raise DatasetError(f"{path}: pictures are written as PNG; give a name that ends in .png")
     buffer = io.BytesIO()
     # stated: the bytes must not follow Pillow's default
-    Image.fromarray(picture).save(buffer, format="PNG", compress_level=6)
+    Image.fromarray(picture).save(buffer, format="PNG", compress_level=3)
     return write_bytes(path, buffer.getvalue())
 
 
 def _balanced(planes: NDArray[Any], detector: Detector) -> NDArray[Any]:
     """Planes on one scale: electrons per second of the green band (white light gives three equal planes)."""
     gains = np.array(detector.band_electrons_per_joule())
-    return (
-        np.asarray(planes, float)
-        * np.where(gains > 0.0, gains[1] / np.where(gains > 0.0, gains, 1.0), 0.0)[:, None, None]
-    )
+    return np.asarray(planes, np.float32) * np.where(gains > 0.0, gains[1] / np.where(gains > 0.0, gains, 1.0), 0.0)[
+        :, None, None
+    ].astype(np.float32)
 
 
 # Marked spots.

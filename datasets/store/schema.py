@@ -21,11 +21,12 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSeriali
 from phibench.datasets.common.input_files import FILE_NAME, FileName, Name, NoFileName, Text
 from phibench.datasets.rooms.room_sources import ONLY_ROOM
 
-SCHEMA_VERSION = 7
-READABLE_VERSIONS = (4, 5, 6, 7)
+SCHEMA_VERSION = 8
+READABLE_VERSIONS = (4, 5, 6, 7, 8)
 """Version 5 gave mirrors a form, `mirror.form` in `rigs.jsonl`; in version 4 every mirror is a perfect sphere.
 Version 6 gave samples rooms of their own, `rooms.jsonl`; before, `dataset.json` held the only one, shape by shape.
-Version 7 gave spots the centre of their light, `light`; before, there is the axis of the beam alone."""
+Version 7 gave spots the centre of their light, `light`; before, there is the axis of the beam alone.
+Version 8 made ambient layers halves, with `sd.*` in place of `var.*`, and left the angles out of truth layers."""
 Position = Literal["down", "up"]
 
 

@@ -26,7 +26,7 @@ from phibench.render.optics.room_tracer import (
     blocked_by,
     into_room,
 )
-from phibench.scenes.frames import Array
+from phibench.scenes.frames import Array, BoolArray
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.mirror import limb_points
 from phibench.scenes.rig import View
@@ -211,18 +211,8 @@ def _floats(values: Array) -> tuple[float, ...]:
     return tuple(float(x) for x in values)
 
 
-TRUTH_PLANES = (
-    "x_m",
-    "y_m",
-    "z_m",
-    "depth_m",
-    "path_m",
-    "phi_ray_rad",
-    "phi_normal_rad",
-    "phi_incidence_rad",
-    "azimuth_rad",
-    "object_id",
-)
+ANGLES = ("phi_ray_rad", "phi_normal_rad", "phi_incidence_rad", "azimuth_rad")
+TRUTH_PLANES = ("x_m", "y_m", "z_m", "depth_m", "path_m", *ANGLES, "object_id")
 
 
 def truth_layer(view: View, room: GeometryLike, finder: Finder | None = None) -> dict[str, Array]:
@@ -258,6 +248,26 @@ def truth_layer(view: View, room: GeometryLike, finder: Finder | None = None) ->
     return planes
 
 
+def angle_planes(view: View, seen: BoolArray) -> dict[str, Array]:
+    """The planes of `truth_layer` that rig and pixel determine, whatever the room; NaN where nothing is seen.
+
+    Parameters
+    ----------
+    seen : bool array, shape (height, width)
+        Pixels whose ray meets the mirror and something beyond.
+    """
+    planes = {name: np.full(seen.shape, np.nan) for name in ANGLES}
+    pixel = np.flatnonzero(seen)
+    for part in np.array_split(pixel, len(pixel) // _PIXELS + 1):
+        v, u = np.divmod(part, seen.shape[1])
+        rays = trace_pixels(view, np.stack([u, v]).T.astype(float))
+        angles = mirror_angles(rays.normals, rays.directions)
+        for name, plane in planes.items():
+            plane.reshape(-1)[part] = getattr(angles, name)
+    return planes
+
+
+_PIXELS = 1 << 14  # at a time: the work arrays stay in the cache
 _RAY = ("starts_m", "directions")
 _ROWS = 24  # of the image at a time: the work arrays stay in the cache
 

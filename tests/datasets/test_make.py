@@ -159,9 +159,9 @@ def test_a_folder_that_cannot_be_written_is_refused(tmp_path: Path, monkeypatch:
 
 @pytest.mark.usefixtures("inline")
 def test_no_room_on_the_disk_is_refused_with_numbers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(run_tasks.shutil, "disk_usage", lambda _: Usage(10**9, 10**9 - 2_000_000, 2_000_000))
+    monkeypatch.setattr(run_tasks.shutil, "disk_usage", lambda _: Usage(10**9, 10**9 - 200_000, 200_000))
     text = refusal(tmp_path / "out")
-    assert "are needed and 2 MB are free" in text
+    assert "about 1 MB are needed and 0 MB are free" in text
 
 
 def test_no_workers_is_refused(tmp_path: Path) -> None:

@@ -310,7 +310,8 @@ def test_a_missing_row_is_found(copy: Path) -> None:
 
 
 def test_a_changed_pixel_truth_is_found_when_asked_for(copy: Path) -> None:
-    planes = read_truth(copy / TRUTH)
+    dataset = open_dataset(copy)
+    planes = read_truth(copy / TRUTH, dataset.rigs[dataset.info.poses[0].rig].at(0.5))
     planes["depth_m"][60:120, 100:200] *= 1.0 + 1e-5
     write_truth(copy / TRUTH, planes, {"dataset": "smallest", "pose": "h0.500", "offset_m": 0.5})
     sign(copy)

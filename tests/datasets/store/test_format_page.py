@@ -105,7 +105,8 @@ def test_files() -> None:
 
 def test_planes() -> None:
     said = [name for row in table_with("plane", "unit", "meaning") for name in names(row[0])]
-    assert tuple(said) == layers.TRUTH_PLANES == truth.TRUTH_PLANES
+    assert tuple(said) == layers.TRUTH_PLANES
+    assert {*said, *truth.ANGLES} == set(truth.TRUTH_PLANES)
     spots = [name for row in table_with("planes", "unit", "meaning") for name in names(row[0])]
     assert tuple(spots) == layers.SPOT_PLANES
     ambient = [name for row in table_with("ambient plane", "unit", "meaning") for name in names(row[0])]
