@@ -108,7 +108,8 @@ def first_pass(film: CellSampler, window: Crop, budget: float) -> Cells:
     while new.any():
         _cut(film, cells, *np.nonzero(new))
         new = matters & grown(cells.met >= 0, reach_px(grid)) & (cells.rank < 0)
-    _sample_whole(film, cells, np.flatnonzero(cells.rank < 0))
+    if (whole := np.flatnonzero(cells.rank < 0)).size:  # none where every pixel is cut
+        _sample_whole(film, cells, whole)
     cells.lamps = _lamps_near(film, cells)
     return cells
 
