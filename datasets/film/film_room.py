@@ -68,8 +68,11 @@ def renderer(plan: Plan, film: FilmPlan, room: Room) -> Render:
         layer = render_ambient(view, room, light, settings, ambient.cells_per_pixel, seed, crop=crop, budget=budget)
         return layer.electrons_per_s
 
-    budget = BUDGETS[ambient.quality]
+    budget = _PART * BUDGETS[ambient.quality]
     return render
+
+
+_PART = 0.5  # of the budget: noise of key views adds to the error that the proof finds, and doubles their number
 
 
 def _light_maps(rig: Rig, film: FilmPlan, room: Room, settings: BakeSettings) -> list[tuple[Array, list[LightMap]]]:

@@ -81,7 +81,7 @@ def render_ambient(
     light, settings
         Of `bake.bake` for this room.
     cells_per_pixel : int
-        Cells per pixel side; the first pass takes two samples a cell.
+        Cells per pixel side where the image has detail; the first pass takes two samples a cell.
     seed : int
         Of the named stream for this view; 0 is legal.
     crop : (u0, v0, width, height), or None
@@ -90,7 +90,7 @@ def render_ambient(
     rounds : int
         Rounds of refinement at most; 0 leaves the first pass alone.
     budget : float
-        Noise that refinement stops at, as a part of the sensor's: one of `noise_budget.BUDGETS`.
+        Noise that refinement stops at, as a part of the sensor's: `noise_budget.BUDGETS`, or less.
     surfaces : Surfaces, or None
         Of `view_surfaces`, if they are there already.
     """
