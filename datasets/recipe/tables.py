@@ -6,6 +6,8 @@ here and nowhere else. `recipe/checks` checks several keys together. `recipe/loa
 
 from __future__ import annotations
 
+import tomllib
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import (
@@ -39,7 +41,6 @@ from phibench.datasets.recipe.mirror_tables import (
     Unit,
 )
 from phibench.datasets.recipe.room_tables import RoomsTable, RoomTable
-from phibench.render.sensor.settings import pixel_presets
 from phibench.scenes.catalog import BOARD_SIZE_M
 from phibench.scenes.metals import MetalName
 from phibench.scenes.mirror import OF_REVOLVED
@@ -53,10 +54,19 @@ Decentre = Annotated[float, Field(ge=-0.1, le=0.1)]
 Distortion = Annotated[float, Field(ge=-1000.0, le=1000.0)]
 FocalPx = Annotated[float, Field(ge=50.0, le=50000.0)]
 Response = Annotated[tuple[Unit, ...], Field(strict=False, min_length=3, max_length=3)]
+
+
+def _pixel_presets() -> tuple[str, ...]:
+    """Names of the shipped presets that end in pixels; `settings` is not imported, as no spot depends on a sensor."""
+    file = Path(__file__).parents[2] / "render" / "sensor" / "settings_presets.toml"
+    presets = tomllib.loads(file.read_text(encoding="utf-8"))["presets"]
+    return tuple(name for name, table in presets.items() if table["output"] != "electrons")
+
+
 if TYPE_CHECKING:
     Preset = str
 else:
-    Preset = Literal[pixel_presets()]
+    Preset = Literal[_pixel_presets()]
 Probability = Annotated[float, Field(ge=0.0, le=1.0)]
 OWN_ALBEDO = "surface"
 """Value of `laser.albedo`: that of each surface."""

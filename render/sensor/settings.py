@@ -131,11 +131,6 @@ class Sensor(BaseModel):
         return _checked(self.name, {**self.model_dump(exclude_none=True), **changes})
 
 
-def pixel_presets() -> tuple[str, ...]:
-    """Names of the shipped presets that end in pixels, as a camera's chain does: all but "ideal"."""
-    return tuple(name for name, table in _tables()["presets"].items() if table["output"] != "electrons")
-
-
 def sensor(preset: str = "mjpeg", **changes: Any) -> Sensor:
     """A preset, with changes: ``sensor("mjpeg", exposure_s=0.01)``.
 

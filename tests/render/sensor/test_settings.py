@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
 from helpers.sensor_light import room
 
+from phibench.datasets.recipe.tables import Preset
 from phibench.render.sensor.camera_chain import Chain
 from phibench.render.sensor.noise_tiles import NoiseStream
 from phibench.render.sensor.processing import compressed, eight_bit, linear_rgb, linear_signal, rendered
-from phibench.render.sensor.settings import SensorError, pixel_presets, sensor
+from phibench.render.sensor.settings import SensorError, sensor
 
 ROOT = Path(__file__).resolve().parents[3]
 STREAM = NoiseStream(("presets", 0))
@@ -26,7 +28,7 @@ SHAPES = {
 
 
 def test_numbers_of_the_presets() -> None:
-    assert ("ideal", *pixel_presets()) == tuple(SHAPES)
+    assert ("ideal", *get_args(Preset)) == tuple(SHAPES)
     s = sensor()
     assert s.name == "mjpeg"
     assert (s.full_well_e, s.read_noise_e, s.prnu, s.dsnu_e, s.dark_e_per_s) == (12000.0, 4.0, 0.01, 1.5, 3.0)
