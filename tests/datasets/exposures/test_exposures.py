@@ -164,14 +164,16 @@ def test_a_spot_is_anywhere_in_its_box(bench_dataset: Path) -> None:
 
 def test_a_box_at_the_border_stays_in_the_image() -> None:
     random = np.random.default_rng(3)
-    starts = [module._start(random, centre, 32, 320) for centre in (-0.5, 2.0, 160.0, 318.0, 319.5) * 100]
+    starts = [
+        module._start(random, centre, 32, BOX_MARGIN_PX, 320) for centre in (-0.5, 2.0, 160.0, 318.0, 319.5) * 100
+    ]
     checked = 0
     for centre, start in zip((-0.5, 2.0, 160.0, 318.0, 319.5) * 100, starts, strict=True):
         assert 0 <= start <= 288
         assert start - 0.5 <= centre <= start + 31.5
         checked += 1
     assert checked == 500
-    assert module._start(random, 5.0, 64, 48) == 0  # a box larger than the image is the image
+    assert module._start(random, 5.0, 64, BOX_MARGIN_PX, 48) == 0  # a box larger than the image is the image
 
 
 def test_without_a_place_of_the_spot_the_box_is_anywhere(bench_dataset: Path) -> None:
