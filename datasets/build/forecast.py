@@ -189,6 +189,8 @@ def _texels(plan: Plan) -> float:
 
 def megabytes(count: int) -> str:
     """Bytes for people."""
+    if count < 1e6:
+        return f"{count / 1e6:.1f} MB"
     return f"{count / 1e6:.0f} MB" if count < 5e9 else f"{count / 1e9:.0f} GB"
 
 

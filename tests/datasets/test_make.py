@@ -115,7 +115,7 @@ def test_a_finished_data_set_is_left_alone_and_a_damaged_one_made_again(smallest
     (copy / f"{TEMPORARY_PREFIX}left.exr").write_bytes(b"")
     console = quiet()
     make.make(SMALLEST, copy, workers=2, console=console)
-    assert "to make: 1 view; about 1 MB" in said(console)
+    assert "to make: 1 view; about 0.2 MB" in said(console)
     assert "7 of 8 tasks are done" in said(console)
     assert "tasks: 1/1" in said(console)
     assert (copy / schema.CHECKSUMS).read_text() == (smallest_dataset / schema.CHECKSUMS).read_text()
@@ -161,7 +161,7 @@ def test_a_folder_that_cannot_be_written_is_refused(tmp_path: Path, monkeypatch:
 def test_no_room_on_the_disk_is_refused_with_numbers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(run_tasks.shutil, "disk_usage", lambda _: Usage(10**9, 10**9 - 200_000, 200_000))
     text = refusal(tmp_path / "out")
-    assert "about 1 MB are needed and 0 MB are free" in text
+    assert "about 0.8 MB are needed and 0.2 MB are free" in text
 
 
 def test_no_workers_is_refused(tmp_path: Path) -> None:
