@@ -43,8 +43,10 @@ def test_many_views_in_one_process(
 ) -> None:
     child = python(CODE, str(Path(__file__).resolve().parents[2] / "tiny.toml"), str(tmp_path), str(count))
     assert child.returncode == 0, child.stderr
-    (early, _), (late, peak) = (map(float, line.split()) for line in child.stdout.splitlines())
+    (early, first_peak), (late, peak) = (map(float, line.split()) for line in child.stdout.splitlines())
     print(f"\n{early:.0f} MB after 50 views, {late:.0f} MB after {count}, peak {peak:.0f} MB")
     assert 100.0 < early
     assert late < 1.1 * early
-    assert peak < 1.2 * early
+    # planes of a view come and go, some 50 MB of these pixels and their blur: the peak is that of one view, not of many
+    assert peak < 1.05 * first_peak
+    assert peak < 1.4 * early
