@@ -55,7 +55,6 @@ calibration/sensor_fit
 calibration/outline
 calibration/rig
 calibration/captures
-benchmark/release
 benchmark/isolation
 benchmark/pair_sets
 benchmark/scores
@@ -63,6 +62,7 @@ benchmark/reports
 benchmark/scored_dataset
 benchmark/sealed
 benchmark/export
+benchmark/release
 robot/film
 robot/loop
 studies/paper

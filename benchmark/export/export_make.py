@@ -35,12 +35,12 @@ from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import InputFile
 from phibench.datasets.common.progress import progress_console
 from phibench.datasets.exposures.draw import require_outside, sample_key
-from phibench.datasets.frames.request import whole_number
+from phibench.datasets.frames.request import FrameOptions, whole_number
 from phibench.datasets.frames.source import FrameSource, has_place
 from phibench.datasets.read import Dataset, open_dataset, open_finished
 from phibench.datasets.recipe.tables import FramesTable
 from phibench.datasets.store import schema
-from phibench.datasets.store.checksums import differing_files, read_checksums
+from phibench.datasets.store.checksums import checksums_text, differing_files, read_checksums
 from phibench.datasets.store.croissant import LICENSE_TEXT
 from phibench.datasets.store.documents import parquet_bytes
 from phibench.datasets.store.files import sha256, write_text
@@ -113,6 +113,38 @@ def export(
         _finish(dataset, request, out, shards, brought)
     counts = {name: sum(len(shard.pairs) for shard in shards if shard.split == name) for name in SPLITS}
     return ExportOutcome(out, counts, len(brought.made), len(shards) - len(brought.made), tuple(notes))
+
+
+def export_frames_sets(
+    folder: Path, pairs: Mapping[str, int], out: Path, *, workers: int | None = None, console: Console | None = None
+) -> Path:
+    """Write frames sets of a data set's first samples, a folder for each preset, and a list of all their files.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the finished data set.
+    pairs : mapping
+        Samples by preset, at most: a smaller data set has fewer.
+    out : Path
+        Folder of the frames sets.
+
+    Raises
+    ------
+    DatasetError
+        As `export`.
+    """
+    names = tuple(row.sample_id for row in open_finished(folder).rows)
+    laser_off, hashes = scored_with_laser_off(folder), dict[str, str]()
+    for preset, count in pairs.items():
+        request = ExportRequest(
+            "frames", FrameOptions(preset), 1, laser_off, validation=0.0, test=0.0, samples=names[:count], scored=True
+        )
+        made = export(folder, request, out / preset, workers=workers, console=console).folder
+        listed = read_checksums(made) | {schema.CHECKSUMS: sha256(made / schema.CHECKSUMS)}
+        hashes |= {f"{preset}/{name}": digest for name, digest in listed.items()}
+    write_text(out / schema.CHECKSUMS, checksums_text(hashes))
+    return out
 
 
 def make_shard(out: Path, shard: Shard) -> Made:
@@ -274,13 +306,25 @@ def _finish(dataset: Dataset, request: ExportRequest, out: Path, shards: Sequenc
         schema.CROISSANT: croissant(dataset, request, table, hashlib.sha256(index).hexdigest(), hashes).encode(),
         "README.md": card(dataset, request, table).encode(),
         "LICENSE": LICENSE_TEXT.encode(),
-        **{name: InputFile(dataset.folder / name, again).read() for name in _COPIED},
+        **{name: _used_lines(dataset, name, InputFile(dataset.folder / name, again).read()) for name in _COPIED},
     }
     if request.scored:
         lines = [line for result in results for line in result.scored]
         taken = scored_pairs(dataset, request)
         documents |= frames_set_documents(taken, request.frames.preset, request.draws, lines)
     write_documents(out, signed(documents, hashes))
+
+
+def _used_lines(dataset: Dataset, name: str, data: bytes) -> bytes:
+    """Lines of the rigs and rooms that the exported samples have; any other file as it is."""
+    ids = {
+        schema.RIGS: ("rig", {rig for row in dataset.rows for rig in (row.rig, row.nominal_rig)}),
+        schema.ROOMS: ("room", {row.room for row in dataset.rows}),
+    }
+    if name not in ids:
+        return data
+    key, used = ids[name]
+    return b"".join(line for line in data.splitlines(keepends=True) if json.loads(line)[key] in used)
 
 
 def _names(request: ExportRequest, shards: Sequence[Shard], column: str) -> Any:

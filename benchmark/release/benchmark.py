@@ -27,7 +27,7 @@ VERSION = "4.0"
 MANIFEST = "MANIFEST.json"
 FORMAT = "phibench release 1"
 _BLOCK = tarfile.BLOCKSIZE
-Kind = Literal["pairs", "sealed", "films"]
+Kind = Literal["pairs", "sealed", "films", "frames"]
 Digest = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
 
 
@@ -41,20 +41,34 @@ class ReleasePart:
         Last word of its archives' name.
     recipe : str or Path
         Name of a shipped recipe, or a file.
-    kind : "pairs", "sealed" or "films"
+    kind : "pairs", "sealed", "films" or "frames"
     sha256 : str
         Hash of the recipe's values (`content_sha256`).
+    source : str
+        Of frames: name of the part whose first samples they show.
     """
 
     name: str
     recipe: str | Path
     kind: Kind
     sha256: str
+    source: str = ""
 
     @property
     def title(self) -> str:
         """Name of the released data set."""
-        return f"phibench-v{VERSION.split('.')[0]}-{self.name}"
+        return _title(self.name)
+
+    @property
+    def rendered(self) -> str:
+        """Name of the data set behind it: its own, or that of the part whose frames it holds."""
+        return _title(self.source or self.name)
+
+    @property
+    def samples(self) -> int | None:
+        """Number of samples of the whole part; None if its recipe draws none."""
+        own = drawn_numbers(self.text())[1]
+        return own if own is None or self.kind != "frames" else min(own, max(STARTER_PAIRS.values()))
 
     def text(self) -> str:
         """Text of the recipe.
@@ -71,8 +85,15 @@ class ReleasePart:
         return text
 
 
+def _title(name: str) -> str:
+    return f"phibench-v{VERSION.split('.')[0]}-{name}"
+
+
+STARTER_PAIRS = {"mjpeg": 60, "srgb8": 3, "bayer-raw": 3}
+"""Pairs of each frames set of the starter part. PNG files keep the noise: 60 pairs in each would have 0.54 GB."""
+_DEV = "a274640eda114303c9fa7a51185574048483b7e529d3f9916bdac10f89f7ac6b"
 PARTS = (
-    ReleasePart("dev", "bench-dev", "pairs", "a274640eda114303c9fa7a51185574048483b7e529d3f9916bdac10f89f7ac6b"),
+    ReleasePart("dev", "bench-dev", "pairs", _DEV),
     ReleasePart("test", "bench-test", "sealed", "32818cd99112fcf5f0125898b2ab538ab9d53cf02fd90089ec9d14457af67aaa"),
     ReleasePart("paper", "paper", "pairs", "025ece80c9cfc9cce31e558089867a760568627e53154381c59bf926be27563d"),
     ReleasePart(
@@ -80,6 +101,7 @@ PARTS = (
     ),
     ReleasePart("films", "bench-films", "films", "d7e243e791f85a1e0c0e761c5f1ca5377cc839d1a7e1221b5d0a87424c91b9c9"),
     ReleasePart("drives", "bench-drives", "films", "825473dc49345b0f331de47ab49b735d453fcdfafa669aa45dbbb39c4a3926f3"),
+    ReleasePart("starter", "bench-dev", "frames", _DEV, source="dev"),
 )
 
 
@@ -144,7 +166,7 @@ class ReleasedPart(Document):
     """One data set in `MANIFEST.json`.
 
     `size` and `files` are those of the unpacked data set. `sums_sha256` is the hash of its `SHA256SUMS`, and with it
-    that of every file. `recipe_samples` is the number that the frozen recipe draws, null where it draws none.
+    that of every file. `recipe_samples` is the number of the whole part, null where its recipe draws none.
     """
 
     kind: Kind
@@ -169,7 +191,7 @@ class ReleasedPart(Document):
 
     @property
     def count_text(self) -> str:
-        """Number of samples; "3 of 500" where the frozen recipe draws another number."""
+        """Number of samples; "3 of 500" where the whole part has another number."""
         whole = self.recipe_samples
         return str(self.samples) if whole in (None, self.samples) else f"{self.samples} of {whole}"
 

@@ -23,9 +23,11 @@ from typing import IO
 
 from rich.console import Console
 
+from phibench.benchmark.export.export_make import export_frames_sets
 from phibench.benchmark.release.benchmark import (
     FORMAT,
     MANIFEST,
+    STARTER_PAIRS,
     VERSION,
     Archive,
     Manifest,
@@ -50,12 +52,13 @@ from phibench.datasets.film.film_store import INFO as FILM_INFO
 from phibench.datasets.make import cost, make
 from phibench.datasets.recipe.load import parse_recipe, recipe_files, with_numbers
 from phibench.datasets.store import schema
-from phibench.datasets.store.checksums import read_checksums
+from phibench.datasets.store.checksums import differing_files, read_checksums
 from phibench.datasets.store.croissant import LICENSE_TEXT, LICENSE_URL, croissant_text, file_object
 from phibench.datasets.store.documents import read_info
 from phibench.datasets.store.files import sha256, write_atomic, write_text
 from phibench.datasets.store.filling import filling, signed, write_documents
 from phibench.datasets.store.leftovers import folder_for_work
+from phibench.datasets.store.pair_files import FRAMES_SET
 
 Seal = Callable[[Path, Path], object]
 """Sealing of a data set: (folder, public folder); `benchmark.sealed.sealed_set.seal`."""
@@ -64,6 +67,8 @@ README = "README.md"
 _TIME_S = 315532800  # 1980-01-01, as all files of a sealed set have
 _SEAL = "seal.json"
 _IMAGE_BYTES, _IMAGES = 730_000, 4  # of a sealed pair at 1280 x 720; the mean of 40 pairs in three presets
+_PAIR_BYTES = {"mjpeg": 450_000, "srgb8": 4_230_000, "bayer-raw": 4_570_000}  # of dev's first pairs, four images each
+_SET_BYTES = 500_000  # of the documents of a frames set, about
 
 
 @dataclass(frozen=True)
@@ -92,8 +97,19 @@ class ReleaseRequest:
 
     def samples_of(self, part: ReleasePart) -> int | None:
         """Samples to draw; None for a part that draws none."""
-        own = drawn_numbers(part.text())[1]
-        return own if own is None or self.samples is None else self.samples
+        own = part.samples
+        if own is None or self.samples is None:
+            return own
+        return min(own, self.samples) if part.kind == "frames" else self.samples
+
+    def source_of(self, part: ReleasePart) -> ReleasePart | None:
+        """Part of this release whose frames a part shows, if it is asked for, too."""
+        return next((other for other in self.parts if part.source and other.name == part.source), None)
+
+    def frames_of(self, part: ReleasePart) -> dict[str, int]:
+        """Pairs of each frames set of a part, by preset."""
+        samples = self.samples_of(part)
+        return {preset: min(count, samples or count) for preset, count in STARTER_PAIRS.items()}
 
 
 @dataclass(frozen=True)
@@ -143,7 +159,9 @@ def dry_run(request: ReleaseRequest) -> Iterator[str]:
         done = used.get(part.title, request.work / part.title)
         samples = request.samples_of(part)
         count = "" if samples is None else f"{samples} samples, "
-        if (done / schema.CHECKSUMS).is_file() and part.kind != "sealed":
+        if part.kind == "frames":
+            yield f"{part.title}: {count}{_frames_cost(request, part, part.title in used)}"
+        elif (done / schema.CHECKSUMS).is_file() and part.kind != "sealed":
             size = sum((done / name).stat().st_size for name in _members(part, done) if (done / name).is_file())
             yield f"{part.title}: {count}{megabytes(size)}, from {done}"
         elif part.kind == "films":
@@ -161,6 +179,15 @@ def _film_cost(part: ReleasePart) -> str:
     forecast = films_forecast(plan, films)
     hours = (forecast.cpu_s + sum(forecast.bakes)) / 3600.0
     return f"{len(films)} films, about {megabytes(forecast.size)} or more, {hours:.2g} CPU-hours"
+
+
+def _frames_cost(request: ReleaseRequest, part: ReleasePart, is_there: bool) -> str:
+    size = sum(_SET_BYTES + _PAIR_BYTES[preset] * count for preset, count in request.frames_of(part).items())
+    told = f"about {megabytes(size)}, frames of {part.rendered}"
+    if is_there or request.source_of(part) is not None:
+        return told
+    forecast = cost(part.recipe, request.work / part.rendered, request.samples_of(part))
+    return f"{told}, {forecast.cpu_s / 3600.0:.2g} CPU-hours"
 
 
 # Folders, seed, and data sets that are there.
@@ -219,7 +246,7 @@ def _assigned(request: ReleaseRequest) -> dict[str, Path]:
         if not fitting:
             told = [reason for reason in reasons.values() if reason != _OTHER] or [_OTHER]
             raise DatasetError(f"--use {folder}: {told[0]}; leave it out, and it is rendered")
-        folders[fitting[0]] = folder
+        folders |= dict.fromkeys(fitting, folder)  # frames show the same data set as the part that they are of
     return folders
 
 
@@ -227,7 +254,9 @@ _OTHER = "it is no data set of a recipe that is to be released"
 
 
 def _misfit(request: ReleaseRequest, part: ReleasePart, folder: Path) -> str:
-    """Reason why a folder does not do for a part; empty if it does."""
+    """Reason why a folder does not do for a part; empty if it does. Frames are those of their own release."""
+    if (shown := request.source_of(part)) is not None:
+        return _misfit(request, shown, folder)
     info = FILM_INFO if part.kind == "films" else schema.INFO
     if not (folder / info).is_file() or not (folder / schema.RECIPE).is_file():
         return _OTHER
@@ -243,7 +272,7 @@ def _misfit(request: ReleaseRequest, part: ReleasePart, folder: Path) -> str:
         return f"{refused}, and a release has all samples of its recipe"
     seed, samples = drawn_numbers(text)
     wanted = request.samples_of(part)
-    if samples != wanted:
+    if samples != wanted and not (part.kind == "frames" and (samples or 0) > (wanted or 0)):
         return f"it has {samples} samples, and {part.title} is to have {wanted} (--samples)"
     if seed != (meant := _seed(request, part, make_it=False)):
         secret = f"the one in {request.secret_seed}" if part.kind == "sealed" else str(meant)
@@ -253,14 +282,17 @@ def _misfit(request: ReleaseRequest, part: ReleasePart, folder: Path) -> str:
 
 def _dataset(request: ReleaseRequest, part: ReleasePart, used: Mapping[str, Path], seal: Seal) -> Path:
     """Folder whose files are to be packed: made, if need be, or used."""
-    folder = used.get(part.title, request.work / part.title)
-    if part.title not in used:
+    folder = used.get(part.title, request.work / part.rendered)
+    has_frames = part.kind == "frames" and not _misfit(request, part, folder)
+    if part.title not in used and not has_frames:
         part.text()  # the frozen one, or an error
         if part.kind == "films":
             make_films(part.recipe, folder, request.workers, request.console)
         else:
             samples, seed = request.samples_of(part), _seed(request, part)
             make(part.recipe, folder, request.workers, request.console, samples=samples, seed=seed)
+    if part.kind == "frames":
+        return _frames(request, part, folder)
     if part.kind != "sealed":
         return folder
     public = request.work / f"{part.title}-public"
@@ -276,6 +308,16 @@ def _dataset(request: ReleaseRequest, part: ReleasePart, used: Mapping[str, Path
         )
     seal(folder, public)
     return public
+
+
+def _frames(request: ReleaseRequest, part: ReleasePart, folder: Path) -> Path:
+    """Frames sets of the first samples; another data set, or another number of samples, has a folder of its own."""
+    pairs = request.frames_of(part)
+    digest = _digest([sha256(folder / schema.CHECKSUMS), pairs])[:12]
+    out = request.work / f"{part.title}-{digest}"
+    if not (out / schema.CHECKSUMS).is_file() and (faults := differing_files(folder, read_checksums(folder))):
+        raise DatasetError(f"{folder}: {faults[0]}; run `phibench dataset repair {folder}`")
+    return export_frames_sets(folder, pairs, out, workers=request.workers, console=request.console)
 
 
 # Archives.
@@ -310,7 +352,7 @@ def _packed(request: ReleaseRequest, part: ReleasePart, folder: Path, manifest: 
         kind=part.kind,
         recipe_sha256=part.sha256,
         samples=count,
-        recipe_samples=drawn_numbers(part.text())[1],
+        recipe_samples=part.samples,
         files=len(members),
         size=sum((folder / name).stat().st_size for name in members),
         sums_sha256=sha256(folder / schema.CHECKSUMS),
@@ -390,10 +432,14 @@ class _Hashing(io.RawIOBase):
 
 
 def _sample_count(part: ReleasePart, folder: Path) -> int:
-    """Pairs of a data set or of a sealed one, or films."""
-    name, key = {"pairs": (schema.INFO, "samples"), "sealed": (_SEAL, "pairs"), "films": (FILM_INFO, "films")}[
-        part.kind
-    ]
+    """Pairs of a data set, of a sealed one or of the largest frames set, or films."""
+    frames = f"{next(iter(STARTER_PAIRS))}/{FRAMES_SET}"
+    name, key = {
+        "pairs": (schema.INFO, "samples"),
+        "sealed": (_SEAL, "pairs"),
+        "films": (FILM_INFO, "films"),
+        "frames": (frames, "samples"),
+    }[part.kind]
     file = InputFile(folder / name, "run `phibench dataset repair`")
     value = file.json().get(key)
     if isinstance(value, bool) or not isinstance(value, int | list):
@@ -427,6 +473,7 @@ def _card(title: str, manifest: Manifest) -> str:
     lines += [f"Version {VERSION} of the benchmark of phibench, made with phibench {manifest.phibench}.", ""]
     lines += ["    phibench fetch NAME --from PLACE-OF-THIS-FOLDER --out FOLDER", ""]
     kinds = {"pairs": "pairs with truth", "sealed": "pairs, truth sealed", "films": "films with truth"}
+    kinds["frames"] = f"frames with truth: {', '.join(STARTER_PAIRS)}"
     rows = [
         (f"`{name}`", kinds[one.kind], one.count_text, f"{one.files}", megabytes(one.size), f"{len(one.archives)}")
         for name, one in sorted(manifest.parts.items())

@@ -219,7 +219,9 @@ def read_info(folder: Path) -> DatasetInfo:
                 f"{folder} is not a finished data set: it has no {schema.INFO}; wait until `phibench dataset make` has "
                 "ended there, or give the same command again"
             )
-        raise DatasetError(f"{folder} is not a data set: it has no {schema.INFO}")
+        sets = sorted(path.parent.name for path in folder.glob(f"*/{schema.TruthFolder.FRAMES_SET}"))
+        held = f"; give one of its frames sets: {', '.join(sets[:10])}" if sets else ""
+        raise DatasetError(f"{folder} is not a data set: it has no {schema.INFO}{held}")
     file = _info_file(path)
     document = file.json()
     version = document.get("schema_version")

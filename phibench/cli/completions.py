@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 RECIPES = Path(__file__).parents[1] / "datasets" / "recipes"
 _PRESETS = Path(__file__).parents[1] / "render" / "sensor" / "settings_presets.toml"
 _REGISTRY = Path(__file__).parents[1] / "estimator" / "methods" / "registry.py"
-PARTS = ("dev", "test", "paper", "mirrors", "films", "drives")
+PARTS = ("dev", "test", "paper", "mirrors", "films", "drives", "starter")
 TITLE = "phibench-v4-"
 POLICIES = ("paper", "greedy", "drive-only", "random", "oracle")
 METHOD_PACKAGES = "phibench.methods"

@@ -1,4 +1,4 @@
-"""Small release of three parts, and what tests of releases and of fetching do with it."""
+"""Small release of four parts, and what tests of releases and of fetching do with it."""
 
 import hashlib
 from dataclasses import dataclass
@@ -17,11 +17,12 @@ def part_of(name: str, recipe: str, kind: Any) -> ReleasePart:
 
 
 SMALL, FILMS = part_of("small", "smallest.toml", "pairs"), part_of("films", "films.toml", "films")
+STARTER = ReleasePart("starter", SMALL.recipe, "frames", SMALL.sha256, source="small")
 
 
 @dataclass(frozen=True)
 class Made:
-    """A release of three parts, and the sealed data set behind one of them."""
+    """A release of four parts, and the sealed data set behind one of them."""
 
     request: ReleaseRequest
     released: Released

@@ -15,17 +15,22 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from helpers.small_release import Made, flip, snapshot
 from helpers.strange_releases import member
 
-from phibench.benchmark.release.benchmark import Archive
+from phibench.benchmark.export.export_make import verify_export
+from phibench.benchmark.release.benchmark import STARTER_PAIRS, Archive
 from phibench.benchmark.release.fetch import Fetched, fetch, unpack
 from phibench.benchmark.release.release_source import SOURCE
+from phibench.benchmark.scored_dataset import open_dataset
+from phibench.benchmark.scores.document import read_score
 from phibench.benchmark.sealed.sealed_set import read_seal
+from phibench.cli.main import main
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.film.film_store import verify as film_faults
-from phibench.datasets.store.checksums import damaged
+from phibench.datasets.store.checksums import damaged, differing_files, read_checksums
 
 
 def test_fetched_from_a_folder(made: Made, tmp_path: Path, smallest_dataset: Path) -> None:
@@ -40,6 +45,30 @@ def test_fetched_from_a_folder(made: Made, tmp_path: Path, smallest_dataset: Pat
     assert film_faults(tmp_path / "films") == []
     fetch("hidden", tmp_path / "hidden", str(made.out))
     assert read_seal(tmp_path / "hidden").pairs == 2
+
+
+def test_the_starter_part_is_fetched_and_scored(
+    made: Made, tmp_path: Path, smallest_dataset: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Frames that were fetched are those that are drawn from the layers, with their truth."""
+    fetch("starter", tmp_path / "starter", str(made.out))
+    assert differing_files(tmp_path / "starter", read_checksums(tmp_path / "starter")) == []
+    assert [verify_export(tmp_path / "starter" / preset) for preset in STARTER_PAIRS] == [[], [], []]
+    folder, mine = tmp_path / "starter" / "mjpeg", tmp_path / "mine.json"
+    assert main(["score", str(folder), "--method", "red_centroid", "--out", str(mine)]) == 0
+    scored, drawn = read_score(mine), open_dataset(smallest_dataset).pairs("mjpeg")
+    assert (scored.pairs, sum(scored.failures.values())) == (len(drawn), 0) == (2, 0)
+    for (pair, truth), (other, wanted) in zip(open_dataset(folder), drawn, strict=True):
+        assert np.array_equal(pair.down, other.down)
+        assert repr(truth) == repr(wanted)
+    capsys.readouterr()
+    assert main(["score", str(folder), "--method", "red_centroid", "--preset", "yuyv"]) == 2
+    assert "none of 'yuyv'" in capsys.readouterr().err
+    next(folder.rglob("*.up.*")).unlink()
+    assert main(["score", str(folder), "--method", "red_centroid"]) == 2
+    assert "is missing; download the set again" in capsys.readouterr().err
+    assert main(["score", str(tmp_path / "starter"), "--method", "red_centroid"]) == 2
+    assert "give one of its frames sets" in capsys.readouterr().err
 
 
 def test_the_place_is_a_setting(made: Made, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,22 +6,28 @@ import re
 import shutil
 import stat
 import tarfile
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import yaml
-from helpers.small_release import SMALL, Made, ask, flip, snapshot
+from helpers.small_release import SMALL, STARTER, Made, ask, flip, snapshot
 
+from phibench.benchmark.export.export_make import export_frames_sets
+from phibench.benchmark.pair_sets.frames_set import FramesSet
 from phibench.benchmark.release.benchmark import PARTS, VERSION, ReleasePart, content_sha256
-from phibench.benchmark.release.release_make import ReleaseRequest, _card, dry_run, release
+from phibench.benchmark.release.release_make import ReleaseRequest, _card, _misfit, dry_run, release
 from phibench.benchmark.release.release_source import SOURCE
+from phibench.benchmark.scored_dataset import open_dataset
 from phibench.benchmark.sealed.sealed_set import seal
 from phibench.cli.main import main
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.plan.plan import make_plan
 from phibench.datasets.recipe.load import parse_recipe, recipe_text, with_numbers
 from phibench.datasets.store.checksums import damaged, differing_files, read_checksums
+from phibench.datasets.store.documents import read_manifest
 
 ROOT = Path(__file__).parents[3]
 SECRET = 2**128 + 12345
@@ -32,7 +38,7 @@ SECRET = 2**128 + 12345
 
 def test_frozen_recipes_are_unchanged() -> None:
     """The hashes stand in the code; a change of a number in a recipe needs a new version, a comment does not."""
-    assert [part.name for part in PARTS] == ["dev", "test", "paper", "mirrors", "films", "drives"]
+    assert [part.name for part in PARTS] == ["dev", "test", "paper", "mirrors", "films", "drives", "starter"]
     for part in PARTS:
         assert content_sha256(part.text()) == part.sha256
         assert part.title == f"phibench-v4-{part.name}"
@@ -112,6 +118,7 @@ def test_archives_hold_the_data_sets_and_no_secret(made: Made, smallest_dataset:
         "phibench-v4-small": "pairs",
         "phibench-v4-hidden": "sealed",
         "phibench-v4-films": "films",
+        "phibench-v4-starter": "frames",
     }
     assert len(parts["phibench-v4-small"].archives) > 3
     assert differing_files(made.out, read_checksums(made.out)) == []
@@ -169,15 +176,48 @@ def test_a_run_that_was_killed_goes_on(made: Made, tmp_path: Path, smallest_data
 def test_a_damaged_data_set_is_not_released(smallest_dataset: Path, tmp_path: Path) -> None:
     shutil.copytree(smallest_dataset, tmp_path / "set")
     flip(next((tmp_path / "set" / "spots").glob("*.exr")))
-    with pytest.raises(DatasetError, match=r"spots/.* is damaged.*phibench dataset repair"):
-        release(ask(tmp_path, [SMALL], use=[tmp_path / "set"]), seal)
+    for part in (SMALL, STARTER):
+        with pytest.raises(DatasetError, match=r"spots/.* is damaged.*phibench dataset repair"):
+            release(ask(tmp_path, [part], use=[tmp_path / "set"]), seal)
     assert not (tmp_path / "public" / "SHA256SUMS").exists()
+
+
+def test_the_starter_part_takes_the_first_samples_of_dev(tmp_path: Path, smallest_dataset: Path) -> None:
+    """It draws no data set of its own: dev's does, however many samples it has beyond those that are shown."""
+    dev, starter = PARTS[0], PARTS[-1]
+    assert (starter.rendered, starter.samples) == (dev.title, 60)
+    asked = ReleaseRequest([starter], tmp_path / "public", tmp_path / "work", None)
+    assert asked.frames_of(starter) == {"mjpeg": 60, "srgb8": 3, "bayer-raw": 3}
+    fewer = replace(asked, samples=2)
+    assert fewer.frames_of(starter) == {"mjpeg": 2, "srgb8": 2, "bayer-raw": 2}
+    assert replace(asked, samples=5000).frames_of(starter) == asked.frames_of(starter)
+    folder = tmp_path / "dev"
+    folder.mkdir()
+    for name in ("dataset.json", "SHA256SUMS"):
+        shutil.copy2(smallest_dataset / name, folder)
+    for samples, fits in ((59, []), (60, [starter.title]), (500, [dev.title, starter.title])):
+        text = with_numbers(recipe_text("bench-dev"), "bench-dev", samples, None)
+        (folder / "recipe.toml").write_text(text, encoding="utf-8")
+        found = [part.title for part in (dev, starter) if not _misfit(asked, part, folder)]
+        assert found == fits
+    (folder / "recipe.toml").write_text(with_numbers(recipe_text("bench-dev"), "bench-dev", 60, None))
+    assert "it has 60 samples, and phibench-v4-dev is to have 500" in _misfit(
+        replace(asked, parts=[dev, starter]), starter, folder
+    )
+    first = next(iter(read_manifest(smallest_dataset)))
+    sets = export_frames_sets(smallest_dataset, {"mjpeg": 1}, tmp_path / "sets", workers=1)
+    [(pair, truth)] = FramesSet(sets / "mjpeg")
+    drawn = open_dataset(smallest_dataset).pairs("mjpeg")
+    assert truth.sample_id == first.sample_id
+    rigs = [json.loads(line)["rig"] for line in (sets / "mjpeg" / "rigs.jsonl").read_text().splitlines()]
+    assert set(rigs) == {first.rig, first.nominal_rig}
+    assert np.array_equal(pair.up, drawn.pair(drawn.number_of(first.sample_id)).up)
 
 
 def test_a_dry_run_says_sizes_and_writes_nothing(made: Made, tmp_path: Path) -> None:
     request = ask(tmp_path, list(made.request.parts), use=made.request.use)
     lines = list(dry_run(request))
-    assert [line.split(":")[0] for line in lines] == ["phibench-v4-small", "phibench-v4-hidden", "phibench-v4-films"]
+    assert [line.split(":")[0] for line in lines] == [part.title for part in made.request.parts]
     assert all(re.search(r"\d+ MB", line) for line in lines)
     assert "CPU-hours" in lines[1]
     assert list(tmp_path.iterdir()) == []
