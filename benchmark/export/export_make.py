@@ -193,6 +193,13 @@ def scored_pairs(dataset: Dataset, request: ExportRequest) -> DatasetPairs:
     return DatasetPairs(dataset, tuple(draws))
 
 
+def is_export(folder: Path) -> bool:
+    """True of an export, and of a folder of exports as `export_frames_sets` writes it."""
+    is_data_set = (folder / schema.INFO).is_file()
+    signs_exports = (folder / schema.CHECKSUMS).is_file() and any(folder.glob(f"*/{INFO}"))
+    return (folder / INFO).is_file() or (signs_exports and not is_data_set)
+
+
 def verify_export(folder: str | Path) -> list[str]:
     """One sentence per fault of an export: files that are missing, changed or not listed.
 
@@ -202,7 +209,7 @@ def verify_export(folder: str | Path) -> list[str]:
         If the folder is no export, or one that was not finished.
     """
     folder = Path(folder)
-    if not (folder / INFO).is_file():
+    if not is_export(folder):
         raise DatasetError(f"{folder} is no export: it has no {INFO}")
     if not (folder / schema.CHECKSUMS).is_file():
         raise DatasetError(f"{folder} has no {schema.CHECKSUMS}: it was not finished; {_AGAIN}")

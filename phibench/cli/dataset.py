@@ -190,17 +190,17 @@ def verify(
     Parameters
     ----------
     directory
-        Folder of a data set, or of an export.
+        Folder of a data set, of an export, or of several exports that one list signs.
     mitsuba
         Also compare so many samples with Mitsuba's path tracer: light, outline, and the spot's flux and centroid.
     """
     from dataclasses import replace
     from json import dumps
 
-    from phibench.benchmark.export.export_make import INFO, verify_export
+    from phibench.benchmark.export.export_make import is_export, verify_export
     from phibench.datasets.verify import verify as verify_dataset
 
-    if (directory / INFO).is_file():
+    if is_export(directory):
         if mitsuba is not None:
             from phibench.datasets.common.errors import DatasetError
 

@@ -54,6 +54,7 @@ def test_the_starter_part_is_fetched_and_scored(
     fetch("starter", tmp_path / "starter", str(made.out))
     assert differing_files(tmp_path / "starter", read_checksums(tmp_path / "starter")) == []
     assert [verify_export(tmp_path / "starter" / preset) for preset in STARTER_PAIRS] == [[], [], []]
+    assert main(["dataset", "verify", str(tmp_path / "starter")]) == 0
     folder, mine = tmp_path / "starter" / "mjpeg", tmp_path / "mine.json"
     assert main(["score", str(folder), "--method", "red_centroid", "--out", str(mine)]) == 0
     scored, drawn = read_score(mine), open_dataset(smallest_dataset).pairs("mjpeg")
@@ -65,6 +66,8 @@ def test_the_starter_part_is_fetched_and_scored(
     assert main(["score", str(folder), "--method", "red_centroid", "--preset", "yuyv"]) == 2
     assert "none of 'yuyv'" in capsys.readouterr().err
     next(folder.rglob("*.up.*")).unlink()
+    assert main(["dataset", "verify", str(tmp_path / "starter")]) == 1
+    assert ".up.jpg is missing" in capsys.readouterr().out
     assert main(["score", str(folder), "--method", "red_centroid"]) == 2
     assert "is missing; download the set again" in capsys.readouterr().err
     assert main(["score", str(tmp_path / "starter"), "--method", "red_centroid"]) == 2
