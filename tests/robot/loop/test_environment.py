@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import time
 import warnings
 
@@ -11,7 +12,16 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from phibench.robot.loop.environment import ENVIRONMENT, ApproachTarget, action_of, flat_observation, register
+from phibench.robot.loop.environment import (
+    ENVIRONMENT,
+    FLAT,
+    ApproachTarget,
+    action_of,
+    flat_observation,
+    register,
+    scaled,
+    unscaled,
+)
 from phibench.robot.loop.simulator import (
     COLLISION,
     LATE,
@@ -39,7 +49,7 @@ def drive(env, seed: int, steps: int) -> list[np.ndarray]:
     rows = [flat_observation(env.reset(seed=seed)[0])]
     for _ in range(steps):
         action = env.action_space.sample()
-        action["stated_m"][:] = 0.0
+        action["state"] = 0
         observation, reward, over, late, _ = env.step(action)
         rows.append(np.append(flat_observation(observation), reward))
         if over or late:
@@ -74,8 +84,9 @@ def test_the_vector_version_is_the_single_ones_side_by_side(env) -> None:
 
 
 def still(env, **numbers) -> tuple[float, bool, bool, dict]:
-    action = {name: np.zeros(1) for name in env.action_space if name not in ("exposure", "code")}
-    _, reward, over, late, info = env.step(action | {"exposure": 4, "code": 1} | numbers)
+    action = {name: np.zeros(1) for name in env.action_space if name not in ("exposure", "code", "state")}
+    states = int("stated_m" in numbers)
+    _, reward, over, late, info = env.step(action | {"exposure": 4, "code": 1, "state": states} | numbers)
     return reward, over, late, info
 
 
@@ -149,12 +160,67 @@ def test_actions_take_defaults_for_what_is_left_out() -> None:
     assert action_of({"drive_m_per_s": [0.2], "code": 2}) == Action(drive_m_per_s=0.2, code=2)
 
 
+def test_a_number_alone_states_nothing(env) -> None:
+    env.reset(seed=1)
+    assert not env.step({"stated_m": np.array([2.0])})[2]
+    assert action_of({"state": 1, "stated_m": [2.0]}) == Action(stated_m=2.0)
+
+
+@pytest.mark.parametrize(
+    ("action", "words"),
+    [
+        ({"drive": 0.1}, "action 'drive': did you mean 'drive_m_per_s'?"),
+        ({"state": 1}, "give the distance, stated_m, in metres and above 0"),
+        ({"state": 2, "stated_m": 1.0}, "action state = 2"),
+    ],
+)
+def test_a_strange_action_is_one_sentence(action: dict[str, float], words: str) -> None:
+    with pytest.raises(SceneError, match=re.escape(words)) as caught:
+        action_of(action)
+    assert "\n" not in str(caught.value)
+
+
+def test_the_name_with_its_module_is_enough(python) -> None:
+    code = "import gymnasium; print(gymnasium.make('phibench.robot.loop.environment:phibench/ApproachTarget-v0'))"
+    child = python(code)
+    assert "ApproachTarget" in child.stdout, child.stderr
+
+
+@pytest.fixture(scope="module")
+def vectors() -> gymnasium.Env:
+    return gymnasium.make(FLAT).unwrapped
+
+
+def test_the_flat_one_passes_the_checks_of_gymnasium(vectors) -> None:
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", category=UserWarning)
+        check_env(vectors, skip_render_check=True)
+
+
+def test_vectors_are_the_dicts_scaled(env, vectors) -> None:
+    """The ends of each range, and the same episode as the other environment's."""
+    space = env.action_space
+    low, high = (unscaled(np.full(len(space), x), space) for x in (-1.0, 1.0))
+    assert low["drive_m_per_s"] == -high["drive_m_per_s"] == space["drive_m_per_s"].low[0]
+    assert (low["state"], high["state"], high["exposure"]) == (0, 1, space["exposure"].n - 1)
+    assert vectors.reset(seed=7)[0] == pytest.approx(scaled(env.reset(seed=7)[0], env.observation_space), abs=0.0)
+    action = np.array([0.3, -0.2, 0.0, 0.0, 0.1, 0.5, -1.0, 0.0], np.float32)
+    seen, reward, *_ = vectors.step(action)
+    other, expected, *_ = env.step(unscaled(action, space))
+    assert reward == expected
+    assert np.array_equal(seen, scaled(other, env.observation_space))
+    assert seen.dtype == np.float32
+    assert np.abs(seen).max() <= 1.0
+    with pytest.raises(SceneError, match="give 8 from -1 to 1"):
+        unscaled(np.full(8, 1.1), space)
+
+
 @pytest.mark.slow
 def test_steps_per_second_of_the_exact_model(capsys) -> None:
     """At least 2000 steps of one environment in a second of one core, four lights in a room."""
     env = ApproachTarget()
     env.reset(seed=1)
-    actions = [env.action_space.sample() | {"stated_m": np.zeros(1)} for _ in range(500)]
+    actions = [env.action_space.sample() | {"state": 0} for _ in range(500)]
     best = 0.0
     for _ in range(3):
         start = time.process_time()

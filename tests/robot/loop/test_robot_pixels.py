@@ -86,7 +86,7 @@ def test_pixels_of_a_seed_are_the_same_bits(arena) -> None:
         env = ApproachTarget(pixels(arena))
         env.action_space.seed(seed)
         found = [flat_observation(env.reset(seed=seed)[0])]
-        return [*found, *(flat_observation(env.step(env.action_space.sample() | {"stated_m": [0]})[0]) for _ in "123")]
+        return [*found, *(flat_observation(env.step(env.action_space.sample() | {"state": 0})[0]) for _ in "123")]
 
     first, again, other = rows(5), rows(5), rows(6)
     assert all(np.array_equal(a, b) for a, b in zip(first, again, strict=True))
@@ -139,10 +139,10 @@ def test_steps_per_second_of_pixels(arena, capsys, fidelity: str, steps: int, re
     env = ApproachTarget(pixels(arena, fidelity=fidelity))
     env.action_space.seed(1)
     env.reset(seed=1)
-    env.step(env.action_space.sample() | {"stated_m": np.zeros(1)})
+    env.step(env.action_space.sample() | {"state": 0})
     start = time.process_time()
     for _ in range(steps):
-        _, _, over, late, _ = env.step(env.action_space.sample() | {"stated_m": np.zeros(1)})
+        _, _, over, late, _ = env.step(env.action_space.sample() | {"state": 0})
         if over or late:
             env.reset()
     rate = steps / (time.process_time() - start)
