@@ -128,7 +128,7 @@ def test_the_command_asks_for_what_was_given(tmp_path: Path, monkeypatch, capsys
                "--height-m", "0.7", "--power-mw", "0.5", "--stroke-m", "0.3", "0.5", "--out", str(out)]  # fmt: skip
     assert cli.main(command) == 0
     assert (asked["depth_m"], asked["rig"].mirror.radius_m, asked["card"].output) == (2.0, 0.05, "raw")
-    assert (asked["around"].heights_m, asked["laser"].power_w) == ((0.7,), 0.5e-3)
+    assert (asked["around"].heights_m, asked["around"].laser.power_w) == ((0.7,), 0.5e-3)
     assert (asked["strokes_m"], asked["covariance_rig"]) == ((0.1, 1.4), None)
     said = capsys.readouterr().out
     assert "the best stroke is 0.80 m" in said
