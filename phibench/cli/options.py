@@ -63,7 +63,8 @@ Variant = Annotated[
     Parameter(
         name="--variant",
         converter=_variant,
-        help="What renders: llvm, on the processor, or cuda, on an NVIDIA GPU; by default PHIBENCH_VARIANT, else llvm.",
+        help="What renders on this machine: llvm, on the processor, or cuda, on an NVIDIA GPU; by default "
+        "PHIBENCH_VARIANT, else llvm. Workers of a scheduler take their own.",
     ),
 ]
 Whole = Annotated[int, Parameter(converter=_whole)]
