@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import Any
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,8 +44,54 @@ class Box:
         return slice(self.v0_px, self.v0_px + self.height_px), slice(self.u0_px, self.u0_px + self.width_px)
 
 
+class FramedImages(ShortForm):
+    """Images by name, each of one frame or of several: what every kind of pair is made of.
+
+    A pair is a frozen dataclass with a field for each of `IMAGE_NAMES`, and these: number, rig, stroke_m, card, frames.
+    """
+
+    IMAGE_NAMES: ClassVar[tuple[str, ...]]
+    card: SensorCard
+    frames: Mapping[str, Image] | None
+    rig: Rig
+    stroke_m: float
+
+    def _shown(self) -> dict[str, Any]:
+        image, camera = self.images["down"], self.rig.camera
+        return {
+            "images": f"{', '.join(self.images)}: {' x '.join(map(str, image.shape))} {image.dtype}",
+            "frames": ", ".join(f"{self.count(name)} of {name}" for name in self.images),
+            "output": f"{self.card.output} of '{self.card.name}', exposure {1e3 * self.card.exposure_s:.4g} ms",
+            "camera": f"{camera.width_px} x {camera.height_px} px, fx {camera.fx_px:g} px",
+            "stroke h": f"{self.stroke_m:g} m",
+        }
+
+    @classmethod
+    def of_frames(cls, number: int, frames: Mapping[str, Sequence[Image]], **others: Any) -> Self:
+        """Pair of the frames of each image; of one frame each, images are these very frames."""
+        if all(len(group) == 1 for group in frames.values()):
+            return cls(**{"number": number, **{name: group[0] for name, group in frames.items()}, **others})
+        stacks = {name: _read_only(np.stack(group)) for name, group in frames.items()}
+        means = {name: _read_only(stack.mean(axis=0, dtype=np.float32)) for name, stack in stacks.items()}
+        return cls(**{"number": number, **means, **others, "frames": MappingProxyType(stacks)})
+
+    def stack(self, name: str) -> Image:
+        """Frames of an image that is there, shape (n, H, W, ...)."""
+        return np.asarray(self.images[name])[None] if self.frames is None else self.frames[name]
+
+    def count(self, name: str) -> int:
+        """Number of frames of an image; 0 where it is not there."""
+        return len(self.stack(name)) if name in self.images else 0
+
+    @property
+    def images(self) -> Mapping[str, Image]:
+        """Images by name, those that are there, in the order of `IMAGE_NAMES`."""
+        named = {name: getattr(self, name) for name in self.IMAGE_NAMES}
+        return MappingProxyType({name: image for name, image in named.items() if image is not None})
+
+
 @dataclass(frozen=True, repr=False)
-class Pair(ShortForm):
+class Pair(FramedImages):
     """Pair of images (down, up) of one spot in one noise realisation, as a camera and a user deliver it.
 
     Attributes
@@ -76,6 +122,8 @@ class Pair(ShortForm):
         What the user knows of the laser's spot: its diameter by the distance.
     """
 
+    IMAGE_NAMES = ("down", "up", "down_off", "up_off")
+
     number: int
     down: Image = field(repr=False)
     up: Image = field(repr=False)
@@ -94,44 +142,12 @@ class Pair(ShortForm):
         return f"Pair {self.number}"
 
     def _shown(self) -> dict[str, Any]:
-        image = self.down
         boxes = [f"{box.width_px} x {box.height_px} px" for box in (self.box_down, self.box_up) if box is not None]
-        camera = self.rig.camera
         return {
-            "images": f"{', '.join(self.images)}: {' x '.join(map(str, image.shape))} {image.dtype}",
-            "frames": ", ".join(f"{self.count(name)} of {name}" for name in self.images),
-            "output": f"{self.card.output} of '{self.card.name}', exposure {1e3 * self.card.exposure_s:.4g} ms",
-            "camera": f"{camera.width_px} x {camera.height_px} px, fx {camera.fx_px:g} px",
-            "stroke h": f"{self.stroke_m:g} m",
+            **super()._shown(),
             "boxes": ", ".join(boxes) or "none",
             "calibration": "none" if self.calibration_covariance is None else "with its covariance",
         }
-
-    @classmethod
-    def of_frames(cls, number: int, frames: Mapping[str, Sequence[Image]], **others: Any) -> Pair:
-        """Pair of the frames of each image; of one frame each, images are these very frames."""
-        if all(len(group) == 1 for group in frames.values()):
-            single: dict[str, Any] = {name: group[0] for name, group in frames.items()}
-            return cls(number, **single, **others)
-        stacks = {name: _read_only(np.stack(group)) for name, group in frames.items()}
-        means: dict[str, Any] = {
-            name: _read_only(stack.mean(axis=0, dtype=np.float32)) for name, stack in stacks.items()
-        }
-        return cls(number, **means, **others, frames=MappingProxyType(stacks))
-
-    def stack(self, name: str) -> Image:
-        """Frames of an image that is there, shape (n, H, W, ...)."""
-        return np.asarray(self.images[name])[None] if self.frames is None else self.frames[name]
-
-    def count(self, name: str) -> int:
-        """Number of frames of an image; 0 where it is not there."""
-        return len(self.stack(name)) if name in self.images else 0
-
-    @property
-    def images(self) -> Mapping[str, Image]:
-        """Images by name, those that are there: "down", "up", "down_off", "up_off"."""
-        named = {name: getattr(self, name) for name in ("down", "up", "down_off", "up_off")}
-        return MappingProxyType({name: image for name, image in named.items() if image is not None})
 
 
 def _read_only(image: Image) -> Image:
