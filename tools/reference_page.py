@@ -121,8 +121,8 @@ and `room_tables.py`. A test compares. Do not edit.
 
 A recipe is a TOML file (UTF-8). `phibench dataset make NAME_OR_FILE --out FOLDER` takes a file or the name of a
 shipped one (`paper`, `paper-misaligned`, `random`, `worlds`, `smoke`, `bench-...`, `study-...`; in
-`datasets/recipes/`). Keys that are left out take the default; an unknown key is a fault. All faults are reported in
-one go, before anything is rendered.
+`datasets/recipes/`). Keys that are left out take the default; an unknown key is a fault. All faults of the
+tables are reported in one go; once they are mended, all faults of the scene. Both come before anything is rendered.
 
 A range "0 to 5" holds its ends, and a number is meant where no kind is named.
 """

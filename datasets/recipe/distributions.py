@@ -5,8 +5,8 @@ A value is the quantile of a number u in [0, 1), so any sequence of points in th
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Annotated, Any, TypeVar, cast
+from collections.abc import Callable, Collection, Iterable, Sequence
+from typing import Annotated, Any, ClassVar, Literal, get_origin
 
 import numpy as np
 from pydantic import (
@@ -16,11 +16,13 @@ from pydantic import (
     Field,
     GetCoreSchemaHandler,
     GetJsonSchemaHandler,
+    SerializerFunctionWrapHandler,
     TypeAdapter,
     ValidationError,
     ValidationInfo,
     create_model,
     field_validator,
+    model_serializer,
     model_validator,
 )
 from pydantic_core import CoreSchema, core_schema
@@ -34,6 +36,14 @@ class Table(BaseModel):
     """A table of a recipe: no unknown keys, no silent conversions, no NaN or infinity, immutable."""
 
     model_config = ConfigDict(strict=True, frozen=True, extra="forbid", allow_inf_nan=False)
+    later: ClassVar[Collection[str]] = ()
+    """Keys that came later: a recipe that does not give them keeps the hash that it had before there were any."""
+
+    @model_serializer(mode="wrap")
+    def _without_later_defaults(self, serialised: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        document: dict[str, Any] = serialised(self)
+        fields = type(self).model_fields
+        return {key: x for key, x in document.items() if key not in self.later or x != fields[key].default}
 
 
 KINDS = ("uniform", "log_uniform", "normal", "choice")
@@ -172,6 +182,18 @@ def values_of(kind: Any, whole: bool = False) -> ValuesOf:
     return ValuesOf(check, words.replace("a number", "a whole number") if whole else words)
 
 
+def drawn_fields(table: type[Table], keys: Iterable[str]) -> dict[str, Any]:
+    """Fields of `create_model`: a distribution, in its range or of its names, of each of some keys of a table."""
+    fields = {}
+    for key in keys:
+        given = table.model_fields[key]
+        kind = Annotated[given.annotation, Field(), *given.metadata]  # type: ignore[name-defined]
+        is_name = get_origin(given.annotation) is Literal
+        drawn: Any = names_of(given.annotation) if is_name else Annotated[Distribution, values_of(kind)] | None
+        fields[key] = (drawn, Field(default=None, description=given.description))
+    return fields
+
+
 class TargetChoice(Table):
     """Boards to draw from, with equal probability."""
 
@@ -213,48 +235,3 @@ def _quantile(table: DistributionTable, u: Array) -> Array:
 def pick(values: Sequence[Any], u: Array) -> list[Any]:
     """Equally probable values for parts u of the probability."""
     return [values[min(int(x * len(values)), len(values) - 1)] for x in u]
-
-
-# -- tables of a document that may be faulty ---------------------------------------------------------------------------
-
-Raw = dict[str, Any]
-T = TypeVar("T", bound=Table)
-
-
-def sound_of(raw: object, model: type[T]) -> T | None:
-    """Table of `raw` without its faulty keys; None where that leaves out a key that must be there."""
-    try:
-        return model.model_validate(raw)
-    except ValidationError as error:
-        faulty = {details["loc"][0] for details in error.errors() if details["loc"]}
-    rest = {key: value for key, value in raw.items() if key not in faulty} if isinstance(raw, dict) else None
-    return None if rest is None or len(rest) == len(cast(Raw, raw)) else sound_of(rest, model)
-
-
-def distribution_of(given: object) -> DistributionTable | None:
-    """Distribution, or None where it is missing or faulty."""
-    return None if given is None else sound_of(one_number(given), DistributionTable)
-
-
-def table_of(raw: Raw, *keys: str) -> Raw:
-    """Table below some keys; an empty one where there is none."""
-    found: object = raw
-    for key in keys:
-        found = found.get(key) if isinstance(found, dict) else None
-    return found if isinstance(found, dict) else {}
-
-
-def tables_of(raw: Raw, key: str) -> list[tuple[int, Raw]]:
-    """Entries of an array of tables that are tables, with their index."""
-    return [(i, entry) for i, entry in enumerate(list_of(raw, key)) if isinstance(entry, dict)]
-
-
-def list_of(table: Raw, key: str) -> list[Any]:
-    """List of a key; an empty one where there is none."""
-    return values if isinstance(values := table.get(key), list) else []
-
-
-def boards_of(table: Raw) -> list[Any]:
-    """Names of the boards that a table with `target` draws from."""
-    given = table.get("target")
-    return [given] if isinstance(given, str) else list_of(table_of(table, "target"), "choice")

@@ -1,4 +1,6 @@
-"""Reading of recipe files: TOML text, all faults in one go, and the same text with other numbers in it.
+"""Reading of recipe files: TOML text, its faults in two stages, and the same text with other numbers in it.
+
+All faults of the tables come in one go; where there are none, all faults of the scene do (`checks`).
 
 A data set keeps the text of its recipe, so a number that the command line changes is changed in the text as well.
 """
@@ -11,7 +13,7 @@ from typing import Any
 
 from phibench.datasets.common.errors import RecipeError
 from phibench.datasets.common.input_files import SETTINGS_BYTES, InputFile
-from phibench.datasets.recipe.checks import semantic_faults
+from phibench.datasets.recipe.checks import scene_faults, table_faults
 from phibench.datasets.recipe.room_checks import file_faults
 from phibench.datasets.recipe.tables import Recipe
 from phibench.datasets.rooms.room_files import RoomFiles
@@ -34,7 +36,7 @@ def load_recipe(path: str | Path) -> Recipe:
     Raises
     ------
     RecipeError
-        With one line per fault, all of them.
+        With one line per fault: all of the tables, or else all of the scene.
     """
     return parse_recipe(recipe_text(path), str(find_recipe(path)), recipe_files(path))
 
@@ -66,13 +68,17 @@ def parse_recipe(text: str, source: str = "recipe", files: RoomFiles | None = No
 
 def check_recipe(raw: dict[str, Any], source: str = "recipe", files: RoomFiles | None = None) -> Recipe:
     """Check a recipe that is a dict already."""
-    semantic = [*semantic_faults(raw), *([] if files is None else file_faults(raw, files))]
-    explained = {fault.path for fault in semantic}  # better than that the key is unknown
-    faults = [*(f for f in structural_faults(Recipe, raw) if not (f.unknown and f.path in explained)), *semantic]
+    structural = structural_faults(Recipe, raw)
+    tables = list(table_faults(raw))
+    explained = {fault.path for fault in tables}  # better than that the key is unknown
+    faults = [*(f for f in structural if not (f.unknown and f.path in explained)), *tables]
+    if not faults:
+        recipe = Recipe.model_validate(raw)
+        faults = [*scene_faults(recipe), *([] if files is None else file_faults(recipe, files))]
     if faults:
         count = f"{len(faults)} fault" + "s" * (len(faults) > 1)
         raise RecipeError("\n".join([f"{source} has {count}:", *(f"  {fault}" for fault in faults)]))
-    return Recipe.model_validate(raw)
+    return recipe
 
 
 def _text(path: Path) -> str:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
-from pydantic import Field, SerializerFunctionWrapHandler, model_serializer
+from pydantic import Field
 
 from phibench.datasets.recipe.distributions import Table
 from phibench.scenes.holder import LARGEST_INDEX, OF_TUBES
@@ -20,11 +20,7 @@ HolderM = Annotated[float, Field(ge=1e-4, le=1.0)]
 class OfHolder(Table):
     """Table with keys of a holder."""
 
-    @model_serializer(mode="wrap")
-    def _without_what_is_not_given(self, serialised: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Recipes that say nothing of a tube keep the hash that they had before there was one."""
-        document: dict[str, Any] = serialised(self)
-        return {key: value for key, value in document.items() if key not in OF_TUBES or value is not None}
+    later = OF_TUBES
 
 
 class HolderTable(OfHolder):
@@ -99,11 +95,7 @@ OF_SHAPES = tuple(dict.fromkeys(key for shape in SHAPES.values() for key in shap
 class MirrorTable(Table):
     """`[rig.mirror]`: a mirror of revolution instead of the sphere."""
 
-    @model_serializer(mode="wrap")
-    def _without_what_is_not_given(self, serialised: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Recipes of mirrors that are upright keep the hash that they had before a tilt could be given."""
-        document: dict[str, Any] = serialised(self)
-        return {key: value for key, value in document.items() if not key.startswith("tilt_") or value}
+    later = ("tilt_x_rad", "tilt_y_rad")
 
     shape: ShapeName = Field(description="surface at z_c_m; a sphere needs no table")
     rim_radius_m: float = Field(default=0.060, gt=0.0, le=1.0, description="radius of the rim, where the mirror ends")

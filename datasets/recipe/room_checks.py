@@ -4,24 +4,19 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from typing import Any
 
-from pydantic import ValidationError
-
-from phibench.datasets.recipe.distributions import DistributionTable, Raw, distribution_of, table_of, tables_of
-from phibench.datasets.recipe.room_tables import ROOM_LISTS, GeometryTable, MeshTable, PanoramaTable, generated_count
+from phibench.datasets.recipe.distributions import DistributionTable
+from phibench.datasets.recipe.room_tables import ROOM_LISTS, GeometryTable, MeshTable, PanoramaTable, RoomsTable
+from phibench.datasets.recipe.tables import Recipe
 from phibench.datasets.rooms.room_files import RoomError, RoomFiles
 from phibench.scenes.rig import Rig
 from phibench.scenes.validation import Fault, SceneError
 from phibench.scenes.worlds.properties import PROPERTIES
 
-_KINDS: tuple[tuple[str, type[PanoramaTable] | type[MeshTable]], ...] = (
-    ("panoramas", PanoramaTable),
-    ("meshes", MeshTable),
-)
 
-
-def room_faults(raw: Raw) -> Iterator[Fault]:
-    """Faults of the tables of rooms: a recipe has boards, or rooms with spots that rays find."""
+def tables_of_rooms(raw: dict[str, Any]) -> Iterator[Fault]:
+    """Tables of a document that do not go with its rooms: it has boards, or rooms with spots that rays find."""
     if "rooms" not in raw:
         if raw.get("targets") in (None, []):
             yield Fault(
@@ -34,50 +29,41 @@ def room_faults(raw: Raw) -> Iterator[Fault]:
         yield Fault("room", "given together with [rooms]; give one or the other")
     if "random" not in raw:
         yield Fault("rooms", "given without [random]; rooms of their own are for samples that are drawn, add [random]")
-    elif "azimuth_deg" not in table_of(raw, "random", "spot"):
+
+
+def room_faults(recipe: Recipe) -> Iterator[Fault]:
+    """Faults of `[rooms]`: numbers of rooms, places of cameras and lamps in them, heights of rays."""
+    if recipe.rooms is None:
+        return  # one room, with boards
+    if recipe.random is not None and not recipe.random.spot.by_ray:
         yield Fault("random.spot.azimuth_deg", "missing; in these rooms a ray finds the spot, give its azimuth_deg")
-    yield from _counts(raw)
-    for path, table in _file_rooms(raw):
-        if fault := _settings_fault(path, table, raw):
+    yield from _counts(recipe.rooms)
+    for path, table in _file_rooms(recipe.rooms):
+        if fault := _settings_fault(path, table, recipe):
             yield fault
-    yield from _ray_height(raw)
+    yield from _ray_height(recipe, recipe.rooms)
 
 
-def _counts(raw: Raw) -> Iterator[Fault]:
-    rooms = table_of(raw, "rooms")
-    others, exported = _listed(rooms), _exported(rooms)
-    if rooms.get("count") == 0 and type(rooms["count"]) is int and not others and not exported:
+def _counts(rooms: RoomsTable) -> Iterator[Fault]:
+    others = any(getattr(rooms, key) for key in ROOM_LISTS)
+    if rooms.count == 0 and not others and not rooms.exported:
         text = "0, and there are no panoramas or meshes; give 1 or more, or [[rooms.panoramas]] or [[rooms.meshes]]"
         yield Fault("rooms.count", text)
-    elif others and not exported and not rooms.get("count") and table_of(rooms, "properties"):
+    elif others and not rooms.exported and not rooms.count and rooms.properties.model_fields_set:
         yield Fault("rooms.properties", "given, but no room is generated; give rooms.count above 0, or remove it")
 
 
-def _listed(rooms: Raw) -> int:
-    """Number of rooms that the recipe lists one by one."""
-    return sum(len(tables_of(rooms, key)) for key in ROOM_LISTS)
+def _file_rooms(rooms: RoomsTable | None) -> Iterator[tuple[str, PanoramaTable | MeshTable]]:
+    """Tables of panoramas and meshes, with their paths."""
+    for key in ROOM_LISTS:
+        for i, table in enumerate(getattr(rooms, key, ())):
+            yield f"rooms.{key}[{i}]", table
 
 
-def _exported(rooms: Raw) -> int:
-    """Number of generated rooms that become files; a value that is no number of rooms is told by itself."""
-    counts = (rooms.get(f"exported_{key}", 0) for key, _ in _KINDS)
-    return sum(count for count in counts if type(count) is int and count > 0)
-
-
-def _file_rooms(raw: Raw) -> Iterator[tuple[str, PanoramaTable | MeshTable]]:
-    """Sound tables of panoramas and meshes, with their paths; a faulty one is told by itself."""
-    for key, model in _KINDS:
-        for i, entry in tables_of(table_of(raw, "rooms"), key):
-            try:
-                yield f"rooms.{key}[{i}]", model.model_validate(entry)
-            except ValidationError:  # told by the table
-                continue
-
-
-def _settings_fault(path: str, one: PanoramaTable | MeshTable, raw: Raw) -> Fault | None:
+def _settings_fault(path: str, one: PanoramaTable | MeshTable, recipe: Recipe) -> Fault | None:
     """Fault of numbers of which no room can be made, at the key that it is about; None if there is none."""
     try:
-        one.settings(_least_stroke_m(raw))
+        one.settings(_least_stroke_m(recipe))
     except SceneError as error:
         within_it = ".mesh" if isinstance(one, PanoramaTable) else ""
         text = str(error).replace("MeshSettings", f"PanoramaSettings{within_it}", 1)
@@ -92,53 +78,48 @@ def _settings_fault(path: str, one: PanoramaTable | MeshTable, raw: Raw) -> Faul
 # Heights.
 
 
-def low_rooms(raw: Raw, rig: Rig) -> Iterator[Fault]:
+def low_rooms(recipe: Recipe, rig: Rig) -> Iterator[Fault]:
     """Rooms whose ceiling the mirror's top reaches with the shortest stroke; longer ones are drawn again."""
-    stroke_m = _least_stroke_m(raw)
+    stroke_m = _least_stroke_m(recipe)
     top_m = float(rig.at(stroke_m).sphere_centre_m[2]) + rig.mirror.bound_m
     with_it = f"the mirror's top is at {top_m:.2f} m with the shortest stroke of [random], {stroke_m:g} m"
-    for path, height_m in _heights(raw):
+    for path, height_m in _heights(recipe, recipe.rooms or RoomsTable()):
         if height_m <= top_m:
             text = f"the ceiling can be at {height_m:g} m, and {with_it}"
             yield Fault(path, f"{text}; make the room higher or the stroke shorter")
 
 
-def _heights(raw: Raw) -> Iterator[tuple[str, float]]:
+def _heights(recipe: Recipe, rooms: RoomsTable) -> Iterator[tuple[str, float]]:
     """Path and least height of generated rooms and of boxes."""
-    rooms = table_of(raw, "rooms")
-    others, count = _listed(rooms), rooms.get("count")
-    exported = _exported(rooms)
-    if exported or generated_count(count if isinstance(count, int) else None, others):
+    if rooms.exported or rooms.generated:
         default = DistributionTable.model_validate(dict(PROPERTIES["height_m"].default))
-        table = distribution_of(table_of(rooms, "properties").get("height_m")) or default
-        if table.support[0] >= PROPERTIES["height_m"].low:  # else told by the table
-            yield "rooms.properties.height_m", table.support[0]
-    for path, one in _file_rooms(raw):
-        if isinstance(one, PanoramaTable) and one.box_m is not None and not _settings_fault(path, one, raw):
+        drawn: DistributionTable | None = getattr(rooms.properties, "height_m", None)
+        yield "rooms.properties.height_m", (drawn or default).support[0]
+    for path, one in _file_rooms(rooms):
+        if isinstance(one, PanoramaTable) and one.box_m is not None and not _settings_fault(path, one, recipe):
             yield f"{path}.box_m", one.box_m[4]
 
 
-def _ray_height(raw: Raw) -> Iterator[Fault]:
-    table = distribution_of(table_of(raw, "random", "spot").get("height_m"))
+def _ray_height(recipe: Recipe, rooms: RoomsTable) -> Iterator[Fault]:
+    table = None if recipe.random is None else recipe.random.spot.height_m
     if table is None:
-        return  # told by the table
-    (low, high), limit_m = table.support, min((height for _, height in _heights(raw)), default=float("inf"))
+        return  # no ray
+    (low, high), limit_m = table.support, min((m for _, m in _heights(recipe, rooms)), default=float("inf"))
     if low <= 0.0 or high >= limit_m:
         text = f"{low:g} m is" if low == high else f"reaches from {low:g} to {high:g} m,"
         yield Fault("random.spot.height_m", f"{text} beyond floor or ceiling; stay above 0 and below {limit_m:g}")
 
 
-def _least_stroke_m(raw: Raw) -> float:
-    table = distribution_of(table_of(raw, "random").get("stroke_m"))
-    return 0.0 if table is None else max(table.support[0], 0.0)
+def _least_stroke_m(recipe: Recipe) -> float:
+    return 0.0 if recipe.random is None else recipe.random.stroke_m.support[0]
 
 
 # Files.
 
 
-def file_faults(raw: Raw, files: RoomFiles) -> Iterator[Fault]:
+def file_faults(recipe: Recipe, files: RoomFiles) -> Iterator[Fault]:
     """Files of rooms that are missing, too large, or not those of the stated SHA-256."""
-    for path, table in _file_rooms(raw):
+    for path, table in _file_rooms(recipe.rooms):
         yield from _file_fault(path, table, files)
         if isinstance(table, PanoramaTable) and table.mesh is not None:
             yield from _file_fault(f"{path}.mesh", table.mesh, files)

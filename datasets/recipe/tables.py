@@ -1,7 +1,7 @@
 """Recipe of a data set as pydantic models, one per TOML table: keys, types, ranges, defaults, meanings.
 
 Lengths are in metres, angles in radians unless the key says degrees; every key names its unit. Types and ranges stand
-here and nowhere else. `recipe/checks` checks several keys together. `recipe/load` reports all faults in one go.
+here and nowhere else. `recipe/checks` checks several keys together. `recipe/load` reports the faults.
 """
 
 from __future__ import annotations
@@ -10,15 +10,7 @@ import tomllib
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import (
-    AfterValidator,
-    Discriminator,
-    Field,
-    SerializerFunctionWrapHandler,
-    Tag,
-    create_model,
-    model_serializer,
-)
+from pydantic import AfterValidator, Discriminator, Field, Tag, create_model
 
 from phibench.datasets.recipe.distributions import (
     Distribution,
@@ -26,8 +18,8 @@ from phibench.datasets.recipe.distributions import (
     Name,
     Table,
     Targets,
+    drawn_fields,
     is_whole,
-    names_of,
     values_of,
 )
 from phibench.datasets.recipe.film_tables import FilmTable
@@ -124,17 +116,10 @@ class DatasetTable(Table):
     seed: int = Field(default=0, ge=0, le=LARGEST_SEED, description="root of all random streams; 0 is legal")
 
 
-_LATER_RIG = ("mirror", "metal", "reflectance")
-
-
 class RigTable(Table):
     """`[rig]`: a preset, and what differs from it."""
 
-    @model_serializer(mode="wrap")
-    def _without_what_is_not_given(self, serialised: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Recipes with a sphere of steel keep the hash that they had before there were other mirrors."""
-        document: dict[str, Any] = serialised(self)
-        return {key: value for key, value in document.items() if key not in _LATER_RIG or value is not None}
+    later = ("mirror", "metal", "reflectance")
 
     preset: Literal["default", "c310"] = Field(default="default", description="rig to start from")
     z_c_m: float | None = Field(
@@ -186,11 +171,7 @@ class RigTable(Table):
 class _OfMisalignment(Table):
     """Table with keys of a misalignment."""
 
-    @model_serializer(mode="wrap")
-    def _without_what_is_not_given(self, serialised: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Recipes that say nothing of a mirror's own tilt or rim keep the hash that they had before there were any."""
-        document: dict[str, Any] = serialised(self)
-        return {key: value for key, value in document.items() if key not in OF_REVOLVED or value}
+    later = OF_REVOLVED
 
 
 if TYPE_CHECKING:
@@ -210,13 +191,7 @@ else:
         "RandomMisalignmentTable",
         __base__=_OfMisalignment,
         __doc__="`[random.misalignment]`: distributions of keys of `[misalignment]`.",
-        **{
-            key: (
-                Annotated[Distribution, values_of(Annotated[float, Field(ge=-one.limit, le=one.limit)])] | None,
-                Field(default=None, description=one.meaning),
-            )
-            for key, one in PARAMETERS.items()
-        },
+        **drawn_fields(MisalignmentTable, PARAMETERS),
     )
 
 
@@ -306,15 +281,7 @@ else:
         "RandomHolderTable",
         __base__=OfHolder,
         __doc__="`[random.rig.holder]`: distributions of keys of `[rig.holder]`.",
-        **{
-            key: (
-                names_of(field.annotation)
-                if key == "kind"
-                else Annotated[Distribution, values_of(Annotated[field.annotation, Field(), *field.metadata])] | None,
-                Field(default=None, description=field.description),
-            )
-            for key, field in HolderTable.model_fields.items()
-        },
+        **drawn_fields(HolderTable, HolderTable.model_fields),
     )
 
 if TYPE_CHECKING:
@@ -324,27 +291,14 @@ else:
         "RandomMirrorTable",
         __base__=Table,
         __doc__="`[random.rig.mirror]`: distributions of keys of `[rig.mirror]`.",
-        **{
-            key: (
-                names_of(field.annotation)
-                if key == "shape"
-                else Annotated[Distribution, values_of(Annotated[field.annotation, Field(), *field.metadata])] | None,
-                Field(default=None, description=field.description),
-            )
-            for key, field in MirrorTable.model_fields.items()
-            if key in DRAWN_OF_MIRROR
-        },
+        **drawn_fields(MirrorTable, DRAWN_OF_MIRROR),
     )
 
 
 class _OfRandomRig(Table):
     """Table with distributions of keys of a rig."""
 
-    @model_serializer(mode="wrap")
-    def _without_what_is_not_given(self, serialised: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Recipes that draw no mirror's shape keep the hash that they had before there was a table for it."""
-        document: dict[str, Any] = serialised(self)
-        return {key: value for key, value in document.items() if key != "mirror" or value is not None}
+    later = ("mirror",)
 
 
 if TYPE_CHECKING:
@@ -354,14 +308,7 @@ else:
         "RandomRigTable",
         __base__=_OfRandomRig,
         __doc__="`[random.rig]`: distributions of keys of `[rig]`.",
-        **{
-            key: (
-                Annotated[Distribution, values_of(Annotated[field.annotation, Field(), *field.metadata])] | None,
-                Field(default=None, description=field.description),
-            )
-            for key, field in RigTable.model_fields.items()
-            if key in DRAWABLE
-        },
+        **drawn_fields(RigTable, DRAWABLE),
         holder=(
             RandomHolderTable,
             Field(default=RandomHolderTable(), description="distributions of keys of [rig.holder]"),
@@ -430,6 +377,8 @@ class DrawnRigsTable(Table):
 class FramesTable(Table):
     """`[frames]`: how frames are taken; every number is drawn per sample and is the same in all presets."""
 
+    later = ("sensor",)
+
     presets: Annotated[tuple[Preset, ...], Field(strict=False, min_length=1)] = Field(
         default=("bayer-raw",), description="sensor presets, each for every sample"
     )
@@ -451,12 +400,6 @@ class FramesTable(Table):
         default="per_sample", description="whether each sample has a camera, hence a fixed pattern, of its own"
     )
     sensor: dict[str, Any] | None = Field(default=None, description="numbers of a measured camera, as in a sensor file")
-
-    @model_serializer(mode="wrap")
-    def _without_a_sensor(self, serialised: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Recipes without a sensor of their own keep the hash that they had before there was one."""
-        document: dict[str, Any] = serialised(self)
-        return {key: value for key, value in document.items() if key != "sensor" or value is not None}
 
 
 class DistractorTable(Table):
@@ -488,11 +431,7 @@ class DistractorTable(Table):
 class Recipe(Table):
     """A whole recipe: `[[experiments]]` or `[random]` says what is seen."""
 
-    @model_serializer(mode="wrap")
-    def _without_a_film(self, serialised: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Recipes that film nothing keep the hash that they had before anything moved."""
-        document: dict[str, Any] = serialised(self)
-        return {key: value for key, value in document.items() if key != "film" or value is not None}
+    later = ("film",)
 
     dataset: DatasetTable = Field(description="name and seed")
     rig: RigTable = Field(default=RigTable(), description="camera, mirror and stroke axis, as the estimator knows them")

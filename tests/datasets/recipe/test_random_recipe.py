@@ -101,12 +101,14 @@ def test_a_recipe_has_experiments_or_draws() -> None:
 
 def test_all_faults_of_a_random_recipe_come_in_one_go() -> None:
     raw = drawing(samples=0, stroke_m={"uniform": [2, 1]}, rig={"z_c": 0.3, "k1": {"log_uniform": [0, 1]}})
-    raw["random"]["spot"] = {"up_m": 0.2}
     raw["dataset"] = {"name": "x", "seed": -1}
     assert {line.split(": ")[0] for line in complaints(raw)} == {
-        *("dataset.seed", "random.samples", "random.stroke_m.uniform", "random.rig.z_c", "random.rig.k1.log_uniform"),
-        "random.spot.up_m",
+        *("dataset.seed", "random.samples", "random.stroke_m.uniform", "random.rig.z_c", "random.rig.k1.log_uniform")
     }
+    raw = drawing(spot={"up_m": 0.2, "target": {"choice": ["a", "a", "b"]}})
+    assert [line.split(": ")[0] for line in complaints(raw)] == [
+        *("random.spot.target.choice[2]", "random.spot.target.choice[1]", "random.spot.up_m")
+    ]
 
 
 @pytest.mark.parametrize("nonsense", [3, [], {"rig": 3, "spot": []}, {"stroke_m": [1]}, {"spot": {"target": 3}}])

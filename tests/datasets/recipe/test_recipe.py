@@ -119,28 +119,23 @@ def test_each_fault_is_one_line_that_helps(raw: dict[str, Any], path: str, words
     assert [word for word in words if word not in line] == []
 
 
-def test_all_faults_come_in_one_go() -> None:
-    lines = complaints(
-        {
-            "dataset": {"name": "x", "seed": -1},
-            "rig": {"presett": "default", "k1": math.nan},
-            "laser": {"profile": "gauss", "diameter_m": 0.01, "diameter_base_m": 0.01},
-            "targets": [target(depth_m=0.2, height_m=0.2), target()],
-            "experiments": [{"name": "e", "targets": ["c"], "strokes_m": [0.0, 2.5]}],
-        }
-    )
-    paths = {line.split(": ")[0] for line in lines}
-    assert paths == {
-        *(
-            "dataset.seed",
-            "rig.presett",
-            "rig.k1",
-            "laser.profile",
-            "laser.diameter_m",
-            "targets[0]",
-            "targets[1].name",
-        ),
-        *("experiments[0].targets[0]", "experiments[0].strokes_m[0]", "experiments[0].strokes_m[1]"),
+def test_all_faults_of_a_stage_come_in_one_go() -> None:
+    """First those of the tables, then, once they are mended, those of the scene."""
+    raw = {
+        "dataset": {"name": "x", "seed": -1},
+        "rig": {"presett": "default", "k1": math.nan},
+        "laser": {"profile": "gauss", "diameter_m": 0.01, "diameter_base_m": 0.01},
+        "targets": [target(depth_m=0.2, height_m=0.2), target()],
+        "experiments": [{"name": "e", "targets": ["c"], "strokes_m": [0.0, 2.5]}],
+    }
+    assert {line.split(": ")[0] for line in complaints(raw)} == {
+        *("dataset.seed", "rig.presett", "rig.k1", "laser.profile", "experiments[0].strokes_m[0]")
+    }
+    raw["experiments"][0]["strokes_m"] = [0.3, 2.5]  # type: ignore[index]
+    mended = raw | {"dataset": {"name": "x"}, "rig": {}, "laser": {"diameter_m": 0.01, "diameter_base_m": 0.01}}
+    assert {line.split(": ")[0] for line in complaints(mended)} == {
+        *("laser.diameter_m", "targets[0]", "targets[1].name"),
+        *("experiments[0].targets[0]", "experiments[0].strokes_m[1]"),
     }
 
 
