@@ -49,6 +49,8 @@ from phibench.scenes.validation import nearest, printable_line
 if TYPE_CHECKING:
     from polars import DataFrame
 
+    from phibench.render.optics.correspondence import Correspondence
+
 
 @dataclass(frozen=True, repr=False)
 class Dataset(ShortForm):
@@ -313,6 +315,17 @@ class Sample(ShortForm):
         """Truth of every pixel centre: planes of shape (H, W), NaN where there is nothing (see FORMAT.md)."""
         path = self.dataset.folder / self.truth_row(position).view_truth_file
         return read_truth(path, self.view(position), **self._view(position))
+
+    def correspondence(self, position: str = "down") -> Correspondence:
+        """Place in the other image of the room point that each pixel of this one shows, or why it is not seen there.
+
+        Computed from the room and the true rig in float64, in some 1.5 CPU-seconds; no layer is read.
+        """
+        from phibench.render.optics.correspondence import correspondence
+
+        other = {"down": "up", "up": "down"}
+        self.truth_row(position)
+        return correspondence(self.room, self.view(position), self.view(other[position]))
 
     def spot(self, position: str) -> SpotWindow:
         """Spot layer; an empty window where no light of the spot reaches the image."""

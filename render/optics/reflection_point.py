@@ -71,12 +71,14 @@ class MirrorPoints:
     bent: BoolArray | None = None
 
 
-def mirror_points(view: View, points_m: Array, eyes_m: Array) -> MirrorPoints:
+def mirror_points(view: View, points_m: Array, eyes_m: Array, rest: float = 4e-16) -> MirrorPoints:
     """Reflection points for pairs of world points, shape (N, 3) each.
 
     Where glass is around the mirror and no ray through it leads to a point, the straight one is given, and not lit.
+    A perfect sphere's search ends with a step below `rest` of the angle between the points. The default asks for the
+    last bit; Newton's method squares the error, so that 1e-9 leaves 1e-16, in an eighth of the steps.
     """
-    tube, solver = view.tube, _solver_of(view.rig.mirror)
+    tube, solver = view.tube, _solver_of(view.rig.mirror, rest)
     if tube is None:
         return solver.points(view, points_m, eyes_m)
     apparent, bent = points_m, tube.outside(points_m)
@@ -155,12 +157,12 @@ class _Solver(Protocol):
         """Square metres at the eye per steradian at the point, shape (N,), without glass."""
 
 
-def _solver_of(mirror: Mirror) -> _Solver:
+def _solver_of(mirror: Mirror, rest: float = 4e-16) -> _Solver:
     """Optics of a mirror: the one test of its type on the world's side."""
     if isinstance(mirror, RevolvedMirror):
         return _Revolved(mirror)
     if isinstance(mirror, SphereMirror):
-        return _Round(mirror) if mirror.form is None else _Formed(mirror, mirror.form)
+        return _Round(mirror, rest) if mirror.form is None else _Formed(mirror, mirror.form)
     raise TypeError(f"no reflection points of {type(mirror).__name__}: add it to render/optics/reflection_point.py")
 
 
@@ -179,10 +181,11 @@ class _Round:
     """Alhazen's point; with s the distance point to mirror and l mirror to eye, s^2 (1 + l/s_t) (1 + l/s_s)."""
 
     mirror: SphereMirror
+    rest: float
 
     def points(self, view: View, points_m: Array, eyes_m: Array) -> MirrorPoints:
         centre, radius_m = view.sphere_centre_m, self.mirror.radius_m
-        found, lit = reflection_points(points_m - centre, eyes_m - centre, radius_m)
+        found, lit = reflection_points(points_m - centre, eyes_m - centre, radius_m, self.rest)
         found = found + centre
         return MirrorPoints(found, (found - centre) / radius_m, lit, points_m)
 
@@ -268,7 +271,9 @@ def _stretch(view: View, tube: GlassTube, found: MirrorPoints, eyes_m: Array) ->
 _ALHAZEN_STEPS = 60  # bisection alone would need 53; Newton takes 4 to 7
 
 
-def reflection_points(points_m: Array, eyes_m: Array, radius_m: float) -> tuple[Array, NDArray[np.bool_]]:
+def reflection_points(
+    points_m: Array, eyes_m: Array, radius_m: float, rest: float = 4e-16
+) -> tuple[Array, NDArray[np.bool_]]:
     """Reflection points on the convex side of a sphere at the origin.
 
     Parameters
@@ -276,6 +281,8 @@ def reflection_points(points_m: Array, eyes_m: Array, radius_m: float) -> tuple[
     points_m, eyes_m : arrays, shape (N, 3)
         The two points, metres, relative to the sphere centre.
     radius_m : float
+    rest : float
+        Of the angle between the points: the step that ends the search.
 
     Returns
     -------
@@ -295,7 +302,7 @@ def reflection_points(points_m: Array, eyes_m: Array, radius_m: float) -> tuple[
         lit = low <= high
         low, high = np.where(lit, low, np.nan), np.where(lit, high, np.nan)
         f = partial(_stationarity, p, c, beta, radius_m)
-        gamma = rising_root(f, 0.5 * (low + high), (low, high), 4e-16 * beta, _ALHAZEN_STEPS)
+        gamma = rising_root(f, 0.5 * (low + high), (low, high), rest * beta, _ALHAZEN_STEPS)
     found = radius_m * (np.cos(gamma)[:, None] * e1 + np.sin(gamma)[:, None] * e2)
     return np.where(lit[:, None], found, np.nan), lit
 

@@ -287,7 +287,7 @@ class _Block:
 
 
 def _disc_blocks(view: View) -> Iterator[tuple[range, range]]:
-    rows, columns = _disc_window(view)
+    rows, columns = disc_window(view)
     for first in range(rows.start, rows.stop, _ROWS):
         yield range(first, min(first + _ROWS, rows.stop)), range(columns.start, columns.stop)
 
@@ -321,7 +321,7 @@ def _fill(planes: dict[str, Array], view: View, room: RoomGeometry, block: _Bloc
         planes[name].reshape(-1)[block.pixel] = value
 
 
-def _disc_window(view: View) -> tuple[slice, slice]:
+def disc_window(view: View) -> tuple[slice, slice]:
     """Rows and columns of the image that can see the mirror: the bounding box of its outline, one pixel wider."""
     outline = view.rig.outline_px()
     if not np.isfinite(outline).all():  # part of the outline is outside the lens model: look everywhere

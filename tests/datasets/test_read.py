@@ -286,3 +286,17 @@ def test_a_data_set_of_version_4_is_read_as_perfect_spheres(tiny_dataset: Path, 
     assert old.rigs["rig"] == new.rigs["rig"]
     assert old.rigs["rig"].mirror.form is None
     assert list(plan_faults(old)) == []
+
+
+def test_counterparts_of_pixels_are_those_of_the_rig_and_the_room(dataset: Dataset) -> None:
+    sample = dataset["seen-near-h0.500"]
+    for position in ("down", "up"):
+        found, truth = sample.correspondence(position), sample.truth(position)
+        assert found.object_names == sample.object_names
+        # a layer holds float32; where a face ends, it may hold the next one
+        same = np.abs(found.depth_m - truth["depth_m"])[truth["object_id"] >= 0] < 1e-5
+        assert same.mean() > 0.999
+        assert np.array_equal(np.isfinite(found.depth_m), truth["object_id"] >= 0)
+        assert found.seen.sum() > 1000
+    with pytest.raises(DatasetError, match="must be 'down' or 'up'"):
+        sample.correspondence("left")

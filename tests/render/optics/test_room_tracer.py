@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.triangles import by_determinants
 
 from phibench.render.optics.faces import face_table
 from phibench.render.optics.room_tracer import RoomGeometry, blocked_by, first_hit, room_geometry
@@ -44,25 +45,6 @@ def bumpy(name: str, pose: Pose, rng: np.random.Generator, size_m: float, side: 
     corner = (np.arange(side - 1)[:, None] * side + np.arange(side - 1)).ravel()
     halves = [[corner, corner + 1, corner + side + 1], [corner, corner + side + 1, corner + side]]
     return Mesh(name, vertices, np.concatenate([np.stack(half, axis=-1) for half in halves]), Uniform((0.5, 0.5, 0.5)))
-
-
-def by_determinants(shapes: tuple[Shape, ...], origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Distance, object and face of the first triangle, shape (N,) each: a loop over triangles, Cramer's rule."""
-    table = face_table(shapes)
-    distance, face = np.full(len(origins), np.inf), np.full(len(origins), -1)
-    for corners, patch in zip(table.corners_m, table.patch, strict=True):
-        e1, e2 = corners[1] - corners[0], corners[2] - corners[0]
-        across = np.cross(directions, e2)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            scale = 1.0 / (across @ e1)
-            from_corner = origins - corners[0]
-            b1 = np.einsum("ni,ni->n", from_corner, across) * scale
-            turned = np.cross(from_corner, e1)
-            b2 = np.einsum("ni,ni->n", directions, turned) * scale
-            t = turned @ e2 * scale
-            nearer = (b1 >= 0) & (b2 >= 0) & (b1 + b2 <= 1) & (t > 0) & (t < distance)
-        distance[nearer], face[nearer] = t[nearer], patch
-    return distance, np.where(face >= 0, table.shape[face], -1), face
 
 
 def rays(seed: int, count: int) -> tuple[np.ndarray, np.ndarray]:
