@@ -18,6 +18,7 @@ from phibench.datasets.frames.sensor_file import SensorFile
 from phibench.datasets.store.pair_files import is_frames_set
 
 if TYPE_CHECKING:
+    from phibench.benchmark.dense.dense_pairs import DensePairs
     from phibench.benchmark.pair_sets.dataset_pairs import DatasetPairs, Track
 
 
@@ -62,6 +63,18 @@ class ScoredDataset(read.Dataset):
 
         pairs = dataset_pairs(self, preset, draws, hints=hints, boxes_px=boxes_px, sensor=sensor)
         return pairs if track is None else pairs.of_track(track)
+
+    def dense_pairs(
+        self, preset: str | None = None, draws: int | None = None, *, pairs: int | None = None, frames: int = 1
+    ) -> DensePairs:
+        """Pairs of images with the laser off, and the truth of their pixels (docs/dense.md).
+
+        The images are those of `pairs` with the laser off, byte for byte; of samples with the same two views one is
+        taken. Parameters and errors as for `benchmark.dense.dense_pairs.dense_pairs`.
+        """
+        from phibench.benchmark.dense.dense_pairs import dense_pairs
+
+        return dense_pairs(self, preset, draws, pairs, frames)
 
 
 def open_dataset(folder: str | Path) -> ScoredDataset | FramesSet:

@@ -49,7 +49,7 @@ from phibench.scenes.validation import nearest, printable_line
 if TYPE_CHECKING:
     from polars import DataFrame
 
-    from phibench.render.optics.correspondence import Correspondence
+    from phibench.render.optics.correspondence import Correspondence as Correspondence
 
 
 @dataclass(frozen=True, repr=False)

@@ -60,6 +60,7 @@ benchmark/isolation
 benchmark/pair_sets
 benchmark/scores
 benchmark/reports
+benchmark/dense
 benchmark/scored_dataset
 benchmark/sealed
 benchmark/export

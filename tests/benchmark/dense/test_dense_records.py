@@ -1,0 +1,136 @@
+"""Records of dense scores: oracles score 0, parts of the error add up, and metrics are what loops make of them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.dense_truths import smaller, truth_of
+from helpers.oracles import random_rig
+from helpers.revolved_rigs import revolved
+
+from phibench.benchmark.dense.dense_pairs import DenseTruth
+from phibench.benchmark.dense.dense_records import COLUMNS, TruthErrors, ause, pair_records
+from phibench.estimator.dense.dense_interface import DenseAnswer
+from phibench.scenes.catalog import default_rig
+from phibench.scenes.misalignment import Misalignment
+
+ROUNDING = 1e-9
+
+
+@pytest.fixture(scope="module")
+def truth() -> DenseTruth:
+    return truth_of(smaller(default_rig()))
+
+
+@pytest.fixture(scope="module")
+def errors(truth: DenseTruth) -> TruthErrors:
+    return TruthErrors(truth)
+
+
+def test_perfect_answers_score_nothing(truth: DenseTruth, errors: TruthErrors) -> None:
+    """D itself, and the place in the other image, which the score makes D of."""
+    for answer in (DenseAnswer(truth.depth_m), DenseAnswer(target_uv_px=truth.found.uv_px)):
+        table = pair_records(errors, answer, 0.1)
+        assert table.columns == list(COLUMNS)
+        for name in ("median", "mean", "p90", "bias", "above_2", "mae_m", "disparity_mae_deg", "seam_m", "calibration"):
+            assert np.abs(table[name].drop_nulls().to_numpy()).max() < ROUNDING, name
+        assert (table["recall"] == 1.0).all()
+        assert (table["answered"] == 1.0).all()
+        assert len(table) > 10
+
+
+def test_an_unanswered_pair_has_no_errors(errors: TruthErrors) -> None:
+    table = pair_records(errors, None, 1.0, "error", "it broke")
+    assert table["median"].null_count() == len(table)
+    assert (table["recall"] == 0.0).all()
+    assert (table["answered"] == 0.0).all()
+    assert set(table["message"]) == {"it broke"}
+
+
+def test_metrics_by_loops_over_pixels(truth: DenseTruth, errors: TruthErrors) -> None:
+    rng = np.random.default_rng(3)
+    relative = 0.05 * rng.normal(size=truth.depth_m.shape)
+    depth = np.where(rng.random(relative.shape) < 0.6, truth.depth_m * (1.0 + relative), np.nan)
+    row = pair_records(errors, DenseAnswer(depth, sigma_depth_m=0.05 * truth.depth_m), 0.1).row(0, named=True)
+    sizes, total, squares, metres, within = [], 0, 0.0, 0.0, 0
+    for v, u in np.argwhere(truth.scored):
+        total += 1
+        if np.isnan(depth[v, u]):
+            continue
+        e = depth[v, u] / truth.depth_m[v, u] - 1.0
+        sizes.append(abs(e))
+        squares += e * e
+        metres += abs(depth[v, u] - truth.depth_m[v, u])
+        within += abs(depth[v, u] - truth.depth_m[v, u]) <= 1.959963984540054 * 0.05 * truth.depth_m[v, u]
+    n = len(sizes)
+    recall = np.mean([sum(e <= t for e in sizes) for t in (0.005, 0.01, 0.02, 0.05, 0.1, 0.2)]) / total
+    expected = {
+        "pixels": total,
+        "answered": n / total,
+        "median": sorted(sizes)[n // 2],
+        "mean": sum(sizes) / n,
+        "square": squares / n,
+        "above_5": sum(e > 0.05 for e in sizes) / n,
+        "recall": recall,
+        "mae_m": metres / n,
+        "coverage": within / n,
+    }
+    for name, value in expected.items():
+        assert row[name] == pytest.approx(value, rel=1e-4 if name == "median" else 1e-9), name
+    # 95 % of Gaussian errors of the claimed size, to 4 of 0.22 / sqrt(n)
+    assert row["coverage"] == pytest.approx(0.95, abs=4.0 * 0.22 / n**0.5)
+
+
+def test_the_sparsification_curve_by_its_definition() -> None:
+    rng = np.random.default_rng(5)
+    error, sigma = rng.exponential(size=400), rng.exponential(size=400)
+    assert ause(error, error) == 0.0
+    shares, curves = np.arange(100) / 100.0, []
+    for key in (sigma, error):
+        order = sorted(range(400), key=lambda i: key[i])
+        curves.append([np.mean([error[i] for i in order[: round(400 * (1 - s))]]) for s in shares])
+    area = np.trapezoid(np.subtract(*curves), shares) / error.mean()
+    assert ause(error, sigma) == pytest.approx(area, rel=1e-9)
+    assert ause(error, -error) > ause(error, sigma) > 0.0
+
+
+def test_a_hyperboloid_in_its_focus_is_central_and_a_sphere_is_not(errors: TruthErrors) -> None:
+    focus = TruthErrors(truth_of(smaller(revolved("hyperboloid"))))
+    seen = focus.truth.scored
+    assert seen.sum() > 5000
+    assert np.nanmax(np.abs(focus.central[seen])) < ROUNDING
+    assert np.nanmedian(np.abs(errors.central[errors.truth.scored])) > 1e-3
+
+
+def test_the_error_of_a_rig_is_the_calibrations_part(errors: TruthErrors) -> None:
+    """Perfect matches seen through the nominal rig: all of the error is calibration, and none is matching."""
+    nominal = smaller(default_rig())
+    true = nominal.perturbed(Misalignment(tilt_x_rad=0.01))
+    wrong = TruthErrors(truth_of(true, given=nominal))
+    row = pair_records(wrong, DenseAnswer(target_uv_px=wrong.truth.found.uv_px), 0.1).row(0, named=True)
+    assert row["calibration"] > 1e-3
+    assert row["median"] == pytest.approx(row["calibration"], rel=1e-12)
+    assert row["matching"] < ROUNDING
+    exact = TruthErrors(replace(wrong.truth, given_rig=true))
+    assert np.nanmax(np.abs(exact.calibration)) < ROUNDING
+
+
+def test_disparity_is_the_angle_between_both_centres_views() -> None:
+    """Of a misaligned rig: by the points of the truth, and by the law of cosines at a wrong D."""
+    truth = truth_of(smaller(random_rig(np.random.default_rng(2))))
+    errors, X = TruthErrors(truth), truth.found.point_world_m
+    centres = [truth.true_rig.at(h).sphere_centre_m for h in (0.0, truth.stroke_m)]
+    a, b = (X - centre for centre in centres)
+    cosine = (a * b).sum(axis=2) / np.linalg.norm(a, axis=2) / np.linalg.norm(b, axis=2)
+    found = errors.true_disparity_rad
+    assert np.nanmax(np.abs(np.cos(found) - cosine)[truth.scored]) < 1e-12
+    assert np.nanmedian(errors.disparity_rad(1.1 * truth.depth_m)[truth.scored] / found[truth.scored]) < 1.0
+
+
+def test_the_seam_compares_both_of_its_sides(truth: DenseTruth, errors: TruthErrors) -> None:
+    """An answer that is 0.3 m too far on one side of the seam alone is 0.3 m inconsistent."""
+    middle = int(np.floor(truth.given_rig.camera.project(truth.given_rig.sphere_in_camera_m)[1]))
+    depth = truth.depth_m.copy()
+    depth[: middle + 1] += 0.3
+    row = pair_records(errors, DenseAnswer(depth), 0.1).row(0, named=True)
+    assert row["seam_m"] == pytest.approx(0.3, rel=1e-9)
