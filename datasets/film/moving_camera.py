@@ -7,7 +7,7 @@ frames, or windows of them, through the sensor's chain (`render.sensor`): room (
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -104,10 +104,13 @@ def bake_rooms(
     count: int,
     *stream: Name,
     settings: BakeSettings | None = None,
+    fits: Callable[[Room], bool] | None = None,
     workers: int | None = None,
     console: Console | None = None,
 ) -> int:
     """Bake generated rooms that a named stream draws; light maps that the user's cache has are taken from there.
+
+    Rooms that `fits`, a function at the top of a module, does not take are drawn again.
 
     Raises
     ------
@@ -116,7 +119,7 @@ def bake_rooms(
     """
     console, settings = console or progress_console(), settings or BakeSettings()
     code = code_behind(__name__)
-    tasks = [_bake_task(number, stream, settings, code) for number in range(count)]
+    tasks = [_bake_task(number, stream, settings, fits, code) for number in range(count)]
     with filling(out):
         brought = bring_all({task.name: task for task in tasks}, out, workers, console, "rooms", sign=INFO)
         infos = brought.results(BakedRoomInfo)
@@ -124,12 +127,17 @@ def bake_rooms(
     return count
 
 
-def _bake_task(number: int, stream: tuple[Name, ...], settings: BakeSettings, code: str) -> BuildTask:
-    key = task_key([number, stream, asdict(settings)], code, {"packages": provenance()["packages"]})
-    return BuildTask(f"room room{number:03d}", key, bake_drawn_room, (settings, stream, number))
+def _bake_task(
+    number: int, stream: tuple[Name, ...], settings: BakeSettings, fits: Callable[[Room], bool] | None, code: str
+) -> BuildTask:
+    rule = None if fits is None else f"{fits.__module__}.{fits.__qualname__}"
+    key = task_key([number, stream, asdict(settings), rule], code, {"packages": provenance()["packages"]})
+    return BuildTask(f"room room{number:03d}", key, bake_drawn_room, (settings, stream, number, fits))
 
 
-def bake_drawn_room(out: Path, settings: BakeSettings, stream: tuple[Name, ...], number: int) -> Made:
+def bake_drawn_room(
+    out: Path, settings: BakeSettings, stream: tuple[Name, ...], number: int, fits: Callable[[Room], bool] | None
+) -> Made:
     """Task: write the light map of a drawn room below `out`; the result is its `BakedRoomInfo`."""
     from phibench.datasets.build.light_map_cache import light_map
     from phibench.datasets.build.view_task import start_renderer
@@ -138,7 +146,7 @@ def bake_drawn_room(out: Path, settings: BakeSettings, stream: tuple[Name, ...],
         start_renderer()
     except ImportError as error:
         raise DatasetError("baking needs Mitsuba: pip install 'phibench[render]'") from error
-    source, room = _drawn_room(*stream, number)
+    source, room = _drawn_room(fits, *stream, number)
     light = light_map(Rig().at(0.0), room, settings)
     name = f"room{number:03d}"
     write_bytes(out / f"{name}.npz", encoded(light))
@@ -146,15 +154,18 @@ def bake_drawn_room(out: Path, settings: BakeSettings, stream: tuple[Name, ...],
     return Made((f"{name}.npz",), info.model_dump(mode="json"))
 
 
-def _drawn_room(*stream: Name) -> tuple[GeneratedRoom, Room]:
+def _drawn_room(fits: Callable[[Room], bool] | None, *stream: Name) -> tuple[GeneratedRoom, Room]:
     for turn in range(_TRIES):
         names = (*stream, turn) if turn else stream
         source = GeneratedRoom(drawn_properties(*names), names)
         try:
-            return source, replace(source.build(), robot=False)
+            room = replace(source.build(), robot=False)
         except SceneError:  # the lamps have no place: the next room of the stream
             continue
-    raise DatasetError(f"no room of the stream {stream} has a place for its lamps; take another stream")
+        if fits is None or fits(room):
+            return source, room
+    asked = "" if fits is None else " and does what is asked of it"
+    raise DatasetError(f"no room of the stream {stream} has a place for its lamps{asked}; take another stream")
 
 
 def open_baked_rooms(folder: str | Path) -> dict[str, BakedRoom]:

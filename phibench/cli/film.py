@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -265,18 +266,24 @@ class RobotOptions:
 
     Parameters
     ----------
+    setting
+        Lights, distances, power, rig, slip and rooms: easy, default or hard; what follows is put in its place.
     rooms
         Folder of `phibench loop bake`; without it each episode has a plain room of its own.
     fidelity
         Spots by the exact measurement model, or read in pixels: windows around spots, or whole frames, 2 CPU-s each.
+    distance_m
+        Least and largest distance of targets, in metres.
     calibration
         File of `phibench calibrate`: the robot knows this rig to its covariance, from which each episode's is drawn.
     as_built
         The same with a rig as built by hand: its errors are so many times those of `RigParameter.prior_sigma`.
     """
 
+    setting: Literal["easy", "default", "hard"] = "default"
     rooms: Path | None = None
     fidelity: Literal["exact", "windows", "frames"] = "exact"
+    distance_m: tuple[float, float] | None = None
     calibration: Path | None = None
     as_built: float | None = None
 
@@ -288,7 +295,7 @@ class RobotOptions:
         DatasetError
             If a calibration is given together with `as_built`, or cannot be read.
         SceneError
-            If `as_built` is not between 0 and 2.
+            If `as_built` is not between 0 and 2, or a number of the task is out of range.
         """
         import numpy as np
 
@@ -296,11 +303,11 @@ class RobotOptions:
         from phibench.datasets.common.errors import DatasetError
         from phibench.estimator.geometry.rig_parameters import prior_sigmas
         from phibench.robot.loop.arena import baked_arenas
-        from phibench.robot.loop.simulator import Setup
-        from phibench.scenes.rig import Rig
+        from phibench.robot.loop.setups import named_setup
         from phibench.scenes.validation import within
 
-        nominal, covariance = Rig(), None  # None: the rig is known exactly
+        chosen = named_setup(self.setting)
+        nominal, covariance = chosen.rig, chosen.rig_covariance  # None: the rig is known exactly
         if self.calibration is not None:
             if self.as_built is not None:
                 raise DatasetError("--calibration and --as-built: both say how well the rig is known; give one of them")
@@ -308,8 +315,15 @@ class RobotOptions:
             nominal, covariance = read.rig, read.covariance
         elif self.as_built is not None:
             covariance = within("loop", "as_built", self.as_built, 0.0, 2.0) ** 2 * np.diag(prior_sigmas() ** 2)
-        arenas = () if self.rooms is None else baked_arenas(self.rooms)
-        return Setup(rig=nominal, arenas=arenas, fidelity=self.fidelity, rig_covariance=covariance)
+        return replace(
+            chosen,
+            rig=nominal,
+            arenas=chosen.arenas if self.rooms is None else baked_arenas(self.rooms),
+            fidelity=self.fidelity,
+            rig_covariance=covariance,
+            own_rigs=covariance is not None,
+            task=chosen.task if self.distance_m is None else replace(chosen.task, distances_m=self.distance_m),
+        )
 
 
 _ROBOT = RobotOptions()
@@ -318,6 +332,8 @@ _ROBOT = RobotOptions()
 @loop.command
 def bake(*, out: OutFolder, rooms: Whole = 5, seed: str = "rooms", workers: Workers = None) -> int:
     """Bake the light of generated rooms, so that a robot's camera can stand anywhere in them.
+
+    A room in which no target can be driven to is drawn again.
 
     Parameters
     ----------
@@ -328,9 +344,10 @@ def bake(*, out: OutFolder, rooms: Whole = 5, seed: str = "rooms", workers: Work
     """
     from phibench.datasets.film.moving_camera import bake_rooms
     from phibench.datasets.frames.request import whole_number
+    from phibench.robot.loop.arena import offers_targets
 
     whole_number("--rooms", rooms, 1)
-    print(f"{out}: {bake_rooms(out, rooms, seed, workers=workers)} rooms")
+    print(f"{out}: {bake_rooms(out, rooms, seed, fits=offers_targets, workers=workers)} rooms")
     return 0
 
 
@@ -370,7 +387,7 @@ def run(
     if out is not None:
         require_writable(out)
     setup = robot.setup()
-    known, isolations = setup.rig_covariance is not None, set[str]()
+    isolations = set[str]()
     if ".py" in policy:
         # it must not look rooms up
         limits, hidden = RunLimits(seconds=seconds), [robot.rooms] if robot.rooms is not None else []
@@ -381,11 +398,10 @@ def run(
             seed,
             limits=limits,
             hidden=hidden,
-            own_rigs=known,
             told=isolations.add,
         )
     else:
-        running = episodes_of(setup, policy, episodes, seed, own_rigs=known)
+        running = episodes_of(setup, policy, episodes, seed)
     rows = []
     with Steps(progress_console(), "episodes", episodes) as steps:
         for row in running:
@@ -402,39 +418,51 @@ def run(
 
 @loop.command(name="show")
 def show_loop(
-    policy: Literal["paper", "greedy", "drive-only"] = "paper",
+    policy: Annotated[str, Parameter(completer=policies)] = "paper",
     *,
     out: Path,
     robot: RobotOptions = _ROBOT,
     seed: str = "show",
     episode: Whole = 0,
+    seconds: float = 5.0,
 ) -> int:
     """Write an episode as an MP4: what the camera sees, the room from above, and what the robot believes.
 
     Parameters
     ----------
     policy
-        Of the robot.
+        paper, greedy, drive-only, random or oracle; or FILE.py:NAME, as for `phibench loop run`.
     out
         MP4 to write.
     seed
         Name of the stream that targets, lights and noise are drawn from.
     episode
         Number of the episode in that stream.
+    seconds
+        Time that a policy of yours has for one answer.
     """
+    from phibench.benchmark.isolation.resolve import RunLimits
     from phibench.datasets.frames.request import whole_number
     from phibench.datasets.store.files import require_writable
-    from phibench.robot.loop.episodes import with_own_rig
+    from phibench.robot.loop.foreign_policies import PolicyFile, PolicyProcess
     from phibench.studies.loop.drawings import show_episode
 
     whole_number("--episode", episode)
     require_writable(out)
-    setup = with_own_rig(robot.setup(), seed, episode)
-    print(f"{out}: {show_episode(setup, out, policy, seed, episode)}")
+    setup = robot.setup()
+    with ExitStack() as ends:
+        chosen: str | PolicyProcess = policy
+        if ".py" in policy:
+            limits, hidden = RunLimits(seconds=seconds), [robot.rooms] if robot.rooms is not None else []
+            chosen = PolicyProcess(PolicyFile.of(policy), setup.known, limits, hidden)
+            ends.callback(chosen.close)
+        print(f"{out}: {show_episode(setup, out, chosen, seed, episode)}")
     return 0
 
 
 def _print(rows: list[Episode]) -> None:
+    from phibench.robot.loop.setups import loop_score
+
     print(f"{'episode':>7s} {'outcome':18s} {'s':>5s} {'m':>5s} {'strokes':>7s} {'D m':>6s} {'stated m':>8s}  cause")
     for row in rows:
         stated = f"{row.stated_m:.3f}" if math.isfinite(row.stated_m) else "-"
@@ -445,4 +473,4 @@ def _print(rows: list[Episode]) -> None:
     for row in rows:
         if row.refused:
             print(f"episode {row.number}: refused {row.refused}")
-    print(f"reached: {sum(row.reached for row in rows)} of {len(rows)}")
+    print(loop_score(rows).sentence())

@@ -198,6 +198,15 @@ def arena_of(room: Room) -> Arena:
     return Arena(room.name, sight, _upright(sight.chosen((top > _LOW_M) & (bottom < _HIGH_M))))
 
 
+def offers_targets(room: Room) -> bool:
+    """True if the default task has targets in a room that the robot can drive to; drawn with a stream of its own."""
+    try:
+        arena_of(room).draw_target(generator(room.name, "offers targets"), (1.5, 4.5), 1.0)
+    except SceneError:
+        return False
+    return True
+
+
 def _upright(boxes: Boxes) -> Boxes:
     """The boxes, leaning ones replaced by the upright boxes around them."""
     leans = np.abs(boxes.axes[:, 2, 2]) < 1.0 - 1e-9  # rounding of an upright box

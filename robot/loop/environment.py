@@ -6,9 +6,12 @@
 `gymnasium.make("phibench.robot.loop.environment:phibench/ApproachTarget-v0")` does both. The flat one has a vector of
 -1 to 1 for actions and one of float32 for observations, as most learners ask for.
 
+Settings `-easy-v0` and `-hard-v0` of both stand beside them (`robot.loop.setups`).
+
 Reward: -0.01 a second, -0.01 for a command that is refused, +1 when the distance is stated right at the stand-off
 distance, -1 when it is stated wrongly or the robot runs into something. `terminated` says the last three, `truncated`
 that the time is over. `info` holds the outcome, what was refused, and the truth, which no policy may use.
+`shaped=True` adds what a step brings the true state nearer to its end, for training only; `info["shaped"]` says so.
 
 The exact model observes spots with their noise; the other fidelities of `Setup` observe pixels of baked rooms.
 """
@@ -22,7 +25,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phibench.robot.loop.robot_pixels import WINDOW_PX, pixel_form
+from phibench.robot.loop.room_view import room_view
 from phibench.robot.loop.sensing import EXPOSURES_S
+from phibench.robot.loop.setups import SETTINGS, named_setup
 from phibench.robot.loop.simulator import (
     CODES,
     COLLISION,
@@ -48,15 +53,17 @@ except ImportError as error:  # this module alone needs it
 ENVIRONMENT, FLAT = "phibench/ApproachTarget-v0", "phibench/ApproachTargetFlat-v0"
 SPOT_COLUMNS = ("u_px", "v_px", "sigma_px", "electrons")
 """Of the rows of `spots`; rows without a spot are 0."""
-_COST_PER_S, _COST_REFUSED = 0.01, 0.01  # an episode of 90 s costs 0.9: less than what success gives
+COST_PER_S, COST_REFUSED = 0.01, 0.01  # an episode of 90 s costs 0.9: less than what success gives
 _FARTHEST_M = 20.0  # that may be stated: beyond every room
 
 
 def register() -> None:
-    """Make `ENVIRONMENT` and `FLAT` known to `gymnasium`; again does nothing."""
-    for name, place in ((ENVIRONMENT, "ApproachTarget"), (FLAT, "ApproachTargetFlat")):
-        if name not in gymnasium.registry:
-            gymnasium.register(name, entry_point=f"{__name__}:{place}")
+    """Make both environments in every setting known to `gymnasium`; again does nothing."""
+    for place in ("ApproachTarget", "ApproachTargetFlat"):
+        for setting in SETTINGS:
+            name = f"phibench/{place}-v0" if setting == "default" else f"phibench/{place}-{setting}-v0"
+            if name not in gymnasium.registry:
+                gymnasium.register(name, entry_point=f"{__name__}:{place}", kwargs={"setup": setting})
 
 
 class ApproachTarget(gymnasium.Env[dict[str, Any], dict[str, Any]]):
@@ -64,8 +71,12 @@ class ApproachTarget(gymnasium.Env[dict[str, Any], dict[str, Any]]):
 
     Parameters
     ----------
-    setup : Setup, optional
+    setup : Setup, or "easy", "default" or "hard"
         Vehicle, rig, sensor, rooms and task.
+    render_mode : "rgb_array" or None
+        `render` then gives the room from above (`room_view`).
+    shaped : bool
+        Reward with shaping, for training only.
     **task : Any
         Numbers of `Task`, in place of the setup's.
 
@@ -73,12 +84,20 @@ class ApproachTarget(gymnasium.Env[dict[str, Any], dict[str, Any]]):
     ----------
     simulator : Simulator
         Holds the truth; for scoring, not for policies.
+    observation : Observation
+        The latest one.
     """
 
-    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 - gymnasium reads it from the class
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012 - gymnasium reads it
 
-    def __init__(self, setup: Setup | None = None, **task: Any) -> None:
-        given = setup or Setup()
+    def __init__(
+        self, setup: Setup | str = "default", *, render_mode: str | None = None, shaped: bool = False, **task: Any
+    ) -> None:
+        given = named_setup(setup) if isinstance(setup, str) else setup
+        if render_mode not in (None, "rgb_array"):
+            raise SceneError(f"render_mode '{render_mode}': this environment has 'rgb_array'; give it, or None")
+        self.render_mode, self.shaped = render_mode, shaped
+        self._way_m: list[tuple[float, float]] = []
         self.setup = replace(given, task=replace(given.task, **task)) if task else given
         self.simulator = Simulator(self.setup, reads=False)
         self.action_space = _action_space(self.setup)
@@ -90,8 +109,9 @@ class ApproachTarget(gymnasium.Env[dict[str, Any], dict[str, Any]]):
         """Begin an episode; the same seed gives the same episode, to the bit. `options["stream"]` names it instead."""
         super().reset(seed=seed)
         stream: tuple[Name, ...] = tuple((options or {}).get("stream", ()))
-        observation = self.simulator.start(*(stream or ("episode", int(self.np_random.integers(2**62)))))
-        return as_arrays(observation, self.setup), self._info()
+        self.observation = self.simulator.start(*(stream or ("episode", int(self.np_random.integers(2**62)))))
+        self._way_m = [(self.simulator.pose.x_m, self.simulator.pose.y_m)]
+        return as_arrays(self.observation, self.setup), self.info()
 
     def step(self, action: dict[str, Any]) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         """Perform one step.
@@ -101,16 +121,37 @@ class ApproachTarget(gymnasium.Env[dict[str, Any], dict[str, Any]]):
         SceneError
             If a key or a number of the action is none, or the episode is over.
         """
-        observation = self.simulator.act(action_of(action))
-        outcome = self.simulator.outcome
-        reward = -_COST_PER_S * self.setup.task.step_s - (_COST_REFUSED if self.simulator.refused else 0.0)
-        reward += {REACHED: 1.0, WRONG: -1.0, COLLISION: -1.0}.get(outcome, 0.0)
-        over = outcome not in (RUNNING, LATE)
-        return as_arrays(observation, self.setup), reward, over, outcome == LATE, self._info()
+        reward, over, late = self.perform(action_of(action))
+        return as_arrays(self.observation, self.setup), reward, over, late, self.info()
 
-    def _info(self) -> dict[str, Any]:
+    def perform(self, action: Action) -> tuple[float, bool, bool]:
+        """Perform one step: reward, over, late; `observation` then holds what is seen."""
+        before = self._potential() if self.shaped else 0.0
+        self.observation = self.simulator.act(action)
+        self._way_m.append((self.simulator.pose.x_m, self.simulator.pose.y_m))
+        outcome = self.simulator.outcome
+        reward = -COST_PER_S * self.setup.task.step_s - (COST_REFUSED if self.simulator.refused else 0.0)
+        reward += {REACHED: 1.0, WRONG: -1.0, COLLISION: -1.0}.get(outcome, 0.0)
+        reward += self._potential() - before if self.shaped else 0.0
+        return reward, outcome not in (RUNNING, LATE), outcome == LATE
+
+    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
+        """Room from above, shape (400, 400, 3), where `render_mode` is "rgb_array", else None."""
+        return room_view(self.simulator, self._way_m) if self.render_mode == "rgb_array" else None
+
+    def _potential(self) -> float:
+        """Minus what is left: metres to the stand-off distance, and the share of half a turn to the target.
+
+        Its differences leave the best policy as it is (A. Y. Ng, D. Harada and S. Russell, ICML 1999).
+        """
+        x, y, _ = self.simulator.target_in_rig_m()
+        return -0.3 * abs(np.hypot(x, y) - self.setup.task.stand_off_m) - 0.3 * abs(np.arctan2(y, x)) / np.pi
+
+    def info(self) -> dict[str, Any]:
+        """Outcome, what was refused, and the truth, which no policy may use."""
         s = self.simulator
-        return {"outcome": s.outcome, "refused": s.refused, "distance_m": s.distance_m, "unseen": s.unseen_cause}
+        told = {"outcome": s.outcome, "refused": s.refused, "distance_m": s.distance_m, "unseen": s.unseen_cause}
+        return told | ({"shaped": True} if self.shaped else {})
 
 
 def action_of(values: dict[str, Any]) -> Action:
@@ -249,10 +290,8 @@ class ApproachTargetFlat(gymnasium.Env[NDArray[Any], NDArray[Any]]):
 
     Parameters
     ----------
-    setup : Setup, optional
+    setup, **options : as for `ApproachTarget`
         Of the exact model.
-    **task : Any
-        Numbers of `Task`, in place of the setup's.
 
     Attributes
     ----------
@@ -260,10 +299,11 @@ class ApproachTargetFlat(gymnasium.Env[NDArray[Any], NDArray[Any]]):
         The environment behind it, with dicts; for scoring.
     """
 
-    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 - gymnasium reads it from the class
+    metadata = ApproachTarget.metadata
 
-    def __init__(self, setup: Setup | None = None, **task: Any) -> None:
-        self.inner = ApproachTarget(setup, **task)
+    def __init__(self, setup: Setup | str = "default", **options: Any) -> None:
+        self.inner = ApproachTarget(setup, **options)
+        self.render_mode = self.inner.render_mode
         if self.inner.setup.fidelity != "exact":
             raise SceneError("the flat environment is that of the exact model: pixels make no vector of float32")
         size = len(scaled(self.inner.reset(seed=0)[0], self._bounds))
@@ -296,6 +336,10 @@ class ApproachTargetFlat(gymnasium.Env[NDArray[Any], NDArray[Any]]):
         """
         observation, reward, over, late, info = self.inner.step(unscaled(action, self._actions))
         return scaled(observation, self._bounds), reward, over, late, info
+
+    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
+        """Picture of `ApproachTarget`."""
+        return self.inner.render()
 
 
 def unscaled(vector: NDArray[Any], space: spaces.Dict) -> dict[str, Any]:

@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 
 import polars as pl
 
 from phibench.benchmark.isolation.resolve import RunLimits
-from phibench.estimator.geometry.rig_parameters import drawn_deviation
 from phibench.robot.loop.belief import Belief, require_filter
 from phibench.robot.loop.foreign_policies import ANSWER_S, PolicyFile, PolicyProcess
 from phibench.robot.loop.policies import BELIEVING, POLICIES, Policy
-from phibench.robot.loop.simulator import REACHED, RUNNING, Action, Observation, Setup, Simulator
-from phibench.scenes.random_streams import Name, generator
+from phibench.robot.loop.simulator import REACHED, RUNNING, Action, Known, Observation, Setup, Simulator
+from phibench.scenes.random_streams import Name
 from phibench.scenes.validation import SceneError, nearest
 
 LOST = "policy failed"
@@ -35,6 +34,8 @@ class Episode:
         One sentence for an episode that was not reached; empty for one that was.
     time_s, driven_m : float
     strokes : int
+    shortest_m : float
+        Straight way from the start to the stand-off distance.
     distance_m, stated_m, sigma_m : float
         True D at the end, what was stated, and the belief's standard deviation; NaN where there is none.
     locked_s : float
@@ -51,6 +52,7 @@ class Episode:
     cause: str
     time_s: float
     driven_m: float
+    shortest_m: float
     strokes: int
     distance_m: float
     stated_m: float
@@ -89,6 +91,7 @@ def run_episode(simulator: Simulator, policy: Policy, observation: Observation, 
         failure or _cause(simulator, stated, was_seen),
         simulator.time_s,
         simulator.driven_m,
+        simulator.shortest_m,
         simulator.strokes,
         simulator.distance_m,
         stated,
@@ -124,7 +127,7 @@ def run_episodes(setup: Setup, policy: str, count: int, *stream: Name) -> list[E
     return list(episodes_of(setup, policy, count, *stream))
 
 
-def episodes_of(setup: Setup, policy: str, count: int, *stream: Name, own_rigs: bool = False) -> Iterator[Episode]:
+def episodes_of(setup: Setup, policy: str, count: int, *stream: Name) -> Iterator[Episode]:
     """Episodes of a built-in policy, in this process, one after the other.
 
     Parameters
@@ -133,39 +136,38 @@ def episodes_of(setup: Setup, policy: str, count: int, *stream: Name, own_rigs: 
     policy : str
     count : int
     *stream : names
-    own_rigs : bool
-        Every episode has a true rig of its own, drawn from the covariance of the setup.
 
     Raises
     ------
     SceneError
         If there is no such policy, or it needs a package that is not installed.
     """
-    if policy not in POLICIES:
-        raise SceneError(f"policy '{policy}': {nearest(policy, POLICIES)}")
-    if policy in BELIEVING:
-        require_filter()  # else each episode would count as one that the policy has lost
+    made = built_in_policy(policy)
     return (
-        run_episode(simulator, POLICIES[policy](setup.known, simulator), observation, number)
-        for number, simulator, observation in _started(setup, count, stream, own_rigs)
+        run_episode(simulator, made(setup.known, simulator), observation, number)
+        for number, simulator, observation in _started(setup, count, stream)
     )
 
 
-def with_own_rig(setup: Setup, *stream: Name) -> Setup:
-    """Setup whose true rig is drawn from its covariance; as it is without one."""
-    if setup.rig_covariance is None:
-        return setup
-    return replace(setup, misalignment=drawn_deviation(setup.rig_covariance, generator(*stream, "rig")))
+def built_in_policy(name: str) -> Callable[[Known, Simulator], Policy]:
+    """Function that makes a built-in policy.
+
+    Raises
+    ------
+    SceneError
+        If there is none of that name, or it needs a package that is not installed.
+    """
+    if name not in POLICIES:
+        raise SceneError(f"policy '{name}': {nearest(name, POLICIES)}")
+    if name in BELIEVING:
+        require_filter()  # else each episode would count as one that the policy has lost
+    return POLICIES[name]
 
 
-def _started(
-    setup: Setup, count: int, stream: Sequence[Name], own_rigs: bool
-) -> Iterator[tuple[int, Simulator, Observation]]:
+def _started(setup: Setup, count: int, stream: Sequence[Name]) -> Iterator[tuple[int, Simulator, Observation]]:
     """Number, simulator and first observation of each episode."""
     simulator = Simulator(setup)
     for number in range(count):
-        if own_rigs:
-            simulator = Simulator(with_own_rig(setup, *stream, number))
         yield number, simulator, simulator.start(*stream, number)
 
 
@@ -184,14 +186,13 @@ def run_foreign(
     *stream: Name,
     limits: RunLimits | None = None,
     hidden: Sequence[Path] = (),
-    own_rigs: bool = False,
     told: Callable[[str], None] = lambda sentence: None,
 ) -> Iterator[Episode]:
     """Episodes of a policy of others: a process for each, so that what it does to one episode stays there.
 
     Parameters
     ----------
-    setup, count, *stream, own_rigs : as for `episodes_of`
+    setup, count, *stream : as for `episodes_of`
     file : PolicyFile
     limits : RunLimits, optional
         `seconds` are those of one answer.
@@ -206,7 +207,7 @@ def run_foreign(
         If the file lies in a hidden folder.
     """
     start = partial(PolicyProcess, file, setup.known, limits or RunLimits(seconds=ANSWER_S), hidden)
-    for number, simulator, observation in _started(setup, count, stream, own_rigs):
+    for number, simulator, observation in _started(setup, count, stream):
         policy = _Started(start, told)
         try:
             yield run_episode(simulator, policy, observation, number)

@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from phibench.estimator.geometry.rig_parameters import drawn_deviation
 from phibench.estimator.spots.spot_prediction import Laser
 from phibench.robot.loop.arena import Arena, Target, plain_arena
 from phibench.robot.loop.robot_pixels import FIDELITIES, Fidelity, RobotCamera, SpotReader, Window, pixel_form
@@ -186,6 +187,8 @@ class Setup:
         is exact.
     preset : str
         Sensor whose bound is the noise, or whose pixels are drawn.
+    own_rigs : bool
+        Every episode has a true rig of its own, drawn from `rig_covariance`, in place of `misalignment`.
     task : Task
         What it is to do.
     arenas : tuple of Arena
@@ -196,7 +199,8 @@ class Setup:
     Raises
     ------
     SceneError
-        If there is no such fidelity, or pixels are asked for and a room is not baked.
+        If there is no such fidelity, pixels are asked for and a room is not baked, or rigs are to be drawn from no
+        covariance.
     """
 
     vehicle: Vehicle = field(default_factory=Vehicle)
@@ -207,8 +211,11 @@ class Setup:
     arenas: tuple[Arena, ...] = ()
     fidelity: Fidelity = "exact"
     rig_covariance: Array | None = field(default=None, compare=False)
+    own_rigs: bool = False
 
     def __post_init__(self) -> None:
+        if self.own_rigs and self.rig_covariance is None:
+            raise SceneError("Setup.own_rigs: rigs are drawn from rig_covariance; give it, or leave own_rigs")
         if self.fidelity not in FIDELITIES:
             raise SceneError(f"Setup.fidelity = '{self.fidelity}': must be one of {', '.join(FIDELITIES)}")
         if self.fidelity == "exact":
@@ -252,17 +259,25 @@ class Simulator:
 
     def __init__(self, setup: Setup, reads: bool = True) -> None:
         self.setup = setup
-        rig, laser = setup.rig.perturbed(setup.misalignment), setup.task.laser
-        self._sensing = Sensing(rig, setup.preset, laser)
-        self._camera: RobotCamera | None = None
         self._reader: SpotReader | None = None
-        if setup.fidelity != "exact":
-            self._camera = RobotCamera(rig, setup.preset, laser, setup.fidelity)
-            self._reader = SpotReader(setup.rig, setup.preset, setup.fidelity) if reads else None
+        if setup.fidelity != "exact" and reads:
+            self._reader = SpotReader(setup.rig, setup.preset, setup.fidelity)
+        self._stand_on(setup.misalignment)
         self.outcome = NOT_STARTED
 
+    def _stand_on(self, misalignment: Misalignment) -> None:
+        """Take a true rig."""
+        setup, laser = self.setup, self.setup.task.laser
+        self.misalignment, rig = misalignment, setup.rig.perturbed(misalignment)
+        self._sensing = Sensing(rig, setup.preset, laser)
+        exact = setup.fidelity == "exact"
+        self._camera = None if exact else RobotCamera(rig, setup.preset, laser, setup.fidelity)
+
     def start(self, *stream: Name) -> Observation:
-        """Begin an episode: the names decide on room, target, lights, slip and noise."""
+        """Begin an episode: the names decide on room, target, lights, rig, slip and noise."""
+        if self.setup.own_rigs:
+            assert self.setup.rig_covariance is not None  # `Setup` checks it
+            self._stand_on(drawn_deviation(self.setup.rig_covariance, generator(*stream, "rig")))
         setup, task, rng = self.setup, self.setup.task, generator(*stream, "loop")
         self.stream, self._rng = stream, rng
         self.arena, self.target = self._place(rng, stream)
@@ -282,6 +297,7 @@ class Simulator:
         self.pose = PlanarPose(-ahead * math.cos(heading), -ahead * math.sin(heading), heading)
         self.flipper_rad, self.stroke_m, self.step, self.outcome = 0.0, 0.0, 0, RUNNING
         self.driven_m, self.strokes, self.refused = 0.0, 0, ""
+        self.shortest_m = max(math.hypot(*self.target.point_m[:2]) - task.stand_off_m, 0.0)
         self._stroke_way = 0
         self.unseen_cause = SEEN
         return self._observe(Action(), 0.0, 0.0)
@@ -336,7 +352,7 @@ class Simulator:
     @property
     def raised_m(self) -> float:
         """True place of the carriage, where `stroke_m` is what its encoder reads (`rig_parameters.stroke_of`)."""
-        own = self.setup.misalignment
+        own = self.misalignment
         return (1.0 + own.stroke_relative) * self.stroke_m + own.stroke_offset_m
 
     @property

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from phibench.datasets.film.film_video import write_mp4
 from phibench.robot.loop.arena import Arena, Boxes, plain_arena
-from phibench.robot.loop.policies import POLICIES, SearchingPolicy
+from phibench.robot.loop.episodes import built_in_policy
+from phibench.robot.loop.policies import Policy, SearchingPolicy
 from phibench.robot.loop.robot_pixels import Window
 from phibench.robot.loop.simulator import REACHED, RUNNING, Observation, Setup, Simulator
 from phibench.scenes.frames import Array
@@ -98,12 +99,12 @@ class Track:
 
 
 def episode_steps(
-    setup: Setup, policy: str, *stream: str | int
+    setup: Setup, policy: str | Policy, *stream: str | int
 ) -> Iterator[tuple[Simulator, SearchingPolicy, Observation, Track]]:
-    """Steps of an episode of a built-in policy."""
+    """Steps of an episode of a policy, a built-in one by its name."""
     simulator, track = Simulator(setup), Track()
     observation = simulator.start(*stream)
-    chosen: Any = POLICIES[policy](setup.known, simulator)
+    chosen: Any = built_in_policy(policy)(setup.known, simulator) if isinstance(policy, str) else policy
     while simulator.outcome == RUNNING:
         action = chosen.act(observation)  # the belief then holds this observation
         track.add(simulator, chosen, observation)
@@ -202,7 +203,7 @@ def belief_axes(ax: Axes, track: Track) -> None:
 # -- film ------------------------------------------------------------------------------------------------------------
 
 
-def show_episode(setup: Setup, out: Path, policy: str, *stream: str | int) -> str:
+def show_episode(setup: Setup, out: Path, policy: str | Policy, *stream: str | int) -> str:
     """Write an episode as an MP4: what the camera sees, the room from above, the belief; return its outcome.
 
     The camera sees whole frames or windows of baked rooms; of the exact model only the spots are drawn.

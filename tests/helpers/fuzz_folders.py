@@ -129,7 +129,7 @@ def _frames(path: Path) -> object:
 
 def _baked(folder: Path) -> tuple[bytes, bytes]:
     """`rooms.json` and the light map of a room without light, of texels of 2 m."""
-    source, room = moving_camera._drawn_room("fuzz", 0)
+    source, room = moving_camera._drawn_room(None, "fuzz", 0)
     dark = moving_camera.BakedRoom("room000", room, 2.0, np.zeros((0, 3), np.float32))
     zeros = np.zeros((dark.lit.texels.count, 3), np.float32)
     light = encoded(LightMap(zeros, zeros, np.zeros(len(zeros), bool)))

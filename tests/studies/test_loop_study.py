@@ -38,7 +38,7 @@ rooms = 1
 
 
 def episode(number: int, time_s: float, outcome: str = REACHED) -> Episode:
-    return Episode(number, outcome, "", time_s, 1.0, 1, 1.0, 1.001, 0.01, 1.5, 1.0, 3.0)
+    return Episode(number, outcome, "", time_s, 1.0, 1.0, 1, 1.0, 1.001, 0.01, 1.5, 1.0, 3.0)
 
 
 def test_every_parameter_that_is_ours_is_tried_at_both_ends() -> None:

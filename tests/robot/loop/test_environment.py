@@ -232,3 +232,80 @@ def test_steps_per_second_of_the_exact_model(capsys) -> None:
     with capsys.disabled():
         print(f"exact model: {best:.0f} steps per CPU second")
     assert best >= 2000
+
+
+def test_named_settings_are_environments_of_gymnasium() -> None:
+    """What the page says of each; `hard` draws a rig of its own for every episode."""
+    for place in ("ApproachTarget", "ApproachTargetFlat"):
+        easy = gymnasium.make(f"phibench/{place}-easy-v0").unwrapped
+        setup = easy.setup if isinstance(easy, ApproachTarget) else easy.inner.setup  # type: ignore[attr-defined]
+        assert (setup.task.lights, setup.task.distances_m, setup.own_rigs) == (0, (1.5, 3.0), False)
+    hard = ApproachTarget("hard")
+    assert (hard.setup.task.lights, hard.setup.task.power, hard.setup.own_rigs) == (5, 0.1, True)
+    rigs = []
+    for seed in (1, 2, 1):
+        hard.reset(seed=seed)
+        rigs.append(hard.simulator.misalignment)
+    assert rigs[0] == rigs[2] != rigs[1]
+    with pytest.raises(SceneError, match="setting 'hrad': did you mean 'hard'"):
+        ApproachTarget("hrad")
+
+
+def test_shaping_adds_what_a_potential_gains(env) -> None:
+    """Over an episode the additions sum to the potential's difference: the best policy stays the best."""
+    shaped, plain = ApproachTarget(shaped=True), ApproachTarget()
+    gained = 0.0
+    for one in (shaped, plain):
+        one.reset(seed=7)
+    begin = shaped._potential()
+    for _ in range(30):
+        action = {"drive_m_per_s": 0.2, "turn_rad_per_s": 0.3}
+        more, less = shaped.step(action), plain.step(action)
+        gained += more[1] - less[1]
+    assert gained == pytest.approx(shaped._potential() - begin, abs=1e-12)
+    assert abs(gained) > 1e-3
+    assert more[4]["shaped"] is True
+    assert "shaped" not in less[4]
+
+
+def test_a_picture_shows_robot_and_target(env) -> None:
+    """Room from above: the target's red disc lies where its place is, 40 px a metre about the middle; y is up."""
+    made = ApproachTarget(render_mode="rgb_array")
+    made.reset(seed=5)
+    picture = made.render()
+    assert picture.shape == (400, 400, 3)
+    x, y, _ = made.simulator.target.point_m
+    u, v = round(200 + 40 * x), round(200 - 40 * y)
+    assert picture[v, u].tolist() == [204, 51, 17]
+    pose = made.simulator.pose
+    assert picture[round(200 - 40 * pose.y_m) + 0, round(200 + 40 * pose.x_m)].tolist() in ([153, 153, 68], [0, 0, 0])
+    assert ApproachTarget().render() is None
+    with pytest.raises(SceneError, match="render_mode 'human'"):
+        ApproachTarget(render_mode="human")
+
+
+def test_a_belief_is_enough_to_reach_the_target() -> None:
+    """Some rules, no pixel: turn, stroke until D is known to 0.5 %, drive, state. The inner belief does the rest.
+
+    Seeds are fixed: the same episodes each time.
+    """
+    env = gymnasium.make("phibench.robot.loop.belief_environment:phibench/ApproachTargetBelief-easy-v0")
+    check_env(env.unwrapped, skip_render_check=True)
+    for seed in range(3):
+        observation, info = env.reset(seed=seed)
+        over = late = False
+        while not (over or late):
+            sin, _, left, enlarged, sigma, stroke, _, _ = observation
+            there = abs(enlarged) < 0.2
+            if abs(sin) > 0.05 and not there:
+                action = [0.0, np.clip(2 * sin, -1, 1), 0.0, -1.0]
+            elif sigma > -0.15 and stroke < 0.99:
+                action = [0.0, 0.0, 0.6, -1.0]
+            else:
+                action = [np.clip(8 * left, -1, 1), 0.0, 0.0, 1.0 if there else -1.0]
+            observation, reward, over, late, info = env.step(np.array(action, np.float32))
+        assert (info["outcome"], reward) == (REACHED, pytest.approx(1.0 - 0.001))
+    env.reset(seed=1)
+    assert env.step(np.array([0, 0, 0, 1], np.float32))[1] == pytest.approx(-0.011)  # far from the stand-off distance
+    with pytest.raises(SceneError, match="action of 3 numbers: give 4 from -1 to 1, drive, turn, stroke, state"):
+        env.unwrapped.step(np.zeros(3))

@@ -18,16 +18,17 @@ from phibench.cli import main as cli
 from phibench.robot.loop.arena import generated_arena
 from phibench.robot.loop.episodes import (
     LOST,
+    Episode,
     episode_frame,
     run_episode,
     run_episodes,
     run_foreign,
-    with_own_rig,
 )
 from phibench.robot.loop.foreign_policies import PolicyFile, policy_of
 from phibench.robot.loop.policies import CODED, POLICIES, ApproachPlan, Identifier
 from phibench.robot.loop.sensing import SEEN, SpotReading
-from phibench.robot.loop.simulator import CODES, Action, Observation, Setup, Simulator, Task
+from phibench.robot.loop.setups import loop_score
+from phibench.robot.loop.simulator import CODES, COLLISION, REACHED, Action, Observation, Setup, Simulator, Task
 from phibench.scenes.motion.vehicle import PlanarPose
 from phibench.scenes.validation import SceneError
 from phibench.studies.loop.study import misaligned, summary
@@ -238,9 +239,14 @@ def test_rigs_whose_covariance_is_stated(capsys, policy: str) -> None:
 
 
 def test_the_command_line_draws_rigs_from_what_is_known_of_them(tmp_path, capsys) -> None:
-    one, other = (with_own_rig(Setup(rig_covariance=rig_covariance(1.0)), "x", n).misalignment for n in (0, 1))
-    assert one != other
-    assert with_own_rig(Setup(), "x", 0) == Setup()
+    setup = Setup(rig_covariance=rig_covariance(1.0), own_rigs=True)
+    simulator, drawn = Simulator(setup), []
+    for number in (0, 1, 0):
+        simulator.start("x", number)
+        drawn.append(simulator.misalignment)
+    assert drawn[0] == drawn[2] != drawn[1]
+    with pytest.raises(SceneError, match="own_rigs: rigs are drawn from rig_covariance"):
+        Setup(own_rigs=True)
     assert cli.main(["loop", "run", "oracle", "--episodes", "1", "--as-built", "0.5"]) == 0
     assert "reached: 1 of 1" in capsys.readouterr().out
     both = ["--as-built", "1", "--calibration", str(tmp_path / "none.json")]
@@ -285,3 +291,30 @@ def test_the_process_reaches_its_target_in_twenty_rooms(capsys) -> None:
         print(f"reached {reached} of 200 ({low:.3f} to {high:.3f}), pull {pull:.2f}")
     assert reached >= 190
     assert 0.9 <= pull <= 1.1
+
+
+def episode(outcome: str, driven_m: float, shortest_m: float, pull: float = math.nan) -> Episode:
+    nan = math.nan
+    return Episode(0, outcome, "", 10.0, driven_m, shortest_m, 1, 1.0, 1.0, nan, nan, pull, nan)
+
+
+def test_score_of_episodes() -> None:
+    """SPL by hand: (1 + 2/4 + 0) / 3; 2 of 3 by Clopper and Pearson are 9.4 to 99.2 %."""
+    rows = [episode(REACHED, 1.9, 2.0, 1.0), episode(REACHED, 4.0, 2.0, -2.0), episode(COLLISION, 1.0, 2.0)]
+    score = loop_score(rows)
+    assert (score.count, score.reached, score.pulls) == (3, 2, 2)
+    assert score.spl == pytest.approx(0.5)
+    assert score.pull == pytest.approx(math.sqrt(2.5))
+    assert (score.share_low, score.share_high) == pytest.approx((0.0943, 0.9916), abs=1e-4)
+    assert "reached: 2 of 3 (95 %: 9 to 99 %); SPL 0.50" in score.sentence()
+    with pytest.raises(SceneError, match="there are no episodes"):
+        loop_score([])
+
+
+def test_settings_and_distances_of_the_command_line(tmp_path, capsys) -> None:
+    assert cli.main(["loop", "run", "oracle", "--episodes", "2", "--setting", "easy", "--distance-m", "2", "2.1"]) == 0
+    assert "reached: 2 of 2 (95 %: 16 to 100 %); SPL 1.00" in capsys.readouterr().out
+    assert cli.main(["loop", "run", "oracle", "--distance-m", "0.2", "2"]) == 2
+    assert "stand_off_m" in capsys.readouterr().err
+    assert cli.main(["loop", "show", "papr", "--out", str(tmp_path / "x.mp4")]) == 2
+    assert "did you mean 'paper'" in capsys.readouterr().err
