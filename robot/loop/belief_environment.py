@@ -97,7 +97,7 @@ class ApproachTargetBelief(gymnasium.Env[NDArray[Any], NDArray[Any]]):
         over, late = (outcome not in (RUNNING, LATE), outcome == LATE) if more else (over, late)
         return self._features(), reward + more - refused, over, late, self.inner.info()
 
-    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
+    def render(self) -> NDArray[np.uint8] | None:
         """Picture of `ApproachTarget`."""
         return self.inner.render()
 

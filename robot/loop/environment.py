@@ -135,7 +135,7 @@ class ApproachTarget(gymnasium.Env[dict[str, Any], dict[str, Any]]):
         reward += self._potential() - before if self.shaped else 0.0
         return reward, outcome not in (RUNNING, LATE), outcome == LATE
 
-    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
+    def render(self) -> NDArray[np.uint8] | None:
         """Room from above, shape (400, 400, 3), where `render_mode` is "rgb_array", else None."""
         return room_view(self.simulator, self._way_m) if self.render_mode == "rgb_array" else None
 
@@ -337,7 +337,7 @@ class ApproachTargetFlat(gymnasium.Env[NDArray[Any], NDArray[Any]]):
         observation, reward, over, late, info = self.inner.step(unscaled(action, self._actions))
         return scaled(observation, self._bounds), reward, over, late, info
 
-    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
+    def render(self) -> NDArray[np.uint8] | None:
         """Picture of `ApproachTarget`."""
         return self.inner.render()
 
