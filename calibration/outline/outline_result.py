@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from phibench.calibration.outline.ball_circle import BallCircle
 from phibench.calibration.outline.edge_ring import TURNS
-from phibench.calibration.outline.limb_image import JPEG_LUMA, PoseMeasurement
+from phibench.calibration.outline.limb_image import JPEG_LUMA, Plane, PoseMeasurement
 from phibench.calibration.outline.outline_fit import OutlinePixels, Step
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.estimator.spots.camera_codes import light_of, tone_of
@@ -130,6 +130,45 @@ def mean_measured(parts: Sequence[PoseMeasurement]) -> PoseMeasurement:
     return PoseMeasurement(mean, covariance * max(1.0, chi2 / degrees if degrees else 1.0))
 
 
+# -- what mirrors of all shapes have for the fit -----------------------------------------------------------------------
+
+MIN_ARC = 0.5
+"""Part of the outline that must lie in the image."""
+
+
+@dataclass(frozen=True)
+class MirrorOutline:
+    """Outline of a rig's mirror at a place, for the fit of `outline`: what all shapes have.
+
+    Attributes
+    ----------
+    planes : of the image
+    rig : Rig
+        Nominal.
+    place : shape (3,) or (5,)
+        Centre or vertex in the camera frame, metres; then what the outline has besides, pixels.
+    """
+
+    planes: tuple[Plane, ...]
+    rig: Rig
+    place: Array
+
+    def visible_part(self, outline_px: Array, margin_px: float) -> float:
+        """Part of an outline, of which points (n, 2) are given, that lies `margin_px` inside the image's border."""
+        camera = self.rig.camera
+        low, high = margin_px - 0.5, np.array([camera.width_px, camera.height_px]) - 0.5 - margin_px
+        return float(np.mean(np.all((outline_px >= low) & (outline_px <= high), axis=-1)))
+
+
+@dataclass(frozen=True)
+class OutlineStart:
+    """Circle in a picture that may be the mirror's outline, the edge near it, and the place of such an outline."""
+
+    place: Array
+    circle: BallCircle
+    edge: BallCircle
+
+
 # -- what fits of outlines share ---------------------------------------------------------------------------------------
 
 
@@ -151,6 +190,13 @@ def binned_rig(rig: Rig, block: int) -> Rig:
     return replace(
         rig, camera=replace(camera, pixel_pitch_um=camera.pixel_pitch_um * block, **size, **lengths, **centre)
     )
+
+
+def edge_shifts_px(circle: BallCircle) -> Array:
+    """Mean distance of the edges from a circle in each sector, shape (SECTORS,); NaN in one without an edge."""
+    off = np.roll(circle.off_px, TURNS // 2).reshape(SECTORS, -1)
+    seen = np.isfinite(off)
+    return np.where(seen.any(axis=1), np.nansum(off, axis=1) / np.maximum(seen.sum(axis=1), 1), np.nan)
 
 
 def require_near(rig: Rig, circle: BallCircle) -> None:

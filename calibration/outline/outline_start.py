@@ -45,27 +45,15 @@ def grey(planes: tuple[Plane, ...]) -> Array:
     return np.nan_to_num(picture / level)
 
 
-def rough_outlines(picture: Array, rig: Rig) -> Iterator[tuple[Array, BallCircle]]:
-    """Sphere centres in the camera frame, shape (3,), metres, to about a pixel of the outline, the likeliest first.
+def circles_by_size(picture: Array, rig: Rig) -> Iterator[Iterator[BallCircle]]:
+    """Circles of a picture, the clearest first: those of about the size that the rig says, then those of all sizes.
 
-    Circles of tiles and lamps in the mirror may be clearer than the mirror's own; the fit of the light across them
-    tells which is which.
-
-    Raises
-    ------
-    ImageError
-        If no circle of about the expected size is found.
+    A holder's plates are clear circles, too, and circles of tiles and lamps in the mirror may be clearer than the
+    mirror's own; the fit of the light across them tells which is which.
     """
-    yielded, (low, high) = 0, radii_px(rig)
-    near = (low * _NEAR[0] / _RADII[0], high * _NEAR[1] / _RADII[1])  # a holder's plates are clear circles, too
-    for radii, count in ((near, _FEW), ((low, high), _CANDIDATES)):
-        for circle in circles(picture, radii, count):
-            yielded += 1
-            yield sphere_from_rays(rig.camera.rays(circle.points_px), rig.sphere.radius_m), circle
-    if not yielded:
-        raise ImageError(
-            "an image without a mirror: no circle of the outline's size has edges all around; check the picture"
-        )
+    low, high = radii_px(rig)
+    near = (low * _NEAR[0] / _RADII[0], high * _NEAR[1] / _RADII[1])
+    return (circles(picture, radii, count) for radii, count in ((near, _FEW), ((low, high), _CANDIDATES)))
 
 
 def radii_px(rig: Rig) -> tuple[float, float]:

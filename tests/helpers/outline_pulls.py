@@ -10,9 +10,7 @@ from helpers.limb_frames import drawn_revolved, drawn_rig, drawn_room, drawn_tin
 
 from phibench.calibration.outline.contour import place_of_rig
 from phibench.calibration.outline.limb_image import planes_of
-from phibench.calibration.outline.rim_outline import fit_rim
-from phibench.calibration.outline.sphere_outline import find_sphere_outline as find_outline
-from phibench.calibration.outline.sphere_outline import fit_outline
+from phibench.calibration.outline.outline import find_outline, fit_outline, outline_at
 from phibench.datasets.frames.sensor_card import sensor_card
 from phibench.estimator.spots.image_planes import ImageError
 from phibench.render.sensor.camera_chain import Chain
@@ -49,7 +47,8 @@ def rim_cases(shape: str, rigs: range, *presets: str) -> Iterator[Case]:
             card = sensor_card(preset)
             again = (frame, card) if preset == "mjpeg" else None
             try:
-                found = fit_rim(planes_of(frame, card), rig, place_of_rig(rig) + off, again=again)
+                start = outline_at(planes_of(frame, card), rig, place_of_rig(rig) + off)
+                found = fit_outline(start, again)
             except ImageError as error:
                 print(f"{shape} {k} {preset}: {error}")
                 continue
@@ -73,7 +72,8 @@ def cases(rigs: range, *kinds: tuple[str, dict]) -> Iterator[Case]:
                     found = find_outline(frame, replace(rig, T_camera_sphere=start), card)
                 else:
                     again = (frame, card) if preset == "mjpeg" else None
-                    found = fit_outline(planes_of(frame, card), rig, rig.sphere_in_camera_m + off, again=again)
+                    start_at = outline_at(planes_of(frame, card), rig, rig.sphere_in_camera_m + off)
+                    found = fit_outline(start_at, again)
             except ImageError as error:
                 print(f"rig {k} {preset} {changes}: {error}")
                 continue

@@ -11,17 +11,16 @@ from helpers.limb_frames import drawn_rig, limb_light
 
 from phibench.calibration.outline.limb_image import Plane, Tap, binned, planes_of
 from phibench.calibration.outline.limb_sectors import Sectors, _medians, scatter
-from phibench.calibration.outline.outline import find_outline
+from phibench.calibration.outline.outline import _approach as approach
+from phibench.calibration.outline.outline import find_outline, fit_outline, outline_at
 from phibench.calibration.outline.outline_fit import step_from
 from phibench.calibration.outline.outline_result import binned_rig
 from phibench.calibration.outline.outline_start import (
+    circles_by_size,
     grey,
-    rough_outlines,
     sphere_from_circle,
     sphere_from_rays,
 )
-from phibench.calibration.outline.sphere_outline import _approach as approach
-from phibench.calibration.outline.sphere_outline import fit_outline, visible_arc
 from phibench.datasets.frames.sensor_card import sensor_card
 from phibench.estimator.spots.camera_codes import linear_to_srgb, srgb_to_linear
 from phibench.estimator.spots.image_planes import ImageError
@@ -88,7 +87,7 @@ def test_plain_fits_are_biased(case) -> None:
     """The steepest place of the light is inside the limb: circle, ellipse and cone put the sphere 0.1 mm too far."""
     rig, light = case
     picture = grey(planes_of(light))
-    points, s = next(rough_outlines(picture, nominal(rig)))[1].points_px, rig.sphere_in_camera_m
+    points, s = next(next(circles_by_size(picture, nominal(rig)))).points_px, rig.sphere_in_camera_m
     camera, R = rig.camera, rig.sphere.radius_m
     for found in (
         sphere_from_circle(plain_circle(points), camera, R),
@@ -122,14 +121,14 @@ def test_a_long_picture_is_fitted_in_squares(case, frames, monkeypatch: pytest.M
     """
     rig, card = nominal(case[0]), sensor_card("mjpeg")
     whole = find_outline(frames["mjpeg"], rig, card)
-    monkeypatch.setattr("phibench.calibration.outline.sphere_outline._BINNED_PX", 640)
+    monkeypatch.setattr("phibench.calibration.outline.outline._BINNED_PX", 640)
     sizes: list[tuple[int, ...]] = []
 
-    def approached(planes, *arguments):
-        sizes.append(planes[0].values.shape)
-        return approach(planes, *arguments)
+    def approached(at, *arguments):
+        sizes.append(at.planes[0].values.shape)
+        return approach(at, *arguments)
 
-    monkeypatch.setattr("phibench.calibration.outline.sphere_outline._approach", approached)
+    monkeypatch.setattr("phibench.calibration.outline.outline._approach", approached)
     found = find_outline(frames["mjpeg"], rig, card)
     assert sizes == [(360, 640)]
     error = found.sphere_in_camera_m - case[0].sphere_in_camera_m
@@ -137,7 +136,7 @@ def test_a_long_picture_is_fitted_in_squares(case, frames, monkeypatch: pytest.M
     assert (found.sigma_m < 1.5 * whole.sigma_m).all()
     assert found.blur_px == pytest.approx(whole.blur_px, abs=0.4)
     squares = binned(planes_of(frames["mjpeg"], card), 2)
-    again = fit_outline(squares, binned_rig(rig, 2), found.sphere_in_camera_m)
+    again = fit_outline(outline_at(squares, binned_rig(rig, 2), found.sphere_in_camera_m))
     assert found.shift_rms_px == pytest.approx(2.0 * again.shift_rms_px, rel=0.05)
     assert np.allclose((binned_rig(rig, 2).outline_px() + 0.5) * 2.0 - 0.5, rig.outline_px())
 
@@ -158,7 +157,7 @@ def test_a_hopeless_fit_ends_soon(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr("phibench.calibration.outline.sphere_outline.step_from", counted)
     with pytest.raises(ImageError, match="without a mirror"):
-        fit_outline(planes_of(np.stack([light] * 3)), rig, rig.sphere_in_camera_m)
+        fit_outline(outline_at(planes_of(np.stack([light] * 3)), rig, rig.sphere_in_camera_m))
     assert len(steps) <= 6 + 6  # to come near, and to see that it leads nowhere
 
 
@@ -197,7 +196,8 @@ def test_radius_and_distance_scale_together(case) -> None:
     rig, light = case
     planes, s = planes_of(light), rig.sphere_in_camera_m
     larger = replace(rig, mirror=replace(rig.mirror, radius_m=1.01 * rig.sphere.radius_m))
-    a, b = fit_outline(planes, rig, s + 1e-4), fit_outline(planes, larger, 1.01 * (s + 1e-4))
+    starts = outline_at(planes, rig, s + 1e-4), outline_at(planes, larger, 1.01 * (s + 1e-4))
+    a, b = map(fit_outline, starts)
     # the same cone; Fresnel's angle across the limb is the same too; 1e-7 m is where the steps come to rest
     assert b.sphere_in_camera_m == pytest.approx(1.01 * a.sphere_in_camera_m, abs=1e-6)
 
@@ -217,15 +217,15 @@ def test_a_mirror_cut_by_the_frame(case) -> None:
         cut = np.roll(light, -shift, axis=1)
         cut[:, -shift:] = np.median(light)
         moved = replace(rig, camera=replace(rig.camera, cy_px=rig.camera.cy_px - shift))
-        assert (visible_arc(moved, rig.sphere_in_camera_m) > 0.5) is enough
+        assert (outline_at((), moved, rig.sphere_in_camera_m).visible_arc() > 0.5) is enough
         if enough:
-            found = fit_outline(planes_of(cut), moved, rig.sphere_in_camera_m + 2e-4)
+            found = fit_outline(outline_at(planes_of(cut), moved, rig.sphere_in_camera_m + 2e-4))
             error = found.sphere_in_camera_m - rig.sphere_in_camera_m
             assert np.abs(error).max() < 2e-5
             assert found.arc < 0.85
         else:
             with pytest.raises(ImageError, match="cut by the frame"):
-                fit_outline(planes_of(cut), moved, rig.sphere_in_camera_m + 2e-4)
+                fit_outline(outline_at(planes_of(cut), moved, rig.sphere_in_camera_m + 2e-4))
 
 
 def lamps_on_a_dark_plate(rig: Rig, part: float) -> np.ndarray:

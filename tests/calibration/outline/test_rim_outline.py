@@ -21,10 +21,9 @@ from phibench.calibration.outline.contour import (
     tilts_of_ellipse,
 )
 from phibench.calibration.outline.limb_image import planes_of
-from phibench.calibration.outline.outline import find_outline
+from phibench.calibration.outline.outline import find_outline, fit_outline, outline_at
 from phibench.calibration.outline.outline_fit import OutlinePixels
 from phibench.calibration.outline.outline_result import Outline, mean_outline
-from phibench.calibration.outline.rim_outline import fit_rim
 from phibench.datasets.frames.sensor_card import sensor_card
 from phibench.estimator.spots.image_planes import ImageError
 from phibench.render.sensor.camera_chain import Chain
@@ -175,7 +174,7 @@ def nearby(shape: str) -> Outline:
     """Fit of a raw frame from a place nearby."""
     rig, card = scene(shape)[0], sensor_card("bayer-raw")
     start = place_of_rig(rig) + [2e-5, -2e-5, 3e-4, 0.0, 0.0]
-    return fit_rim(planes_of(frame_of(shape, "bayer-raw"), card), rig, start)
+    return fit_outline(outline_at(planes_of(frame_of(shape, "bayer-raw"), card), rig, start))
 
 
 @pytest.mark.slow
@@ -207,9 +206,9 @@ def test_pictures_without_a_rim_are_refused_in_one_sentence() -> None:
     with pytest.raises(ImageError, match="no circle of the rim's size has edges all around"):
         find_outline(np.ones((3, 720, 1280)), rig)
     with pytest.raises(ImageError, match="no edge along the mirror's rim"):
-        fit_rim(blank, rig, place_of_rig(rig))
+        fit_outline(outline_at(blank, rig, place_of_rig(rig)))
     with pytest.raises(ImageError, match="cut by the frame"):
-        fit_rim(blank, rig, place_of_rig(rig) + [0.14, 0.0, 0.0, 0.0, 0.0], near=True)
+        fit_outline(outline_at(blank, rig, place_of_rig(rig) + [0.14, 0.0, 0.0, 0.0, 0.0]), near=True)
 
 
 def test_a_part_of_a_picture_is_refused_in_one_sentence() -> None:
