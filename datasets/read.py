@@ -22,9 +22,9 @@ from pydantic import ValidationError
 
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import first_fault
+from phibench.datasets.common.shown_text import ShortForm
 from phibench.datasets.frames.distractors import Distractor, distractors
-from phibench.datasets.frames.request import FrameOptions, FrameRequest
-from phibench.datasets.frames.sample_request import sample_request
+from phibench.datasets.frames.request import FrameOptions, FrameRequest, sample_request
 from phibench.datasets.frames.source import Frames, FrameSource
 from phibench.datasets.recipe.build import spot_albedo
 from phibench.datasets.recipe.tables import Recipe
@@ -39,7 +39,6 @@ from phibench.datasets.store.documents import (
 )
 from phibench.datasets.store.layers import SpotWindow, read_ambient, read_ambient_variance, read_spot, read_truth
 from phibench.datasets.store.schema import INFO, RIGS, ROOMS, DatasetInfo, ManifestRow, SpotRow
-from phibench.datasets.store.short_form import ShortForm
 from phibench.datasets.store.stored_rooms import Rooms, read_rooms
 from phibench.scenes.laser import Beam, LaserSpot
 from phibench.scenes.rig import POSITIONS, Rig, View

@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phibench.datasets.common.errors import DatasetError
-from phibench.datasets.frames.request import FrameOptions, FrameRequest, in_one_sentence, whole_number
-from phibench.datasets.frames.sample_request import sample_request
+from phibench.datasets.common.shown_text import ShortForm
+from phibench.datasets.frames.request import FrameOptions, FrameRequest, in_one_sentence, sample_request, whole_number
 from phibench.datasets.frames.sensor_card import SensorCard, card_of
 from phibench.datasets.frames.source import FrameSource
 from phibench.datasets.read import Dataset, Sample, open_finished
@@ -29,7 +29,6 @@ from phibench.datasets.recipe.tables import FramesTable
 from phibench.datasets.store.documents import from_json
 from phibench.datasets.store.layers import SpotWindow
 from phibench.datasets.store.pair_files import IMAGES_OFF, FramesRow, PairFiles, is_frames_set
-from phibench.datasets.store.short_form import ShortForm
 from phibench.render.sensor.camera_chain import Chain, auto_exposed
 from phibench.render.sensor.light import Light, Region
 from phibench.render.sensor.noise_tiles import NoiseStream

@@ -38,7 +38,7 @@ from phibench.datasets.store.checksums import (
     read_checksums,
     strays,
 )
-from phibench.datasets.store.documents import differences, parse_info, same_number, sensitivity_fault, to_json
+from phibench.datasets.store.documents import alike, differences, parse_info, same_number, sensitivity_fault, to_json
 from phibench.datasets.store.layers import (
     SPOT_STACKS,
     read_ambient,
@@ -492,12 +492,3 @@ def _with_form(rig: dict[str, Any]) -> dict[str, Any]:
     if not isinstance(mirror, dict) or "profile" in mirror:
         return rig
     return {**rig, "mirror": {"form": None, **mirror}}
-
-
-def alike(a: Any, b: Any) -> bool:
-    """Equality of nested documents, of their numbers to rounding."""
-    if isinstance(a, dict) and isinstance(b, dict):
-        return a.keys() == b.keys() and all(alike(a[key], b[key]) for key in a)
-    if isinstance(a, list | tuple) and isinstance(b, list | tuple):
-        return len(a) == len(b) and all(alike(x, y) for x, y in zip(a, b, strict=True))
-    return same_number(a, b) if isinstance(a, float) and isinstance(b, float | int) else bool(a == b)

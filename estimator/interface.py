@@ -19,8 +19,8 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from phibench.datasets.common.shown_text import ShortForm
 from phibench.datasets.frames.sensor_card import SensorCard
-from phibench.datasets.store.short_form import ShortForm
 from phibench.scenes.laser import Beam
 from phibench.scenes.rig import Rig
 

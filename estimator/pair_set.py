@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
+from phibench.datasets.common.shown_text import ShortForm
 from phibench.datasets.store.pair_files import LEAST_BOX_PX
-from phibench.datasets.store.short_form import ShortForm
 from phibench.estimator.interface import Pair
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import Rig

@@ -19,9 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phibench.benchmark.isolation.resolve import MethodError
+from phibench.datasets.common.shown_text import ShortForm
 from phibench.datasets.exposures.expected import ExpectedRegion
 from phibench.datasets.frames.sensor_card import SensorCard, sensor_card
-from phibench.datasets.store.short_form import ShortForm
 from phibench.estimator.geometry.mirror_image import image_of
 from phibench.estimator.geometry.phi import phi_incidence, phi_normal, phi_ray
 from phibench.estimator.interface import Box, Pair

@@ -17,6 +17,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.common.shown_text import ShortForm
 from phibench.datasets.exposures.expected import ExpectedRegion, expected_of_light
 from phibench.datasets.exposures.pair_draws import CachedSample, FrameCounts, PairDraw, pair_draws, search_boxes
 from phibench.datasets.frames.sensor_card import SensorCard, card_of
@@ -27,7 +28,6 @@ from phibench.datasets.store import schema
 from phibench.datasets.store.files import sha256
 from phibench.datasets.store.pair_files import LEAST_BOX_PX
 from phibench.datasets.store.provenance import provenance
-from phibench.datasets.store.short_form import ShortForm
 from phibench.estimator.interface import Pair
 from phibench.estimator.limits.off_frame_bound import on_off_limit, processed_on_off_limit
 from phibench.estimator.limits.position_bound import SpotLimit, spot_limit

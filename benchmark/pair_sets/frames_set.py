@@ -23,6 +23,7 @@ from phibench.benchmark.pair_sets.dataset_pairs import BOX_MARGIN_PX, BOX_PX, TA
 from phibench.benchmark.pair_sets.truth_file import truth_document, truth_of
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import SETTINGS_BYTES, InputFile, Name
+from phibench.datasets.common.shown_text import ShortForm
 from phibench.datasets.exposures.pair_draws import search_box
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.datasets.store.documents import from_json
@@ -39,7 +40,6 @@ from phibench.datasets.store.pair_files import (
 )
 from phibench.datasets.store.provenance import provenance
 from phibench.datasets.store.schema import CHECKSUMS, Document
-from phibench.datasets.store.short_form import ShortForm
 from phibench.estimator.interface import Box, Pair
 from phibench.estimator.pair_set import PairTruth
 from phibench.scenes.laser import Beam

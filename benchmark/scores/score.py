@@ -43,9 +43,9 @@ from phibench.benchmark.scores.score_tables import score_table, text_of
 from phibench.benchmark.scores.worst_images import worst, worst_of, worst_records
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.progress import Steps, progress_console
+from phibench.datasets.common.shown_text import ShortForm
 from phibench.datasets.read import Dataset
 from phibench.datasets.store.files import require_writable
-from phibench.datasets.store.short_form import ShortForm
 from phibench.estimator.interface import Method, Outcome
 from phibench.estimator.methods.fit_at_truth import KeptFits
 from phibench.estimator.pair_set import CachedPairs, PairSet, truth_folders

@@ -40,8 +40,7 @@ from phibench.estimator.geometry.least_squares_depth import depth_general
 from phibench.estimator.geometry.rig_parameters import stroke_of
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.estimator.interface import Pair
-from phibench.estimator.methods.fit_place import kept
-from phibench.estimator.methods.locate import SharedPair
+from phibench.estimator.methods.locate import SharedPair, kept
 from phibench.estimator.methods.raw_likelihood import with_posteriors
 from phibench.estimator.spots.image_planes import ImageError
 from phibench.scenes.rig import POSITIONS, Rig

@@ -60,8 +60,7 @@ from phibench.estimator.geometry.least_squares_depth import GeneralDepth, depth_
 from phibench.estimator.geometry.rig_parameters import PARAMETERS, prior_sigmas, stroke_of
 from phibench.estimator.geometry.status import Status, describe
 from phibench.estimator.interface import Answer, Image, Pair, Spot
-from phibench.estimator.methods.fit_place import kept
-from phibench.estimator.methods.locate import SharedPair
+from phibench.estimator.methods.locate import SharedPair, kept
 from phibench.estimator.methods.raw_likelihood import with_posteriors
 from phibench.estimator.spots.detect import detect
 from phibench.estimator.spots.image_planes import ImageError

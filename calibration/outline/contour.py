@@ -110,17 +110,12 @@ def contour_of(rig: Rig, place: Array) -> Contour:
     there = rig_at(rig, place)
     middle, t = there.outline_px(POINTS).mean(axis=0), _turns(POINTS)
     radius = _radius_at(t, there.outline_px(POINTS), middle)
-    slopes = []
-    for i in range(3):
-        step = _STEP_M * np.eye(PLACES)[i]
-        plus, minus = (_radius_at(t, rig_at(rig, place + s * step).outline_px(POINTS), middle) for s in (1.0, -1.0))
-        slopes.append((plus - minus) / (2.0 * _STEP_M))
-    ellipse = [np.cos(2.0 * t), np.sin(2.0 * t)]
+    slopes = _slopes(rig, place, t, middle, POINTS)
     rim, depth_m, bend = _seen(there, t, middle)
     return Contour(
         middle,
-        _closed(t, radius + place[3] * ellipse[0] + place[4] * ellipse[1]),
-        _closed(t, np.stack([*slopes, *ellipse], axis=-1)),
+        _closed(t, radius + place[3] * slopes[:, 3] + place[4] * slopes[:, 4]),
+        _closed(t, slopes),
         rim,
         depth_m,
         bend,
@@ -157,7 +152,7 @@ def place_of_outline(rig: Rig, outline_px: Array, start: Array | None = None, el
 def _way_back(rig: Rig, ellipse: bool) -> tuple[Array, Array]:
     """Middle of a rig's own contour, and the place's change with its radii; slopes change little on the way there."""
     middle = rig.outline_px(POINTS).mean(axis=0)
-    slopes = _slopes(rig, place_of_rig(rig), _turns(_FEWER), middle)
+    slopes = _slopes(rig, place_of_rig(rig), _turns(_FEWER), middle, _FEWER)
     return middle, np.asarray(np.linalg.pinv(slopes[:, : PLACES if ellipse else 3]))
 
 
@@ -189,11 +184,12 @@ def tilts_of_ellipse(rig: Rig, size_rad: float) -> Callable[[Array], Array]:
     return of
 
 
-def _slopes(rig: Rig, place: Array, turn: Array, middle: Array) -> Array:
+def _slopes(rig: Rig, place: Array, turn: Array, middle: Array, count: int) -> Array:
+    """Derivatives of the radii at turns (n,) by a place, shape (n, 5), by `count` points of the outline."""
     columns = []
     for i in range(3):
         step = _STEP_M * np.eye(PLACES)[i]
-        plus, minus = (_radius_at(turn, rig_at(rig, place + s * step).outline_px(_FEWER), middle) for s in (1.0, -1.0))
+        plus, minus = (_radius_at(turn, rig_at(rig, place + s * step).outline_px(count), middle) for s in (1.0, -1.0))
         columns.append((plus - minus) / (2.0 * _STEP_M))
     return np.stack([*columns, np.cos(2.0 * turn), np.sin(2.0 * turn)], axis=-1)
 

@@ -30,6 +30,7 @@ from scipy import optimize
 
 from phibench.calibration.outline.contour import place_of_outline, tilts_of_ellipse
 from phibench.calibration.outline.limb_image import PoseMeasurement
+from phibench.calibration.outline.outline_start import sphere_from_rays
 from phibench.calibration.rig.vertical_edges import vertical_of
 from phibench.datasets.common.errors import DatasetError
 from phibench.estimator.geometry.mirror_image import image_of
@@ -399,10 +400,7 @@ def apparent_outline(nominal: Rig, true: Rig) -> Array:
     uv = true.outline_px(90)
     if nominal.mirror.has_rim:
         return place_of_outline(nominal, uv)
-    rays = nominal.camera.rays(uv)
-    x = np.linalg.lstsq(rays, np.ones(len(rays)), rcond=None)[0]  # n / cos a0
-    cosine = 1.0 / np.linalg.norm(x)  # of the limb's angle a0; |s| = R / sin a0
-    return np.asarray(x * cosine * nominal.sphere.radius_m / np.sqrt((1.0 - cosine) * (1.0 + cosine)))
+    return sphere_from_rays(nominal.camera.rays(uv), nominal.sphere.radius_m)
 
 
 def apparent_vertical(nominal: Rig, true: Rig) -> Array:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -19,7 +18,7 @@ from pydantic import BaseModel, ConfigDict
 from phibench.calibration.rig.bundle import Bundle
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import MIB, InputFile
-from phibench.datasets.store.documents import from_json, to_json
+from phibench.datasets.store.documents import alike, from_json, to_json
 from phibench.datasets.store.files import write_text
 from phibench.estimator.geometry.rig_parameters import PARAMETERS, RENAMED, changed
 from phibench.scenes.frames import IDENTITY, Array
@@ -173,7 +172,8 @@ def _require_sound(path: Path, nominal: Rig, rig: Rig, values: Array, covariance
             f"{path} has no covariance: its matrix is not symmetric with eigenvalues of 0 or above; make it again"
         )
     try:
-        same = _close(_document(changed(nominal, values)), _document(rig))
+        # another machine rounds the last bits otherwise, another Python or program may print fewer digits
+        same = alike(_document(changed(nominal, values)), _document(rig), relative=1e-9)
     except SceneError as error:
         raise CalibrationError(f"{path} corrects the rig to one that cannot be: {error}; make it again") from error
     if not same:
@@ -205,17 +205,6 @@ def _document(rig: Rig) -> dict[str, Any]:
     if not rig.mirror.has_axes:
         rig = replace(rig, T_camera_sphere=replace(rig.T_camera_sphere, rotation=IDENTITY))
     return dict(to_json(rig))
-
-
-def _close(a: Any, b: Any) -> bool:
-    """Equality of documents, of their numbers to 1e-9: another machine rounds the last bits otherwise."""
-    if isinstance(a, dict) and isinstance(b, dict):
-        return a.keys() == b.keys() and all(_close(a[key], b[key]) for key in a)
-    if isinstance(a, list | tuple) and isinstance(b, list | tuple):
-        return len(a) == len(b) and all(_close(x, y) for x, y in zip(a, b, strict=True))
-    if isinstance(a, float) and isinstance(b, float | int):
-        return math.isclose(a, b, rel_tol=1e-9, abs_tol=1e-12)  # another Python or program may print fewer digits
-    return bool(a == b)
 
 
 def _file(path: Path) -> InputFile:

@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.frames.distractors import Distractor, present
-from phibench.datasets.frames.request import FrameOptions, FrameRequest, whole_number
-from phibench.datasets.frames.sample_request import sample_stream
+from phibench.datasets.frames.request import FrameOptions, FrameRequest, sample_stream, whole_number
 from phibench.datasets.frames.sensor_file import SensorFile
 from phibench.datasets.frames.source import FrameSource, has_place
 from phibench.datasets.read import Dataset, Sample

@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.common.shown_text import ShortForm
 from phibench.datasets.frames.distractors import Distractor
 from phibench.datasets.frames.request import FrameRequest, in_one_sentence, whole_number
 from phibench.datasets.store.layers import SpotWindow
 from phibench.datasets.store.schema import ManifestRow, SpotRow
-from phibench.datasets.store.short_form import ShortForm
 from phibench.render.sensor.camera_chain import Chain, auto_exposed
 from phibench.render.sensor.light import Light, Region
 from phibench.render.sensor.noise_tiles import frame_stream

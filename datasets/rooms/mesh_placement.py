@@ -3,6 +3,11 @@
 The user states the metres of a unit, the axis that points up, and the point of the floor on which the robot stands. The
 world's origin is that point. The floor below it comes to z = 0. Then the numbers are checked: a room measures 2 to
 100 m, and nothing stands in the robot or in the way of the mirror.
+
+Files (glTF, OBJ, PLY) are parts of one material each, with linear colours. Each format is read by its definition in a
+module of its own. What a file states is read rightly or refused by name: a reading library would pass over it, or make
+it up. Pictures, the colours of OBJ materials and vertex colours of OBJ and PLY are sRGB. Factors and vertex colours of
+glTF are linear by its specification. A triangle with vertex colours has their mean.
 """
 
 from __future__ import annotations
@@ -15,12 +20,62 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from phibench.datasets.rooms.mesh_files import read_mesh
-from phibench.datasets.rooms.mesh_parts import MeshPart
+from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.common.input_files import InputFile
+from phibench.datasets.rooms.gltf_file import gltf_parts
+from phibench.datasets.rooms.mesh_parts import (
+    REMEDY,
+    Companions,
+    MeshPart,
+    check_count,
+    check_part,
+    check_parts,
+    damaged,
+    named_parts,
+)
+from phibench.datasets.rooms.obj_file import obj_parts
+from phibench.datasets.rooms.ply_file import ply_parts
+from phibench.datasets.rooms.polygons import CuttingError
 from phibench.datasets.rooms.room_files import RoomError
 from phibench.scenes.frames import Array, Vector
 from phibench.scenes.room import chassis
 from phibench.scenes.validation import finite_vector, positive, unit_vector, within
+
+_READERS = {".glb": gltf_parts, ".gltf": gltf_parts, ".obj": obj_parts, ".ply": ply_parts}
+SUFFIXES = tuple(_READERS)
+
+
+def read_mesh(path: Path, one_file: bool = False) -> tuple[MeshPart, ...]:
+    """Read the parts of a mesh file, in the order of their names; `one_file` refuses one that names others.
+
+    Raises
+    ------
+    RoomError
+        If the file is missing, damaged, of another kind, without triangles, has what is not read, or names what is not
+        there.
+    """
+    file = InputFile(path, REMEDY, RoomError)
+    reader = _READERS.get(path.suffix.lower())
+    if reader is None:
+        raise RoomError(f"{path} is no mesh: give a file that ends in {', '.join(SUFFIXES)}")
+    try:
+        with np.errstate(all="ignore"):
+            parts = reader(file, Companions(file, one_file))
+    except (DatasetError, MemoryError):
+        raise
+    except CuttingError as error:
+        raise file.fault(f"has {error}: export triangles") from error
+    except Exception as error:  # documents and arrays can contradict each other in any way
+        raise damaged(file) from error
+    named = named_parts(part for part in parts if len(part.triangles))
+    check_count(file, sum(len(part.triangles) for part in named))
+    check_parts(file, len(named))
+    for part in named:
+        check_part(file, part)
+    return named
+
+
+# -- mesh files --------------------------------------------------------------------------------------------------------
 
 EXTENT_M = (2.0, 100.0)  # of a room: a wrong unit leaves these limits
 FLOOR_REACH_M = 0.10

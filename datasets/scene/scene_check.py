@@ -25,8 +25,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from phibench.datasets.read import Dataset, Sample
-from phibench.datasets.scene.scene_export import expected_radiance, in_carried_pixels, sample_scene
-from phibench.datasets.scene.scene_xml import write_scene
+from phibench.datasets.scene.scene_export import expected_radiance, in_carried_pixels, sample_scene, write_scene
 from phibench.render.plugins.standard_scene import Light, carried, etendue, film_axes
 from phibench.render.setup.variant import activate
 from phibench.scenes.frames import Array

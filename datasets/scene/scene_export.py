@@ -1,33 +1,44 @@
-"""Export of a sample as Mitsuba scenes that an unmodified Mitsuba opens, with what phibench has in the same pixels.
+"""Export of a sample: Mitsuba scenes that an unmodified Mitsuba opens, and glTF files for Blender and other programs.
 
 One folder holds both stroke positions, each with all its light, the room's alone and the laser spot alone. Beside them
 lie our own layers as radiance in the same pixels, and a README that says what a scene does not carry.
+
+Numbers of the XML are written so that they read back exactly. Its meshes (PLY) and pictures (PFM) are named after the
+shape and their contents: both stroke positions share what is the same.
+
+The glTF is that of rooms (`gltf_export`) with the rig, one node each: the mirror is a mesh of a smooth metal, whose
+colour is its reflectance in the three bands at normal incidence. glTF's camera has a pinhole in the image's middle,
+without a principal point, distortion or focus. The spot is a disc of its diameter that shines red.
 """
 
 from __future__ import annotations
 
+import hashlib
+import math
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from xml.sax.saxutils import quoteattr
 
 import numpy as np
 from scipy import ndimage
 
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.read import Sample
-from phibench.datasets.scene.scene_gltf import scene_glb
-from phibench.datasets.scene.scene_xml import write_scene
+from phibench.datasets.rooms.gltf_export import GltfWriter, y_up
 from phibench.datasets.store.files import require_writable, write_bytes, write_text
 from phibench.datasets.store.layers import write_exr
-from phibench.render.plugins.plugin_tree import Plugin, mitsuba_dict
+from phibench.render.plugins.mirror_plugins import grid_triangles
+from phibench.render.plugins.plugin_tree import BitmapPlugin, Plugin, Rgb, SceneSetting, Triangles, Value, mitsuba_dict
 from phibench.render.plugins.standard_scene import LIGHTS, Light, carried, etendue, standard_scene
 from phibench.render.setup.variant import activate
 from phibench.scenes.camera import Camera
 from phibench.scenes.frames import Array
+from phibench.scenes.laser import LaserSpot
 from phibench.scenes.rig import POSITIONS, View
-from phibench.scenes.room import Room
+from phibench.scenes.room import MIRROR_NAME, Room
 
 README = "README.md"
 
@@ -243,3 +254,146 @@ The cosine is that of the angle to the optical axis, which meets pixel ({cx:g}, 
 
 {losses}
 """
+
+
+# -- Mitsuba XML and the files that it names ---------------------------------------------------------------------------
+
+FOLDERS = {"ply": "meshes", "pfm": "pictures"}
+
+
+def write_scene(path: Path, scene: Plugin) -> Path:
+    """Write a scene as XML and its meshes and pictures beside it, each atomically; the XML comes last."""
+    return write_text(path, _Writer(path.parent).text(scene))
+
+
+class _Writer:
+    """Lines of one XML file; equal contents are written once."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._names: dict[str, str] = {}
+
+    def text(self, scene: Plugin) -> str:
+        settings = {value.name: value.value for value in scene.all_values() if isinstance(value, SceneSetting)}
+        lines = ['<?xml version="1.0" encoding="utf-8"?>', '<scene version="3.0.0">']
+        lines += [f'    <default name="{name}" value="{value}"/>' for name, value in settings.items()]
+        for name, value in scene.values.items():
+            lines += self._lines(name, value, 1)
+        return "\n".join([*lines, "</scene>", ""])
+
+    def _lines(self, name: str, value: Value, depth: int) -> Iterator[str]:
+        indent = "    " * depth
+        if not isinstance(value, Plugin):
+            yield f"{indent}{self._line(name, value)}"
+            return
+        if value.label:
+            yield f"{indent}<!-- {value.label.replace('--', '- -')} -->"
+        own = f" id={quoteattr(value.name)}" if value.name else "" if depth == 1 else f" name={quoteattr(name)}"
+        head = f"{indent}<{value.kind} type={quoteattr(value.type)}{own}"
+        if not value.values:
+            yield f"{head}/>"
+            return
+        yield f"{head}>"
+        for key, inner in value.values.items():
+            yield from self._lines(key, inner, depth + 1)
+        yield f"{indent}</{value.kind}>"
+
+    def _line(self, name: str, value: Value) -> str:
+        if isinstance(value, np.ndarray):
+            if value.ndim == 2:
+                return f'<transform name="{name}"><matrix value="{_numbers(value.ravel())}"/></transform>'
+            x, y, z = (repr(float(number)) for number in value)
+            return f'<point name="{name}" x="{x}" y="{y}" z="{z}"/>'
+        if isinstance(value, Rgb):
+            return f'<rgb name="{name}" value="{_numbers(np.array(value.values))}"/>'
+        if isinstance(value, SceneSetting):
+            return f'<integer name="{name}" value="${value.name}"/>'
+        if isinstance(value, bool):
+            return f'<boolean name="{name}" value="{str(value).lower()}"/>'
+        if isinstance(value, int | float):
+            return f'<float name="{name}" value="{float(value)!r}"/>'
+        if isinstance(value, BitmapPlugin | Triangles):
+            value = self._file(value)
+        return f"<string name={quoteattr(name)} value={quoteattr(str(value))}/>"
+
+    def _file(self, content: BitmapPlugin | Triangles) -> str:
+        """Name of a file with this content; written now if it is not yet."""
+        data = content.data()
+        digest = hashlib.sha256(data).hexdigest()
+        if digest not in self._names:
+            name = f"{FOLDERS[content.suffix]}/{content.name}-{digest[:8]}.{content.suffix}"
+            write_bytes(self._folder / name, data)
+            self._names[digest] = name
+        return self._names[digest]
+
+
+def _numbers(values: np.ndarray) -> str:
+    return " ".join(repr(float(x)) for x in values)
+
+
+# -- glTF --------------------------------------------------------------------------------------------------------------
+
+_RINGS, _SPOKES = 91, 180  # of the mirror's mesh, two degrees apart
+_SPOT_SIDES = 32  # of the polygon that is shown for the spot
+_SPOT_LIFT_M = 1e-4  # off the surface: two faces in one plane flicker
+
+
+def scene_glb(view: View, room: Room, spot: LaserSpot | None = None) -> bytes:
+    """Bytes of a `.glb` file of one view."""
+    document = GltfWriter()
+    for shape in room.shapes(view):
+        document.add(shape)
+    _add_mirror(document, view)
+    if spot is not None:
+        _add_spot(document, spot)
+    _add_camera(document, view)
+    return document.encoded(room.name)
+
+
+def _add_mirror(document: GltfWriter, view: View) -> None:
+    mirror = view.rig.mirror
+    points, normals = mirror.grid(_RINGS, _SPOKES)
+    pose = view.T_world_sphere
+    bands = view.rig.camera.detector.band_wavelength_nm
+    colour = [float(mirror.reflectance(np.array(1.0), nm)) for nm in bands]
+    surface = {"metallicFactor": 1.0, "baseColorFactor": [*colour, 1.0]}
+    # glTF's roughness is the square root of the microfacets' alpha
+    surface["roughnessFactor"] = math.sqrt(mirror.roughness_alpha)
+    document.add_mesh(
+        MIRROR_NAME,
+        pose.points(points.reshape(-1, 3)),
+        {"name": MIRROR_NAME, "doubleSided": True, "pbrMetallicRoughness": surface},
+        grid_triangles(_RINGS, _SPOKES, closed=True),
+        pose.directions(normals.reshape(-1, 3)),
+    )
+
+
+def _add_spot(document: GltfWriter, spot: LaserSpot) -> None:
+    a, b = spot.tangents()
+    turn = 2.0 * np.pi * np.arange(_SPOT_SIDES) / _SPOT_SIDES
+    rim = 0.5 * spot.diameter_m * (np.cos(turn)[:, None] * a + np.sin(turn)[:, None] * b)
+    normal = np.array(spot.normal_world)
+    points = np.array(spot.position_world_m) + _SPOT_LIFT_M * normal + np.concatenate([np.zeros((1, 3)), rim])
+    i = np.arange(_SPOT_SIDES)
+    fan = np.stack([np.zeros_like(i), 1 + i, 1 + (i + 1) % _SPOT_SIDES], axis=-1)
+    area_m2 = math.pi * spot.diameter_m**2 / 4.0
+    # of a Lambertian disc that sends out all the power that its albedo leaves
+    radiance = spot.power_w * (0.7 if spot.albedo is None else spot.albedo) / (math.pi * area_m2)
+    document.add_mesh("laser_spot", points, document.emitting("laser_spot", (radiance, 0.0, 0.0)), fan)
+
+
+def _add_camera(document: GltfWriter, view: View) -> None:
+    """Camera of the view; glTF's looks along -z, its y axis up in the image."""
+    camera = view.rig.camera
+    matrix = np.eye(4)
+    matrix[:3, :3] = y_up(view.T_world_camera.R.T).T @ np.diag([1.0, -1.0, -1.0])
+    matrix[:3, 3] = y_up(view.camera_centre_m)
+    document.add_camera(
+        "camera",
+        {
+            "yfov": 2.0 * math.atan(0.5 * camera.height_px / camera.fy_px),
+            "aspectRatio": camera.width_px / camera.height_px * camera.fy_px / camera.fx_px,
+            "znear": 0.001,  # metres; the mirror is decimetres away
+        },
+        matrix,
+    )

@@ -29,8 +29,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import PICTURE_PIXELS, InputFile, quiet_terminal
+from phibench.datasets.common.shown_text import ShortForm
 from phibench.datasets.store.files import require_file, write_atomic
-from phibench.datasets.store.short_form import ShortForm
 from phibench.render.optics.truth import angle_planes
 from phibench.scenes.camera import FILTERS, LARGEST_SIDE_PX
 from phibench.scenes.frames import Array

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from phibench.datasets.store.short_form import ShortForm, short
+from phibench.datasets.common.shown_text import ShortForm, short
 from phibench.estimator.geometry.mirror_geometry import geometry_of
 from phibench.estimator.geometry.paper_depth import PARALLEL_SINE, depth_approx
 from phibench.estimator.geometry.phi import CONVENTIONS
@@ -156,6 +156,13 @@ def exact_gradient(rig: Rig, stroke_m: ArrayLike, uv_down_px: Array, uv_up_px: A
     """dD/d(u1, v1, u2, v2) of `depth_exact`, shape (..., 4), metres per pixel, analytic; NaN where D is."""
     _, gradient = meeting_gradients(rig, stroke_m, uv_down_px, uv_up_px)
     return keep(gradient, meeting(rig, stroke_m, uv_down_px, uv_up_px).status)
+
+
+def depth_of(rig: Rig, point_world_m: Array) -> tuple[float, Array]:
+    """D of one point, and its derivative by the point, shape (3,)."""
+    radial = point_world_m[:2] - rig.at(0.0).sphere_centre_m[:2]
+    D = float(np.hypot(*radial))
+    return D, np.array([*(radial / D), 0.0])
 
 
 def meeting(rig: Rig, stroke_m: ArrayLike, uv_down_px: Array, uv_up_px: Array) -> Meeting:

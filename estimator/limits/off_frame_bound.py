@@ -32,27 +32,24 @@ from phibench.datasets.exposures.expected import ExpectedRegion
 from phibench.datasets.exposures.pair_draws import FrameCounts
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.estimator.limits.position_bound import SpotLimit, derivative_images, limit_of, raw_information
+from phibench.estimator.limits.processed_bound import limit_window, spot_codes
 from phibench.estimator.processed.chain_model import (
     ChainModel,
     Codes,
-    chain_model,
     code_slopes,
     codes,
     excess_variance,
     noise_factor,
     raw_variance_e2,
 )
-from phibench.estimator.processed.fit_chain import own_codes, unrounded
-from phibench.estimator.processed.fit_jpeg import grid_px
+from phibench.estimator.processed.fit_chain import own_codes
 from phibench.estimator.spots.fisher import covariance_bound, fisher_matrix
-from phibench.estimator.spots.gaussian_spot import LASER_RESPONSE, SpotBlur, SpotModel, SpotPixels
+from phibench.estimator.spots.gaussian_spot import LASER_RESPONSE, SpotBlur
 from phibench.estimator.spots.image_planes import PROCESSED
 from phibench.estimator.spots.jpeg_coefficients import hidden_share, quantised
-from phibench.estimator.spots.pixel_statistics import code_law, code_table, cut_pixels
-from phibench.estimator.spots.raw_pixels import bayer_filters
+from phibench.estimator.spots.pixel_statistics import cut_pixels
 from phibench.scenes.frames import Array
 
-_REACH_PX = 10  # around the spot, for codes of their own
 _LIVE = 2e-3  # variance of an output, in steps squared, below which its coefficient says nothing
 
 
@@ -130,11 +127,7 @@ def _of_codes(
     response: tuple[float, float, float],
     frames: FrameCounts,
 ) -> SpotLimit:
-    corner = np.floor(theta[:2]).astype(np.int64) - _REACH_PX
-    filters = bayer_filters(corner[None], (2 * _REACH_PX + 2, 2 * _REACH_PX + 2))
-    theta = theta - np.array([*corner, 0, 0, 0, 0])
-    mean, derivatives = SpotPixels.of(filters, blur, SpotModel(response)).at(theta[None])
-    law = code_law(np.zeros(filters.shape, np.uint8), filters, card, unrounded(card, True), code_table(card))
+    law, mean, derivatives = spot_codes(card, theta, blur, response, pattern_known=True)
     spot = theta[2] * derivatives[:, 2]
     J = without_room(law.information(mean), law.information(mean - spot), spot, frames, card.prnu)
     fisher = fisher_matrix(derivatives[0, :3], J[0])
@@ -186,11 +179,9 @@ def _of_window(
     frames: FrameCounts,
     steps: bool,
 ) -> SpotLimit:
-    model = chain_model(card, unrounded(card, True))
-    units, sides = np.array(grid_px(card)[::-1]), np.array(model.shape[::-1])
-    corner = np.rint((theta[:2] + 0.5 - sides / 2) / units) * units - model.margin
-    pixels = SpotPixels.of(model.filters[None], blur, SpotModel(response))
-    mean, derivatives = pixels.at((theta - np.array([*corner, 0, 0, 0, 0]))[None])
+    window, corner = limit_window(card, theta[:2], blur, response, pattern_known=True)
+    model = window.model
+    mean, derivatives = window.pixels.at((theta - np.array([*corner, 0, 0, 0, 0]))[None])
     D = derivatives[0, :3].reshape(3, -1)
     spot, mean_e = theta[2] * D[2], mean.ravel()
     on, off = _readings(model, mean_e), _readings(model, mean_e - spot)

@@ -30,7 +30,7 @@ from phibench.estimator.processed.quasi_score import CoefficientWindow
 from phibench.estimator.spots.fisher import covariance_bound, fisher_matrix
 from phibench.estimator.spots.gaussian_spot import LASER_RESPONSE, SpotBlur, SpotModel, SpotPixels
 from phibench.estimator.spots.image_planes import PROCESSED
-from phibench.estimator.spots.pixel_statistics import code_law, code_table
+from phibench.estimator.spots.pixel_statistics import CodeLaw, code_law, code_table
 from phibench.estimator.spots.raw_pixels import bayer_filters
 from phibench.scenes.frames import Array
 
@@ -90,13 +90,20 @@ def chain_limit(
 def _of_codes(
     card: SensorCard, theta: Array, blur: SpotBlur, response: tuple[float, float, float], known: bool
 ) -> SpotLimit:
-    corner = np.floor(theta[:2]).astype(np.int64) - _REACH_PX
-    filters = bayer_filters(corner[None], (2 * _REACH_PX + 2, 2 * _REACH_PX + 2))
-    theta = theta - np.array([*corner, 0, 0, 0, 0])
-    mean, derivatives = SpotPixels.of(filters, blur, SpotModel(response)).at(theta[None])
-    law = code_law(np.zeros(filters.shape, np.uint8), filters, card, unrounded(card, known), code_table(card))
+    law, mean, derivatives = spot_codes(card, theta, blur, response, known)
     fisher = fisher_matrix(derivatives[0], law.information(mean)[0])
     return SpotLimit(covariance_bound(fisher), fisher)
+
+
+def spot_codes(
+    card: SensorCard, theta: Array, blur: SpotBlur, response: tuple[float, float, float], pattern_known: bool
+) -> tuple[CodeLaw, Array, Array]:
+    """Law of the codes about a spot, shape (1, h, w), their pixels' means and derivatives by theta; a camera's own."""
+    corner = np.floor(theta[:2]).astype(np.int64) - _REACH_PX
+    filters = bayer_filters(corner[None], (2 * _REACH_PX + 2, 2 * _REACH_PX + 2))
+    mean, derivatives = SpotPixels.of(filters, blur, SpotModel(response)).at((theta - [*corner, 0, 0, 0, 0])[None])
+    law = code_law(np.zeros(filters.shape, np.uint8), filters, card, unrounded(card, pattern_known), code_table(card))
+    return law, mean, derivatives
 
 
 def _of_window(

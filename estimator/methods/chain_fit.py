@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.estimator.geometry.status import Status, describe
 from phibench.estimator.interface import Answer, Box, Pair, Spot
-from phibench.estimator.methods.fit_place import at_detection
 from phibench.estimator.methods.likelihood_maps import SpotLikelihood, claimed_px2, of_pixels, of_window
 from phibench.estimator.methods.locate import around as box_at
 from phibench.estimator.methods.locate import (
+    at_detection,
     box_around,
     detected,
     measured_twice,

@@ -12,8 +12,7 @@ import numpy as np
 from phibench.estimator.interface import Answer, Box, Method, Pair, Spot
 from phibench.estimator.learned.network_input import frame_input
 from phibench.estimator.learned.networks import CROP, DETECT, Network, heat_peaks, network, refined, shipped
-from phibench.estimator.methods.fit_place import at_detection
-from phibench.estimator.methods.locate import SearchRegion, each_spot
+from phibench.estimator.methods.locate import SearchRegion, at_detection, each_spot
 from phibench.estimator.spots.candidates import Candidates
 from phibench.estimator.spots.detect import Thresholds, choose, mirror_box, outline_mask
 from phibench.estimator.spots.image_planes import kind_of

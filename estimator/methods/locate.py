@@ -1,5 +1,8 @@
 """Search for a spot by the built-in methods: shared work, boxes around detections, search regions, and its distance.
 
+A fit begins at a detection and may walk off along noise, to a lamp's edge or to another light. Its covariance is that
+of the place where it ended, and says nothing of this: `at_detection` and `kept` test how far it lies from there.
+
 Integer (u, v) are pixel centres, u along the columns, v along the rows.
 """
 
@@ -22,17 +25,11 @@ from phibench.estimator.methods.pair_light import SIGMA_OF_MAD
 from phibench.estimator.spots.camera_codes import rgb_codes
 from phibench.estimator.spots.detect import Detection, PairDetection, detect
 from phibench.estimator.spots.gaussian_spot import SpotBlur
-from phibench.estimator.spots.image_planes import (
-    demosaiced,
-    full_scale_e,
-    kind_of,
-    linear_planes,
-    redness,
-    variance_e2,
-)
+from phibench.estimator.spots.image_planes import demosaiced, full_scale_e, kind_of, linear_planes, redness, variance_e2
 from phibench.estimator.spots.simple_spots import SpotPositions
 from phibench.estimator.spots.spot_prediction import spot_blur
 from phibench.scenes.frames import Array, BoolArray
+from phibench.scenes.rig import POSITIONS
 
 SIDE_PX = 15  # of a window: holds 99.9 % of a spot with a blur of up to 2 px, and a border to take the background from
 _DETECTED_SIDE_PX = 21  # of a box around a detection: room for a fit's surroundings
@@ -403,3 +400,41 @@ def seen_depth_m(pair: Pair, answer: Answer) -> float | None:
 def pair_blur(pair: Pair, uv_px: ArrayLike, depth_m: float | None) -> SpotBlur:
     """Blur of a spot of the pair's laser at a distance; None leaves the beam's size out."""
     return spot_blur(pair.rig, uv_px, depth_m, pair.beam)
+
+
+# -- places of fits ----------------------------------------------------------------------------------------------------
+
+_OFF_PX = 1.0  # of a detection on interpolated pixels; 0.9 was seen
+_SIGMAS = 4.0  # of detection and fit together
+_MOST_PX = 2.0  # whatever a fit claims: with `_OFF_PX` a fit stays within 3 px of the light
+_BLUR_PX = 1.0  # of a spot, whose detection has this over its significance for a standard deviation
+
+
+def left_px(found: Detection, spot: Spot) -> float | None:
+    """Distance of a fit from the detection, pixels, where it is more than both sigmas allow; otherwise None."""
+    if spot.uv_px is None:
+        return None
+    apart = math.dist(spot.uv_px, found.uv_px)
+    claimed2 = 0.0 if spot.covariance_px2 is None else 0.5 * float(np.trace(spot.covariance_px2))
+    sigma = math.sqrt(claimed2 + (_BLUR_PX / max(found.significance, 1.0)) ** 2)
+    return apart if not apart <= min(_OFF_PX + _SIGMAS * sigma, _MOST_PX) else None
+
+
+def at_detection(found: Detection | None, spot: Spot) -> Spot:
+    """The spot of a fit; of one that left its detection, or ended nowhere, the detection's place without covariance.
+
+    A place without covariance says that no fit stands behind it.
+    """
+    if found is None or (spot.uv_px is not None and left_px(found, spot) is None):
+        return spot
+    return Spot(found.uv_px)
+
+
+def kept(pair: Pair, separate: Answer, together: Answer) -> Answer:
+    """The answer for both images together; the separate one where a spot of it left its detection."""
+    detections = detected(pair)
+    for position in POSITIONS:
+        detection, spot = getattr(detections, position), getattr(together, position)
+        if detection is not None and left_px(detection, spot) is not None:
+            return separate
+    return together

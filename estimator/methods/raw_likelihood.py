@@ -30,7 +30,6 @@ from phibench.estimator.geometry.joint_posterior import JointPosterior, joint_po
 from phibench.estimator.geometry.status import Status, describe
 from phibench.estimator.interface import Answer, Image, Matrix2, Pair, Spot
 from phibench.estimator.methods.chain_fit import chain_fit, spot_likelihood
-from phibench.estimator.methods.fit_place import at_detection, kept
 from phibench.estimator.methods.likelihood_maps import (
     FAINT_PX,
     SpotLikelihood,
@@ -42,7 +41,9 @@ from phibench.estimator.methods.likelihood_maps import (
 from phibench.estimator.methods.locate import (
     SearchRegion,
     SharedPair,
+    at_detection,
     each_spot_twice,
+    kept,
     once,
     pair_blur,
     seen_depth_m,
@@ -169,7 +170,7 @@ def raw_likelihood(pair: Pair) -> Answer:
 def joint_fit(pair: Pair) -> Answer:
     """Positions and depth of a pair; the separate answers where one image has no spot or the two are not one point.
 
-    Nor are they taken from a spot that left the place where it was seen (`fit_place`).
+    Nor are they taken from a spot that left the place where it was seen (`locate`).
     """
     shared = pair if isinstance(pair, SharedPair) else SharedPair.of(pair)
     separate = raw_likelihood(shared) if pair.card.output == "raw" else chain_fit(shared)

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import gaussian_laplace
 from scipy.optimize import least_squares
 
-from phibench.datasets.store.short_form import ShortForm, short
+from phibench.datasets.common.shown_text import ShortForm, short
 from phibench.estimator.geometry.status import Status, StatusArray, flag, keep
 from phibench.scenes.frames import Array, BoolArray
 

@@ -21,7 +21,7 @@ from phibench.datasets.common.errors import DatasetError
 from phibench.estimator.geometry.mirror_image import image_of
 from phibench.estimator.geometry.rig_parameters import PARAMETERS, STROKE_PARAMETERS
 from phibench.estimator.geometry.status import depth_interval
-from phibench.estimator.geometry.triangulate import depth_exact
+from phibench.estimator.geometry.triangulate import depth_exact, depth_of
 from phibench.robot.film.film_positions import FilmPositions
 from phibench.scenes.frames import Array, BoolArray
 from phibench.scenes.misalignment import PARAMETERS as MISALIGNMENT
@@ -242,9 +242,7 @@ def _result(
 ) -> FilmDepth:
     at = _predicted(rig, X, readings)
     covariance = np.linalg.inv(at.by_point.T @ cho_solve(S, at.by_point))
-    radial = X[:2] - rig.at(0.0).sphere_centre_m[:2]
-    D = float(np.hypot(*radial))
-    gradient = np.array([*(radial / D), 0.0])
+    D, gradient = depth_of(rig, X)
     by_rig_m = np.zeros(len(PARAMETERS))
     if calibrated:  # a rig that moves the images as u moves the fitted point as -u
         weights = cho_solve(S, at.by_point @ (covariance @ gradient))
@@ -289,6 +287,5 @@ def expected_sigma_m(
     C, sigma_m = positions.covariance_px2(), np.broadcast_to(encoder_sigma_m, positions.good.shape)
     S = cho_factor(_total(rig, point_world_m, offsets_m, C, at.by_offset, sigma_m, covariance_rig))
     covariance = np.linalg.inv(at.by_point.T @ cho_solve(S, at.by_point))
-    radial = point_world_m[:2] - rig.at(0.0).sphere_centre_m[:2]
-    gradient = np.array([*(radial / np.hypot(*radial)), 0.0])
+    _, gradient = depth_of(rig, point_world_m)
     return float(np.sqrt(gradient @ covariance @ gradient))

@@ -30,6 +30,7 @@ from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.film.film_read import Film
 from phibench.datasets.frames.sensor_card import SensorCard, card_of
 from phibench.estimator.geometry.mirror_image import image_of
+from phibench.estimator.geometry.triangulate import depth_of
 from phibench.estimator.spots.gaussian_spot import SpotBlur, SpotParts
 from phibench.estimator.spots.raw_pixels import PixelNoise, raw_electrons
 from phibench.estimator.spots.spot_prediction import spot_blur
@@ -125,7 +126,7 @@ class FilmFrames:
 
     def blur(self, point_world_m: Array, uv_px: Array) -> SpotBlur:
         """Blur of the N spots at (u, v), drawn out by the motion during the exposure."""
-        D = float(np.hypot(*(point_world_m[:2] - self.rig.at(0.0).sphere_centre_m[:2])))
+        D, _ = depth_of(self.rig, point_world_m)
         middle = self.times.row_s(self.on.astype(float), uv_px[:, 1])[:, None]
         when = np.hstack([middle, middle + 0.5 * self.times.exposure_s * leggauss(_NODES)[0]])
         places = self.image_px(point_world_m, self.stroke_scale * self.carriage.position_m(when))

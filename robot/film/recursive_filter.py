@@ -20,6 +20,7 @@ import numpy as np
 
 from phibench.estimator.geometry.mirror_image import image_of
 from phibench.estimator.geometry.reflection import room_rays
+from phibench.estimator.geometry.triangulate import depth_of
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import Rig
 
@@ -78,10 +79,8 @@ class FilterState:
 
     def depth(self, rig: Rig) -> tuple[float, float]:
         """D and its standard deviation, metres."""
-        X, J = self.point_m(), self.point_by_state()
-        radial = X[:2] - rig.at(0.0).sphere_centre_m[:2]
-        D = float(np.hypot(*radial))
-        gradient = np.array([*(radial / D), 0.0]) @ J
+        D, by_point = depth_of(rig, self.point_m())
+        gradient = by_point @ self.point_by_state()
         return D, float(np.sqrt(gradient @ self.covariance[:3, :3] @ gradient))
 
 

@@ -28,7 +28,7 @@ from phibench.datasets.common.camera_pictures import read_camera_picture
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import InputFile
 from phibench.datasets.rooms import polygons
-from phibench.datasets.rooms.mesh_files import read_mesh
+from phibench.datasets.rooms.mesh_placement import read_mesh
 from phibench.datasets.rooms.panorama_files import read_light
 from phibench.datasets.rooms.room_files import RoomFiles, checked_data
 

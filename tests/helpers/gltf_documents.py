@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from phibench.datasets.rooms.mesh_files import read_mesh
 from phibench.datasets.rooms.mesh_parts import MeshPart
+from phibench.datasets.rooms.mesh_placement import read_mesh
 
 SQUARE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], np.float32)
 UV = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32)

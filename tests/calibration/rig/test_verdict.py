@@ -15,8 +15,8 @@ from phibench.calibration.outline.outline import find_outline
 from phibench.calibration.outline.outline_fit import band, step_from
 from phibench.calibration.outline.outline_result import SECTORS, Outline
 from phibench.calibration.rig.bundle import Bundle, calibrate
+from phibench.calibration.rig.from_dataset import BAD, DOUBTFUL, GOOD, verdict_of
 from phibench.calibration.rig.outline_picture import write_overlay
-from phibench.calibration.rig.verdict import BAD, DOUBTFUL, GOOD, verdict_of
 from phibench.estimator.geometry.rig_parameters import PARAMETERS, prior_sigmas
 from phibench.estimator.spots.image_planes import ImageError
 from phibench.scenes.frames import Pose

@@ -13,7 +13,7 @@ import trimesh
 from helpers.gltf_documents import SQUARE, UV, Gltf
 from helpers.mesh_files import area, normals, scene, write_glb, y_up
 
-from phibench.datasets.rooms.mesh_files import read_mesh
+from phibench.datasets.rooms.mesh_placement import read_mesh
 from phibench.datasets.rooms.room_files import RoomError
 
 CORNERS = np.array([[0, 1, 2], [0, 2, 3]])  # of the fan, each triangle's first corner last by the definition

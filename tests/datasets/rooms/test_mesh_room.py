@@ -25,8 +25,7 @@ from helpers.mesh_files import (
 from PIL import Image
 
 from phibench.datasets.rooms import mesh_room as mesh_room_module
-from phibench.datasets.rooms.mesh_files import read_mesh
-from phibench.datasets.rooms.mesh_placement import MeshLamp, MeshSettings, meets_box
+from phibench.datasets.rooms.mesh_placement import MeshLamp, MeshSettings, meets_box, read_mesh
 from phibench.datasets.rooms.mesh_room import mesh_room
 from phibench.render.optics.faces import FaceTable, face_table
 from phibench.scenes.room import Room

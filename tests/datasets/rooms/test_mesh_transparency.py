@@ -10,8 +10,8 @@ import pytest
 from helpers.gltf_documents import SQUARE, UV, Gltf
 from PIL import Image
 
-from phibench.datasets.rooms.mesh_files import read_mesh
 from phibench.datasets.rooms.mesh_parts import MeshPart, opacities
+from phibench.datasets.rooms.mesh_placement import read_mesh
 from phibench.datasets.rooms.room_files import RoomError
 
 
