@@ -28,8 +28,7 @@ from phibench.render.sensor.processing import eight_bit
 from phibench.render.sensor.srgb import srgb_encoded
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import POSITIONS, View
-from phibench.scenes.shapes import Cuboid, Mesh, Prism, Rectangle, Shape, faces
-from phibench.scenes.textures import Bitmap
+from phibench.scenes.shapes import Bitmap, Cuboid, Mesh, Prism, Rectangle, Shape, faces
 
 STEPS = {
     "x_m": 1e-3,

@@ -15,7 +15,8 @@ from phibench.render.room.ambient import render_ambient
 from phibench.render.room.light_map import BakeSettings
 from phibench.scenes.catalog import default_rig, lab
 from phibench.scenes.frames import Pose
-from phibench.scenes.revolved_mirror import RevolvedMirror, cone, hyperboloid, paraboloid
+from phibench.scenes.revolved_mirror import RevolvedMirror
+from phibench.scenes.revolved_profile import cone, hyperboloid, paraboloid
 
 _COARSE = BakeSettings(texel_m=0.25, lamp_rays=8, bounces=3, bounce_rays=16, final_rays=32)
 _WIDTH, _HEIGHT, _SQUARE = 640, 480, 470

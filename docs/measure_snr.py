@@ -9,8 +9,8 @@ Gaussian features of equal noise: the features weighted by mean over variance. I
 the mean deviation. Features are raw pixels, each pixel's own code, or the coefficients of a JPEG's blocks, those whose
 mean stands out by 3 standard errors. No model of the estimator's enters.
 
-Prints per preset the ratio of `limits.spot_snr` to d' (median, 5 and 95 % of scenes with a d' of 2 to 15), the rank
-correlation, and how many scenes one of the two puts below 5 and the other above 7.
+Prints per preset the ratio of the signal to noise of `limits.position_bound` to d' (median, 5 and 95 % of scenes with a
+d' of 2 to 15), the rank correlation, and how many scenes one of the two puts below 5 and the other above 7.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ from helpers.chain_scenes import COLLECTED, MIDDLE, ROOM, UNITS, scene
 
 from phibench.datasets.exposures.expected import expected_of_light
 from phibench.datasets.frames.sensor_card import card_of
+from phibench.estimator.limits.position_bound import processed_snr, raw_snr
 from phibench.estimator.limits.processed_bound import chain_limit
-from phibench.estimator.limits.spot_snr import processed_snr, raw_snr
 from phibench.estimator.spots.gaussian_spot import SpotBlur
 from phibench.render.sensor.camera_chain import Chain
 from phibench.render.sensor.light import Light

@@ -47,6 +47,7 @@ REFERENCE = {
         "phibench.scenes.camera",
         "phibench.scenes.mirror",
         "phibench.scenes.revolved_mirror",
+        "phibench.scenes.revolved_profile",
         "phibench.scenes.laser",
         "phibench.scenes.misalignment",
     ),

@@ -47,7 +47,8 @@ class ImageTruth:
     peak_e : float
         Largest expected electrons of a pixel, room included.
     snr : float
-        Signal to noise of the light in this image, after all processing, place and room known (`limits.spot_snr`).
+        Signal to noise of the light in this image, after all processing, with place and room known
+        (`limits.position_bound`).
     saturated : bool
         A pixel of the spot is expected above the sensor's saturation.
     bound_px2 : array, shape (2, 2), or None

@@ -10,8 +10,7 @@ from phibench.scenes.camera import Camera
 from phibench.scenes.frames import Vector, rotation_xyz
 from phibench.scenes.rig import Rig
 from phibench.scenes.room import Room
-from phibench.scenes.shapes import Cuboid, Rectangle, cuboid, rectangle
-from phibench.scenes.textures import Checker, Uniform
+from phibench.scenes.shapes import Checker, Cuboid, Rectangle, Uniform, cuboid, rectangle
 from phibench.scenes.validation import finite, positive
 
 # Inner faces of the lab, metres: about 10 x 9 x 3 with the stroke axis at the origin.

@@ -31,8 +31,7 @@ import numpy as np
 
 from phibench.scenes.frames import Array, Pose, as_matrix, as_vector
 from phibench.scenes.glass_tube import GlassTube
-from phibench.scenes.shapes import Cuboid, Prism
-from phibench.scenes.textures import Uniform
+from phibench.scenes.shapes import Cuboid, Prism, Uniform
 from phibench.scenes.validation import SceneError, finite, within
 
 HolderKind = Literal["rods", "post", "tube"]

@@ -5,7 +5,7 @@ sensitivities and studies use these names. `Motion` is what moves the whole rig 
 
 Conventions: world axes (z up; the robot's front is world +x); angles turn right-handed. The form's x, y, z are the
 world's at the down position, about the sphere centre; from there the form goes with the rig. That of a mirror of
-revolution lies in its own frame, and its harmonics are polynomials on the rim's disc (`scenes.revolved_mirror`). Of
+revolution lies in its own frame, and its harmonics are polynomials on the rim's disc (`scenes.revolved_profile`). Of
 several deviations at once: the sphere moves first, then the camera turns about its lens and leaves sphere and lens
 where they are. A recipe's `decentre`, `tilt` and `stroke_tilt` in `[rig]` mean the same as here. A mirror of revolution
 moves with its vertex, and turns about it: its tilt is its own, besides that of the camera.

@@ -17,8 +17,7 @@ import numpy as np
 
 from phibench.scenes.frames import Pose, Vector, as_matrix, as_vector, rotation_xyz
 from phibench.scenes.rig import RobotPose, View
-from phibench.scenes.shapes import Cuboid, Mesh, Prism, Rectangle, Shape, cuboid, shines
-from phibench.scenes.textures import Uniform
+from phibench.scenes.shapes import Cuboid, Mesh, Prism, Rectangle, Shape, Uniform, cuboid, shines
 from phibench.scenes.validation import SceneError, finite_vector, unit_vector, within
 
 # The robot.

@@ -30,7 +30,8 @@ from phibench.scenes.laser import beam_diameter_m
 from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.motion.drive import Drive, DriveLeg, placement
 from phibench.scenes.motion.vehicle import Vehicle
-from phibench.scenes.revolved_mirror import FormedProfile, RevolvedMirror, paraboloid
+from phibench.scenes.revolved_mirror import RevolvedMirror
+from phibench.scenes.revolved_profile import FormedProfile, paraboloid
 from phibench.scenes.rig import Rig
 
 PAGE = Path(__file__).resolve().parent.parent / "docs/implement.md"

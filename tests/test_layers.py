@@ -209,7 +209,7 @@ def graph_of(*edges: tuple[str, str]) -> grimp.ImportGraph:
         ("datasets.build.a", "phibench.estimator.geometry.phi", "may not import phibench.estimator"),
         ("estimator.spots.a", "phibench.render.optics.truth", "may not import phibench.render"),
         ("estimator.geometry.a", "phibench.estimator.spots.detect", "may not import phibench.estimator"),
-        ("estimator.limits.a", "phibench.estimator.methods.simple", "may not import phibench.estimator"),
+        ("estimator.limits.a", "phibench.estimator.methods.registry", "may not import phibench.estimator"),
         ("datasets.read", "mitsuba", "imports mitsuba outside"),
         ("studies.a", "drjit.llvm", "imports drjit outside"),
         ("scenes.a", "scenes.rig", "imports scenes, which is no package of ours"),

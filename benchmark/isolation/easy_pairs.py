@@ -25,8 +25,7 @@ from phibench.datasets.frames.sensor_card import SensorCard, sensor_card
 from phibench.estimator.geometry.mirror_image import image_of
 from phibench.estimator.geometry.phi import phi_incidence, phi_normal, phi_ray
 from phibench.estimator.interface import Box, Pair
-from phibench.estimator.limits.position_bound import spot_limit
-from phibench.estimator.limits.spot_snr import raw_snr
+from phibench.estimator.limits.position_bound import raw_snr, spot_limit
 from phibench.estimator.methods.locate import around, clipped
 from phibench.estimator.pair_set import ImageTruth, PairTruth
 from phibench.estimator.spots.camera_codes import tone_of, yuyv_image

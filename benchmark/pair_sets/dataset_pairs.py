@@ -30,9 +30,8 @@ from phibench.datasets.store.pair_files import LEAST_BOX_PX
 from phibench.datasets.store.provenance import provenance
 from phibench.estimator.interface import Pair
 from phibench.estimator.limits.off_frame_bound import on_off_limit, processed_on_off_limit
-from phibench.estimator.limits.position_bound import SpotLimit, spot_limit
+from phibench.estimator.limits.position_bound import SpotLimit, processed_snr, raw_snr, spot_limit
 from phibench.estimator.limits.processed_bound import chain_limit
-from phibench.estimator.limits.spot_snr import processed_snr, raw_snr
 from phibench.estimator.methods.draw_pairs import DrawnPairs
 from phibench.estimator.pair_set import Distraction, ImageTruth, PairTruth
 from phibench.estimator.spots.gaussian_spot import SpotBlur

@@ -8,7 +8,7 @@ edge          the spot's image is nearer than 3 blurs to the mirror's outline or
 confused      the answer is within `match_px` of another light, or its 4 x 4 pixels (two Bayer cells) are brighter than
               the spot's: in the image as it is, or less the laser-off image. A lamp that the laser-off image would have
               ruled out is still what the method was confused by
-below_noise   signal to noise (`limits.spot_snr`) below 5. The largest of 1280 x 720 Gaussian numbers is 4.9
+below_noise   signal to noise (`limits.position_bound`) below 5. The largest of 1280 x 720 Gaussian numbers is 4.9
               deviations on average: a fainter spot cannot be told from noise (A. Rose, J. Opt. Soc. Am. 38, 196,
               1948, has 5 for the eye)
 compression   the raw pixels are good enough (bound below 1 px along each axis), but the spot is lost in the 8-bit

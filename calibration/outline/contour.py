@@ -23,7 +23,7 @@ import scipy
 from phibench.calibration.outline.outline_fit import OutlinePixels, Place
 from phibench.scenes.frames import Array, BoolArray, as_vector
 from phibench.scenes.misalignment import Misalignment
-from phibench.scenes.revolved_mirror import rim_points
+from phibench.scenes.revolved_profile import rim_points
 from phibench.scenes.rig import Rig
 
 PLACES = 5

@@ -33,8 +33,7 @@ from phibench.render.setup.llvm_library import LlvmError, cache_root
 from phibench.render.setup.variant import renders_with
 from phibench.scenes.rig import View
 from phibench.scenes.room import Room
-from phibench.scenes.shapes import Rectangle, Shape
-from phibench.scenes.textures import Bitmap
+from phibench.scenes.shapes import Bitmap, Rectangle, Shape
 
 LIMIT_MB = 1000.0
 """Limit of a cache that was given none; a room of the default settings has 2 MB."""

@@ -28,7 +28,8 @@ from phibench.scenes.holder import LENGTHS, Holder, fitted
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.metals import ReflectanceTable
 from phibench.scenes.misalignment import Misalignment
-from phibench.scenes.revolved_mirror import Profile, RevolvedMirror, cone
+from phibench.scenes.revolved_mirror import RevolvedMirror
+from phibench.scenes.revolved_profile import Profile, cone
 from phibench.scenes.rig import Rig
 from phibench.scenes.room import Room
 from phibench.scenes.validation import Fault, SceneError

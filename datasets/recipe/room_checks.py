@@ -55,7 +55,7 @@ def _counts(rooms: RoomsTable) -> Iterator[Fault]:
 
 def _file_rooms(rooms: RoomsTable | None) -> Iterator[tuple[str, PanoramaTable | MeshTable]]:
     """Tables of panoramas and meshes, with their paths."""
-    for key in ROOM_LISTS:
+    for key in ("panoramas", "meshes"):  # rooms of other sources have no files
         for i, table in enumerate(getattr(rooms, key, ())):
             yield f"rooms.{key}[{i}]", table
 

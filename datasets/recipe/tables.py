@@ -453,9 +453,3 @@ class Recipe(Table):
     distractors: Annotated[tuple[DistractorTable, ...], Field(strict=False)] = Field(
         default=(), description="other lights that may be taken for the spot"
     )
-
-
-def recipe_schema() -> dict[str, Any]:
-    """JSON schema of a recipe, for editors that complete and check TOML."""
-    schema = Recipe.model_json_schema()
-    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema, "title": "phibench recipe"}

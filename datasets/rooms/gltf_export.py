@@ -20,8 +20,7 @@ from phibench.render.optics.faces import FaceTable, face_table
 from phibench.render.sensor.srgb import srgb_encoded
 from phibench.scenes.frames import Array, Vector
 from phibench.scenes.room import Room
-from phibench.scenes.shapes import Shape
-from phibench.scenes.textures import Bitmap, Checker, Texture, Uniform
+from phibench.scenes.shapes import Bitmap, Checker, Shape, Texture, Uniform
 
 _CELL = 64  # texels along a side of a checker's cell
 _MAGIC, _JSON, _BIN = 0x46546C67, 0x4E4F534A, 0x004E4942  # "glTF", "JSON" and "BIN" as numbers

@@ -32,8 +32,7 @@ from phibench.datasets.rooms.room_files import RoomError
 from phibench.render.sensor.srgb import srgb_decoded
 from phibench.scenes.frames import Array, Pose, as_matrix, as_vector
 from phibench.scenes.room import Room
-from phibench.scenes.shapes import Mesh, Rectangle, rectangle
-from phibench.scenes.textures import Bitmap, Texture, Uniform
+from phibench.scenes.shapes import Bitmap, Mesh, Rectangle, Texture, Uniform, rectangle
 
 MOST_VALUES = 16_000_000
 """Of all bitmaps of a room, four a texel."""

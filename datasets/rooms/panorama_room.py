@@ -30,8 +30,7 @@ from phibench.datasets.rooms.panorama_settings import CLEAR_M, PanoramaSettings
 from phibench.datasets.rooms.room_files import RoomError
 from phibench.scenes.frames import Array, Vector
 from phibench.scenes.room import Room
-from phibench.scenes.shapes import Rectangle, rectangle
-from phibench.scenes.textures import Bitmap
+from phibench.scenes.shapes import Bitmap, Rectangle, rectangle
 
 MEAN_IRRADIANCE_W_M2 = 1.0
 """Pi times the mean radiance of all directions, mean of the three bands, unless a scale is stated: about 300 lx."""

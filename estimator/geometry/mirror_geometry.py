@@ -22,7 +22,8 @@ from phibench.estimator.geometry.paper_depth import depth_paper, depth_revolved,
 from phibench.estimator.geometry.status import DepthEstimate
 from phibench.scenes.frames import Array, Pose
 from phibench.scenes.mirror import HARMONICS, Form, Level, Mirror, SphereMirror, gradients_by_parameter, level
-from phibench.scenes.revolved_mirror import FormedProfile, Heights, Profile, RevolvedMirror, height_level, lengthening
+from phibench.scenes.revolved_mirror import RevolvedMirror
+from phibench.scenes.revolved_profile import FormedProfile, Heights, Profile, height_level, lengthening
 from phibench.scenes.rig import Rig, View
 from phibench.scenes.validation import SceneError
 

@@ -25,7 +25,7 @@ from phibench.estimator.geometry.status import (
     stroke_status,
 )
 from phibench.scenes.frames import Array
-from phibench.scenes.revolved_mirror import Profile
+from phibench.scenes.revolved_profile import Profile
 
 # Sine of the disparity below which two rays count as parallel: the depth would be more than 1e8 strokes.
 PARALLEL_SINE = 1e-9

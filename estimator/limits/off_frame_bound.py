@@ -31,7 +31,13 @@ from scipy.linalg import cho_factor, cho_solve
 from phibench.datasets.exposures.expected import ExpectedRegion
 from phibench.datasets.exposures.pair_draws import FrameCounts
 from phibench.datasets.frames.sensor_card import SensorCard
-from phibench.estimator.limits.position_bound import SpotLimit, derivative_images, limit_of, raw_information
+from phibench.estimator.limits.position_bound import (
+    SpotLimit,
+    derivative_images,
+    limit_of,
+    raw_information,
+    without_room,
+)
 from phibench.estimator.limits.processed_bound import limit_window, spot_codes
 from phibench.estimator.processed.chain_model import (
     ChainModel,
@@ -69,20 +75,6 @@ def on_off_limit(
     on, off = (raw_information(mean, card, pattern_known=True) for mean in (region.mean_e, region.background_e))
     prnu = 0.0 if pattern_known else card.prnu
     return limit_of(derivative_images(region, "flux"), without_room(on, off, region.spot_e, frames, prnu))
-
-
-def without_room(on: Array, off: Array, spot_e: Array, frames: FrameCounts, prnu: float) -> Array:
-    """Information of pixels about the spot's light, electrons^-2, shape of `on`; the room is an unknown of each.
-
-    Parameters
-    ----------
-    on, off : information of one reading with and without the laser, pattern left out
-    spot_e : electrons of the spot
-    frames : FrameCounts
-    prnu : float, relative, unknown
-    """
-    with np.errstate(divide="ignore"):
-        return np.asarray(1.0 / (1.0 / (frames.on * on) + 1.0 / (frames.off * off) + (prnu * spot_e) ** 2))
 
 
 def processed_on_off_limit(

@@ -35,7 +35,7 @@ from phibench.scenes.frames import Array, BoolArray
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.rig import View
 from phibench.scenes.room import escalade360
-from phibench.scenes.textures import Bitmap, Checker, Texture
+from phibench.scenes.shapes import Bitmap, Checker, Texture
 
 Placement = tuple[Array, Array]
 """Rotation, shape (3, 3), and origin, shape (3,), of the rig's frame in the world."""

@@ -26,7 +26,7 @@ from phibench.render.optics.faces import FaceTable, IntArray
 from phibench.render.optics.room_tracer import RoomGeometry
 from phibench.scenes.frames import Array
 from phibench.scenes.laser import LaserSpot
-from phibench.scenes.textures import Bitmap, Checker
+from phibench.scenes.shapes import Bitmap, Checker
 
 BEAM_REACH_M = 0.25  # before and behind the spot's centre, along the beam
 

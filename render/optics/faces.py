@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phibench.scenes.frames import Array, Pose
-from phibench.scenes.shapes import Cuboid, Mesh, Prism, Rectangle, Shape, faces
-from phibench.scenes.textures import Bitmap, Checker, Texture
+from phibench.scenes.shapes import Bitmap, Checker, Cuboid, Mesh, Prism, Rectangle, Shape, Texture, faces
 
 IntArray = NDArray[np.int64]
 

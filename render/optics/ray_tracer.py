@@ -22,7 +22,8 @@ from phibench.render.optics.faces import IntArray
 from phibench.scenes.frames import Array
 from phibench.scenes.glass_tube import GlassTube
 from phibench.scenes.mirror import Form, Mirror, SphereMirror
-from phibench.scenes.revolved_mirror import FormedProfile, Profile, RevolvedMirror
+from phibench.scenes.revolved_mirror import RevolvedMirror
+from phibench.scenes.revolved_profile import FormedProfile, Profile
 from phibench.scenes.rig import View
 
 Radius = Callable[[Array], Array]

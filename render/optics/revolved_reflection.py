@@ -32,7 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phibench.scenes.frames import Array
-from phibench.scenes.revolved_mirror import FormedProfile, Profile
+from phibench.scenes.revolved_profile import FormedProfile, Profile
 
 _PLANE_STEPS = 80  # bisection alone would need 55; Newton takes 3 to 5
 _STEPS = 30  # 2 to 5 do

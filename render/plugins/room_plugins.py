@@ -21,8 +21,7 @@ from phibench.render.room.camera_plugin import MM_PER_M
 from phibench.scenes.frames import Array, Pose
 from phibench.scenes.rig import View
 from phibench.scenes.room import Room
-from phibench.scenes.shapes import Cuboid, Mesh, Rectangle, Shape
-from phibench.scenes.textures import Bitmap, Texture, Uniform
+from phibench.scenes.shapes import Bitmap, Cuboid, Mesh, Rectangle, Shape, Texture, Uniform
 
 BLACK = Rgb((0.0, 0.0, 0.0))
 

@@ -28,7 +28,7 @@ from phibench.scenes.frames import Array, Pose, Vector, as_matrix, as_vector
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.rig import View
 from phibench.scenes.room import Room
-from phibench.scenes.textures import Bitmap, Checker
+from phibench.scenes.shapes import Bitmap, Checker
 
 _SIGMAS = 5.0  # of a Gaussian: 4e-6 of its power lies beyond
 _TEXELS, _FINER = 96, 3  # along a side of a rectangle, and places along a side of a texel

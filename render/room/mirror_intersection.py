@@ -27,7 +27,8 @@ import numpy as np
 
 from phibench.render.room.camera_plugin import MM_PER_M
 from phibench.scenes.frames import Array
-from phibench.scenes.revolved_mirror import FormedProfile, Profile, RevolvedMirror, disc_polynomials
+from phibench.scenes.revolved_mirror import RevolvedMirror
+from phibench.scenes.revolved_profile import FormedProfile, Profile, disc_polynomials
 from phibench.scenes.rig import View
 
 Meeting = Callable[[Any, Any], tuple[Any, Any, Any]]

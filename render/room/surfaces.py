@@ -25,7 +25,7 @@ from phibench.render.room.camera_plugin import MM_PER_M
 from phibench.render.room.texel_grid import TexelGrid
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import View
-from phibench.scenes.textures import Bitmap, Checker, Texture
+from phibench.scenes.shapes import Bitmap, Checker, Texture
 
 _ALIGNMENT = 64  # bytes
 _ROW = 8  # groups of four numbers

@@ -15,7 +15,7 @@ log2(phases) bits more.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -461,16 +461,6 @@ class TargetTracker:
             f"target '{name}' was never seen in {self.frame + 1} frames: none of {self.lights} lights blinks by the "
             f"code {code.bits[:60]}; look longer, turn the robot, or expose longer"
         )
-
-
-def track_targets(
-    images: Iterable[NDArray[Any]], rig: Rig, card: SensorCard, times: FilmTimes, codes: Sequence[TargetCode]
-) -> TargetTracker:
-    """Tracker after all frames of a film; `TargetTracker` says more."""
-    tracker = TargetTracker(rig, card, times, codes)
-    for image in images:
-        tracker.add(image)
-    return tracker
 
 
 def _check(times: FilmTimes, codes: Sequence[TargetCode]) -> None:

@@ -15,8 +15,7 @@ import numpy as np
 
 from phibench.scenes.random_streams import Name, generator
 from phibench.scenes.room import Room, Sun
-from phibench.scenes.shapes import Rectangle, Shape
-from phibench.scenes.textures import Bitmap, Uniform
+from phibench.scenes.shapes import Bitmap, Rectangle, Shape, Uniform
 from phibench.scenes.validation import SceneError
 from phibench.scenes.worlds import fixtures, furniture, graphics, small_objects, standing_objects, tabletop
 from phibench.scenes.worlds.assembly import Assembly, AssemblyShape, Footprint, footprint_of, moved

@@ -26,7 +26,7 @@ import numpy as np
 
 from phibench.scenes.frames import Array, Vector
 from phibench.scenes.random_streams import Name, generator
-from phibench.scenes.textures import Bitmap, Texture, Uniform
+from phibench.scenes.shapes import Bitmap, Texture, Uniform
 from phibench.scenes.worlds import patterns
 from phibench.scenes.worlds.patterns import Draw, Shape2
 from phibench.scenes.worlds.properties import RoomProperties

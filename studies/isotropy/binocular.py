@@ -20,8 +20,7 @@ from phibench.render.sensor.settings import Sensor
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import Rig, View
 from phibench.scenes.room import carriage
-from phibench.scenes.shapes import Mesh, Shape
-from phibench.scenes.textures import Uniform
+from phibench.scenes.shapes import Mesh, Shape, Uniform
 from phibench.studies.findings import Finding
 from phibench.studies.isotropy.lines import moved
 from phibench.studies.isotropy.noise import fitted_px, flat_pair, sideways

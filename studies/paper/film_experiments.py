@@ -6,7 +6,7 @@ Every film then gives D in two ways, each for several cameras, whose fixed patte
 1. burst: frames at rest at both ends, every other one with the laser off, by the method that is closest to the bound
    (`method_for`), as for stills of so many frames;
 2. stroke: all frames of the film, by the joint bundle (`film_bundle`). Of processed images these are both bursts, and
-   the frames on the way one by one (`processed_film`).
+   the frames on the way one by one (`processed_positions`).
 
 Errors of one rig's calibration are common to all its rows. `closure_interval` draws errors that are as the budget says,
 that part common, and so tells how far rms over predicted may lie from 1.
@@ -36,8 +36,7 @@ from phibench.estimator.interface import Image, Pair
 from phibench.robot.film.film_bundle import FilmDepth, film_depth
 from phibench.robot.film.film_estimates import EqualLight, bundle_depth, equal_light, seen_film
 from phibench.robot.film.film_frames import film_frames, lit_frames
-from phibench.robot.film.film_positions import FilmPositions, joined
-from phibench.robot.film.processed_film import processed_positions
+from phibench.robot.film.film_positions import FilmPositions, joined, processed_positions
 from phibench.scenes.frames import Array
 from phibench.scenes.laser import Beam
 from phibench.scenes.random_streams import generator

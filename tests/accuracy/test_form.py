@@ -21,8 +21,7 @@ from phibench.scenes.mirror import HARMONICS, Form
 from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.rig import POSITIONS
 from phibench.scenes.room import Room
-from phibench.scenes.shapes import rectangle
-from phibench.scenes.textures import Uniform
+from phibench.scenes.shapes import Uniform, rectangle
 from phibench.scenes.validation import SceneError
 
 UNSEEN = ("no_reflection", "mirror_edge")

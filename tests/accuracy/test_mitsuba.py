@@ -28,8 +28,7 @@ from phibench.scenes.frames import Pose, rotation_xyz
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.rig import Rig, View
 from phibench.scenes.room import Room
-from phibench.scenes.shapes import cuboid, rectangle
-from phibench.scenes.textures import Checker, Uniform
+from phibench.scenes.shapes import Checker, Uniform, cuboid, rectangle
 
 SHARP = 0.05  # px; the least blur that Camera allows
 TILTED = Rig(

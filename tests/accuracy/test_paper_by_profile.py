@@ -14,7 +14,8 @@ from phibench.render.optics.truth import SpotTruth, spot_truth
 from phibench.scenes.catalog import default_rig
 from phibench.scenes.frames import Pose
 from phibench.scenes.laser import LaserSpot, beam_diameter_m
-from phibench.scenes.revolved_mirror import RevolvedMirror, sphere_cap
+from phibench.scenes.revolved_mirror import RevolvedMirror
+from phibench.scenes.revolved_profile import sphere_cap
 from phibench.scenes.rig import Rig
 
 ANGLES = ("phi_ray_rad", "phi_normal_rad", "phi_incidence_rad", "azimuth_rad")

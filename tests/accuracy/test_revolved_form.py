@@ -30,7 +30,8 @@ from phibench.scenes.laser import LaserSpot
 from phibench.scenes.mirror import HARMONICS, Form
 from phibench.scenes.misalignment import PARAMETERS as MISALIGNMENT
 from phibench.scenes.misalignment import Misalignment
-from phibench.scenes.revolved_mirror import FormedProfile, RevolvedMirror
+from phibench.scenes.revolved_mirror import RevolvedMirror
+from phibench.scenes.revolved_profile import FormedProfile
 from phibench.scenes.rig import Rig, View
 from phibench.scenes.validation import SceneError
 

@@ -13,7 +13,7 @@ from helpers.oracles import camera_at, project_cv2
 from scipy import optimize
 
 from phibench.scenes.mirror import HARMONICS, Form
-from phibench.scenes.revolved_mirror import FormedProfile
+from phibench.scenes.revolved_profile import FormedProfile
 from phibench.scenes.rig import Rig
 
 # magnitude of each polar factor's peak, from its derivative's zero

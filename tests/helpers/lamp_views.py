@@ -12,8 +12,7 @@ from phibench.render.optics.room_tracer import first_hit
 from phibench.scenes.camera import Camera
 from phibench.scenes.rig import View
 from phibench.scenes.room import Room
-from phibench.scenes.shapes import rectangle
-from phibench.scenes.textures import Uniform
+from phibench.scenes.shapes import Uniform, rectangle
 
 LAMP = rectangle(
     *("lamp", (1.5, 0.2, 0.7), (-1, 0, 0), (0.4, 0.4)),

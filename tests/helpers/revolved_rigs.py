@@ -7,7 +7,8 @@ import math
 
 from phibench.scenes.catalog import default_rig
 from phibench.scenes.frames import Pose, rotation_xyz
-from phibench.scenes.revolved_mirror import Profile, RevolvedMirror, cone, hyperboloid, paraboloid, sphere_cap
+from phibench.scenes.revolved_mirror import RevolvedMirror
+from phibench.scenes.revolved_profile import Profile, cone, hyperboloid, paraboloid, sphere_cap
 from phibench.scenes.rig import Rig
 
 VERTEX_M = 0.2

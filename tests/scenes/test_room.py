@@ -13,8 +13,7 @@ from phibench.scenes.catalog import RIGS, ROOMS, TargetBoard, dark, lab
 from phibench.scenes.frames import Pose, rotation_xyz
 from phibench.scenes.rig import Rig
 from phibench.scenes.room import Room, chassis, escalade360
-from phibench.scenes.shapes import Cuboid, Rectangle, cuboid, rectangle
-from phibench.scenes.textures import Bitmap, Checker, Uniform
+from phibench.scenes.shapes import Bitmap, Checker, Cuboid, Rectangle, Uniform, cuboid, rectangle
 from phibench.scenes.validation import SceneError
 
 NAN, INF = math.nan, math.inf

@@ -16,7 +16,7 @@ from phibench.scenes.laser import LaserSpot, beam_diameter_m
 from phibench.scenes.metals import METALS, STEEL
 from phibench.scenes.mirror import SphereMirror
 from phibench.scenes.rig import POSITIONS, Rig, Stroke
-from phibench.scenes.textures import Uniform
+from phibench.scenes.shapes import Uniform
 from phibench.scenes.validation import SceneError
 
 NAN, INF = math.nan, math.inf

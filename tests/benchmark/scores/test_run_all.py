@@ -59,7 +59,7 @@ def test_registered_methods_run_beside_built_in_ones(
     bench_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A package's method that is `detect` by another name has its scores, to the last bit."""
-    theirs = EntryPoint("theirs", "phibench.estimator.methods.simple:detected_spots", GROUP)
+    theirs = EntryPoint("theirs", "phibench.estimator.methods.registry:detected_spots", GROUP)
     monkeypatch.setattr(resolving, "entry_points", lambda group: [theirs])
     # all presets and the report's thirty figures are those of the test above
     monkeypatch.setattr(benching, "_presets", lambda _: ["bayer-raw", "mjpeg"])

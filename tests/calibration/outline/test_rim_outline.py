@@ -32,7 +32,8 @@ from phibench.render.sensor.noise_tiles import NoiseStream
 from phibench.render.sensor.settings import sensor
 from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.random_streams import generator
-from phibench.scenes.revolved_mirror import Profile, RevolvedMirror
+from phibench.scenes.revolved_mirror import RevolvedMirror
+from phibench.scenes.revolved_profile import Profile
 from phibench.scenes.rig import Rig
 
 GRAZED = Profile(0.06, 0.8, 0.0445)

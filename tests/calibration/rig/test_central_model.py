@@ -15,7 +15,8 @@ from helpers.central_model import (
 from helpers.oracles import true_pixel
 
 from phibench.scenes.frames import Pose
-from phibench.scenes.revolved_mirror import Profile, RevolvedMirror, hyperboloid, paraboloid
+from phibench.scenes.revolved_mirror import RevolvedMirror
+from phibench.scenes.revolved_profile import Profile, hyperboloid, paraboloid
 from phibench.scenes.rig import Rig
 
 RIG = Rig()

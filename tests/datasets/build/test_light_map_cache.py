@@ -20,8 +20,7 @@ from phibench.datasets.common.errors import DatasetError
 from phibench.render.room.light_map import BakeSettings, LightMap, texel_count
 from phibench.scenes.catalog import default_rig
 from phibench.scenes.room import Room, Sun
-from phibench.scenes.shapes import rectangle
-from phibench.scenes.textures import Bitmap
+from phibench.scenes.shapes import Bitmap, rectangle
 
 VIEW = default_rig().at(0.0)
 LAMP = dataclasses.replace(rectangle("lamp", (0, 0, 2), (0, 0, -1), (0.5, 0.5)), radiance_w_m2_sr=(1.0, 1.0, 0.5))

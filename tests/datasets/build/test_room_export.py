@@ -20,8 +20,7 @@ from phibench.render.optics.room_tracer import own_geometry
 from phibench.render.room.ambient import render_ambient
 from phibench.render.room.light_map import BakeSettings, bake
 from phibench.scenes.room import Room
-from phibench.scenes.shapes import rectangle
-from phibench.scenes.textures import Bitmap, Checker, Uniform
+from phibench.scenes.shapes import Bitmap, Checker, Uniform, rectangle
 
 BOX = (-2.4, 2.6, -2.0, 2.2, 2.7)
 POINT = (0.5, -0.4, 1.3)

@@ -25,8 +25,7 @@ from phibench.scenes.catalog import default_rig
 from phibench.scenes.frames import as_vector
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.room import Room, carriage
-from phibench.scenes.shapes import rectangle
-from phibench.scenes.textures import Uniform
+from phibench.scenes.shapes import Uniform, rectangle
 from phibench.scenes.validation import SceneError
 
 WORLDS = (Path(__file__).resolve().parents[2] / "tiny_worlds.toml").read_text(encoding="utf-8")

@@ -23,8 +23,7 @@ from phibench.scenes.catalog import default_rig
 from phibench.scenes.frames import Pose, rotation_xyz
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.room import Room
-from phibench.scenes.shapes import Cuboid, Mesh, Prism, Rectangle, Shape, rectangle
-from phibench.scenes.textures import Bitmap, Uniform
+from phibench.scenes.shapes import Bitmap, Cuboid, Mesh, Prism, Rectangle, Shape, Uniform, rectangle
 
 OWN, DISC = LaserTable(albedo="surface"), LaserTable()
 BLACK = Uniform((0.03, 0.03, 0.03))

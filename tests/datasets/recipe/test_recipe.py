@@ -10,7 +10,6 @@ from phibench.datasets.common.errors import RecipeError
 from phibench.datasets.recipe.build import build_rig, build_spot
 from phibench.datasets.recipe.checks import warnings
 from phibench.datasets.recipe.load import RECIPES, check_recipe, find_recipe, load_recipe, parse_recipe
-from phibench.datasets.recipe.tables import Recipe, recipe_schema
 from phibench.scenes.catalog import c310_rig, default_rig
 
 
@@ -179,10 +178,6 @@ def test_the_outline_of_a_rig_that_no_sample_has_is_no_warning(drawn: dict[str, 
 def test_a_board_that_nobody_uses_is_a_warning() -> None:
     [warning] = warnings(check_recipe(changed(targets=[target(), target(name="b", azimuth_deg=90.0)])))
     assert "b stand" in warning
-
-
-def test_the_schema_for_editors_knows_every_table() -> None:
-    assert set(recipe_schema()["properties"]) == set(Recipe.model_fields)
 
 
 @pytest.mark.parametrize(

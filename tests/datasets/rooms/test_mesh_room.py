@@ -29,8 +29,7 @@ from phibench.datasets.rooms.mesh_placement import MeshLamp, MeshSettings, meets
 from phibench.datasets.rooms.mesh_room import mesh_room
 from phibench.render.optics.faces import FaceTable, face_table
 from phibench.scenes.room import Room
-from phibench.scenes.shapes import Mesh
-from phibench.scenes.textures import Bitmap, Uniform
+from phibench.scenes.shapes import Bitmap, Mesh, Uniform
 from phibench.scenes.validation import SceneError
 
 LAMP = MeshLamp((0.0, 0.0, 2.7), (0.0, 0.0, -1.0), (1.2, 0.6))

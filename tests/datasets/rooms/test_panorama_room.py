@@ -18,7 +18,7 @@ from phibench.datasets.rooms.panorama_room import MEAN_IRRADIANCE_W_M2, panorama
 from phibench.datasets.rooms.panorama_settings import PanoramaSettings
 from phibench.render.optics.faces import face_table
 from phibench.scenes.room import Room
-from phibench.scenes.textures import Bitmap
+from phibench.scenes.shapes import Bitmap
 from phibench.scenes.validation import SceneError
 
 BOX = (-3.0, 2.5, -2.0, 2.4, 2.7)

@@ -26,7 +26,7 @@ from phibench.scenes.holder import fitted
 from phibench.scenes.mirror import OF_REVOLVED
 from phibench.scenes.misalignment import PARAMETERS as MISALIGNMENT
 from phibench.scenes.misalignment import Misalignment
-from phibench.scenes.revolved_mirror import cone, sphere_cap
+from phibench.scenes.revolved_profile import cone, sphere_cap
 from phibench.scenes.rig import Rig, View
 
 STROKE_M = 0.4

@@ -10,8 +10,8 @@ from scipy.special import ndtr
 
 from phibench.datasets.exposures.expected import ExpectedRegion
 from phibench.datasets.frames.sensor_card import SensorCard, sensor_card
+from phibench.estimator.limits.position_bound import processed_snr, raw_snr
 from phibench.estimator.limits.processed_bound import chain_limit
-from phibench.estimator.limits.spot_snr import processed_snr, raw_snr
 from phibench.estimator.spots.gaussian_spot import SpotBlur
 
 SIDE, CENTRE = 16, (7.3, 7.8)

@@ -23,7 +23,7 @@ from phibench.estimator.interface import Box, Pair
 from phibench.estimator.limits.position_bound import spot_limit
 from phibench.estimator.methods.locate import box_around, locate
 from phibench.estimator.methods.raw_likelihood import joint_fit
-from phibench.estimator.methods.simple import detected_spots
+from phibench.estimator.methods.registry import detected_spots
 from phibench.estimator.spots.candidates import Candidates, candidates_at, lattice
 from phibench.estimator.spots.detect import (
     PROCESSED,

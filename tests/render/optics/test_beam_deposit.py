@@ -20,8 +20,7 @@ from phibench.scenes.catalog import default_rig
 from phibench.scenes.frames import Pose, rotation_xyz
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.rig import View
-from phibench.scenes.shapes import Cuboid, Mesh, Prism, Rectangle, Shape, rectangle
-from phibench.scenes.textures import Bitmap, Checker, Uniform
+from phibench.scenes.shapes import Bitmap, Checker, Cuboid, Mesh, Prism, Rectangle, Shape, Uniform, rectangle
 from phibench.scenes.validation import SceneError
 
 VIEW = default_rig().at(0.2)

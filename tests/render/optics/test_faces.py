@@ -12,8 +12,7 @@ from phibench.render.optics.faces import FaceTable, face_table
 from phibench.scenes.catalog import lab
 from phibench.scenes.frames import Pose, rotation_xyz
 from phibench.scenes.rig import Rig
-from phibench.scenes.shapes import Cuboid, Mesh, Prism, faces, rectangle
-from phibench.scenes.textures import Bitmap, Checker, Uniform
+from phibench.scenes.shapes import Bitmap, Checker, Cuboid, Mesh, Prism, Uniform, faces, rectangle
 from phibench.scenes.validation import SceneError
 
 TURNED = Pose("world", "shape", (0.3, -0.2, 1.1), rotation_xyz(0.4, -0.7, 1.9))

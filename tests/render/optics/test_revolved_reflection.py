@@ -24,7 +24,8 @@ from phibench.render.optics.reflection_point import bundle_spread, mirror_points
 from phibench.render.optics.revolved_reflection import revolved_points
 from phibench.scenes.frames import Array, Pose
 from phibench.scenes.mirror import Form, SphereMirror
-from phibench.scenes.revolved_mirror import Profile, RevolvedMirror, cone, hyperboloid, paraboloid, sphere_cap
+from phibench.scenes.revolved_mirror import RevolvedMirror
+from phibench.scenes.revolved_profile import Profile, cone, hyperboloid, paraboloid, sphere_cap
 from phibench.scenes.rig import Rig, View
 
 QUADRICS = [name for name, profile in PROFILES.items() if profile.is_quadric]

@@ -16,8 +16,7 @@ from phibench.render.optics.truth import truth_layer
 from phibench.scenes.catalog import default_rig, lab
 from phibench.scenes.frames import Pose, rotation_xyz
 from phibench.scenes.room import Room
-from phibench.scenes.shapes import Cuboid, Mesh, Prism, Shape, rectangle
-from phibench.scenes.textures import Uniform
+from phibench.scenes.shapes import Cuboid, Mesh, Prism, Shape, Uniform, rectangle
 
 VIEW = default_rig().at(0.3)
 

@@ -18,8 +18,7 @@ from phibench.scenes.catalog import default_rig, lab
 from phibench.scenes.frames import Pose, rotation_xyz
 from phibench.scenes.rig import Rig
 from phibench.scenes.room import Room
-from phibench.scenes.shapes import Mesh, Prism, cuboid, faces, rectangle
-from phibench.scenes.textures import Uniform
+from phibench.scenes.shapes import Mesh, Prism, Uniform, cuboid, faces, rectangle
 
 ROOM, RIG = lab(TARGETS), default_rig()
 SETTINGS = BakeSettings(lamp_rays=32, bounce_rays=16, final_rays=256)

@@ -13,8 +13,7 @@ from phibench.render.room.texel_grid import TexelGrid
 from phibench.render.room.texel_points import Texels
 from phibench.render.setup.variant import activate
 from phibench.scenes.catalog import default_rig
-from phibench.scenes.shapes import rectangle
-from phibench.scenes.textures import Uniform
+from phibench.scenes.shapes import Uniform, rectangle
 
 VIEW = default_rig().at(0.0)
 HIGH_M, SPOT_M, ALBEDO, LIGHT = 2.0, 0.4, 0.5, 100.0

@@ -41,8 +41,7 @@ from phibench.render.room.subpixel_grid import (
 from phibench.render.setup.variant import activate
 from phibench.scenes.catalog import default_rig, lab
 from phibench.scenes.laser import LaserSpot, beam_diameter_m
-from phibench.scenes.shapes import rectangle
-from phibench.scenes.textures import Uniform
+from phibench.scenes.shapes import Uniform, rectangle
 
 ROOM, RIG = lab(TARGETS), default_rig()
 SETTINGS = BakeSettings(lamp_rays=16, bounces=4, bounce_rays=16, final_rays=64)

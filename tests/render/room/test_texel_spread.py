@@ -11,8 +11,7 @@ from phibench.render.room.texel_grid import TexelGrid
 from phibench.render.room.texel_points import Texels, spread_out
 from phibench.render.setup.variant import activate
 from phibench.scenes.catalog import default_rig
-from phibench.scenes.shapes import Mesh, Shape, cuboid, rectangle
-from phibench.scenes.textures import Uniform
+from phibench.scenes.shapes import Mesh, Shape, Uniform, cuboid, rectangle
 
 VIEW = default_rig().at(0.0)
 TEXEL_M, LAMP_M, HIGH_M, EDGE_M, EDGE_X_M = 0.25, 0.4, 2.0, 0.3, 0.06

@@ -20,8 +20,7 @@ from phibench.scenes.catalog import default_rig
 from phibench.scenes.frames import Pose, rotation_xyz
 from phibench.scenes.holder import fitted
 from phibench.scenes.room import Room, Sun
-from phibench.scenes.shapes import Mesh, Prism, cuboid, rectangle
-from phibench.scenes.textures import Bitmap, Uniform
+from phibench.scenes.shapes import Bitmap, Mesh, Prism, Uniform, cuboid, rectangle
 
 RIG = default_rig()
 VIEW = RIG.at(0.3)

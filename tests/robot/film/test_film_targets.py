@@ -2,7 +2,7 @@
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,10 +13,11 @@ import scipy
 from conftest import ROOT
 from helpers.simple_targets import ColourIdentity, NearestBlob
 from helpers.target_films import CODE, Outcome, RenderedRoom, StagedFilm, rendered_rooms, staged, swept
+from numpy.typing import NDArray
 
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.film.film_read import open_films
-from phibench.datasets.frames.sensor_card import card_of
+from phibench.datasets.frames.sensor_card import SensorCard, card_of
 from phibench.estimator.interface import Box
 from phibench.render.sensor.light import Region
 from phibench.render.sensor.settings import sensor
@@ -29,7 +30,6 @@ from phibench.robot.film.blink_identity import (
     _by_chance,
     _likelihood,
     evidence,
-    track_targets,
 )
 from phibench.robot.film.film_estimates import found_rows, track_film, tracked_positions
 from phibench.robot.film.spot_tracks import FrameSearch, FrameSpots, SpotTrack, _assigned, _motion
@@ -45,6 +45,15 @@ from phibench.scenes.validation import SceneError
 BIT_S = 1 / 30
 FILMS = range(400, 475)  # development looked at films below 375 of the same rooms
 TIMES = FilmTimes(15, 30.0, 1 / 60, 0.030, 720)
+
+
+def track_targets(
+    images: Iterable[NDArray[Any]], rig: Rig, card: SensorCard, times: FilmTimes, codes: Sequence[TargetCode]
+) -> TargetTracker:
+    tracker = TargetTracker(rig, card, times, codes)
+    for image in images:
+        tracker.add(image)
+    return tracker
 
 
 @pytest.mark.parametrize("bit_s", [1 / 30, 0.01, 0.21])

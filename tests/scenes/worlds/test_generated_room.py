@@ -14,8 +14,7 @@ import pytest
 from phibench.datasets.recipe.build import ceiling_m
 from phibench.render.optics.faces import FaceTable, face_table
 from phibench.scenes.room import Room, chassis
-from phibench.scenes.shapes import Cuboid, Mesh, Prism, Rectangle, cuboid
-from phibench.scenes.textures import Bitmap
+from phibench.scenes.shapes import Bitmap, Cuboid, Mesh, Prism, Rectangle, cuboid
 from phibench.scenes.worlds.floor_plan import FREE_DISC_HEIGHT_M, FREE_DISC_M, FREE_RADIUS_M, floor_plan
 from phibench.scenes.worlds.generated_room import MOST_LIGHTS, MOST_PATCHES, generate_room
 from phibench.scenes.worlds.properties import PROPERTIES, RoomProperties, drawn_properties

@@ -7,7 +7,7 @@ import inspect
 import numpy as np
 import pytest
 
-from phibench.scenes.textures import Bitmap
+from phibench.scenes.shapes import Bitmap
 from phibench.scenes.worlds import graphics, patterns
 from phibench.scenes.worlds.materials import MATERIALS, MaterialSet
 from phibench.scenes.worlds.properties import drawn_properties
