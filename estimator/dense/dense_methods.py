@@ -1,0 +1,87 @@
+"""Built-in dense methods, by name. To add one, add an entry to `_ALL`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib.util import find_spec
+
+from phibench.estimator.dense.dense_interface import DenseAnswer, DenseMethod, DensePair
+from phibench.estimator.dense.panorama_matchers import dense_flow, dense_sgbm, dense_sgbm_exact, dense_sift
+from phibench.estimator.dense.sweep import dense_sweep
+from phibench.estimator.spots.image_planes import KINDS, kind_of
+
+
+@dataclass(frozen=True)
+class DenseBuiltIn:
+    """One built-in dense method; call it like any method.
+
+    Parameters
+    ----------
+    name : str
+    function : DenseMethod
+    description : str
+        One line.
+    source : str
+        Where the idea comes from.
+    accepts : tuple of str
+        Kinds of images, of `image_planes.KINDS`.
+    """
+
+    name: str
+    function: DenseMethod
+    description: str
+    source: str
+    accepts: tuple[str, ...] = KINDS
+
+    @property
+    def installed(self) -> bool:
+        """OpenCV can be imported."""
+        return find_spec("cv2") is not None
+
+    def refusal(self, pair: DensePair) -> str:
+        """Reason that this pair cannot be taken; "" if it can."""
+        if not self.installed:
+            return "install OpenCV: pip install 'phibench[dense]'"
+        kind = kind_of(pair.card)
+        return "" if kind in self.accepts else f"takes {', '.join(self.accepts)}, not {kind}"
+
+    def __call__(self, pair: DensePair) -> DenseAnswer:
+        """Answer for the pair."""
+        return self.function(pair)
+
+
+_ALL = (
+    DenseBuiltIn(
+        "dense_sgbm",
+        dense_sgbm,
+        "semi-global block matching on panoramas, central model: the published way",
+        "H. Hirschmueller, IEEE Trans. PAMI 30, 328 (2008); cv2.StereoSGBM",
+    ),
+    DenseBuiltIn(
+        "dense_sgbm_exact",
+        dense_sgbm_exact,
+        "the same matches, D by the rig's own rays",
+        "cv2.StereoSGBM; midpoint of both rays",
+    ),
+    DenseBuiltIn(
+        "dense_flow",
+        dense_flow,
+        "dense flow between panoramas, D by the rig's own rays",
+        "T. Kroeger and others, ECCV (2016); cv2.DISOpticalFlow",
+    ),
+    DenseBuiltIn(
+        "dense_sift",
+        dense_sift,
+        "sparse features of both panoramas, D by the rig's own rays",
+        "D. G. Lowe, Int. J. Computer Vision 60, 91 (2004); cv2.SIFT",
+    ),
+    DenseBuiltIn(
+        "dense_sweep",
+        dense_sweep,
+        "sweep over inverse distance by the rig's own rays, then planes fitted to both images",
+        "R. T. Collins, CVPR (1996); B. D. Lucas and T. Kanade, IJCAI (1981)",
+    ),
+)
+
+DENSE_METHODS: dict[str, DenseBuiltIn] = {method.name: method for method in _ALL}
+"""All of them, also where OpenCV is missing: `refusal` says so."""

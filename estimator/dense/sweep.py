@@ -1,0 +1,255 @@
+"""Sweep over inverse distance through the exact geometry of the rig, and a fit of planes to the images.
+
+1. Cost: for each 1 / D the up image is fetched at the place where each grid point of the down panorama would be seen.
+   The map is exact, so that it holds for misaligned rigs and needs no epipolar lines (R. T. Collins, CVPR 1996).
+2. Aggregation: semi-global matching in four directions (H. Hirschmueller, IEEE Trans. PAMI 30, 328, 2008).
+3. Fit: the pixels' differences a - b, and their slopes by 1 / D, are fitted by planes of the room. On a plane 1 / D is
+   a combination of cos(azimuth), sin(azimuth) and tan(elevation). So windows may be large, and slanted surfaces have
+   no stairs. A window grows while the larger one agrees with the smaller.
+
+The claimed sigma is that of the fit, by the residuals in its window.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phibench.estimator.dense.dense_interface import DenseAnswer, DensePair
+from phibench.estimator.dense.panorama_matchers import opencv
+from phibench.estimator.dense.smooth_maps import PanoramaMaps
+from phibench.estimator.dense.unrolled_pair import FARTHEST_M, NEAREST_M, WIDTH_PX, Float32, UnrolledPair, at_places
+from phibench.estimator.geometry.reflection import room_rays
+from phibench.scenes.frames import Array, BoolArray
+
+Costs = NDArray[np.int16]
+_LEVEL_PX = 1.0  # by which the up image's place moves between two levels, for nine pixels of ten
+_LEVELS = (16, 144)
+_COST_WINDOW = (5, 5)
+_CUT_CODES = 12.0  # of a difference of luma or of its slope: behind an edge of depth they say nothing more
+_SCALE = 20  # of costs, that they are whole numbers
+_SMALL_JUMP, _LARGE_JUMP = 200, 2400  # costs of a change by one level and by more
+_WINDOWS_RAD = (0.137, 0.268)  # of the planes: 21 and 41 px of the default panorama
+_LEAST_WINDOW_PX = 9
+_ROUNDS = 3
+_AGREE = 3.0  # deviations by which a larger window may differ
+_LEAST_NOISE = 1.5  # codes, of a difference: what JPEG leaves
+_OFFSET = 0.5  # codes, between both images: gloss, and a JPEG's rounding of what is smooth
+_UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+_CLAIM = 2.0  # noise of neighbours is not independent: measured on the lab's samples (docs/dense.md)
+_WORST_CLAIM = 0.2  # relative sigma from which on there is no answer
+_MOVED = 3.0  # levels by which the fit may leave the sweep's minimum
+_HIDDEN = 1.05  # a point is hidden where another one, so much nearer, is seen at its place in the up image
+_STILL = 0.5  # share of the fit's residual below which "the same pixel" is the better match: robot and holder
+
+
+def dense_sweep(pair: DensePair, width_px: int = WIDTH_PX) -> DenseAnswer:
+    """Sweep over inverse distance and fit of planes, by the rays of the rig."""
+    opencv()
+    unrolled = UnrolledPair.of(pair, width_px)
+    levels = inverse_levels(unrolled.maps)
+    start = least(aggregated(costs(unrolled, levels)), levels)
+    fit = fitted(unrolled, start, float(levels[1] - levels[0]))
+    good = unrolled.seen & (np.abs(fit.inverse - start) < _MOVED * (levels[1] - levels[0]))
+    good &= ~_stands_still(unrolled, fit) & ~hidden(unrolled.maps, fit.inverse)
+    sigma = _CLAIM * fit.sigma
+    good &= sigma < _WORST_CLAIM * fit.inverse
+    return unrolled.answer(np.where(good, fit.inverse, np.nan), np.where(good, sigma, np.nan))
+
+
+# -- sweep -------------------------------------------------------------------------------------------------------------
+
+
+def inverse_levels(maps: PanoramaMaps) -> Array:
+    """Even steps of 1 / D, 1 / m, between the farthest and the nearest answer."""
+    low, high = 1.0 / FARTHEST_M, 1.0 / NEAREST_M
+    middle, step = 0.5 * (low + high), 1e-3
+    speed = np.linalg.norm(maps.up_px(middle + step) - maps.up_px(middle - step), axis=-1) / (2.0 * step)
+    count = (high - low) * float(np.percentile(speed, 90.0)) / _LEVEL_PX
+    return np.linspace(low, high, int(np.clip(count, *_LEVELS)))
+
+
+def costs(unrolled: UnrolledPair, levels: Array) -> Costs:
+    """Cost of each level, shape (H, levels, W): differences of luma and of its slope along the elevation, cut."""
+    cv2 = opencv()
+
+    def slope(image: Float32) -> Float32:
+        return np.asarray(cv2.Sobel(image, cv2.CV_32F, 0, 1, ksize=3, scale=0.25))
+
+    down, up = unrolled.down, unrolled.up_image
+    down_slope = slope(down)
+    result = np.empty((down.shape[0], len(levels), down.shape[1]), np.int16)
+    for k, level in enumerate(levels):
+        there = cv2.remap(up, unrolled.maps.up_px(float(level)).astype(np.float32), None, cv2.INTER_LINEAR)
+        cost = cv2.min(cv2.absdiff(down, there), _CUT_CODES)
+        cost += cv2.min(cv2.absdiff(down_slope, slope(there)), _CUT_CODES)
+        result[:, k] = cv2.boxFilter(cost, -1, _COST_WINDOW) * _SCALE
+    return result
+
+
+def aggregated(cost: Costs) -> Costs:
+    """Sum over four directions of the least cost of the paths to each pixel, shape (H, levels, W)."""
+    total = np.zeros_like(cost)
+    _along(cost, total)
+    _along(cost[::-1], total[::-1])
+    turned = np.ascontiguousarray(cost.transpose(2, 1, 0))
+    across = np.zeros_like(turned)
+    _along(turned, across)
+    _along(turned[::-1], across[::-1])
+    total += across.transpose(2, 1, 0)
+    return total
+
+
+def _along(cost: Costs, total: Costs) -> None:
+    """Add the least costs of the paths along the first axis to a sum."""
+    path = cost[0].copy()
+    total[0] += path
+    for k in range(1, len(cost)):
+        lowest = path.min(axis=0)
+        best = np.minimum(path, lowest + np.int16(_LARGE_JUMP))
+        np.minimum(best[1:], path[:-1] + np.int16(_SMALL_JUMP), out=best[1:])
+        np.minimum(best[:-1], path[1:] + np.int16(_SMALL_JUMP), out=best[:-1])
+        path = best - lowest + cost[k]
+        total[k] += path
+
+
+def least(total: Costs, levels: Array) -> Array:
+    """1 / D of the least sum, shape (H, W), between levels by a parabola, and without lone pixels."""
+    k = np.clip(total.argmin(axis=1), 1, len(levels) - 2)
+    before, here, after = (
+        np.take_along_axis(total, (k + step)[:, None], axis=1)[:, 0].astype(float) for step in (-1, 0, 1)
+    )
+    bend = before - 2.0 * here + after
+    offset = np.where(bend > 0.0, 0.5 * (before - after) / np.maximum(bend, 1e-9), 0.0)
+    found = levels[k] + np.clip(offset, -1.0, 1.0) * (levels[1] - levels[0])
+    return np.asarray(opencv().medianBlur(found.astype(np.float32), 5), float)
+
+
+# -- fit of planes -----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class PlaneFit:
+    """Planes around each grid point, arrays of shape (H, W).
+
+    Attributes
+    ----------
+    inverse, sigma : 1 / D and its standard deviation, 1 / m
+    variance : of the differences around the plane, codes squared
+    """
+
+    inverse: Array
+    sigma: Array
+    variance: Array
+
+    def or_larger(self, larger: PlaneFit, allowed: BoolArray) -> tuple[PlaneFit, BoolArray]:
+        """Take the larger window's fit where it is allowed and agrees; and where it was taken."""
+        apart = np.abs(larger.inverse - self.inverse)
+        agrees = allowed & (apart < _AGREE * np.hypot(self.sigma, larger.sigma))
+        agrees &= larger.variance < 1.5 * self.variance + 0.5 * _LEAST_NOISE**2
+        pairs = zip(
+            (larger.inverse, larger.sigma, larger.variance), (self.inverse, self.sigma, self.variance), strict=True
+        )
+        return PlaneFit(*(np.where(agrees, new, old) for new, old in pairs)), agrees
+
+
+def fitted(unrolled: UnrolledPair, start: Array, step: float) -> PlaneFit:
+    """Planes that explain the differences between both images best, from a start; `step` is a level of 1 / D."""
+    inverse, windows = start, windows_px(unrolled.maps)
+    for _ in range(_ROUNDS):
+        there, slope = seen_at(unrolled, inverse, step)
+        difference = unrolled.down.astype(float) - there
+        fit = _planes(unrolled.maps, inverse, difference, slope, windows[0], step)
+        larger_may = np.ones(inverse.shape, bool)
+        for window in windows[1:]:
+            larger = _planes(unrolled.maps, inverse, difference, slope, window, step)
+            fit, larger_may = fit.or_larger(larger, larger_may)
+        moved = inverse + np.clip(fit.inverse - inverse, -1.5 * step, 1.5 * step)
+        inverse = np.clip(moved, 1e-3, 1.0 / unrolled.maps.nearest_m)
+    return PlaneFit(inverse, fit.sigma, fit.variance)
+
+
+def windows_px(maps: PanoramaMaps) -> tuple[int, ...]:
+    """Sides of the windows, odd numbers of pixels."""
+    return tuple(max(2 * int(angle / maps.grid.step_rad / 2.0) + 1, _LEAST_WINDOW_PX) for angle in _WINDOWS_RAD)
+
+
+def seen_at(unrolled: UnrolledPair, inverse: Array, step: float) -> tuple[Array, Array]:
+    """Codes of the up image where points at a 1 / D are seen, and their slope by 1 / D, shape (H, W) each.
+
+    The slope is a central difference over a pixel along the epipolar curve.
+    """
+    near, far = (unrolled.maps.up_px_of(inverse + side * step / 8.0) for side in (1.0, -1.0))
+    along = (near - far) / (step / 4.0)
+    speed = np.linalg.norm(along, axis=-1)
+    half = 0.5 * along / np.maximum(speed, 1e-9)[..., None]
+    middle = 0.5 * (near + far)
+    before, here, after = (at_places(unrolled.up_spline, middle + k * half).astype(float) for k in (-1, 0, 1))
+    return here, (after - before) * speed
+
+
+def _planes(maps: PanoramaMaps, inverse: Array, difference: Array, slope: Array, window: int, step: float) -> PlaneFit:
+    """Least squares of difference + slope (inverse - plane) over windows around each grid point.
+
+    Each window has an offset of its own, known to `_OFFSET`, which elimination takes out. A weak pull to the start, as
+    of one measurement with the sigma of a level, keeps windows without texture in place.
+    """
+    cv2 = opencv()
+    azimuth, elevation = maps.grid.azimuths_rad[None, :], maps.grid.elevations_rad[:, None]
+    basis = np.broadcast_arrays(np.cos(azimuth), np.sin(azimuth), np.tan(elevation))
+
+    def mean(values: Array) -> Array:
+        return np.asarray(cv2.boxFilter(values, cv2.CV_64F, (window, window)))
+
+    pull = (_LEAST_NOISE / window / step) ** 2
+    weight = slope**2 + pull
+    told = slope * (difference + slope * inverse) + pull * inverse
+    seen = difference + slope * inverse
+    free = 1.0 / (1.0 + (_LEAST_NOISE / window / _OFFSET) ** 2)
+    beside = [mean(slope * each) for each in basis]
+    level = mean(seen)
+    product = [mean(weight * basis[i] * basis[j]) - free * beside[i] * beside[j] for i, j in _UPPER]
+    right = [mean(told * each) - free * with_offset * level for each, with_offset in zip(basis, beside, strict=True)]
+    inverted = _inverse3(*product)
+    plane = [sum(map(np.multiply, row, right)) for row in inverted]
+    left = mean(seen**2 + pull * inverse**2) - free * level**2 - sum(map(np.multiply, plane, right))
+    variance = np.maximum(left, _LEAST_NOISE**2)
+    spread = sum(x * sum(map(np.multiply, row, basis)) for x, row in zip(basis, inverted, strict=True)) / window**2
+    sigma = np.sqrt(np.maximum(spread, 0.0) * variance)
+    return PlaneFit(np.asarray(sum(map(np.multiply, plane, basis))), sigma, variance)
+
+
+def _inverse3(a: Array, b: Array, c: Array, d: Array, e: Array, f: Array) -> list[tuple[Array, Array, Array]]:
+    """Rows of the inverses of symmetric matrices ((a, b, c), (b, d, e), (c, e, f)), by cofactors."""
+    A, B, C = d * f - e * e, c * e - b * f, b * e - c * d
+    det = a * A + b * B + c * C
+    D, E, F = a * f - c * c, b * c - a * e, a * d - b * b
+    A, B, C, D, E, F = (each / det for each in (A, B, C, D, E, F))
+    return [(A, B, C), (B, D, E), (C, E, F)]
+
+
+# -- what is no match --------------------------------------------------------------------------------------------------
+
+
+def hidden(maps: PanoramaMaps, inverse: Array) -> BoolArray:
+    """Mask of the grid points whose place in the up image shows another point, nearer to it, shape (H, W)."""
+    up = maps.up_px_of(np.clip(inverse, 1e-3, 1.0 / maps.nearest_m))
+    place = maps.grid.place(room_rays(maps.rig.at(maps.stroke_m), up).direction_world)
+    height, width = inverse.shape
+    with np.errstate(invalid="ignore"):
+        row, column = np.rint(np.nan_to_num(place[..., 1], nan=-1.0)), np.rint(np.nan_to_num(place[..., 0]))
+    inside = (row >= 0) & (row < height)
+    cell = np.clip(row, 0, height - 1).astype(np.intp) * width + column.astype(np.intp) % width
+    nearest = np.zeros(height * width)
+    np.maximum.at(nearest, cell[inside], inverse[inside])
+    return np.asarray(inside & (nearest[cell] > _HIDDEN * inverse))
+
+
+def _stands_still(unrolled: UnrolledPair, fit: PlaneFit) -> BoolArray:
+    """Mask of what moves with the camera: the up image shows it at the very same pixel, and better than the fit."""
+    same = at_places(unrolled.up_spline, unrolled.maps.down_px).astype(float)
+    window = windows_px(unrolled.maps)[0]
+    variance = opencv().boxFilter((unrolled.down - same) ** 2, -1, (window, window))
+    return np.asarray(variance < _STILL * fit.variance)
