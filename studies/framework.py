@@ -1,33 +1,189 @@
-"""Frame of the studies: data sets, drawings, the result, and the settings in a TOML file.
+"""Frame of the studies: findings, tables of text, data sets, drawings, the result, and settings in a TOML file.
 
 A study is a question, settings, and a function from settings and data sets to a result. Data sets are rendered from
 recipes, kept between runs and shared between studies. The top level of `settings.toml` is the full study; its table
 `[quick]` holds what the reduced one changes. Drawings are SVG, or PNG where there are many marks.
+
+A finding is a number that a study states: label, value, the ends of its 95 % interval, unit. Where a statement hangs on
+the number there is a threshold, and a verdict. The terminal, Markdown and the HTML report show the same cells.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Generic, Literal, TypeVar
 
+import numpy as np
 import polars as pl
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, Field
 from rich.console import Console
 
 from phibench.benchmark.reports import figures
 from phibench.benchmark.reports.figures import EmbeddedFigure
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import SETTINGS_BYTES, InputFile
+from phibench.datasets.common.parallel import parallel_map
+from phibench.datasets.common.progress import Steps
+from phibench.datasets.common.shown_text import table_lines
 from phibench.datasets.read import Dataset, open_finished
 from phibench.datasets.recipe.load import find_recipe
+from phibench.scenes.frames import Array
 from phibench.scenes.validation import structural_faults
-from phibench.studies.findings import Finding, Row
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+T = TypeVar("T")
+U = TypeVar("U")
+
+# -- findings ----------------------------------------------------------------------------------------------------------
+
+Row = tuple[str, ...]
+Ends = tuple[float, float, float]
+"""Value, and the ends of its interval."""
+Relation = Literal["", "<=", ">=", "=", "!="]
+Verdict = Literal["", "met", "missed", "undecided", "favoured", "disfavoured"]
+HEADS = ("finding", "value", "95 %", "unit", "threshold", "verdict")
+_WHOLE_FROM = 1000.0  # three digits of a larger number would hide its units
+_SMALLEST = 1e-3  # below it numbers have an exponent
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One number that a study states.
+
+    Attributes
+    ----------
+    label : str
+        Quantity and the case that it belongs to; no two findings of a study share it.
+    value : float or None
+        In `unit`; None where there is no number.
+    low, high : float or None
+        Ends of its interval of 95 %; None without one.
+    unit : str
+    relation, threshold
+        Statement that the number decides, such as "<=" 1.0.
+    verdict : str
+        "met", "missed" or "undecided"; of an explanation "favoured", "disfavoured" or "undecided".
+    """
+
+    label: str
+    value: float | None
+    low: float | None = None
+    high: float | None = None
+    unit: str = ""
+    relation: Relation = ""
+    threshold: float | None = None
+    verdict: Verdict = ""
+
+    def __post_init__(self) -> None:
+        for name in ("value", "low", "high", "threshold"):
+            number = getattr(self, name)
+            known = number is not None and math.isfinite(number)
+            object.__setattr__(self, name, float(number) if known else None)
+
+    @classmethod
+    def ranged(cls, label: str, ends: Iterable[float], unit: str = "", scale: float = 1.0) -> Finding:
+        """Finding from value, low and high in this order, each times `scale`."""
+        value, low, high = (scale * float(x) for x in ends)
+        return cls(label, value, low, high, unit)
+
+    def judged(self, relation: Relation, threshold: float) -> Finding:
+        """The same row with a threshold and a verdict.
+
+        The whole interval decides, or the value where there is no interval. An interval with the threshold inside is
+        undecided; "=" asks for just that, and "!=" for the opposite.
+        """
+        return replace(self, relation=relation, threshold=threshold, verdict=self._verdict(relation, threshold))
+
+    def _verdict(self, relation: Relation, threshold: float) -> Verdict:
+        low, high = (self.value if end is None else end for end in (self.low, self.high))
+        if low is None or high is None:
+            return "undecided"
+        inside = low <= threshold <= high
+        if relation == "=":
+            return "met" if inside else "missed"
+        if relation == "!=":
+            return "undecided" if inside else "met"
+        if (high <= threshold) if relation == "<=" else (low >= threshold):
+            return "met"
+        return "undecided" if inside else "missed"
+
+    @property
+    def row(self) -> Row:
+        """Cells below `HEADS`."""
+        interval = "" if self.low is None or self.high is None else f"{number(self.low)} to {number(self.high)}"
+        threshold = "" if self.threshold is None else f"{self.relation} {number(self.threshold)}"
+        return (self.label, number(self.value), interval, self.unit, threshold, self.verdict)
+
+    @property
+    def text(self) -> str:
+        """Label, value and interval in words, for the text alternative of a drawing."""
+        _, value, interval, unit, _, _ = self.row
+        return " ".join(filter(None, (f"{self.label}:", value, unit, f"({interval})" if interval else "")))
+
+
+def number(value: float | None) -> str:
+    """A number with three digits, whole from 1000 on; a dash for none."""
+    if value is None or not math.isfinite(value):
+        return "-"
+    if value == round(value) and abs(value) < 1e15:  # beyond it every double is whole
+        return f"{value:.0f}"
+    if abs(value) >= _WHOLE_FROM:
+        return f"{value:.0f}"
+    return f"{value:#.3g}".rstrip(".") if abs(value) >= _SMALLEST else f"{value:.2e}"
+
+
+def rms(values: Array | Sequence[float], axis: int = -1) -> Any:
+    """Root mean square; NaN of nothing."""
+    return np.sqrt(np.mean(np.square(values), axis=axis)) if np.size(values) else math.nan
+
+
+def ends_text(ends: Iterable[float], form: str = ".3g", scale: float = 1.0) -> str:
+    """Value and its interval, if there is one, such as "1.2 (1.1 to 1.3)"; a dash for no value."""
+    value, low, high = (*(scale * x for x in ends), math.nan, math.nan)[:3]
+    if not math.isfinite(value):
+        return "-"
+    return f"{value:{form}} ({low:{form}} to {high:{form}})" if math.isfinite(low) else f"{value:{form}}"
+
+
+def text_table(items: Iterable[T], columns: Mapping[str, Callable[[T], str]]) -> tuple[Row, ...]:
+    """Heads, and a row per item: every column has its head and the text of an item's cell."""
+    return (tuple(columns), *(tuple(cell(item) for cell in columns.values()) for item in items))
+
+
+def findings_table(findings: Iterable[Finding]) -> tuple[Row, ...]:
+    """Heads and a row per finding; columns that are empty throughout are left out."""
+    rows = [HEADS, *(finding.row for finding in findings)]
+    kept = [i for i in range(len(HEADS)) if i < 2 or any(row[i] for row in rows[1:])]
+    return tuple(tuple(row[i] for i in kept) for row in rows)
+
+
+def markdown_table(rows: Sequence[Row]) -> str:
+    """Lines of a Markdown table; the first row is the heads."""
+    head, *body = ([cell.replace("|", "\\|") for cell in row] for row in rows)
+    return "\n".join(table_lines(head, body, [" --- "] * len(head)))
+
+
+def print_table(rows: Sequence[Row]) -> None:
+    """Print a table on the terminal; long labels are wrapped."""
+    from rich.console import Console
+    from rich.table import Table
+
+    head, *body = rows
+    table = Table(*head)
+    for column in table.columns[1:]:
+        column.no_wrap = True
+    for row in body:
+        table.add_row(*row)
+    Console(markup=False, emoji=False).print(table)
+
+
+# -- data sets and drawings --------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -78,9 +234,25 @@ class StudyDatasets:
                 ) from error
         return open_finished(target)
 
+    def each(self, cases: Sequence[T], what: str) -> Iterator[T]:
+        """Cases one by one; progress counts those that the loop has left behind."""
+        with Steps(self.console, what, len(cases)) as steps:
+            for case in cases:
+                yield case
+                steps.advance()
+
+    def map(self, function: Callable[[T], U], cases: Sequence[T], what: str) -> list[U]:
+        """Results of a picklable function for all cases, by the workers, which change no number."""
+        with Steps(self.console, what, len(cases)) as steps:
+            results = []
+            for result in parallel_map(function, cases, self.workers):
+                results.append(result)
+                steps.advance()
+        return results
+
 
 COLOURS = (*figures.COLOURS, "#000000")
-MARKERS, LINES, line_style = figures.MARKERS, figures.LINES, figures.line_style
+MARKERS, LINES, line_style, error_bars = figures.MARKERS, figures.LINES, figures.line_style, figures.error_bars
 
 
 @dataclass(frozen=True)
@@ -159,6 +331,13 @@ class Settings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
+
+# TOML knows arrays; settings have tuples
+Names = Annotated[tuple[str, ...], Field(strict=False)]
+Numbers = Annotated[tuple[float, ...], Field(strict=False)]
+Metres = Annotated[tuple[Annotated[float, Field(ge=0.2, le=20.0)], ...], Field(strict=False, min_length=1)]
+Heights = Annotated[tuple[Annotated[float, Field(ge=0.0, le=3.0)], ...], Field(strict=False, min_length=1)]
+Presets = Annotated[tuple[Literal["bayer-raw", "srgb8", "mjpeg"], ...], Field(strict=False, min_length=1)]
 
 S = TypeVar("S", bound=Settings)
 

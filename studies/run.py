@@ -8,14 +8,12 @@ from __future__ import annotations
 
 import hashlib
 import importlib
-import io
 import json
 import time
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal
 
-import polars as pl
 from pydantic import Field
 from rich.console import Console
 
@@ -23,12 +21,22 @@ from phibench.benchmark.reports.report import Section
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import FileName, InputFile
 from phibench.datasets.common.progress import progress_console
+from phibench.datasets.store.documents import parquet_bytes
 from phibench.datasets.store.files import require_writable, sha256, write_bytes, write_text
 from phibench.datasets.store.provenance import provenance
 from phibench.datasets.store.schema import Document
 from phibench.scenes.validation import nearest
-from phibench.studies.findings import Finding, findings_table, markdown_table
-from phibench.studies.framework import Drawing, Settings, Study, StudyDatasets, StudyResult, read_settings
+from phibench.studies.framework import (
+    Drawing,
+    Finding,
+    Settings,
+    Study,
+    StudyDatasets,
+    StudyResult,
+    findings_table,
+    markdown_table,
+    read_settings,
+)
 
 KIND: Literal["phibench study"] = "phibench study"
 DOCUMENT = "study.json"
@@ -166,7 +174,7 @@ def findings_text(study: Study[Any], result: StudyResult) -> str:
 
 
 def _files(study: Study[Any], settings: Settings, result: StudyResult) -> dict[str, bytes]:
-    tables = {f"{name}.parquet": _parquet(table) for name, table in result.tables.items()}
+    tables = {f"{name}.parquet": parquet_bytes(table) for name, table in result.tables.items()}
     drawings = {drawing.file_name: drawing.data for drawing in result.drawings}
     text = json.dumps(settings.model_dump(mode="json"), indent=1) + "\n"
     return {
@@ -175,12 +183,6 @@ def _files(study: Study[Any], settings: Settings, result: StudyResult) -> dict[s
         "settings.json": text.encode(),
         FINDINGS: findings_text(study, result).encode(),
     }
-
-
-def _parquet(table: pl.DataFrame) -> bytes:
-    buffer = io.BytesIO()
-    table.write_parquet(buffer)
-    return buffer.getvalue()
 
 
 def find_study(name: str) -> Study[Any]:

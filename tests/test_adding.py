@@ -124,8 +124,7 @@ STUDY = '''"""Study `echo`: its own setting."""
 
 import polars as pl
 
-from phibench.studies.findings import Finding
-from phibench.studies.framework import Settings, Study, StudyDatasets, StudyResult
+from phibench.studies.framework import Finding, Settings, Study, StudyDatasets, StudyResult
 
 
 class EchoSettings(Settings):

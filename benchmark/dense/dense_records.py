@@ -24,7 +24,8 @@ import polars as pl
 from scipy.ndimage import binary_dilation
 
 from phibench.benchmark.dense.dense_pairs import DenseTruth
-from phibench.benchmark.scores.track_columns import THRESHOLDS
+from phibench.benchmark.scores.intervals import NORMAL_95
+from phibench.benchmark.scores.record_columns import THRESHOLDS
 from phibench.estimator.dense.dense_interface import DenseAnswer
 from phibench.estimator.geometry.mirror_image import range_at
 from phibench.estimator.geometry.reflection import room_rays
@@ -33,8 +34,6 @@ from phibench.estimator.geometry.triangulate import approx_estimator, meeting
 from phibench.scenes.frames import Array, BoolArray
 from phibench.scenes.rig import Rig
 
-WITHIN = 1.959963984540054
-"""Standard deviations of a normal error that hold 95 %."""
 ABOVE = (0.02, 0.05, 0.10)
 _REMOVED = np.arange(100) / 100.0  # shares that are left out, of the sparsification
 _LEAST_PIXELS = 200  # of a stratum in a pair
@@ -266,7 +265,7 @@ def _split(relative: Array, calibration: Array, central: Array) -> dict[str, flo
 def _claims(relative: Array, sigma: Array) -> dict[str, float]:
     if not len(relative):
         return {}
-    return {"ause": ause(np.abs(relative), sigma), "coverage": float(np.mean(np.abs(relative) <= WITHIN * sigma))}
+    return {"ause": ause(np.abs(relative), sigma), "coverage": float(np.mean(np.abs(relative) <= NORMAL_95 * sigma))}
 
 
 def ause(error: Array, sigma: Array) -> float:

@@ -28,8 +28,7 @@ from typing import IO, Any
 
 from phibench.benchmark.isolation.answers import AnswerError, checked
 from phibench.benchmark.isolation.isolation import Access, Isolation
-from phibench.benchmark.isolation.loaded_packages import MOST_NAMES
-from phibench.benchmark.isolation.opened_files import OpenedFiles
+from phibench.benchmark.isolation.method_provenance import MOST_NAMES, OpenedFiles
 from phibench.benchmark.isolation.readable_files import access_of
 from phibench.benchmark.isolation.resolve import MethodError, Reference, RunLimits
 from phibench.benchmark.isolation.supervisor import HUNG_UP, KILL_SECONDS, processes_in
@@ -223,7 +222,7 @@ class MethodProcess:
             raise MethodError("built-in methods alone share a process: ask methods of your own one by one")
         self.stages: dict[str, float] = {}
         self.loaded = set[str]()
-        """Names of modules that the process has told of: `loaded_packages.loaded_names`."""
+        """Names of modules that the process has told of: `method_provenance.loaded_names`."""
         self._access, self._isolation = access_of(reference, limits, hidden), Isolation(reason="it did not start")
         self._lock, self._closed = threading.Lock(), False
         self._process: GuestProcess | None = None

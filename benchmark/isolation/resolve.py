@@ -20,7 +20,7 @@ from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from phibench.benchmark.isolation.loaded_packages import package_sha256
+from phibench.benchmark.isolation.method_provenance import package_sha256
 from phibench.datasets.common.input_files import MIB, InputFile
 from phibench.datasets.store.files import sha256, write_text
 from phibench.datasets.store.provenance import code_behind

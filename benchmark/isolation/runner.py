@@ -19,7 +19,7 @@ from types import TracebackType
 from typing import TypeVar
 
 from phibench.benchmark.isolation.isolation import Isolation
-from phibench.benchmark.isolation.loaded_packages import loaded_names, packages_of
+from phibench.benchmark.isolation.method_provenance import loaded_names, packages_of
 from phibench.benchmark.isolation.process import MethodProcess, outcome_of
 from phibench.benchmark.isolation.resolve import MethodError, Reference, RunLimits, resolve
 from phibench.benchmark.isolation.worker import reply_of, require_method
@@ -36,9 +36,9 @@ class Ran:
     Attributes
     ----------
     packages : dict of str to str or None
-        Version of every package that it has loaded, the interface's own among them: `loaded_packages.packages_of`.
+        Version of every package that it has loaded, the interface's own among them: `method_provenance.packages_of`.
     files : dict of str to str or None
-        SHA-256 of other files that were opened where it may read: `opened_files.OpenedFiles`.
+        SHA-256 of other files that were opened where it may read: `method_provenance.OpenedFiles`.
     files_complete : bool
         Every file is known that was opened there.
     """

@@ -31,7 +31,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from phibench.benchmark.isolation.answers import answer_text, to_bytes
-from phibench.benchmark.isolation.loaded_packages import loaded_names
+from phibench.benchmark.isolation.method_provenance import loaded_names
 from phibench.benchmark.isolation.resolve import MethodError, Reference, RunLimits
 from phibench.benchmark.isolation.transport import Connection, ReceivedPair, SharedPages, TransportError, unpack
 from phibench.estimator.interface import Answer, Method

@@ -4,27 +4,24 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypedDict
+from typing import TYPE_CHECKING, Any, TypedDict
 
 import numpy as np
 
-from phibench.benchmark.pair_sets.dataset_pairs import (
-    TASK_VERSION,
-    Track,
-    dataset_pairs,
-)
+from phibench.benchmark.pair_sets.dataset_pairs import TASK_VERSION, DatasetPairs, Track, dataset_pairs
 from phibench.benchmark.pair_sets.frames_set import FramesSet
-from phibench.calibration.captures.imported_set import ImportedSet, imported_pairs, is_imported, open_imported
-from phibench.calibration.captures.spot_shape import with_shape
-from phibench.calibration.rig.file import Calibration, CalibrationError, read_calibration
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.exposures.pair_draws import FrameCounts
 from phibench.datasets.frames.sensor_file import read_sensor_file
 from phibench.datasets.read import Dataset, Sample, open_finished
-from phibench.datasets.store.pair_files import is_frames_set
+from phibench.datasets.store.pair_files import is_frames_set, is_imported
 from phibench.estimator.geometry.rig_parameters import stroke_of
 from phibench.estimator.interface import Pair
 from phibench.estimator.pair_set import PairSet, PairTruth, tell_answered, truth_folders
+
+if TYPE_CHECKING:  # 25 modules of the calibration, which most scores do without
+    from phibench.calibration.captures.imported_set import ImportedSet
+    from phibench.calibration.rig.file import Calibration
 
 
 @dataclass(frozen=True)
@@ -84,7 +81,11 @@ def open_scored(folder: str | Path) -> Dataset | ImportedSet | FramesSet:
     """Finished data set, a frames set, or a set of real pairs."""
     if is_frames_set(folder):
         return FramesSet(folder)
-    return open_imported(folder) if is_imported(folder) else open_finished(folder)
+    if not is_imported(folder):
+        return open_finished(folder)
+    from phibench.calibration.captures.imported_set import open_imported
+
+    return open_imported(folder)
 
 
 def wanted_pairs(dataset: Dataset | ImportedSet | FramesSet, choice: PairChoice) -> PairSet:
@@ -103,7 +104,7 @@ def wanted_pairs(dataset: Dataset | ImportedSet | FramesSet, choice: PairChoice)
             )
         chosen = dataset.pairs(choice.preset, choice.draws, pairs=choice.pairs, hints=choice.hints)
         return chosen if choice.track is None else chosen.of_track(choice.track)
-    if isinstance(dataset, ImportedSet):
+    if not isinstance(dataset, Dataset):
         if choice.track == "localise":
             raise DatasetError(f"{dataset.folder} holds pictures whose spots nobody has measured: leave --track out")
         if any(option is not None for option in (choice.boxes_px, choice.sensor, choice.frames)):
@@ -115,10 +116,16 @@ def wanted_pairs(dataset: Dataset | ImportedSet | FramesSet, choice: PairChoice)
     camera = None if choice.sensor is None else read_sensor_file(choice.sensor)
     counts = None if choice.frames is None else frame_counts(*choice.frames)
     taken = (choice.preset, choice.draws, choice.pairs, choice.hints, choice.boxes_px, camera, counts)
-    read = None if choice.calibration is None else read_calibration(choice.calibration)
-    pairs = dataset_pairs(dataset if read is None else of_calibration(dataset, read), *taken)
-    pairs = pairs if choice.track is None else pairs.of_track(choice.track)
-    return pairs if read is None else CalibratedPairs(pairs, read)
+    if choice.calibration is None:
+        return _of_track(dataset_pairs(dataset, *taken), choice)
+    from phibench.calibration.rig.file import read_calibration
+
+    read = read_calibration(choice.calibration)
+    return CalibratedPairs(_of_track(dataset_pairs(of_calibration(dataset, read), *taken), choice), read)
+
+
+def _of_track(pairs: DatasetPairs, choice: PairChoice) -> DatasetPairs:
+    return pairs if choice.track is None else pairs.of_track(choice.track)
 
 
 MOST_FRAMES = 100
@@ -142,6 +149,10 @@ def frame_counts(on: int, off: int) -> FrameCounts:
 
 
 def _real_pairs(imported: ImportedSet, choice: PairChoice) -> PairSet:
+    from phibench.calibration.captures.imported_set import imported_pairs
+    from phibench.calibration.captures.spot_shape import with_shape
+    from phibench.calibration.rig.file import read_calibration
+
     if choice.preset not in (None, imported.preset):
         raise DatasetError(f"{imported.folder} holds pictures of the kind '{imported.preset}': leave --preset out")
     pairs = imported_pairs(imported, TASK_VERSION, choice.draws, choice.pairs)
@@ -212,6 +223,8 @@ def of_calibration(dataset: Dataset, calibration: Calibration) -> Dataset:
         If the nominal rig of a sample is not the one that the calibration started from, or the samples have several
         true rigs and the calibration was made from none of them.
     """
+    from phibench.calibration.rig.file import CalibrationError
+
     for sample in dataset:
         if sample.nominal_rig != calibration.nominal:
             raise CalibrationError(

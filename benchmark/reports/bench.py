@@ -15,6 +15,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 
@@ -25,7 +26,6 @@ from phibench.benchmark.pair_sets.wanted_pairs import PairChoice, open_scored, w
 from phibench.benchmark.reports.report import time_section, write_report
 from phibench.benchmark.scores.document import records_kept
 from phibench.benchmark.scores.score import Scored, run_and_score, saved_each
-from phibench.calibration.captures.imported_set import ImportedSet
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.progress import progress_console
 from phibench.datasets.read import Dataset
@@ -33,6 +33,9 @@ from phibench.datasets.store.files import require_writable
 from phibench.estimator.interface import Box
 from phibench.estimator.methods.registry import METHODS, BuiltIn
 from phibench.estimator.pair_set import PairSet
+
+if TYPE_CHECKING:
+    from phibench.calibration.captures.imported_set import ImportedSet
 
 PRESETS = ("bayer-raw", "srgb8", "mjpeg")
 """Of a data set whose recipe has no `[frames]`."""
@@ -123,7 +126,7 @@ def show(page: Path) -> bool:
 
 def _runs(dataset: Dataset | ImportedSet | FramesSet, tracks: Sequence[Track] | None) -> list[Track | None]:
     """Runs that the tracks need: whole frames serve two of them. Of pictures nobody knows where boxes belong."""
-    if isinstance(dataset, ImportedSet):
+    if not isinstance(dataset, Dataset | FramesSet):
         return [None]
     wanted = set(TRACKS if tracks is None else tracks)
     runs: list[Track | None] = ["find"] if wanted & {"find", "depth"} else []
@@ -131,7 +134,7 @@ def _runs(dataset: Dataset | ImportedSet | FramesSet, tracks: Sequence[Track] | 
 
 
 def _presets(dataset: Dataset | ImportedSet | FramesSet) -> tuple[str, ...]:
-    if isinstance(dataset, ImportedSet | FramesSet):
+    if not isinstance(dataset, Dataset):
         return (dataset.preset,)
     frames = dataset.recipe.frames
     return PRESETS if frames is None else frames.presets

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import polars as pl
 import scipy
+from numpy.typing import ArrayLike
 
 from phibench.benchmark.scores.document import ScoreDocument, StratumScore, Value
 from phibench.benchmark.scores.metrics import METRICS
@@ -55,6 +56,12 @@ class EmbeddedFigure:
 def line_style(i: int) -> dict[str, Any]:
     """Colour, line and marker of the i-th curve."""
     return {"color": COLOURS[i % len(COLOURS)], "linestyle": LINES[i % len(LINES)], "marker": MARKERS[i % len(MARKERS)]}
+
+
+def error_bars(ends: ArrayLike) -> Array:
+    """Lengths of bars below and above values, shape (2, n), from value, low and high, (n, 3); 0 without an interval."""
+    value, low, high = np.asarray(ends, float).T
+    return np.nan_to_num(np.maximum([value - low, high - value], 0.0))
 
 
 @contextmanager
@@ -225,7 +232,8 @@ def _curves(axes: Axes, scores: Named, by: str, metric: str, factor: float) -> N
         if not shown:
             continue  # no value in any stratum
         x, y = [x for x, _ in shown], [factor * (value.value or math.nan) for _, value in shown]
-        axes.errorbar(x, y, yerr=_bars([value for _, value in shown], factor), label=name, capsize=3, **line_style(i))
+        ends = [factor * np.array([e.value, e.low, e.high]) for e in (value.estimate for _, value in shown)]
+        axes.errorbar(x, y, yerr=error_bars(ends), label=name, capsize=3, **line_style(i))
         lone = [number for number, (_, value) in enumerate(shown) if value.low is None]
         colour, mark = line_style(i)["color"], line_style(i)["marker"]
         axes.plot([x[n] for n in lone], [y[n] for n in lone], mark, color=colour, markerfacecolor="white", zorder=3)
@@ -241,14 +249,6 @@ def _points(score: ScoreDocument, by: str, metric: str) -> list[tuple[float, Val
     """Values above 0 of a metric over strata, which a logarithmic axis can show."""
     parts = [(x, stratum.metrics[metric]) for x, stratum in _strata(score, by) if metric in stratum.metrics]
     return [(x, value) for x, value in parts if (value.value or 0.0) > 0.0]
-
-
-def _bars(values: Sequence[Value], factor: float) -> Array:
-    """Lengths of the error bars downwards and upwards, shape (2, n); 0 where there is no interval."""
-    y = [value.value or 0.0 for value in values]
-    low = [a - value.low if value.low is not None else 0.0 for a, value in zip(y, values, strict=True)]
-    high = [value.high - a if value.high is not None else 0.0 for a, value in zip(y, values, strict=True)]
-    return factor * np.maximum(np.array([low, high]), 0.0)
 
 
 def _bound(axes: Axes, scores: Named, by: str, metric: str, factor: float) -> None:

@@ -31,19 +31,19 @@ from phibench.benchmark.scores.metrics import METRICS, applies
 from phibench.benchmark.scores.score_tables import (
     DIGITS,
     FLAGGED,
-    TextTable,
     cause_table,
     cell_parts,
     differences_json,
     frames_line,
+    head,
     light_line,
-    markdown,
     ranked,
     refused,
     shown_parts,
+    starred,
 )
 from phibench.datasets.common.errors import DatasetError
-from phibench.datasets.common.shown_text import markdown_cell, markdown_text, table_lines
+from phibench.datasets.common.shown_text import TextTable, markdown, markdown_cell, markdown_text, table_lines
 from phibench.datasets.store.files import write_text
 
 AGAINST = "chain_fit"
@@ -54,21 +54,7 @@ _DIFFERENCES = ("rank_phi_rad", "rank_depth", "detection_rate", "median_px", "rm
 _STRATA = ("spot", "signal", "depth", "stroke", "hint", "quality")
 _SHOWN = 4
 """Methods whose strata are shown: the best ones, and the one that the others are compared with."""
-_HEADS = {
-    "rank_phi_rad": "rank phi",
-    "rank_depth": "rank D",
-    "detection_rate": "found",
-    "false_rate": "false",
-    "median_px": "median",
-    "rms_px": "rms",
-    "median_depth_relative": "median D",
-    "rms_depth_relative": "rms D",
-    "efficiency_px": "efficiency",
-    "efficiency_pair_px": "efficiency, pair",
-    "pull_deviation": "pull",
-    "beyond_5_sigma": "beyond 5 sigma",
-    "coverage_depth": "coverage of D",
-}
+_HEADS = {"median_px": "median", "median_depth_relative": "median D", "coverage_depth": "coverage of D"}  # short ones
 
 
 @dataclass(frozen=True)
@@ -167,23 +153,17 @@ def grids(part: ScoreGroup) -> list[TextTable]:
 
 
 def _head(name: str) -> str:
-    unit = METRICS[name].shown[1]
-    return _HEADS[name] if unit == "1" else f"{_HEADS[name]} / {unit}"
+    text, _, unit = head(name).partition("\n")
+    return " / ".join(filter(None, (_HEADS.get(name, text), unit)))
 
 
 def _board(part: ScoreGroup, title: str, names: Sequence[str]) -> TextTable:
     rows = []
     for score in part.scores:
-        cells = (" ".join(shown_parts(m, score.metrics[m])) if applies(m, score.method.sees) else "" for m in names)
-        rows.append((f"{score.method.name}{FLAGGED if score.flags else ''}", *(_cut(cell) for cell in cells)))
+        cells = (starred(shown_parts(m, score.metrics[m])) if applies(m, score.method.sees) else "" for m in names)
+        rows.append((f"{score.method.name}{FLAGGED if score.flags else ''}", *cells))
     note = " ".join(filter(None, (frames_line(part.scores[0]), light_line(part.scores[0]))))
     return TextTable(title, ("method", *map(_head, names)), tuple(rows), "l" + "r" * len(names), note)
-
-
-def _cut(cell: str) -> str:
-    """Cell with a star in place of the reason why it has no interval."""
-    value, bracket, _ = cell.partition(" (")
-    return f"{value} *" if bracket else cell.strip()
 
 
 def _differences(part: ScoreGroup) -> TextTable:
@@ -201,7 +181,7 @@ _SIGNS = {"second": " **", "first": " **", "no difference shown": "", "too few s
 
 def _change(one: Difference) -> str:
     factor = METRICS[one.name].shown[0]
-    return _cut(" ".join(cell_parts(one.difference, factor, DIGITS, significant=True))) + _SIGNS[one.better]
+    return starred(cell_parts(one.difference, factor, DIGITS, significant=True)) + _SIGNS[one.better]
 
 
 def _strata(part: ScoreGroup) -> TextTable:
@@ -222,10 +202,8 @@ def _in_stratum(one: ScoreDocument, wanted: StratumScore) -> str:
     for stratum in one.strata:
         if (stratum.by, stratum.label) == (wanted.by, wanted.label):
             shown, _ = shown_parts("detection_rate", stratum.metrics["detection_rate"])
-            median = cell_parts(
-                stratum.metrics["median_px"].estimate, METRICS["median_px"].shown[0], 2, significant=True
-            )
-            return f"{shown}; {_cut(' '.join(median))}"
+            median = stratum.metrics["median_px"].estimate
+            return f"{shown}; {starred(cell_parts(median, METRICS['median_px'].shown[0], 2, significant=True))}"
     return ""
 
 

@@ -13,7 +13,8 @@ from dataclasses import dataclass
 from phibench.benchmark.pair_sets.dataset_pairs import TRACKS, Track, tracks_of
 from phibench.benchmark.scores.document import ScoreDocument
 from phibench.benchmark.scores.metrics import METRICS
-from phibench.benchmark.scores.score_tables import FLAGGED, TextTable, shown_parts
+from phibench.benchmark.scores.score_tables import FLAGGED, shown_parts, starred
+from phibench.datasets.common.shown_text import TextTable
 
 
 @dataclass(frozen=True)
@@ -113,8 +114,4 @@ def _beside(track: Track, documents: Sequence[ScoreDocument]) -> TextTable:
 
 
 def _cell(name: str, document: ScoreDocument | None) -> str:
-    """Value and interval; a star in place of the reason why there is no interval."""
-    if document is None:
-        return ""
-    value, interval = shown_parts(name, document.metrics[name])
-    return f"{value} *" if interval.startswith("(") else f"{value} {interval}".strip()
+    return "" if document is None else starred(shown_parts(name, document.metrics[name]))

@@ -23,7 +23,7 @@ from phibench.benchmark.scores.answer_errors import Rules
 from phibench.benchmark.scores.causes import count, count_failures
 from phibench.benchmark.scores.intervals import Estimate
 from phibench.benchmark.scores.metrics import METRICS, MetricEstimate
-from phibench.benchmark.scores.records import COLUMN_TYPES
+from phibench.benchmark.scores.record_columns import COLUMN_TYPES
 from phibench.benchmark.scores.strata import Stratum, count_pairs, light_shift, measured, strata
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import InputFile, Name

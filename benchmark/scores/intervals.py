@@ -36,6 +36,8 @@ from phibench.scenes.frames import Array
 Statistic = Callable[[Array], Array]
 """Weights, shape (b, n samples), to values, shape (b,)."""
 
+NORMAL_95 = 1.959963984540054
+"""Standard deviations of a normal error that hold 95 %."""
 EQUAL = "all resamples equal"
 FEW = "under {} samples"
 PERCENTILE = "BCa undefined: percentile interval"
@@ -52,6 +54,11 @@ class Estimate:
     low: float
     high: float
     note: str = ""
+
+    @property
+    def ends(self) -> tuple[float, float, float]:
+        """Value, low and high."""
+        return self.value, self.low, self.high
 
 
 @dataclass(frozen=True)
@@ -234,6 +241,20 @@ def _bootstrap(statistics: Sequence[Statistic], n: int, rules: Rules, rng: np.ra
             vectorized=True,
             rng=rng,
         )
+
+
+def percentile_interval(
+    data: Sequence[NDArray[Any]], statistic: Callable[..., Any], resamples: int, rng: np.random.Generator
+) -> tuple[Array, Array]:
+    """Ends of the percentile bootstrap's 95 % interval of a statistic of n independent cases.
+
+    Parameters
+    ----------
+    data : columns of shape (n,), drawn together
+    statistic : of as many columns; where it takes `axis`, of many resamples at once
+    """
+    drawn = scipy.stats.bootstrap(data, statistic, paired=True, n_resamples=resamples, method="percentile", rng=rng)
+    return np.atleast_1d(drawn.confidence_interval.low), np.atleast_1d(drawn.confidence_interval.high)
 
 
 def _estimate(value: float, low: float, high: float, drawn: Array, confidence: float) -> Estimate:

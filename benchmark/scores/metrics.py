@@ -35,7 +35,7 @@ from phibench.benchmark.scores.intervals import (
     rms_of,
     rms_ratio_of,
 )
-from phibench.benchmark.scores.track_columns import LOCALISED, track_columns
+from phibench.benchmark.scores.record_columns import LOCALISED, track_columns
 from phibench.scenes.frames import Array
 from phibench.scenes.random_streams import Name, generator
 
@@ -312,12 +312,7 @@ METRICS: dict[str, Metric] = {
         "pair", "mean", ("depth_recall",), "1", "higher", "D within 0.5, 1, 2, 5, 10 and 20 %, mean share of them"
     ),
     "interval_score": Metric(
-        "interval",
-        "mean",
-        ("interval_score",),
-        "1",
-        "lower",
-        "95 % interval score / 3.92 sigma of the bound",
+        "interval", "mean", ("interval_score",), "1", "lower", "95 % interval score / 3.92 sigma of the bound"
     ),
 }
 

@@ -2,7 +2,7 @@
 
 A pair has two rows, "down" and "up"; columns of the pair are in both. Null where there is nothing: no answer, no
 truth (a spot without an image), no claimed covariance, no bound, or a ray that does not reach. Never NaN.
-`COLUMNS` says what each column is.
+`record_columns.COLUMNS` says what each column is.
 """
 
 from __future__ import annotations
@@ -27,7 +27,9 @@ from phibench.benchmark.scores.answer_errors import (
     usable_covariance,
     whitened,
 )
+from phibench.benchmark.scores.intervals import NORMAL_95
 from phibench.benchmark.scores.pair_bounds import SpotBoundsOfImages, pair_bounds
+from phibench.benchmark.scores.record_columns import COLUMNS, OF_FRAMES, TYPES
 from phibench.datasets.common.errors import DatasetError
 from phibench.estimator.geometry.least_squares_depth import nominal_depth
 from phibench.estimator.geometry.phi import outline_circle
@@ -38,127 +40,8 @@ from phibench.estimator.pair_set import ImageTruth, PairSet, PairTruth
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import POSITIONS, Rig
 
-WITHIN = 1.959963984540054
-"""Standard deviations of a normal error that hold 95 %."""
 _NO_MATRIX = np.full((2, 2), np.nan)
 _BAYER = {(0, 0): "red", (1, 0): "green in red row", (0, 1): "green in blue row", (1, 1): "blue"}
-
-COLUMNS: dict[str, str] = {
-    "number": "pair, as in the pair set",
-    "sample_id": "sample; intervals resample these",
-    "draw": "draw of the noise",
-    "image": "down or up",
-    "preset": "preset of the sensor",
-    "jpeg_quality": "libjpeg's quality; null unless MJPEG",
-    "exposure_s": "exposure time of both images",
-    "analogue_gain": "gain before the converter",
-    "laser_level": "factor of the laser's light",
-    "lamp_level": "factor of the room's light",
-    "hinted": "whether the method got boxes",
-    "depth_m": "D of the light",
-    "axis_depth_m": "D of the beam's axis",
-    "stroke_m": "h",
-    "azimuth_rad": "azimuth of the mirror's normal",
-    "electrons": "expected electrons of the spot",
-    "snr": "signal to noise of the light, place and room known (docs/limits.md)",
-    "saturated": "a pixel of the spot is expected above saturation",
-    "visible": "whether the chief ray reaches the sensor",
-    "unseen_because": "why not; none if visible",
-    "u_true_px": "centre of the light",
-    "v_true_px": "centre of the light",
-    "u_axis_px": "image of the beam's axis",
-    "v_axis_px": "image of the beam's axis",
-    "from_centre_px": "true distance from the image of the sphere centre",
-    "bayer": "2 x 2 cell's pixel that holds the true position",
-    "status": "ok, or the method's or the harness's word why there is no position",
-    "u_px": "answer",
-    "v_px": "answer",
-    "du_px": "answer - truth",
-    "dv_px": "answer - truth",
-    "distance_px": "hypot(du, dv)",
-    "radial_px": "error outwards from the image of the sphere centre",
-    "tangential_px": "error across it, u towards v",
-    "detected": "visible, and a position within match_px",
-    "missed": "visible and not detected",
-    "false_detection": "a position where the spot is not visible, or further than match_px from it",
-    "counted_px": "distance_px if detected, match_px if missed",
-    "phi_convention": "ray, normal, incidence or outline",
-    "phi_from": "method or pixels",
-    "phi_rad": "the method's, else estimator.geometry.phi of its pixel through the nominal rig",
-    "phi_true_rad": "truth in that convention; outline: estimator.geometry.phi of the true pixel through the true rig",
-    "phi_error_rad": "phi_rad - phi_true_rad, in units of phi_ray: times d phi_ray / d phi along the gradient",
-    "claimed_uu_px2": "claimed variance of u",
-    "claimed_uv_px2": "claimed covariance of u and v",
-    "claimed_vv_px2": "claimed variance of v",
-    "pull_u": "first component of L^-1 e, C = L L^T the claimed covariance",
-    "pull_v": "second component",
-    "mahalanobis2": "e^T C^-1 e",
-    "bound_px2": "trace of the bound (docs/limits.md): expected squared distance at it",
-    "bound_uu_px2": "the bound itself: variance of u",
-    "bound_uv_px2": "covariance of u and v",
-    "bound_vv_px2": "variance of v",
-    "raw_bound_px2": "as bound_px2, of the raw pixels behind the image",
-    "raw_bound_uu_px2": "that bound itself: variance of u",
-    "raw_bound_uv_px2": "covariance of u and v",
-    "raw_bound_vv_px2": "variance of v",
-    "bound_phi_rad2": "variance of phi at the bound",
-    "pair_bound_px2": "as bound_px2, of both images together: one point of the room",
-    "pair_bound_uu_px2": "that bound itself: variance of u",
-    "pair_bound_uv_px2": "covariance of u and v",
-    "pair_bound_vv_px2": "variance of v",
-    "pair_bound_phi_rad2": "variance of phi at that bound",
-    "rank_phi2_rad2": "square that the rank by phi sums: error (of outline: of phi_ray), missed and false",
-    "pair_visible": "both spots are visible",
-    "pair_false": "a false detection in either image, or a D of the method's own where a spot is not visible",
-    "pair_electrons": "the fainter spot's electrons",
-    "depth_found": "both spots are found, and a finite depth above 0 follows",
-    "depth_from": "method or pixels",
-    "depth_estimate_m": "D of the answer",
-    "depth_error_m": "depth_estimate_m - depth_m",
-    "depth_relative": "depth_error_m / depth_m",
-    "depth_sigma_m": "claimed: the method's with its own depth, else from its covariances; with a calibration's part",
-    "claimed_sigma_m": "the method's sigma of its own D, without a calibration's part",
-    "claimed_low_m": "lower end of the method's 95 % interval of its own D",
-    "claimed_high_m": "upper end",
-    "depth_pull": "depth_error_m / depth_sigma_m; of real pairs the tape's standard deviation is added",
-    "depth_within": "D in the claimed 95 % interval: the method's own, widened as its sigma is, else |pull| <= 1.96",
-    "bound_depth_m2": "variance of D at the bounds of both spots, each by itself; without calibration",
-    "pair_bound_depth_m2": "the same of both images together",
-    "possible_position_chi2": "errors of the pair's positions over what is possible, squared; 3 degrees of freedom",
-    "possible_depth_m2": "smallest possible variance of D",
-    "possible_spot_px2": "trace of the smallest possible covariance of this position, at most 0.5 px^2 along any axis",
-    "possible_spot_chi2": "squared error of this position over that covariance; 2 degrees of freedom",
-    "possible_spot_phi_rad2": "smallest possible variance of this phi",
-    "searched_px2": "area in which a search has to look for the spot: its box, or a quarter of the mirror's disc",
-    "seconds": "inside the method",
-    "failure": "of the harness; empty if none",
-    "message": "about the failure",
-}
-COUNTED: dict[str, str] = {
-    "depth_counted": "|depth_relative|, at most what a miss costs; that too if not found; null unless pair_visible",
-    "rank_depth2": "square that the rank by D sums: relative error, missed and false detection",
-}
-"""Columns that follow from all pairs together: `with_missed`."""
-
-
-_OF_FRAMES = ("exposure_s", "analogue_gain", "laser_level", "lamp_level")
-_WHOLE = ("number", "draw", "jpeg_quality")
-_TEXTS = (
-    *("sample_id", "image", "preset", "unseen_because", "bayer"),
-    *("status", "phi_convention", "phi_from", "depth_from", "failure", "message"),
-)
-_TRUTH_VALUES = (
-    *("hinted", "saturated", "visible", "detected", "missed"),
-    *("false_detection", "pair_visible", "pair_false", "depth_found", "depth_within"),
-)
-_TYPES = {
-    **dict.fromkeys(_WHOLE, pl.Int64()),
-    **dict.fromkeys(_TEXTS, pl.String()),
-    **dict.fromkeys(_TRUTH_VALUES, pl.Boolean()),
-    **dict.fromkeys(_OF_FRAMES, pl.Float64()),
-}
-COLUMN_TYPES: dict[str, pl.DataType] = {name: _TYPES.get(name, pl.Float64()) for name in (*COLUMNS, *COUNTED)}
-"""Type of every column."""
 
 
 def records(pairs: PairSet, outcomes: Iterable[Outcome], rules: Rules) -> pl.DataFrame:
@@ -212,7 +95,7 @@ def record_table(truths: Sequence[PairTruth], outcomes: Sequence[Outcome], rules
         for of_rig in _of_rigs(nominal, true, [truths[i] for i in rows], [outcomes[i] for i in rows], rules)
     ]
     columns = {name: _joined([of_rig[name] for of_rig in parts]) for name in parts[0]}
-    table = pl.DataFrame(columns, schema_overrides=_TYPES).sort("number", pl.col("image") == "up")
+    table = pl.DataFrame(columns, schema_overrides=TYPES).sort("number", pl.col("image") == "up")
     return table.with_columns(pl.col(pl.Float64).fill_nan(None)).select(*COLUMNS)
 
 
@@ -418,7 +301,7 @@ def _pair_columns(
         "draw": [t.draw for t in truths],
         "preset": [t.preset for t in truths],
         "jpeg_quality": [t.jpeg_quality for t in truths],
-        **{name: [getattr(t, name) for t in truths] for name in _OF_FRAMES},
+        **{name: [getattr(t, name) for t in truths] for name in OF_FRAMES},
         "hinted": [t.hinted for t in truths],
         "searched_px2": _searched_px2(nominal, truths),
         "depth_m": true_m,
@@ -488,9 +371,9 @@ def _own_interval(answer: Answer | None) -> tuple[float, float]:
 
 def _within(depth: Array, true_m: Array, pull: Array, intervals: Array, added_m: Array) -> list[bool | None]:
     """Truth of D in the claimed interval, None where none is claimed; `added_m` are errors that it leaves out."""
-    more = WITHIN * np.nan_to_num(added_m)
+    more = NORMAL_95 * np.nan_to_num(added_m)
     low, high = depth - np.hypot(depth - intervals[:, 0], more), depth + np.hypot(intervals[:, 1] - depth, more)
-    inside = np.where(np.isfinite(low), (low <= true_m) & (true_m <= high), np.abs(pull) <= WITHIN)
+    inside = np.where(np.isfinite(low), (low <= true_m) & (true_m <= high), np.abs(pull) <= NORMAL_95)
     known = np.isfinite(true_m) & (np.isfinite(low) | np.isfinite(pull))
     return [bool(x) if there else None for x, there in zip(inside, known, strict=True)]
 

@@ -39,11 +39,11 @@ from phibench.benchmark.scores.document import (
     write_score,
 )
 from phibench.benchmark.scores.records import in_order, missed_relative, record_table, with_missed
-from phibench.benchmark.scores.score_tables import score_table, text_of
+from phibench.benchmark.scores.score_tables import score_table
 from phibench.benchmark.scores.worst_images import worst, worst_of, worst_records
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.progress import Steps, progress_console
-from phibench.datasets.common.shown_text import ShortForm
+from phibench.datasets.common.shown_text import ShortForm, text_of
 from phibench.datasets.read import Dataset
 from phibench.datasets.store.files import require_writable
 from phibench.estimator.interface import Method, Outcome

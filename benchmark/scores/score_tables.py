@@ -1,35 +1,28 @@
 """Tables of scores: for a terminal of 80 columns, or as CSV, Markdown, LaTeX and JSON.
 
-A `TextTable` holds the cells of a table as text; `written` gives it one of the forms. Units are those of `shown`:
-mrad for phi, per cent for rates and relative errors. CSV and JSON hold the numbers of the files instead: SI, in full.
+Units are those of `Metric.shown`: mrad for phi, per cent for rates and relative errors. CSV and JSON hold the numbers
+of the files instead: SI, in full.
 """
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import math
 import sys
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 
 import polars as pl
-from rich.box import SIMPLE_HEAD
 from rich.console import Console
-from rich.table import Table
-from rich.text import Text
 
 from phibench.benchmark.scores.causes import CAUSES, KINDS, NOISE, TAKEN_FOR
 from phibench.benchmark.scores.compare import Difference
 from phibench.benchmark.scores.document import PairRange, ScoreDocument, Value
 from phibench.benchmark.scores.intervals import Estimate
 from phibench.benchmark.scores.metrics import CHOSEN, METRICS, RANKS, applies
-from phibench.datasets.common.shown_text import csv_text, latex_text, markdown_cell, markdown_text, table_lines
+from phibench.datasets.common.shown_text import TextTable, csv_table, latex, markdown, show_grid, table_console
 from phibench.estimator.methods.registry import REFUSED
-from phibench.scenes.validation import printable_line
 
 Form = Literal["terminal", "csv", "markdown", "latex", "json"]
 
@@ -53,38 +46,12 @@ HEADS = {
 NARROW = 8  # columns that fit into 80 signs
 DIGITS = 3
 """Significant digits of a value in a table."""
-WIDE = 210
-"""Columns of a terminal for tables with every interval."""
 FULL_OF_FALSE = 0.2
 """Share of false answers from which a line says what they are."""
 FLAGGED = " !"
 """Mark behind the name of a method whose answers are better than the images allow."""
 _FLAG_NOTE = "!: knows more than the images"
-_MANY = 9  # columns that stand close together
 _STRATA = ("detection_rate", "false_rate", "rms_px", "rms_phi_rad", "rms_depth_relative", "efficiency_px")
-
-
-@dataclass(frozen=True)
-class TextTable:
-    """A table as text.
-
-    Attributes
-    ----------
-    title : str
-    heads : tuple of str
-        A line break parts a head from its unit.
-    rows : tuple of rows, each a tuple of str
-    columns : str
-        A letter each: "r" is a number, "l" a word, "L" a text that may go on on the next line.
-    note : str
-        A line below the table.
-    """
-
-    title: str
-    heads: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
-    columns: str
-    note: str = ""
 
 
 # -- scores --------------------------------------------------------------------------------------------------------
@@ -162,11 +129,16 @@ def strata_table(document: ScoreDocument, wide: bool = False) -> TextTable:
     rows = []
     for stratum in (document.whole, *document.strata):
         there = ((name, stratum.metrics.get(name)) for name in _STRATA)
-        cells = ("" if value is None else _starred(name, value, wide) for name, value in there)
+        cells = ("" if value is None else _in_stratum(name, value, wide) for name, value in there)
         rows.append((stratum.by, stratum.label, str(stratum.images), *cells))
     note = f"*: fewer than {document.rules['least_samples']:g} samples, no interval"
     heads = ("by", "stratum", "images", *map(head, _STRATA))
     return TextTable(f"{document.method.name}: strata", heads, tuple(rows), "ll" + "r" * (1 + len(_STRATA)), note)
+
+
+def _in_stratum(name: str, value: Value, wide: bool) -> str:
+    shown, interval = shown_parts(name, value)
+    return starred((shown, interval if wide or interval.startswith("(") else ""))
 
 
 def cause_table(documents: Sequence[ScoreDocument]) -> TextTable:
@@ -401,61 +373,8 @@ def print_comparison(differences: Sequence[Difference], first: str, second: str,
         sys.stdout.write(texts[form]())
 
 
-def table_console(wide: bool) -> Console:
-    """A console at least 80 columns wide; a wide one does not lose numbers in a narrow terminal or a pipe."""
-    console, least = Console(markup=False, emoji=False), WIDE if wide else 80
-    return console if console.width >= least else Console(width=least, markup=False, emoji=False)
-
-
 def _line(console: Console, text: str) -> None:
     console.print(text, emoji=False, highlight=False, markup=False)
-
-
-# -- forms ---------------------------------------------------------------------------------------------------------
-
-
-def show_grid(console: Console, grid: TextTable) -> None:
-    """Print a table to a terminal; text that is too long for it goes on below."""
-    gap = int(len(grid.heads) < _MANY)
-    table = Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, gap, 0, 0), show_edge=False)
-    for name, kind in zip(grid.heads, grid.columns, strict=True):
-        table.add_column(name, justify="right" if kind == "r" else "left", overflow="fold", no_wrap=kind != "L")
-    for row in grid.rows:
-        table.add_row(*map(Text, row))  # as it is: a string would be searched for markup and emoji
-    for part in (Text(grid.title, style="bold"), table, *([Text(grid.note)] if grid.note else [])):
-        console.print(part)
-    console.print()
-
-
-def text_of(grid: TextTable) -> str:
-    """Table as a terminal of 80 columns shows it."""
-    console = Console(file=io.StringIO(), width=80, markup=False, emoji=False, color_system=None)
-    show_grid(console, grid)
-    shown = console.file.getvalue()  # type: ignore[attr-defined]
-    return "\n".join(line.rstrip() for line in shown.rstrip().split("\n"))
-
-
-def markdown(grid: TextTable) -> str:
-    """Table in Markdown, a line of text before it."""
-    marks = [" --: " if kind == "r" else " :-- " for kind in grid.columns]
-    heads, *rows = (tuple(map(markdown_cell, row)) for row in (grid.heads, *grid.rows))
-    lines = table_lines(heads, rows, marks)
-    note = ("", markdown_text(grid.note)) if grid.note else ()
-    return "\n".join((f"{markdown_text(grid.title)}\n", *lines, *note)) + "\n"
-
-
-def latex(grid: TextTable) -> str:
-    """Table in LaTeX, for the package booktabs."""
-    lines = [" & ".join(map(latex_text, row)) + r" \\" for row in (grid.heads, *grid.rows)]
-    body = [
-        rf"\begin{{tabular}}{{{grid.columns.lower()}}}",
-        r"\toprule",
-        lines[0],
-        r"\midrule",
-        *lines[1:],
-        r"\bottomrule",
-    ]
-    return "\n".join((f"% {printable_line(grid.title)}", *body, r"\end{tabular}")) + "\n"
 
 
 def scores_csv(documents: Sequence[ScoreDocument], by: str = "phi") -> str:
@@ -470,7 +389,7 @@ def scores_csv(documents: Sequence[ScoreDocument], by: str = "phi") -> str:
         ]
         flags = ", ".join(flag.quantity for flag in document.flags)
         rows.append([document.method.name, document.pairs, document.images, document.samples, flags, *numbers])
-    return _csv(["method", "pairs", "images", "samples", "knows_more", *names], rows)
+    return csv_table(["method", "pairs", "images", "samples", "knows_more", *names], rows)
 
 
 def scores_json(documents: Sequence[ScoreDocument], by: str = "phi") -> str:
@@ -481,7 +400,9 @@ def scores_json(documents: Sequence[ScoreDocument], by: str = "phi") -> str:
 
 def differences_csv(differences: Sequence[Difference]) -> str:
     """One row per metric, in the units of the files, in full."""
-    return _csv(list(_difference_fields(differences[0])), [list(_difference_fields(d).values()) for d in differences])
+    return csv_table(
+        list(_difference_fields(differences[0])), [list(_difference_fields(d).values()) for d in differences]
+    )
 
 
 def differences_json(differences: Sequence[Difference]) -> str:
@@ -503,15 +424,6 @@ def _difference_fields(d: Difference) -> dict[str, str | float | int | None]:
         "chance": d.chance if math.isfinite(d.chance) else None,
         "better": d.better,
     }
-
-
-def _csv(heads: list[str], rows: Sequence[Sequence[object]]) -> str:
-    buffer = io.StringIO()
-    writer = csv.writer(buffer, lineterminator="\n")
-    writer.writerows(
-        [heads, *(["" if x is None else csv_text(x) if isinstance(x, str) else x for x in row] for row in rows)]
-    )
-    return buffer.getvalue()
 
 
 # -- numbers -------------------------------------------------------------------------------------------------------
@@ -542,12 +454,10 @@ def _cell(name: str, value: Value, wide: bool) -> str:
     return f"{shown}\n{interval}" if wide and interval else shown
 
 
-def _starred(name: str, value: Value, wide: bool) -> str:
-    """Value with a star where there are too few samples for an interval."""
-    shown, rest = shown_parts(name, value)
-    if rest.startswith("("):
-        return f"{shown} *"
-    return f"{shown} {rest}".strip() if wide else shown
+def starred(parts: tuple[str, str]) -> str:
+    """Value and interval on one line, with a star in place of the reason why there is none."""
+    value, interval = parts
+    return f"{value} *" if interval.startswith("(") else f"{value} {interval}".strip()
 
 
 def one_line(estimate: Estimate, factor: float = 1.0, digits: int = 3) -> str:

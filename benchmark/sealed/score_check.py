@@ -29,7 +29,8 @@ from phibench.benchmark.scores.document import (
     read_score,
     results_sha256,
 )
-from phibench.benchmark.scores.records import COLUMN_TYPES, missed_relative, with_missed
+from phibench.benchmark.scores.record_columns import COLUMN_TYPES
+from phibench.benchmark.scores.records import missed_relative, with_missed
 from phibench.benchmark.sealed.method_check import check_card, check_run
 from phibench.benchmark.sealed.rebuilt_score import ABSOLUTE, GIVEN, RELATIVE, alike, differences, rebuilt, short
 from phibench.datasets.common.errors import DatasetError

@@ -228,11 +228,6 @@ def _stored(work: Path, stem: str, photo: Photo) -> str:
 # -- reading ---------------------------------------------------------------------------------------------------------
 
 
-def is_imported(folder: str | Path) -> bool:
-    """Tell whether a folder is an imported set."""
-    return (Path(folder) / INFO).is_file()
-
-
 @dataclass(frozen=True)
 class ImportedSet:
     """Imported set, opened.

@@ -1,22 +1,28 @@
-"""Texts of strangers in what is written for people: names of methods and cameras, notes of files, reasons.
+"""Texts of strangers in what is written for people, and tables of text: for terminals, Markdown, LaTeX and CSV.
 
-One function for each kind of output, and no output without one. A text stays readable, is one line, and is nothing but
-text: no markup, no link, no command, no formula. A terminal has `validation.printable_line`, HTML of templates the
-template's own escapes, and JSON its own.
+Strangers' texts are names of methods and cameras, notes of files, reasons. One function for each kind of output, and no
+output without one. A text stays readable, is one line, and is nothing but text: no markup, no link, no command, no
+formula. A terminal has `validation.printable_line`, HTML of templates the template's own escapes, and JSON its own.
 
 `ShortForm` is our own text: results show a title with lines of names and values, in a terminal and in a notebook.
 """
 
 from __future__ import annotations
 
+import csv
 import html
+import io
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Any
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from phibench.scenes.validation import printable_line
+
+if TYPE_CHECKING:  # most commands show no table
+    from rich.console import Console
 
 _MOST = 2000  # signs of a stranger's text
 
@@ -133,3 +139,106 @@ def _array(values: np.ndarray[Any, Any]) -> str:
     if values.dtype.kind not in "iuf" or not np.isfinite(values).any():
         return text
     return f"{text}, {short(np.nanmin(values).item())} to {short(np.nanmax(values).item())}"
+
+
+# -- tables ------------------------------------------------------------------------------------------------------------
+
+WIDE = 210
+"""Columns of a terminal for tables with every interval."""
+_MANY = 9  # columns that stand close together
+
+
+@dataclass(frozen=True)
+class TextTable:
+    """A table as text.
+
+    Attributes
+    ----------
+    title : str
+    heads : tuple of str
+        A line break parts a head from its unit.
+    rows : tuple of rows, each a tuple of str
+    columns : str
+        A letter each: "r" is a number, "l" a word, "L" a text that may go on on the next line.
+    note : str
+        A line below the table.
+    """
+
+    title: str
+    heads: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    columns: str
+    note: str = ""
+
+
+def table_console(wide: bool) -> Console:
+    """A console for tables: at least 80 columns wide, or `WIDE`."""
+    return wide_console(WIDE if wide else 80)
+
+
+def wide_console(least: int) -> Console:
+    """A console with so many columns at least: in a narrow terminal or a pipe a table would lose numbers."""
+    from rich.console import Console
+
+    console = Console(markup=False, emoji=False)
+    return console if console.width >= least else Console(width=least, markup=False, emoji=False)
+
+
+def show_grid(console: Console, grid: TextTable) -> None:
+    """Print a table to a terminal; text that is too long for it goes on below."""
+    from rich.box import SIMPLE_HEAD
+    from rich.table import Table
+    from rich.text import Text
+
+    gap = int(len(grid.heads) < _MANY)
+    table = Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, gap, 0, 0), show_edge=False)
+    for name, kind in zip(grid.heads, grid.columns, strict=True):
+        table.add_column(name, justify="right" if kind == "r" else "left", overflow="fold", no_wrap=kind != "L")
+    for row in grid.rows:
+        table.add_row(*map(Text, row))  # as it is: a string would be searched for markup and emoji
+    for part in (Text(grid.title, style="bold"), table, *([Text(grid.note)] if grid.note else [])):
+        console.print(part)
+    console.print()
+
+
+def text_of(grid: TextTable) -> str:
+    """Table as a terminal of 80 columns shows it."""
+    from rich.console import Console
+
+    console = Console(file=io.StringIO(), width=80, markup=False, emoji=False, color_system=None)
+    show_grid(console, grid)
+    shown = console.file.getvalue()  # type: ignore[attr-defined]
+    return "\n".join(line.rstrip() for line in shown.rstrip().split("\n"))
+
+
+def markdown(grid: TextTable) -> str:
+    """Table in Markdown, a line of text before it."""
+    marks = [" --: " if kind == "r" else " :-- " for kind in grid.columns]
+    heads, *rows = (tuple(map(markdown_cell, row)) for row in (grid.heads, *grid.rows))
+    lines = table_lines(heads, rows, marks)
+    note = ("", markdown_text(grid.note)) if grid.note else ()
+    return "\n".join((f"{markdown_text(grid.title)}\n", *lines, *note)) + "\n"
+
+
+def latex(grid: TextTable) -> str:
+    """Table in LaTeX, for the package booktabs."""
+    lines = [" & ".join(map(latex_text, row)) + r" \\" for row in (grid.heads, *grid.rows)]
+    body = [
+        rf"\begin{{tabular}}{{{grid.columns.lower()}}}",
+        r"\toprule",
+        lines[0],
+        r"\midrule",
+        *lines[1:],
+        r"\bottomrule",
+    ]
+    return "\n".join((f"% {printable_line(grid.title)}", *body, r"\end{tabular}")) + "\n"
+
+
+def csv_table(heads: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
+    """CSV; an empty cell for None."""
+    buffer = io.StringIO()
+    writer = csv.writer(buffer, lineterminator="\n")
+    writer.writerows(
+        [heads, *(["" if x is None else csv_text(x) if isinstance(x, str) else x for x in row] for row in rows)]
+    )
+    return buffer.getvalue()

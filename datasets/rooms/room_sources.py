@@ -21,7 +21,6 @@ from phibench.datasets.rooms.room_files import RoomError, checked_file
 from phibench.scenes.catalog import ROOMS, TargetBoard
 from phibench.scenes.room import Room
 from phibench.scenes.validation import SceneError, nearest, printable_line
-from phibench.scenes.worlds.generated_room import generate_room
 from phibench.scenes.worlds.properties import RoomProperties
 
 EXPORTED = "exported"
@@ -68,6 +67,8 @@ class GeneratedRoom:
         SceneError
             If no lamp finds a place.
         """
+        from phibench.scenes.worlds.generated_room import generate_room  # furniture: for rooms that are built
+
         return generate_room(self.properties, *self.stream)
 
 

@@ -178,6 +178,11 @@ def is_frames_set(folder: str | Path) -> bool:
     return (Path(folder) / FRAMES_SET).is_file()
 
 
+def is_imported(folder: str | Path) -> bool:
+    """True if a folder says of itself that it is an imported set."""
+    return (Path(folder) / TruthFolder.IMPORTED.value).is_file()
+
+
 Row = TypeVar("Row", bound=PublicPair)
 
 

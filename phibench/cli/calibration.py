@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from phibench.calibration.rig.sphere_options import SphereOptions
-from phibench.cli.options import DEFAULT_PRESET, DataFolder, Preset, SensorFile
+from phibench.cli.options import DEFAULT_PRESET, DataFolder, Flag, Preset, SensorFile
 
 if TYPE_CHECKING:
     from phibench.calibration.rig.from_dataset import CalibrationSources
@@ -48,7 +48,7 @@ class SourceOptions:
     """
 
     spots: bool = False
-    vertical: Annotated[bool, Parameter(negative="")] = False
+    vertical: Flag = False
     distance_sigma_m: float = 1e-3
     height_sigma_m: float = math.inf
     azimuth_sigma_deg: float = math.inf
@@ -105,11 +105,12 @@ def calibrate(
         PNG to write: the outline on the frame, with its residuals enlarged; by default beside the calibration.
     """
     from phibench.calibration.captures.imported_calibration import calibrate_imported
-    from phibench.calibration.captures.imported_set import is_imported, open_imported
+    from phibench.calibration.captures.imported_set import open_imported
     from phibench.calibration.rig.from_dataset import calibrate_dataset
     from phibench.calibration.rig.spots import Ruler
     from phibench.datasets.common.errors import DatasetError
     from phibench.datasets.store.files import require_writable
+    from phibench.datasets.store.pair_files import is_imported
     from phibench.estimator.geometry.rig_parameters import PARAMETERS, has_effect
     from phibench.scenes.misalignment import PARAMETERS as MISALIGNMENT
 

@@ -8,13 +8,12 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import App, Parameter
 
-from phibench.cli.options import SENSOR, SensorFile, number
+from phibench.cli.options import SENSOR, Metres, SensorFile
 
 if TYPE_CHECKING:
     from phibench.calibration.captures.measure import KnownNumbers
 
 Pictures = Annotated[tuple[Path, ...], Parameter(consume_multiple=True, negative="", show_default=False)]
-Metres = Annotated[float, Parameter(converter=number)]
 
 
 @Parameter(name="*")

@@ -10,19 +10,20 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import App, Parameter
 
-from phibench.cli.completions import parts, pictures, recipes, released
 from phibench.cli.options import (
     DEFAULT_PRESET,
     START,
     DataFolder,
+    Flag,
     OneSample,
     OutFolder,
     OwnOrPreset,
-    Preset,
     Scheduler,
     Variant,
     Whole,
     Workers,
+    pictures,
+    recipes,
 )
 
 if TYPE_CHECKING:
@@ -90,9 +91,9 @@ class RecipeOptions:
     samples: Whole | None = None
     seed: Whole | None = None
     secret_seed: Path | None = None
-    replace: Annotated[bool, Parameter(negative="")] = False
+    replace: Flag = False
     room_files: Path | None = None
-    leave_out_refused: Annotated[bool, Parameter(negative="")] = False
+    leave_out_refused: Flag = False
 
     def keywords(self, *, make_seed: bool) -> Any:
         """Keywords of `make`; the seed of a file, which is made if it is not there and may be."""
@@ -363,151 +364,6 @@ def frames(
     for note in done.notes:
         print(f"note: {note}")
     print(f"{done.folder}: {done.made} files written, {done.kept} kept, index frames.jsonl and frames.parquet")
-    return 0
-
-
-@Parameter(name="*")
-@dataclass(frozen=True)
-class SplitOptions:
-    """Parts of an export.
-
-    Parameters
-    ----------
-    split_by
-        What no two splits share: "both" rig and room, or one of them.
-    validation
-        Share of the pairs, at most; a set of one rig or room is all for training.
-    test
-        Share of the pairs, at most; the rest is for training.
-    pairs_per_shard
-        Pairs in one file of Parquet or tar, or in one folder of image files.
-    """
-
-    split_by: Literal["both", "rig", "room"] = "both"
-    validation: float = 0.1
-    test: float = 0.1
-    pairs_per_shard: Whole = 64
-
-
-_TENTHS = SplitOptions()
-
-
-def export(
-    directory: DataFolder,
-    *,
-    to: Literal["parquet", "webdataset", "frames"],
-    out: OutFolder,
-    preset: Preset = DEFAULT_PRESET,
-    laser_off: bool | None = None,
-    drawing: DrawOptions = _ALL_ONCE,
-    splits: SplitOptions = _TENTHS,
-) -> int:
-    """Write a data set's pairs for other tools, with truth, splits, card, licence and Croissant description.
-
-    What is finished already is kept. `phibench dataset verify` checks an export, too. Files with an exposure, a region
-    or a camera of their own are not for `score`.
-
-    Parameters
-    ----------
-    to
-        "parquet" (read by `datasets`), "webdataset" (tar files) or "frames" (image files; `score` takes them, too).
-    preset
-        Where the camera's chain ends: "mono-raw", "bayer-raw", "srgb8", "yuyv" or "mjpeg" (the camera's own JPEG).
-    laser_off
-        Also every image without the spot; by default for "frames" whose recipe has them.
-    """
-    from phibench.benchmark.export.export_make import export as export_pairs
-    from phibench.benchmark.export.export_make import scored_with_laser_off
-    from phibench.benchmark.export.pair_rows import ExportRequest
-
-    options = drawing.options(preset, {})
-    scored = to == "frames" and not options.given  # other sensors and numbers are not those of any score
-    shares = (splits.split_by, splits.validation, splits.test, splits.pairs_per_shard)
-    # as methods are scored on it
-    off = scored_with_laser_off(directory) if laser_off is None and scored else bool(laser_off)
-    request = ExportRequest(to, options, drawing.draws, off, *shares, samples=drawing.sample, scored=scored)
-    done = export_pairs(directory, request, out, workers=drawing.workers)
-    for note in done.notes:
-        print(f"note: {note}")
-    counts = ", ".join(f"{count} {name}" for name, count in done.pairs.items())
-    print(f"{done.folder}: pairs {counts}; {done.made} shards written, {done.kept} kept")
-    return 0
-
-
-def release(
-    *,
-    out: Path,
-    work: Path,
-    secret_seed: Path | None = None,
-    part: Annotated[tuple[str, ...], Parameter(negative="", completer=parts)] = (),
-    samples: Whole | None = None,
-    use: Annotated[tuple[Path, ...], Parameter(negative="")] = (),
-    workers: Workers = None,
-    dry_run: bool = False,
-) -> int:
-    """Make the frozen benchmark as archives to be published, with a list of their hashes.
-
-    What is finished already is kept, so that a run that ended early goes on.
-
-    Parameters
-    ----------
-    out
-        Folder to publish: archives, MANIFEST.json, SHA256SUMS, card, licence and Croissant.
-    work
-        Folder of the data sets, not to be published: it holds the truth of the sealed part.
-    secret_seed
-        File with the seed of the sealed part, outside --out; one is drawn if there is no such file. Other parts need
-        none.
-    part
-        "dev", "test", "paper", "mirrors", "films", "drives" or "starter". May be given several times; all by default.
-    samples
-        Samples of each part that draws its samples, instead of the recipe's number.
-    use
-        Folder of a finished data set of a part, to be packed in place of a rendered one. May be given several times.
-    dry_run
-        Say how many samples, bytes and CPU-hours each part takes; render nothing.
-    """
-    from phibench.benchmark.release import release_make
-    from phibench.benchmark.release.benchmark import chosen_parts
-    from phibench.benchmark.sealed.sealed_set import seal
-
-    request = release_make.ReleaseRequest(chosen_parts(part), out, work, secret_seed, samples, use, workers=workers)
-    if dry_run:
-        for line in release_make.dry_run(request):
-            print(line)
-        return 0
-    done = release_make.release(request, seal)
-    for name, held in sorted(done.manifest.parts.items()):
-        print(f"{name}: {held.count_text} samples, {len(held.archives)} archives, {held.download / 1e6:.1f} MB")
-    print(f"{out}: {done.made} archives written, {done.kept} kept; SHA-256 of MANIFEST.json: {done.digest}")
-    return 0
-
-
-def fetch(
-    name: Annotated[str, Parameter(completer=released)],
-    *,
-    out: Path,
-    from_: Annotated[str | None, Parameter(name="--from")] = None,
-    manifest_sha256: str | None = None,
-) -> int:
-    """Fetch a released data set and check every file; what was fetched before a break is kept.
-
-    Parameters
-    ----------
-    name
-        "phibench-v4-dev", or its last word.
-    out
-        Folder that the data set will be. It has this name only when all of it is there.
-    from_
-        Folder of a release, or its address with http:// or https://; by default that in PHIBENCH_SOURCE.
-    manifest_sha256
-        SHA-256 that the release's MANIFEST.json must have.
-    """
-    from phibench.benchmark.release.fetch import fetch as fetch_set
-
-    done = fetch_set(name, out, from_, manifest_sha256=manifest_sha256)
-    what = f"{done.fetched} of {done.archives} archives fetched" if done.fetched else "there already"
-    print(f"{done.folder}: {done.title}, {what}; every file has its SHA-256")
     return 0
 
 

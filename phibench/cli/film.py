@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import App, Parameter
 
-from phibench.cli.completions import policies, recipes
-from phibench.cli.options import DATA, SENSOR, FilmFolder, OutFolder, Preset, Variant, Whole, Workers
+from phibench.cli.options import DATA, SENSOR, FilmFolder, OutFolder, Preset, Variant, Whole, Workers, policies, recipes
 
 if TYPE_CHECKING:
     from phibench.robot.loop.episodes import Episode

@@ -25,14 +25,13 @@ from cyclopts import App, CycloptsError
 
 from phibench.cli.calibration import align, calibrate
 from phibench.cli.captures import import_, measure, sensor
-from phibench.cli.dataset import dataset, export, fetch, release
+from phibench.cli.dataset import dataset
 from phibench.cli.film import film, loop
-from phibench.cli.methods import method
 from phibench.cli.options import DATA, INSTALLATION, KEEPERS, METHODS, SENSOR, START, answer_to_old_spelling
+from phibench.cli.publish import export, fetch, release, seal, submission
 from phibench.cli.room import room, scene
 from phibench.cli.score import bench, compare, report, results, score
-from phibench.cli.seal import seal, submission
-from phibench.cli.start import demo, recipe, start
+from phibench.cli.start import demo, method, recipe, start
 from phibench.cli.studies import paper, stroke, study
 from phibench.datasets.common.parallel import ONE_THREAD
 

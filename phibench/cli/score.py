@@ -14,6 +14,7 @@ from phibench.cli.options import (
     LIMITS,
     BootstrapSeed,
     BuiltIn,
+    Counts,
     DataFolder,
     Limits,
     Methods,
@@ -101,7 +102,7 @@ class ChoiceOptions:
     boxes: Whole | None = None
     calibration: Path | None = None
     sensor: Path | None = None
-    frames: Annotated[tuple[Whole, Whole] | None, Parameter(negative="")] = None
+    frames: Counts = None
     track: Literal["localise", "find", "depth"] | None = None
 
     def of(self, directory: Path) -> PairSet:

@@ -10,7 +10,18 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import App, Parameter
 
-from phibench.cli.options import DEFAULT_PRESET, KEEPERS, DataFolder, OutFolder, OwnOrPreset, Preset, Whole, number
+from phibench.cli.options import (
+    DEFAULT_PRESET,
+    KEEPERS,
+    Counts,
+    DataFolder,
+    Flag,
+    Metres,
+    OutFolder,
+    OwnOrPreset,
+    Preset,
+    Whole,
+)
 
 if TYPE_CHECKING:
     from phibench.estimator.limits.best_stroke import BestStroke
@@ -40,7 +51,7 @@ class MisalignedOptions:
     preset: OwnOrPreset = None
     draws: Whole | None = None
     laser_off: bool | None = None
-    frames: Annotated[tuple[Whole, Whole] | None, Parameter(negative="")] = None
+    frames: Counts = None
     rig: Annotated[tuple[str, ...], Parameter(consume_multiple=True, negative="")] = ()
 
     def refuse(self) -> None:
@@ -69,10 +80,10 @@ _BY_DEFAULT = MisalignedOptions()
 def paper(
     directory: DataFolder,
     *,
-    misaligned: Annotated[bool, Parameter(negative="")] = False,
+    misaligned: Flag = False,
     calibration: Path | None = None,
     measured: MisalignedOptions = _BY_DEFAULT,
-    wide: Annotated[bool, Parameter(negative="")] = False,
+    wide: Flag = False,
     out: Path | None = None,
 ) -> int:
     """Print the tables of the paper beside those of every depth estimator; no method runs.
@@ -103,8 +114,8 @@ def paper(
 
 def _tables(directory: Path, calibration: Path | None, wide: bool, out: Path | None) -> int:
     from phibench.benchmark.pair_sets.wanted_pairs import of_calibration
-    from phibench.benchmark.scores.score_tables import show_grid, table_console
     from phibench.calibration.rig.file import read_calibration
+    from phibench.datasets.common.shown_text import show_grid, table_console
     from phibench.datasets.read import open_finished
     from phibench.studies.paper.paper_tables import bias_table, table
     from phibench.studies.paper.paper_tables import score as score_dataset
@@ -136,10 +147,11 @@ def _write_scores(out: Path, directory: Path, scores: Sequence[Score]) -> None:
 
 
 def _experiments(directory: Path, procedure: Procedure, rig: tuple[str, ...], wide: bool, out: Path | None) -> int:
-    from phibench.benchmark.scores.score_tables import show_grid, table_console
+    from phibench.datasets.common.shown_text import show_grid, table_console
     from phibench.datasets.read import open_finished
-    from phibench.datasets.store.files import require_writable
-    from phibench.studies.paper.experiment_bounds import budget_table, write_rows
+    from phibench.datasets.store.documents import parquet_bytes
+    from phibench.datasets.store.files import require_writable, write_bytes
+    from phibench.studies.paper.experiment_bounds import budget_table
     from phibench.studies.paper.experiment_tables import run_experiments
 
     if out is not None:
@@ -147,12 +159,9 @@ def _experiments(directory: Path, procedure: Procedure, rig: tuple[str, ...], wi
     # a line for each rig: each takes minutes
     rows = run_experiments(open_finished(directory), procedure, rig or None, lambda name: print(f"{name} is measured"))
     if out is not None:
-        write_rows(rows, out)
+        write_bytes(out, parquet_bytes(rows))
     show_grid(table_console(wide), budget_table(rows, wide))
     return 0
-
-
-Metres = Annotated[float, Parameter(converter=number)]
 
 
 @Parameter(name="*")
@@ -238,7 +247,7 @@ def stroke(
     out
         PNG or SVG to write: the error and its parts by the stroke.
     """
-    from phibench.benchmark.scores.score_tables import show_grid, table_console
+    from phibench.datasets.common.shown_text import show_grid, table_console
     from phibench.datasets.store.files import require_writable
     from phibench.studies.paper.stroke_chart import best_lines, loss_table, require_picture, write_stroke_picture
 
@@ -272,7 +281,7 @@ def _command(name: str, sentence: str) -> None:
     def run(
         *,
         out: OutFolder,
-        quick: Annotated[bool, Parameter(negative="")] = False,
+        quick: Flag = False,
         settings: Path | None = None,
         data: Path | None = None,
         workers: Whole | None = None,
@@ -293,7 +302,7 @@ def _command(name: str, sentence: str) -> None:
         publish
             Folder of the pages of the studies (docs/studies): NAME.json there is replaced. Full studies only.
         """
-        from phibench.studies.findings import findings_table, print_table
+        from phibench.studies.framework import findings_table, print_table
         from phibench.studies.run import FINDINGS, run_study
 
         result = run_study(name, out, quick, settings, data, workers, publish=publish)

@@ -1,46 +1,46 @@
 """Study `baseline`: the tables of the paper, with the errors that this camera would make.
 
-The settings and the run come first, then the findings and the small tables of the report.
+The settings and the run come first, then the findings, the small tables of the report, and the drawings: Figures 9 to
+11 and Table 4 of the paper with our estimates, and the laws of eq. (7).
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import polars as pl
-import scipy
 from pydantic import Field
 
+from phibench.benchmark.scores.intervals import percentile_interval
 from phibench.estimator.spots.simple_spots import find_spot
 from phibench.scenes.frames import Array
 from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.random_streams import generator
 from phibench.scenes.rig import POSITIONS
-from phibench.studies.baseline.drawings import curves_drawing, laws_drawing
-from phibench.studies.baseline.tables import (
-    EXPECTED,
-    SENSES,
-    Curve,
-    LawFit,
-    band_table,
-    estimates,
-    experiment_table,
-    experiments_of,
-    found_spots,
-    laws_of_noise,
-    published_curve,
-    seen,
+from phibench.studies.baseline import tables
+from phibench.studies.framework import (
+    COLOURS,
+    LINES,
+    Drawing,
+    Finding,
+    Row,
+    Settings,
+    Study,
+    StudyDatasets,
+    StudyResult,
+    canvas,
+    drawn,
+    error_bars,
+    rms,
+    text_table,
 )
-from phibench.studies.findings import Finding, Row
-from phibench.studies.framework import Settings, Study, StudyDatasets, StudyResult
 
 METHODS = ("red_centroid", "chain_fit")
 TABLES = ("table1", "table2", "table3")
 NAMED = ("ray", "normal", "incidence", "outline")
 RESAMPLES = 2000  # of the bootstrap of an rms
-CONFIDENCE = 0.95
 _LEAST = 3  # strokes for two constants and a residual
 
 
@@ -59,13 +59,17 @@ class BaselineSettings(Settings):
 def run(settings: BaselineSettings, datasets: StudyDatasets) -> StudyResult:
     """Run the study."""
     dataset = datasets.dataset(settings.recipe)
-    experiments, rig = experiments_of(dataset), dataset.samples[0].nominal_rig
+    experiments, rig = tables.experiments_of(dataset), dataset.samples[0].nominal_rig
     draws = dict(zip(METHODS, (settings.draws, settings.fit_draws), strict=True))
-    table = experiment_table(experiments, rig, found_spots(dataset, settings.preset, draws, datasets.workers))
-    bands = band_table(experiments, rig, settings.rigs, generator("study", "baseline", "rigs"))
-    laws = laws_of_noise(table, METHODS[0], settings.resamples)
+    table = tables.experiment_table(
+        experiments, rig, tables.found_spots(dataset, settings.preset, draws, datasets.workers)
+    )
+    bands = tables.band_table(experiments, rig, settings.rigs, generator("study", "baseline", "rigs"))
+    laws = tables.laws_of_noise(table, METHODS[0], settings.resamples)
     curves = [
-        published_curve(name, *_published(table, name), settings.resamples) for name in TABLES if _long(table, name)
+        tables.published_curve(name, *_published(table, name), settings.resamples)
+        for name in TABLES
+        if _long(table, name)
     ]
     rendered = pl.concat([_rendered(name, datasets) for name in settings.rendered] or [_NONE])
     all_findings = findings(table, bands, laws, curves, rendered)
@@ -87,7 +91,7 @@ def _curves_alt(found: Sequence[Finding]) -> str:
     return f"Error of D against stroke and distance, by table of the paper. {parts}."
 
 
-def _laws_alt(laws: Sequence[LawFit]) -> str:
+def _laws_alt(laws: Sequence[tables.LawFit]) -> str:
     parts = "; ".join(finding.text for law in laws for finding in _law_findings(law))
     return f"Standard deviation of D against eq. (7), and exponents of D and h. {parts}."
 
@@ -111,8 +115,8 @@ def _rendered(recipe: str, datasets: StudyDatasets) -> pl.DataFrame:
     rig = dataset.samples[0].nominal_rig
     wrong = Misalignment(**dataset.info.recipe["misalignment"])
     points, strokes = np.array([row.spot_world_m for row in rows]), np.array([row.nominal_stroke_m for row in rows])
-    down, up, true = seen(rig, wrong, points, strokes)
-    tables = [
+    down, up, true = tables.seen(rig, wrong, points, strokes)
+    spots_px = [
         np.array(
             [
                 find_spot(sample.expected_image(p, laser=True), sample.expected_image(p, laser=False)).uv_px
@@ -127,10 +131,10 @@ def _rendered(recipe: str, datasets: StudyDatasets) -> pl.DataFrame:
                 "recipe": recipe,
                 "sample_id": row.sample_id,
                 "sense": sense,
-                "rendered_error_m": float(estimates(sense, rig, strokes, *tables)[i] - row.depth_m),
-                "closed_form_error_m": float(estimates(sense, rig, strokes, down, up)[i] - true[i]),
+                "rendered_error_m": float(tables.estimates(sense, rig, strokes, *spots_px)[i] - row.depth_m),
+                "closed_form_error_m": float(tables.estimates(sense, rig, strokes, down, up)[i] - true[i]),
             }
-            for sense in SENSES
+            for sense in tables.SENSES
             for i, row in enumerate(rows)
         ]
     )
@@ -146,7 +150,7 @@ def _published(table: pl.DataFrame, experiment: str) -> tuple[Array, Array]:
     return rows["stroke_m"].to_numpy(), (rows["published_m"] - rows["depth_m"]).to_numpy()
 
 
-def _law_table(laws: list[LawFit]) -> pl.DataFrame:
+def _law_table(laws: list[tables.LawFit]) -> pl.DataFrame:
     return pl.DataFrame(
         [
             {
@@ -164,7 +168,11 @@ def _law_table(laws: list[LawFit]) -> pl.DataFrame:
 
 
 def findings(
-    table: pl.DataFrame, bands: pl.DataFrame, laws: Sequence[LawFit], curves: Sequence[Curve], rendered: pl.DataFrame
+    table: pl.DataFrame,
+    bands: pl.DataFrame,
+    laws: Sequence[tables.LawFit],
+    curves: Sequence[tables.Curve],
+    rendered: pl.DataFrame,
 ) -> tuple[Finding, ...]:
     """Findings: published and ours, senses of phi, misalignment, laws, published curves, rendered misalignment."""
     return (
@@ -231,7 +239,7 @@ def _sense_findings(table: pl.DataFrame) -> Iterator[Finding]:
     alone = rms(((own["published_m"] - own["depth_m"]) / own["depth_m"]).to_numpy())
     for sense in NAMED:
         rows = _own(table, sense)
-        apart = ((rows["published_m"] - rows["noise_free_m"]) / rows["depth_m"]).to_numpy()
+        apart = _apart(rows)
         yield rms_finding(f"published minus noise-free estimate, phi_{sense}, rms", apart, "sense", sense)
         share = Finding(
             f"sum of squares that phi_{sense} leaves of the published errors",
@@ -248,21 +256,21 @@ def _band_findings(table: pl.DataFrame, bands: pl.DataFrame) -> Iterator[Finding
         yield Finding(label, int(inside.sum()), unit=f"of {len(inside)}")
 
 
-def _law_findings(law: LawFit) -> Iterator[Finding]:
+def _law_findings(law: tables.LawFit) -> Iterator[Finding]:
     """Exponents of D and h against those of eq. (7)."""
     for name, value, low, high, expected in zip(
-        "Dh", law.law.exponents, law.law.low, law.law.high, EXPECTED, strict=True
+        "Dh", law.law.exponents, law.law.low, law.law.high, tables.EXPECTED, strict=True
     ):
         yield Finding(f"{law.name}: exponent of {name}", value, low, high).judged("=", expected)
 
 
-def _curve_findings(curve: Curve) -> Iterator[Finding]:
+def _curve_findings(curve: tables.Curve) -> Iterator[Finding]:
     """Signs, exponent and residuals of the published errors of one table; 1/h is the law of noise."""
     title, law = f"published errors of {_title(curve.experiment)}", curve.law
     yield Finding(f"{title}: changes of sign along h", curve.signs)
     yield Finding(f"{title}: rms", curve.rms_m, unit="m")
     exponent = Finding(f"{title}: exponent of h", law.exponents[0], law.low[0], law.high[0])
-    yield exponent.judged("=", EXPECTED[1])
+    yield exponent.judged("=", tables.EXPECTED[1])
     residuals = {"c/h": curve.inverse_m, "a + b h": curve.line_m, "a + b/h": curve.offset_m}
     for name, value in residuals.items():
         yield Finding(f"{title}: residual of {name}, per degree of freedom", value, unit="m")
@@ -283,56 +291,44 @@ def _title(experiment: str) -> str:
 
 def senses_shown(table: pl.DataFrame, bands: pl.DataFrame) -> tuple[Row, ...]:
     """Relative errors by sense of phi: rms and extremes, and how many published points lie in the misaligned band."""
-    rows: list[Row] = [("phi", "rms, %", "smallest, %", "largest, %", "rms to published, %", "published in the band")]
-    for sense in table["sense"].unique(maintain_order=True):
-        own, inside = _own(table, sense), _inside(table, bands, sense)
-        error = own["noise_free_m"].to_numpy() / own["depth_m"].to_numpy() - 1.0
-        apart = (own["published_m"].to_numpy() - own["noise_free_m"].to_numpy()) / own["depth_m"].to_numpy()
-        cells = (f"{100.0 * x:.3f}" for x in (rms(error), error.min(), error.max()))
-        rows.append((sense, *cells, f"{100.0 * rms(apart):.2f}", f"{inside.sum()} of {len(inside)}"))
-    return tuple(rows)
-
-
-def laws_shown(laws: Sequence[LawFit]) -> tuple[Row, ...]:
-    """Exponents with intervals."""
-    head = ("standard deviation of D from", "exponent of D", "95 %", "exponent of h", "95 %", "residual, %")
-    return (head, *(_law_row(law) for law in laws))
-
-
-def _law_row(law: LawFit) -> Row:
-    (p, q), low, high = law.law.exponents, law.law.low, law.law.high
-    return (
-        law.name,
-        f"{p:.2f}",
-        f"{low[0]:.2f} to {high[0]:.2f}",
-        f"{q:.2f}",
-        f"{low[1]:.2f} to {high[1]:.2f}",
-        f"{100.0 * law.law.rms_log:.0f}",
+    own = {sense: _own(table, sense) for sense in table["sense"].unique(maintain_order=True)}
+    error = {sense: (rows["noise_free_m"] / rows["depth_m"] - 1.0).to_numpy() for sense, rows in own.items()}
+    inside = {sense: _inside(table, bands, sense) for sense in own}
+    return text_table(
+        own,
+        {
+            "phi": str,
+            "rms, %": lambda sense: f"{100.0 * rms(error[sense]):.3f}",
+            "smallest, %": lambda sense: f"{100.0 * error[sense].min():.3f}",
+            "largest, %": lambda sense: f"{100.0 * error[sense].max():.3f}",
+            "rms to published, %": lambda sense: f"{100.0 * rms(_apart(own[sense])):.2f}",
+            "published in the band": lambda sense: f"{inside[sense].sum()} of {len(inside[sense])}",
+        },
     )
 
 
-def rms(values: Array) -> float:
-    """Root mean square; NaN of nothing."""
-    return float(np.sqrt(np.mean(np.square(values)))) if len(values) else float("nan")
+def laws_shown(laws: Sequence[tables.LawFit]) -> tuple[Row, ...]:
+    """Exponents with intervals."""
+    head = ("standard deviation of D from", "exponent of D", "95 %", "exponent of h", "95 %", "residual, %")
+    return (
+        head,
+        *((fit.name, *_exponent(fit, 0), *_exponent(fit, 1), f"{100.0 * fit.law.rms_log:.0f}") for fit in laws),
+    )
+
+
+def _exponent(fit: tables.LawFit, k: int) -> tuple[str, str]:
+    return f"{fit.law.exponents[k]:.2f}", f"{fit.law.low[k]:.2f} to {fit.law.high[k]:.2f}"
 
 
 def rms_interval(values: Array, *names: str) -> tuple[float, float]:
-    """Percentile bootstrap interval, 95 %, of a root mean square over independent cases; NaN for less than three.
+    """Interval of a root mean square over independent cases; NaN for less than three.
 
     `names` are those of the random stream.
     """
     if len(values) < 3:
         return float("nan"), float("nan")
-    interval = scipy.stats.bootstrap(
-        (np.square(values),),
-        lambda squares, axis: np.sqrt(np.mean(squares, axis=axis)),
-        n_resamples=RESAMPLES,
-        confidence_level=CONFIDENCE,
-        method="percentile",
-        vectorized=True,
-        rng=generator("study", "spread", *names),
-    )
-    return float(interval.confidence_interval.low), float(interval.confidence_interval.high)
+    low, high = percentile_interval([values], rms, RESAMPLES, generator("study", "spread", *names))
+    return float(low[0]), float(high[0])
 
 
 def rms_finding(label: str, values: Array, *names: str) -> Finding:
@@ -347,10 +343,83 @@ def _own(table: pl.DataFrame, sense: str, method: str | None = None) -> pl.DataF
     return table.filter((pl.col("sense") == sense) & (pl.col("method") == (method or table["method"][0])))
 
 
+def _apart(rows: pl.DataFrame) -> Array:
+    """Published minus noise-free estimate, relative."""
+    return ((rows["published_m"] - rows["noise_free_m"]) / rows["depth_m"]).to_numpy()
+
+
 def _inside(table: pl.DataFrame, bands: pl.DataFrame, sense: str) -> Array:
     own = _own(table, sense).join(bands, on=["sample_id", "sense"])
     error = own["published_m"] - own["depth_m"]
     return ((error >= own["low_m"]) & (error <= own["high_m"])).to_numpy()
+
+
+# -- drawings ----------------------------------------------------------------------------------------------------------
+
+PANELS = {
+    "table1": ("Figure 9: D = 2.18 m", "stroke_m"),
+    "table2": ("Figure 10: D = 3.18 m", "stroke_m"),
+    "table3": ("Figure 11: D = 4.18 m", "stroke_m"),
+    "table4": ("Table 4: h = 0.425 m", "depth_m"),
+}
+_AXES = {"stroke_m": "stroke h (m)", "depth_m": "real depth D (m)"}
+
+
+def curves_drawing(table: pl.DataFrame, bands: pl.DataFrame, method: str, alt: str) -> Drawing:
+    """Error of D against h, and D: published, ours with error bars, each sense of phi, drawn misalignments."""
+    rows = table.filter(pl.col("method") == method).join(bands, on=["sample_id", "sense"], how="left")
+    with canvas(9.0, 6.0) as figure:
+        for ax, (name, (title, axis)) in zip(figure.subplots(2, 2).flat, PANELS.items(), strict=True):
+            _panel(ax, rows.filter(pl.col("experiment") == name).sort(axis), axis)
+            ax.set(title=title, xlabel=_AXES[axis], ylabel="error of D (m)")
+        handles, labels = figure.axes[0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside lower center", ncols=4)
+        return drawn("curves", figure, alt)
+
+
+def laws_drawing(table: pl.DataFrame, laws: list[tables.LawFit], alt: str) -> Drawing:
+    """Deviation of D by noise against D^2 / (h s1 s2): eq. (7) is a line of slope 1."""
+    rows = table.filter((pl.col("sense") == "exact") & (pl.col("method") == table["method"][0]))
+    x = rows["depth_m"] ** 2 / rows["stroke_m"] / rows["sines"] * rows["bound_disparity_rad"]
+    with canvas(9.0, 4.0) as figure:
+        ax, other = figure.subplots(1, 2, width_ratios=[1, 1.2])
+        ax.loglog(x, rows["bound_m"], "o", color=COLOURS[0], label="bound")
+        ax.loglog(x, rows["sd_m"], "s", color=COLOURS[1], mfc="none", label=f"scatter, {rows['method'][0]}")
+        ends = np.array([x.min(), x.max()], float)
+        ax.loglog(ends, ends, "--", color=COLOURS[7], label="eq. (7)")
+        ax.set(xlabel="eq. (7) with the bound of the disparity (m)", ylabel="standard deviation of D (m)")
+        ax.legend()
+        _exponents(other, laws)
+        return drawn("laws", figure, alt)
+
+
+def _panel(ax: Any, rows: pl.DataFrame, axis: str) -> None:
+    ax.axhline(0.0, color=COLOURS[7], linewidth=0.8)
+    exact = rows.filter(pl.col("sense") == "ray")
+    band = {"color": COLOURS[4], "alpha": 0.3, "label": "misaligned rigs, phi_ray, 95 %"}
+    ax.fill_between(exact[axis], exact["low_m"], exact["high_m"], **band)
+    for i, sense in enumerate(NAMED):
+        own = rows.filter(pl.col("sense") == sense)
+        # scatter of a draw; the bound where there is one draw only
+        bars = {} if sense != "ray" else {"yerr": np.where(own["sd_m"].is_nan(), own["bound_m"], own["sd_m"])}
+        style = {"color": COLOURS[i], "linestyle": LINES[i % len(LINES)], "marker": ".", "capsize": 2, **bars}
+        ax.errorbar(own[axis], own["mean_m"] - own["depth_m"], label=f"ours, phi_{sense}", **style)
+    ax.plot(exact[axis], exact["published_m"] - exact["depth_m"], "D", color=COLOURS[7], mfc="none", label="published")
+
+
+def _exponents(ax: Any, laws: list[tables.LawFit]) -> None:
+    for i, law in enumerate(laws):
+        for k, shift in enumerate((-0.12, 0.12)):
+            value, low, high = law.law.exponents[k], law.law.low[k], law.law.high[k]
+            label = ("exponent of D", "exponent of h")[k] if i == 0 else None
+            bars, style = error_bars([(value, low, high)]), {"color": COLOURS[k], "marker": "os"[k], "capsize": 3}
+            ax.errorbar([value], [i + shift], xerr=bars, label=label, **style)
+    for k, expected in enumerate(tables.EXPECTED):
+        ax.axvline(expected, color=COLOURS[k], linestyle=":", linewidth=1.0)
+    ax.set_yticks(range(len(laws)), [law.name.replace(", ", ",\n", 1) for law in laws])
+    ax.set(xlabel="exponent, 95 % interval (dotted: eq. 7)")
+    ax.invert_yaxis()
+    ax.legend(fontsize=7)
 
 
 STUDY = Study(

@@ -14,9 +14,9 @@ from pathlib import Path
 
 import numpy as np
 import polars as pl
-import scipy
 
 from phibench.benchmark.pair_sets.dataset_pairs import DatasetPairs
+from phibench.benchmark.scores.intervals import percentile_interval
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.parallel import parallel_map
 from phibench.datasets.exposures.pair_draws import PairDraw, pair_draws
@@ -73,20 +73,11 @@ def fit_power_law(y: Array, bases: Array, random: np.random.Generator, resamples
     """
     good = np.isfinite(y) & (y > 0.0)
     logs = [np.log(x[good]) for x in (*bases, y)]
-    bootstrap = scipy.stats.bootstrap(
-        logs,
-        lambda *rows: _exponents(rows),
-        paired=True,
-        vectorized=False,
-        n_resamples=resamples,
-        method="percentile",
-        rng=random,
-    )
+    low, high = percentile_interval(logs, lambda *rows: _exponents(rows), resamples, random)
     design = np.stack([np.ones(good.sum()), *logs[:-1]], axis=-1)
     fitted = np.linalg.lstsq(design, logs[-1], rcond=None)[0]
     rms = float(np.sqrt(np.mean((logs[-1] - design @ fitted) ** 2)))
-    interval = bootstrap.confidence_interval
-    return PowerLaw(fitted[1:], np.atleast_1d(interval.low), np.atleast_1d(interval.high), rms)
+    return PowerLaw(fitted[1:], low, high, rms)
 
 
 def _exponents(rows: tuple[Array, ...]) -> Array:

@@ -17,7 +17,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 from pydantic import Field
-from scipy.special import gammaln, ndtr, ndtri
+from scipy.special import gammaln, ndtri
 
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import Rig
@@ -95,15 +95,6 @@ class Prior(Settings):
         low, high = self.uniform or [np.log(x) for x in self.log_uniform or ()]
         value = low + (high - low) * share
         return np.asarray(value if self.uniform else np.exp(value))
-
-    def share_of(self, value: Array) -> Array:
-        """Prior probability below values."""
-        if self.rayleigh is not None:
-            return np.asarray(-np.expm1(-0.5 * (np.maximum(value, 0.0) / self.rayleigh) ** 2))
-        if self.normal is not None:
-            return np.asarray(ndtr((value - self.normal[0]) / self.normal[1]))
-        low, high = self.uniform or [np.log(x) for x in self.log_uniform or ()]
-        return np.clip(((value if self.uniform else np.log(value)) - low) / (high - low), 0.0, 1.0)
 
 
 class Explanation(Settings):

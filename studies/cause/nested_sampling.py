@@ -15,7 +15,6 @@ import numpy as np
 from pydantic import Field
 
 from phibench.datasets.common.errors import DatasetError
-from phibench.datasets.common.parallel import parallel_map
 from phibench.scenes.frames import Array
 from phibench.scenes.random_streams import Name, generator
 from phibench.scenes.rig import Rig
@@ -289,10 +288,6 @@ def made_up(settings: CauseSettings, truth: Truth, number: int, repeat: int) -> 
     return settings.model(truth.explanation, data.with_estimates(estimates))
 
 
-def run_all(runs: Sequence[Run], workers: int | None) -> dict[tuple[Name, ...], Posterior]:
-    """Posteriors by key; the number of workers changes no number, because each run has its own random stream."""
-    return dict(zip((run.key for run in runs), parallel_map(_sampled, runs, workers), strict=True))
-
-
-def _sampled(run: Run) -> Posterior:
+def sampled(run: Run) -> Posterior:
+    """Posterior of a run: it has its own random stream, so that no other run changes it."""
     return sample(run.model, run.live_points, run.stop, *run.key)

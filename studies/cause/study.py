@@ -1,7 +1,8 @@
 """Study `cause`: what makes the error curves that the paper has published.
 
-The run comes first, then the findings from its tables, then the small tables of the report. Log evidences are natural
-logarithms; a finding gives two of their errors on both sides.
+The run comes first, then the findings from its tables, the small tables of the report, and the drawings: predicted
+errors, evidence of each explanation, posterior of noise and tilt. Log evidences are natural logarithms; a finding gives
+two of their errors on both sides.
 """
 
 from __future__ import annotations
@@ -12,20 +13,33 @@ from typing import Any
 import numpy as np
 import polars as pl
 
+from phibench.scenes.random_streams import generator
 from phibench.studies.cause import tables
-from phibench.studies.cause.drawings import evidence_drawing, posterior_drawing, predictive_drawing
-from phibench.studies.cause.model import WHOLE_PIXEL_PX
+from phibench.studies.cause.model import NOISE, WHOLE_PIXEL_PX
 from phibench.studies.cause.nested_sampling import (
     CauseSettings,
     all_runs,
     pooled_runs,
     require_consistent,
     require_sampler,
-    run_all,
+    sampled,
 )
-from phibench.studies.cause.tables import DECIDED, ENOUGH, FLOOR, SIGMAS, verdict
-from phibench.studies.findings import Finding, Row
-from phibench.studies.framework import Study, StudyDatasets, StudyResult
+from phibench.studies.cause.paper_reading import TABLES, published_experiments
+from phibench.studies.cause.tables import DECIDED, ENOUGH, FLOOR, SIGMAS, Posteriors, band, grid_of, verdict
+from phibench.studies.framework import (
+    COLOURS,
+    LINES,
+    Drawing,
+    Finding,
+    Row,
+    Study,
+    StudyDatasets,
+    StudyResult,
+    canvas,
+    drawn,
+    ends_text,
+    text_table,
+)
 
 ALIKE = 0.95  # cosine from which two parameters do the same
 SMALL_P = 0.05  # of a posterior predictive check: the explanation does not describe the data
@@ -46,59 +60,50 @@ def run(settings: CauseSettings, datasets: StudyDatasets) -> StudyResult:
     require_consistent(settings)
     require_sampler()
     runs = all_runs(settings)
-    posteriors = pooled_runs(run_all(runs, datasets.workers), settings)
-    table = tables.explanation_table(settings, posteriors)
-    scales = tables.scale_table(settings, posteriors)
-    posterior = tables.posterior_table(settings, posteriors)
-    offsets = tables.offset_table(settings, posteriors)
-    correlations = tables.correlation_table(settings, posteriors)
-    alike = tables.alike_table(settings, posteriors)
-    made_up = tables.made_up_table(settings, posteriors, runs)
-    density = tables.density_table(settings, posteriors)
-    short = tables.short_stroke_table()
+    sampled_runs = datasets.map(sampled, runs, "cause, samplings")
+    posteriors = pooled_runs(dict(zip((run.key for run in runs), sampled_runs, strict=True)), settings)
+    frames = {
+        "table": tables.explanation_table(settings, posteriors),
+        "prior_scales": tables.scale_table(settings, posteriors),
+        "posterior": tables.posterior_table(settings, posteriors),
+        "offsets": tables.offset_table(settings, posteriors),
+        "correlations": tables.correlation_table(settings, posteriors),
+        "alike": tables.alike_table(settings, posteriors),
+        "left_out": tables.left_out_table(settings, posteriors),
+        "made_up": tables.made_up_table(settings, posteriors, runs),
+        "density": tables.density_table(settings, posteriors),
+        "short_stroke": tables.short_stroke_table(),
+    }
+    table = frames["table"]
     found = (
         *evidence_findings(table),
         *convention_findings(settings, table),
         *noise_findings(table),
         *residual_findings(table),
-        *offset_findings(table, offsets),
-        *scale_findings(scales),
+        *offset_findings(table, frames["offsets"]),
+        *scale_findings(frames["prior_scales"]),
         *left_out_findings(table),
-        *alike_findings(settings, alike, correlations),
-        *made_up_findings(made_up),
-        *density_findings(density),
-        *short_stroke_findings(short),
+        *alike_findings(settings, frames["alike"], frames["correlations"]),
+        *made_up_findings(frames["made_up"]),
+        *density_findings(frames["density"]),
+        *short_stroke_findings(frames["short_stroke"]),
     )
     best = f"Best: {table.sort('log_evidence', descending=True)['text'][0]}."
     noise = "; ".join(finding.text for finding in noise_findings(table) if finding.unit == "px")
-    drawn = ", ".join(f"'{settings.explanation(name).text}'" for name in settings.drawn)
+    texts = {name: f"'{settings.explanation(name).text}'" for name in settings.drawn}
+    names = ", ".join(texts.values())
+    predicted = f"Published errors over 90 % bands and medians of {names}. {best}"
     return StudyResult(
-        {
-            "table": table,
-            "prior_scales": scales,
-            "posterior": posterior,
-            "offsets": offsets,
-            "correlations": correlations,
-            "alike": alike,
-            "left_out": tables.left_out_table(settings, posteriors),
-            "made_up": made_up,
-            "density": density,
-            "short_stroke": short,
-        },
+        frames,
         found,
         (
-            predictive_drawing(
-                settings, posteriors, f"Published errors over 90 % bands and medians of {drawn}. {best}"
-            ),
-            evidence_drawing(table, scales, f"Log evidence of {len(table)} explanations. {best}"),
-            posterior_drawing(settings, posteriors, f"Posteriors of {drawn}. Reading noise: {noise}."),
+            predictive_drawing(settings, posteriors, predicted),
+            evidence_drawing(table, frames["prior_scales"], f"Log evidence of {len(table)} explanations. {best}"),
+            posterior_drawing(settings, posteriors, f"Posteriors of {names}. Reading noise: {noise}."),
         ),
         {
             "Explanations, best first": explanations_shown(table),
-            **{
-                f"Posterior of '{settings.explanation(name).text}'": posterior_shown(posterior, name)
-                for name in settings.drawn
-            },
+            **{f"Posterior of {text}": posterior_shown(frames["posterior"], name) for name, text in texts.items()},
         },
         _LIMITS + _left_out(settings),
     )
@@ -266,48 +271,122 @@ def _decided(label: str, difference: float, error: float) -> Finding:
 
 def explanations_shown(table: pl.DataFrame) -> tuple[Row, ...]:
     """All explanations, best first."""
-    rows: list[Row] = [
-        (
-            "explanation",
-            "free",
-            "log evidence against the first",
-            "noise, px",
-            "rms left, %",
-            "chi2 p",
-            "trend p",
-            "left-out score",
-        )
-    ]
-    for row in table.sort("log_evidence", descending=True).iter_rows(named=True):
-        score = row["left_out_score"]
-        rows.append(
-            (
-                row["text"],
-                str(row["parameters"]),
-                f"{row['against']:+.1f} +- {row['against_error']:.1f}",
-                f"{row['noise_px']:.2f} ({row['noise_low_px']:.2f} to {row['noise_high_px']:.2f})",
-                f"{100.0 * row['left_rms']:.2f}",
-                f"{row['chi2_p']:.3f}",
-                f"{row['trend_p']:.3f}",
-                "-" if np.isnan(score) else f"{score:.1f} +- {row['left_out_error']:.1f}",
-            )
-        )
-    return tuple(rows)
+    return text_table(
+        table.sort("log_evidence", descending=True).to_dicts(),
+        {
+            "explanation": lambda row: row["text"],
+            "free": lambda row: str(row["parameters"]),
+            "log evidence against the first": lambda row: f"{row['against']:+.1f} +- {row['against_error']:.1f}",
+            "noise, px": lambda row: ends_text((row[f"noise{end}_px"] for end in ("", "_low", "_high")), ".2f"),
+            "rms left, %": lambda row: f"{100.0 * row['left_rms']:.2f}",
+            "chi2 p": lambda row: f"{row['chi2_p']:.3f}",
+            "trend p": lambda row: f"{row['trend_p']:.3f}",
+            "left-out score": _left_out_text,
+        },
+    )
+
+
+def _left_out_text(row: dict[str, Any]) -> str:
+    score = row["left_out_score"]
+    return "-" if np.isnan(score) else f"{score:.1f} +- {row['left_out_error']:.1f}"
 
 
 def posterior_shown(posterior: pl.DataFrame, explanation: str) -> tuple[Row, ...]:
     """Parameters of one explanation with the intervals of posterior and prior."""
-    own = posterior.filter(pl.col("explanation") == explanation)
-    rows = [
-        (
-            row["parameter"],
-            f"{row['mean']:.3g}",
-            f"{row['low']:.3g} to {row['high']:.3g}",
-            f"{row['prior_low']:.3g} to {row['prior_high']:.3g}",
-        )
-        for row in own.iter_rows(named=True)
-    ]
-    return (("parameter", "mean", "95 %", "prior, 95 %"), *rows)
+    return text_table(
+        posterior.filter(pl.col("explanation") == explanation).to_dicts(),
+        {
+            "parameter": lambda row: row["parameter"],
+            "mean": lambda row: f"{row['mean']:.3g}",
+            "95 %": lambda row: f"{row['low']:.3g} to {row['high']:.3g}",
+            "prior, 95 %": lambda row: f"{row['prior_low']:.3g} to {row['prior_high']:.3g}",
+        },
+    )
+
+
+# -- drawings ----------------------------------------------------------------------------------------------------------
+
+LEVEL = 0.9  # of the bands that are drawn
+_TITLES = ("Figure 9: D = 2.18 m", "Figure 10: D = 3.18 m", "Figure 11: D = 4.18 m", "Table 4: h = 0.425 m")
+_SCALES = {1.0: "priors as stated", 0.5: "half as wide", 2.0: "twice as wide"}
+
+
+def predictive_drawing(settings: CauseSettings, posteriors: Posteriors, alt: str) -> Drawing:
+    """Published errors over what fitted explanations predict."""
+    data = published_experiments()
+    with canvas(9.0, 6.0) as figure:
+        for table, ax in zip(range(TABLES), figure.subplots(2, 2).flat, strict=True):
+            grid, own = grid_of(table), data.chosen(data.table == table)
+            across = "depth_m" if table == TABLES - 1 else "stroke_m"
+            ax.axhline(0.0, color=COLOURS[7], linewidth=0.8)
+            for i, name in enumerate(settings.drawn):
+                model = settings.model(name, data)
+                points = posteriors["published", name].thinned(settings.predictive)
+                random = generator("study", "cause", "band", name, table)
+                low, median, high = band(model, points, grid, random, LEVEL) - grid.depth_m
+                x = getattr(grid, across)
+                ax.fill_between(x, low, high, color=COLOURS[i], alpha=0.15, linewidth=0)
+                ax.plot(x, median, LINES[i % len(LINES)], color=COLOURS[i], label=model.explanation.text)
+            error = own.estimate_m - own.depth_m
+            ax.plot(getattr(own, across), error, "D", color=COLOURS[7], mfc="none", label="published")
+            # noise at the shortest stroke is without limit; the points are what the eye should see
+            ax.set_ylim(error.min() - 1.5 * np.ptp(error) - 0.1, error.max() + 1.5 * np.ptp(error) + 0.1)
+            ax.set(title=_TITLES[table], xlabel=_axis(across), ylabel="error of D (m)")
+        handles, labels = figure.axes[0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside lower center", ncols=2)
+        return drawn("predictive", figure, alt)
+
+
+def evidence_drawing(table: pl.DataFrame, scales: pl.DataFrame, alt: str) -> Drawing:
+    """Log evidence of every explanation against the first."""
+    rows = table.sort("against")
+    places = {name: i for i, name in enumerate(rows["explanation"])}
+    with canvas(9.0, 0.6 + 0.28 * len(rows)) as figure:
+        ax = figure.subplots()
+        ax.axvline(0.0, color=COLOURS[7], linewidth=0.8)
+        ax.axvspan(-DECIDED, DECIDED, color=COLOURS[6], alpha=0.15, label="odds below 10 to 1")
+        for i, (scale, label) in enumerate(_SCALES.items()):
+            own = scales.filter(pl.col("scale") == scale)
+            if scale == 1.0:
+                own = rows.select("explanation", "against", error="against_error")
+            if len(own):
+                y = [places[name] + 0.18 * (i - 1) * (i > 0) for name in own["explanation"]]
+                ax.errorbar(own["against"], y, xerr=own["error"], fmt="osD"[i], color=COLOURS[i], ms=4, label=label)
+        ax.set_yticks(range(len(rows)), rows["text"])
+        ax.set(xlabel="log evidence against the one at 0 (bars: 1 sigma; decided: two bars or more outside the band)")
+        ax.legend(loc="lower right", fontsize=7)
+        return drawn("evidence", figure, alt)
+
+
+def posterior_drawing(settings: CauseSettings, posteriors: Posteriors, alt: str) -> Drawing:
+    """Reading noise of the drawn explanations; tilt against decentre where both are free."""
+    with canvas(9.0, 3.6) as figure:
+        noise, plane = figure.subplots(1, 2)
+        for i, name in enumerate(settings.drawn):
+            explanation = settings.explanation(name)
+            points = posteriors["published", name].thinned(settings.predictive)
+            named = dict(zip(explanation.parameters, points.T, strict=True))
+            if NOISE in named:
+                _histogram(noise, named[NOISE], i, explanation.text)
+            if "misalignment" in explanation.free:
+                x, y = np.degrees(named["tilt_y_rad"]), 1e3 * named["decentre_x_m"]
+                plane.plot(x, y, ".", ms=2, alpha=0.5, color=COLOURS[i], label=explanation.text)
+        # deviation of an error uniform over a pixel
+        noise.axvline(12.0**-0.5, color=COLOURS[7], linestyle=":", label="whole pixels")
+        noise.set(xlabel="reading noise of a radius (px)", ylabel="posterior density (1/px)")
+        plane.set(xlabel="tilt (deg)", ylabel="decentre along the tilt (mm)")
+        for ax in (noise, plane):
+            ax.legend(fontsize=6, markerscale=4)
+        return drawn("posterior", figure, alt)
+
+
+def _histogram(ax: Any, values: Any, i: int, label: str) -> None:
+    density, edges = np.histogram(values, bins=30, density=True)
+    ax.stairs(density, edges, color=COLOURS[i], linestyle=LINES[i % len(LINES)], label=label)
+
+
+def _axis(name: str) -> str:
+    return {"stroke_m": "stroke h (m)", "depth_m": "real depth D (m)"}[name]
 
 
 STUDY = Study(

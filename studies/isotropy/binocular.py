@@ -21,9 +21,9 @@ from phibench.scenes.frames import Array
 from phibench.scenes.rig import Rig, View
 from phibench.scenes.room import carriage
 from phibench.scenes.shapes import Mesh, Shape, Uniform
-from phibench.studies.findings import Finding
+from phibench.studies.framework import Finding
 from phibench.studies.isotropy.lines import moved
-from phibench.studies.isotropy.noise import fitted_px, flat_pair, sideways
+from phibench.studies.isotropy.noise import NORMAL_95, fitted_px, flat_pair, sideways
 from phibench.studies.misaligned_rigs import spot_of
 
 _ROWS, _COLUMNS = 36, 72  # of the ball's mesh: chords lie up to 0.1 % of the radius inside
@@ -32,7 +32,6 @@ _LOG2_PAIRS = 8  # of points on spot and lens: which part of the light passes is
 _HALF = 0.5  # of a spot's light: below it the spot counts as hidden
 _WIDEST_DEG = 40.0  # of hidden azimuths beside the other camera: none reaches as far
 _HALVINGS = 9  # of the widest angle: 0.08 degrees, less than a spot
-_NORMAL_95 = 1.96  # standard errors on both sides of an interval of 95 %
 _WORDS = {"depth_m": "D", "apart_m": "their distance"}
 _LEAST_FITS = 2  # of a place for a scatter, and places for a power
 _PLACES_PX = (0.0, 0.5, 1.0, 1.5)  # per axis, over the two pixels of a Bayer cell
@@ -221,7 +220,7 @@ def binocular_findings(shares: Sequence[tuple[float, float]], laws: Mapping[str,
         yield Finding(f"hidden from each other, by rendered spots, spot at {height_m:g} m", 100.0 * share, unit="%")
     for of, rows in laws.items():
         value, sigma = power(rows, of)
-        ends = (value, value - _NORMAL_95 * sigma, value + _NORMAL_95 * sigma)
+        ends = (value, value - NORMAL_95 * sigma, value + NORMAL_95 * sigma)
         yield Finding.ranged(f"two sensors, error of D per pixel, by images: power of {_WORDS[of]}", ends)
         by_rays = power(rows, of, "rays_m_per_px")[0]
         yield Finding(f"two sensors, error of D per pixel, by rays: power of {_WORDS[of]}", by_rays)

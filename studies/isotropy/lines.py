@@ -8,9 +8,11 @@ other way round. Hiding bodies are the mirror, the camera's housing and the mast
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import polars as pl
 
 from phibench.estimator.geometry.mirror_image import image_of, range_at
 from phibench.estimator.geometry.panorama import PanoramaGrid
@@ -20,6 +22,7 @@ from phibench.render.optics.room_tracer import blocked_by
 from phibench.scenes.frames import Array, Pose, as_vector
 from phibench.scenes.rig import Rig, View
 from phibench.scenes.room import carriage
+from phibench.studies.framework import COLOURS, Drawing, Finding, canvas, drawn
 from phibench.studies.misaligned_rigs import centroids_px, seen_px
 
 
@@ -171,3 +174,75 @@ def half_width_rad(rig: Rig, apart_m: float, depth_m: float, height_m: float) ->
     # rounding of a real root
     inside = [float(root.real) for root in roots if abs(root.imag) < 1e-12 and 0.0 < root.real < 1.0]
     return math.acos(max(inside)) if inside and A + B + C < 0.0 else 0.0
+
+
+# -- what comes of it --------------------------------------------------------------------------------------------------
+
+STRAIGHT_PX = 0.1
+"""A tenth of a pixel matters, less does not."""
+
+
+def occlusion_findings(hidden: pl.DataFrame, apart_m: float) -> Iterator[Finding]:
+    """Shares of all azimuths that two fixed sensors hide from each other, and one moving sensor from itself."""
+    for row in hidden.iter_rows(named=True):
+        label = f"hidden from each other, two sensors {apart_m:.3g} m apart, spot at {row['height_m']:g} m"
+        yield Finding(label, 100.0 * row["pair"], unit="%")
+    largest = 100.0 * float(np.max(hidden["own"].to_numpy()))
+    yield Finding("hidden from itself, one sensor that moves, largest", largest, unit="%").judged("<=", 0.0)
+
+
+def line_findings(aligned: Sequence[Line], tilted: Sequence[Line]) -> Iterator[Finding]:
+    """Distances of epipolar lines from the radius, the panorama's column, and their best straight line."""
+    for name, lines in (("aligned rig", aligned), ("misaligned rig", tilted)):
+        for word, key, unit in (
+            ("exact points beside the radius", "beside_radius_px", "px"),
+            ("rendered spots beside the radius", "rendered_beside_px", "px"),
+            ("panorama, beside the column", "bend_px", "columns"),
+            ("exact points beside a straight line", "beside_line_px", "px"),
+        ):
+            largest = max(getattr(line, key) for line in lines)
+            yield Finding(f"epipolar lines, {name}: {word}", largest, unit=unit).judged("<=", STRAIGHT_PX)
+
+
+def line_table(lines: tuple[Sequence[Line], Sequence[Line]]) -> pl.DataFrame:
+    """A row per rig and line."""
+    return pl.DataFrame(
+        [
+            {
+                "rig": name,
+                "down_u_px": float(line.down_px[0]),
+                "down_v_px": float(line.down_px[1]),
+                "beside_radius_px": line.beside_radius_px,
+                "beside_line_px": line.beside_line_px,
+                "rendered_beside_px": line.rendered_beside_px,
+                "panorama_bend_px": line.bend_px,
+            }
+            for name, each in zip(("aligned", "misaligned"), lines, strict=True)
+            for line in each
+        ]
+    )
+
+
+def lines_drawing(aligned: Sequence[Line], tilted: Sequence[Line], centre_px: Array) -> Drawing:
+    """Epipolar lines in the image, and their columns in the panorama."""
+    with canvas(9.0, 4.2) as figure:
+        left, right = figure.subplots(1, 2)
+        for i, (name, lines) in enumerate((("aligned", aligned), ("misaligned", tilted))):
+            for k, line in enumerate(lines):
+                label = name if k == 0 else None
+                left.plot(*line.uv_px.T, "-", color=COLOURS[i], label=label, linewidth=1.2)
+                left.plot(*line.down_px, "o", color=COLOURS[i], markersize=3)
+                right.plot(line.columns_px - line.columns_px[-1], line.depths_m, ".-", color=COLOURS[i], label=label)
+        for line in aligned:
+            left.plot(*np.stack([centre_px, line.down_px]).T, ":", color=COLOURS[6], linewidth=0.6)
+        left.set(xlabel="u, px", ylabel="v, px", title="image: down pixel (dot), up image of its ray (line)")
+        left.set_aspect("equal")
+        left.invert_yaxis()
+        right.set(xlabel="column - column of the farthest point, px", ylabel="D, m", title="panorama", yscale="log")
+        left.legend(loc="upper left", fontsize=8)
+        bend = [max(line.bend_px for line in lines) for lines in (aligned, tilted)]
+        alt = (
+            "Epipolar lines: radial in the image and vertical in the panorama for the aligned rig "
+            f"({bend[0]:.1e} columns), up to {bend[1]:.2g} columns off for the misaligned one."
+        )
+        return drawn("lines", figure, alt)

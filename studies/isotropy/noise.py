@@ -1,4 +1,4 @@
-"""Error of D against azimuth for one baseline: bound, measured scatter and bias, and a test of isotropy.
+"""Error of D against azimuth for one baseline: bound, scatter and bias, a test of isotropy; findings and a drawing.
 
 A pair is a spot in the views from both ends of a baseline, with the rig that the estimator knows. The baseline is
 vertical (the rig lifted) or horizontal (the rig moved sideways).
@@ -7,10 +7,11 @@ vertical (the rig lifted) or horizontal (the rig moved sideways).
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+import polars as pl
 import scipy
 
 from phibench.benchmark.scores.answer_errors import Rules
@@ -35,6 +36,17 @@ from phibench.scenes.frames import Array, as_vector
 from phibench.scenes.laser import Beam
 from phibench.scenes.random_streams import generator
 from phibench.scenes.rig import POSITIONS, Rig, View
+from phibench.studies.framework import (
+    Drawing,
+    Finding,
+    Row,
+    canvas,
+    drawn,
+    ends_text,
+    error_bars,
+    line_style,
+    text_table,
+)
 from phibench.studies.misaligned_rigs import spot_of
 
 _SIDE_PX = 11  # a board of 0.3 m at 2.5 m is 16 px high in the image: a larger square has its edges in the corners
@@ -214,16 +226,6 @@ class Isotropy:
         """There were azimuths enough for a test."""
         return math.isfinite(self.p_value) and math.isfinite(self.p_value_over_bound)
 
-    @property
-    def isotropic(self) -> bool:
-        """Nothing speaks against equal scatter."""
-        return self.p_value >= self.false_alarm
-
-    @property
-    def explained(self) -> bool:
-        """Nothing speaks against a scatter that follows the bound."""
-        return self.p_value_over_bound >= self.false_alarm
-
 
 def azimuth_noise(pair: BaselinePair, sensor: Sensor, draws: int, baseline: str, rules: Rules) -> AzimuthNoise:
     """Draw frames of a pair, estimate, and compare with the bound."""
@@ -286,3 +288,103 @@ def circle(depth_m: float, height_m: float, count: int) -> Array:
     """Points around the robot, shape (count, 3), starting half a step from world x."""
     turn = (np.arange(count) + 0.5) * (2.0 * math.pi / count)
     return np.stack([depth_m * np.cos(turn), depth_m * np.sin(turn), np.full(count, height_m)], axis=-1)
+
+
+# -- what comes of it --------------------------------------------------------------------------------------------------
+
+NORMAL_95 = 1.96
+"""Standard errors on both sides of an interval of 95 %."""
+_LEAST_P = 1e-9  # smaller ones say no more
+
+
+def scatter_findings(name: str, noise: Sequence[AzimuthNoise], test: Isotropy) -> Iterator[Finding]:
+    """Smallest and largest scatter of one baseline, and the tests of isotropy; none with too few azimuths."""
+    for word, pick in (("smallest", min), ("largest", max)):
+        azimuth = pick(noise, key=lambda each: each.scatter_m.value)
+        yield Finding.ranged(f"{name}: {word} scatter of D", azimuth.scatter_m.ends, "mm", 1e3)
+        yield Finding(f"{name}: azimuth of the {word} scatter", azimuth.azimuth_deg, unit="deg")
+    yield Finding(f"{name}: D", noise[0].depth_m, unit="m")
+    if test.tested:
+        yield Finding(f"{name}: largest over smallest scatter", test.ratio)
+        for word, p in (
+            ("the same scatter", test.p_value),
+            ("the same multiple of the bound", test.p_value_over_bound),
+        ):
+            yield Finding(f"{name}: p of {word} at all azimuths", max(p, _LEAST_P)).judged(">=", test.false_alarm)
+
+
+def bias_findings(name: str, noise: Sequence[AzimuthNoise]) -> Iterator[Finding]:
+    """Largest systematic error of the likelihood fits; none with too few estimates."""
+    usable = [one for one in noise if one.errors_m.size > 1]
+    if usable:
+        worst = max(usable, key=lambda one: abs(one.bias_m))
+        value, half = 1e3 * abs(worst.bias_m), 1e3 * NORMAL_95 * worst.bias_sigma_m
+        yield Finding(f"{name}: largest mean error", value, value - half, value + half, "mm")
+        yield Finding(f"{name}: largest mean error over the scatter there", abs(worst.bias_m) / worst.scatter_m.value)
+        yield Finding(f"{name}: azimuth of the largest mean error", worst.azimuth_deg, unit="deg")
+
+
+def noise_table(noise: Mapping[str, Sequence[AzimuthNoise]]) -> pl.DataFrame:
+    """A row per baseline and spot."""
+    return pl.DataFrame(
+        [
+            {
+                "baseline": name,
+                "azimuth_deg": row.azimuth_deg,
+                "depth_m": row.depth_m,
+                "bound_m": row.bound_m,
+                "scatter_m": row.scatter_m.value,
+                "scatter_low_m": row.scatter_m.low,
+                "scatter_high_m": row.scatter_m.high,
+                "bias_m": row.bias_m,
+                "bias_sigma_m": row.bias_sigma_m,
+                "draws": len(row.errors_m),
+                "missing": row.missing,
+            }
+            for name, rows in noise.items()
+            for row in rows
+        ]
+    )
+
+
+def noise_rows(noise: Mapping[str, Sequence[AzimuthNoise]]) -> tuple[Row, ...]:
+    """Table: scatter, interval, bound and bias per baseline and azimuth."""
+    return text_table(
+        ((name, row) for name, rows in noise.items() for row in rows),
+        {
+            "baseline": lambda spot: spot[0],
+            "azimuth, degrees": lambda spot: f"{spot[1].azimuth_deg:.0f}",
+            "bound, mm": lambda spot: f"{1e3 * spot[1].bound_m:.2f}",
+            "scatter, mm (95 %)": lambda spot: ends_text(spot[1].scatter_m.ends, ".2f", 1e3),
+            "bias, mm": lambda spot: f"{1e3 * spot[1].bias_m:+.2f} +- {1e3 * spot[1].bias_sigma_m:.2f}",
+            "fits missing": lambda spot: str(spot[1].missing),
+        },
+    )
+
+
+def noise_drawing(curves: Mapping[str, tuple[Array, Array]], noise: Mapping[str, Sequence[AzimuthNoise]]) -> Drawing:
+    """Standard deviation of D against azimuth: bounds on an even background as lines, measured in the room as marks."""
+    with canvas(9.0, 4.2) as figure:
+        ax = figure.subplots()
+        for i, (name, (azimuths, bound)) in enumerate(curves.items()):
+            style = {**line_style(i), "marker": ""}
+            ax.plot(azimuths, 1e3 * bound, label=f"{name}, bound", **style)
+            if name not in noise:
+                continue
+            rows = noise[name]
+            ends = 1e3 * np.array([row.scatter_m.ends for row in rows])
+            places = [row.azimuth_deg for row in rows]
+            marks = {**line_style(i), "linestyle": "none", "markersize": 4}
+            ax.errorbar(places, ends[:, 0], error_bars(ends), label=f"{name}, measured", capsize=3, **marks)
+        ax.set_yscale("log")
+        ax.set(xlabel="azimuth of the spot, degrees (the horizontal baseline lies at 0 and 180)")
+        ax.set(ylabel="standard deviation of D, mm")
+        ax.set_xticks(range(0, 361, 45))
+        figure.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=8)
+        parts = "; ".join(f"{name} {_range(rows)} mm" for name, rows in noise.items())
+        return drawn("noise", figure, f"Standard deviation of D against the azimuth of the spot, measured: {parts}.")
+
+
+def _range(rows: Sequence[AzimuthNoise]) -> str:
+    values = [1e3 * row.scatter_m.value for row in rows]
+    return f"{min(values):.2g} to {max(values):.2g}"

@@ -14,7 +14,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 import polars as pl
-from pydantic import BeforeValidator, Field
+from pydantic import Field
 
 from phibench.benchmark.scores.answer_errors import Rules
 from phibench.datasets.common.errors import DatasetError
@@ -33,32 +33,53 @@ from phibench.render.sensor.settings import sensor
 from phibench.scenes.frames import Array
 from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.rig import Rig
-from phibench.studies.findings import Finding, Row
-from phibench.studies.framework import Settings, Study, StudyDatasets, StudyResult
+from phibench.studies.framework import (
+    Drawing,
+    Finding,
+    Heights,
+    Names,
+    Row,
+    Settings,
+    Study,
+    StudyDatasets,
+    StudyResult,
+    canvas,
+    drawn,
+    line_style,
+    text_table,
+)
 from phibench.studies.isotropy.binocular import Binocular, Laws, tried
-from phibench.studies.isotropy.drawings import lines_drawing, misaligned_drawing, noise_drawing
-from phibench.studies.isotropy.lines import Line, epipolar_line, half_width_rad, hidden_share
+from phibench.studies.isotropy.lines import (
+    STRAIGHT_PX,
+    Line,
+    epipolar_line,
+    half_width_rad,
+    hidden_share,
+    line_findings,
+    line_table,
+    lines_drawing,
+    occlusion_findings,
+)
 from phibench.studies.isotropy.noise import (
+    NORMAL_95,
     AzimuthNoise,
     BaselinePair,
-    Isotropy,
     azimuth_noise,
+    bias_findings,
     bounds,
     bounds_over_grid,
     circle,
     isotropy,
+    noise_drawing,
+    noise_rows,
+    noise_table,
     pairs_of,
+    scatter_findings,
     sideways,
 )
 from phibench.studies.misaligned_rigs import Places, errors
 
-
-def _tuples(value: object) -> object:
-    return tuple(value) if isinstance(value, list) else value
-
-
-Height = Annotated[float, Field(ge=0.0, le=3.0)]
-Depth = Annotated[float, Field(gt=0.2, le=50.0)]
+Depths = Annotated[tuple[Annotated[float, Field(gt=0.2, le=50.0)], ...], Field(strict=False, min_length=3)]
 
 
 class IsotropySettings(Settings):
@@ -69,21 +90,18 @@ class IsotropySettings(Settings):
     false_alarm: float = Field(gt=0.0, lt=0.5, description="probability of a false 'not isotropic'")
     bound_azimuths: int = Field(ge=4, le=720, description="of the bound's curve")
     grid_azimuths: int = Field(ge=4, le=720, description="of the bound averaged over the pixel grid")
-    occlusion_heights_m: Annotated[tuple[Height, ...], BeforeValidator(_tuples)] = Field(min_length=1)
+    occlusion_heights_m: Heights
     occlusion_azimuths: int = Field(ge=36, le=100000)
     line_azimuths: int = Field(ge=2, le=360, description="epipolar lines, evenly around")
-    line_depths_m: Annotated[tuple[Depth, ...], BeforeValidator(_tuples)] = Field(min_length=3)
+    line_depths_m: Depths
     panorama_width_px: int = Field(ge=360, le=16384)
-    edges: Annotated[tuple[str, ...], BeforeValidator(_tuples)] = Field(description="shapes with upright edges")
+    edges: Names = Field(description="shapes with upright edges")
     confidence: float = Field(gt=0.5, lt=1.0)
     resamples: int = Field(ge=100, le=100000, description="of the bootstrap")
 
 
 VERTICAL, HORIZONTAL = "vertical stroke", "horizontal baseline"
 _LOW_RAD, _HIGH_RAD = math.radians(-20.0), math.radians(20.0)  # elevations of the walls of a room
-_LEAST_P = 1e-9  # smaller ones say no more
-_NORMAL_95 = 1.96  # standard errors on both sides of an interval of 95 %
-_STRAIGHT_PX = 0.1  # a tenth of a pixel matters, less does not
 
 
 @dataclass(frozen=True)
@@ -137,13 +155,13 @@ def run(settings: IsotropySettings, datasets: StudyDatasets) -> StudyResult:
     )
     return StudyResult(
         {
-            "table": _noise_table(noise),
+            "table": noise_table(noise),
             "bounds": pl.DataFrame(
                 {"azimuth_deg": azimuths, **_columns(curves, "bound_m"), **_columns(wrong, "error")}
             ),
             "occlusion": hidden,
             "edges": pl.DataFrame([{"rig": name, **vars(e)} for name, found in edges.items() for e in found]),
-            "lines": _line_table(lines),
+            "lines": line_table(lines),
         },
         findings,
         (
@@ -240,46 +258,6 @@ def _edges(settings: IsotropySettings, dataset: Dataset) -> tuple[SeenEdge, ...]
     return tuple(edge for edge in edges_seen if edge is not None)
 
 
-def _noise_table(noise: dict[str, tuple[AzimuthNoise, ...]]) -> pl.DataFrame:
-    return pl.DataFrame(
-        [
-            {
-                "baseline": name,
-                "azimuth_deg": row.azimuth_deg,
-                "depth_m": row.depth_m,
-                "bound_m": row.bound_m,
-                "scatter_m": row.scatter_m.value,
-                "scatter_low_m": row.scatter_m.low,
-                "scatter_high_m": row.scatter_m.high,
-                "bias_m": row.bias_m,
-                "bias_sigma_m": row.bias_sigma_m,
-                "draws": len(row.errors_m),
-                "missing": row.missing,
-            }
-            for name, rows in noise.items()
-            for row in rows
-        ]
-    )
-
-
-def _line_table(lines: tuple[tuple[Line, ...], tuple[Line, ...]]) -> pl.DataFrame:
-    return pl.DataFrame(
-        [
-            {
-                "rig": name,
-                "down_u_px": float(line.down_px[0]),
-                "down_v_px": float(line.down_px[1]),
-                "beside_radius_px": line.beside_radius_px,
-                "beside_line_px": line.beside_line_px,
-                "rendered_beside_px": line.rendered_beside_px,
-                "panorama_bend_px": line.bend_px,
-            }
-            for name, each in zip(("aligned", "misaligned"), lines, strict=True)
-            for line in each
-        ]
-    )
-
-
 def _columns(values: dict[str, Array], what: str) -> dict[str, Array]:
     return {f"{name.split()[0]}_{what}": each for name, each in values.items()}
 
@@ -295,34 +273,6 @@ def _notes(noise: dict[str, tuple[AzimuthNoise, ...]]) -> tuple[str, ...]:
 
 
 # -- findings ------------------------------------------------------------------------------------------------------
-
-
-def scatter_findings(name: str, noise: Sequence[AzimuthNoise], test: Isotropy) -> Iterator[Finding]:
-    """Smallest and largest scatter of one baseline, and the tests of isotropy; none with too few azimuths."""
-    for word, pick in (("smallest", min), ("largest", max)):
-        azimuth = pick(noise, key=lambda each: each.scatter_m.value)
-        ends = (azimuth.scatter_m.value, azimuth.scatter_m.low, azimuth.scatter_m.high)
-        yield Finding.ranged(f"{name}: {word} scatter of D", ends, "mm", 1e3)
-        yield Finding(f"{name}: azimuth of the {word} scatter", azimuth.azimuth_deg, unit="deg")
-    yield Finding(f"{name}: D", noise[0].depth_m, unit="m")
-    if test.tested:
-        yield Finding(f"{name}: largest over smallest scatter", test.ratio)
-        for word, p in (
-            ("the same scatter", test.p_value),
-            ("the same multiple of the bound", test.p_value_over_bound),
-        ):
-            yield Finding(f"{name}: p of {word} at all azimuths", max(p, _LEAST_P)).judged(">=", test.false_alarm)
-
-
-def bias_findings(name: str, noise: Sequence[AzimuthNoise]) -> Iterator[Finding]:
-    """Largest systematic error of the likelihood fits; none with too few estimates."""
-    usable = [one for one in noise if one.errors_m.size > 1]
-    if usable:
-        worst = max(usable, key=lambda one: abs(one.bias_m))
-        value, half = 1e3 * abs(worst.bias_m), 1e3 * _NORMAL_95 * worst.bias_sigma_m
-        yield Finding(f"{name}: largest mean error", value, value - half, value + half, "mm")
-        yield Finding(f"{name}: largest mean error over the scatter there", abs(worst.bias_m) / worst.scatter_m.value)
-        yield Finding(f"{name}: azimuth of the largest mean error", worst.azimuth_deg, unit="deg")
 
 
 def grid_findings(single: Array, averaged: Array) -> Iterator[Finding]:
@@ -360,34 +310,12 @@ def misaligned_findings(errors_by_baseline: Mapping[str, Array], words: str) -> 
         yield Finding(f"{name}, {words}: azimuths with an estimate", count, unit=f"of {values.size}")
 
 
-def occlusion_findings(hidden: pl.DataFrame, apart_m: float) -> Iterator[Finding]:
-    """Shares of all azimuths that two fixed sensors hide from each other, and one moving sensor from itself."""
-    for row in hidden.iter_rows(named=True):
-        label = f"hidden from each other, two sensors {apart_m:.3g} m apart, spot at {row['height_m']:g} m"
-        yield Finding(label, 100.0 * row["pair"], unit="%")
-    largest = 100.0 * float(np.max(hidden["own"].to_numpy()))
-    yield Finding("hidden from itself, one sensor that moves, largest", largest, unit="%").judged("<=", 0.0)
-
-
-def line_findings(aligned: Sequence[Line], tilted: Sequence[Line]) -> Iterator[Finding]:
-    """Distances of epipolar lines from the radius, the panorama's column, and their best straight line."""
-    for name, lines in (("aligned rig", aligned), ("misaligned rig", tilted)):
-        for word, key, unit in (
-            ("exact points beside the radius", "beside_radius_px", "px"),
-            ("rendered spots beside the radius", "rendered_beside_px", "px"),
-            ("panorama, beside the column", "bend_px", "columns"),
-            ("exact points beside a straight line", "beside_line_px", "px"),
-        ):
-            largest = max(getattr(line, key) for line in lines)
-            yield Finding(f"epipolar lines, {name}: {word}", largest, unit=unit).judged("<=", _STRAIGHT_PX)
-
-
 def edge_findings(name: str, edges: Sequence[SeenEdge]) -> Iterator[Finding]:
     """Largest lean of the room's upright edges in the panorama, and its largest difference from the prediction."""
     if edges:
         worst = max(edges, key=lambda edge: abs(edge.lean_px))
-        lean, half = worst.lean_px, _NORMAL_95 * worst.lean_sigma_px
-        size = Finding("", abs(lean), max(abs(lean) - half, 0.0), abs(lean) + half).judged("<=", _STRAIGHT_PX)
+        lean, half = worst.lean_px, NORMAL_95 * worst.lean_sigma_px
+        size = Finding("", abs(lean), max(abs(lean) - half, 0.0), abs(lean) + half).judged("<=", STRAIGHT_PX)
         label = f"upright edges, {name} rig: largest lean (threshold: of its size)"
         yield replace(size, label=label, value=lean, low=lean - half, high=lean + half, unit="columns")
         yield Finding(f"upright edges, {name} rig: rows of the edge with the largest lean", worst.rows)
@@ -398,44 +326,19 @@ def edge_findings(name: str, edges: Sequence[SeenEdge]) -> Iterator[Finding]:
 # -- small tables of the report ----------------------------------------------------------------------------------------
 
 
-def noise_rows(noise: Mapping[str, Sequence[AzimuthNoise]]) -> tuple[Row, ...]:
-    """Table: scatter, interval, bound and bias per baseline and azimuth."""
-    heads = ("baseline", "azimuth, degrees", "bound, mm", "scatter, mm (95 %)", "bias, mm", "fits missing")
-    return (
-        heads,
-        *(
-            (
-                name,
-                f"{row.azimuth_deg:.0f}",
-                f"{1e3 * row.bound_m:.2f}",
-                _interval(row),
-                f"{1e3 * row.bias_m:+.2f} +- {1e3 * row.bias_sigma_m:.2f}",
-                str(row.missing),
-            )
-            for name, rows in noise.items()
-            for row in rows
-        ),
-    )
-
-
 def edge_rows(edges: Mapping[str, Sequence[SeenEdge]]) -> tuple[Row, ...]:
     """Table: upright edges in the panorama."""
-    heads = ("rig", "edge", "azimuth, degrees", "rows", "lean, columns", "predicted", "offset, columns")
-    return (
-        heads,
-        *(
-            (
-                name,
-                edge.name,
-                f"{edge.azimuth_deg:.1f}",
-                str(edge.rows),
-                f"{edge.lean_px:+.3f} +- {edge.lean_sigma_px:.3f}",
-                f"{edge.expected_lean_px:+.3f}",
-                f"{edge.offset_px:+.3f}",
-            )
-            for name, rows in edges.items()
-            for edge in rows
-        ),
+    return text_table(
+        ((name, edge) for name, rows in edges.items() for edge in rows),
+        {
+            "rig": lambda row: row[0],
+            "edge": lambda row: row[1].name,
+            "azimuth, degrees": lambda row: f"{row[1].azimuth_deg:.1f}",
+            "rows": lambda row: str(row[1].rows),
+            "lean, columns": lambda row: f"{row[1].lean_px:+.3f} +- {row[1].lean_sigma_px:.3f}",
+            "predicted": lambda row: f"{row[1].expected_lean_px:+.3f}",
+            "offset, columns": lambda row: f"{row[1].offset_px:+.3f}",
+        },
     )
 
 
@@ -445,9 +348,21 @@ def ratio(values: Array) -> float:
     return float(known.max() / known.min()) if known.size else math.nan
 
 
-def _interval(one: AzimuthNoise) -> str:
-    s = one.scatter_m
-    return f"{1e3 * s.value:.2f} ({1e3 * s.low:.2f} to {1e3 * s.high:.2f})"
+# -- drawing -----------------------------------------------------------------------------------------------------------
+
+
+def misaligned_drawing(azimuths_deg: Array, errors: dict[str, Array], words: str) -> Drawing:
+    """Relative error of the exact estimator with nominal numbers against azimuth."""
+    with canvas(9.0, 3.6) as figure:
+        ax = figure.subplots()
+        for i, (name, values) in enumerate(errors.items()):
+            ax.plot(azimuths_deg, 100.0 * values, label=name, **{**line_style(i), "marker": ""})
+        ax.set(xlabel="azimuth of the spot, degrees", ylabel="error of D, %", title=words)
+        ax.set_yscale("symlog", linthresh=1.0)
+        ax.set_xticks(range(0, 361, 45))
+        ax.legend()
+        parts = "; ".join(f"{k} {100 * np.nanmin(v):+.2g} to {100 * np.nanmax(v):+.2g} %" for k, v in errors.items())
+        return drawn("misaligned", figure, f"Error of D of a misaligned rig against the azimuth: {parts}.")
 
 
 STUDY = Study(

@@ -1,12 +1,12 @@
-"""Drawings of the study `loop`: conditions beside each other, one episode in four pictures, and episodes as films."""
+"""One episode of the study `loop` in four pictures, and episodes as films."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,59 +19,13 @@ from phibench.robot.loop.robot_pixels import Window
 from phibench.robot.loop.simulator import REACHED, RUNNING, Observation, Setup, Simulator
 from phibench.scenes.frames import Array
 from phibench.scenes.room import ROBOT_SIZE_M
-from phibench.studies.framework import COLOURS, Drawing, canvas, drawn
+from phibench.studies.framework import Drawing, canvas, drawn
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-Ends = tuple[float, float, float]
 _CORNERS = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
 _TARGET, _WAY, _ROBOT = "#cc3311", "#0072b2", "#444444"
-
-
-class ConditionNumbers(Protocol):
-    """Numbers of a condition, as `study.Summary`."""
-
-    @property
-    def reached(self) -> Ends:
-        """Share of episodes."""
-
-    @property
-    def time_s(self) -> Ends:
-        """Mean time."""
-
-    @property
-    def pull(self) -> Ends:
-        """Rms pull of 1 / D."""
-
-
-def condition_drawing(found: Mapping[tuple[str, str], ConditionNumbers]) -> Drawing:
-    """Share that was reached, time and pull of every condition."""
-    names = [f"{group}: {name}" for group, name in found]
-    groups = list(dict.fromkeys(group for group, _ in found))
-    with canvas(11.0, 0.6 + 0.24 * len(names)) as figure:
-        axes = figure.subplots(1, 3, sharey=True)
-        titles = ("reached, %", "time of those, s", "pull of 1 / D")
-        for ax, name, scale, title in zip(axes, ("reached", "time_s", "pull"), (100.0, 1.0, 1.0), titles, strict=True):
-            for row, ((group, _), numbers) in enumerate(found.items()):
-                value, low, high = (scale * x for x in getattr(numbers, name))
-                colour = COLOURS[groups.index(group) % len(COLOURS)]
-                if math.isfinite(value):
-                    spread = [[max(value - low, 0.0)], [max(high - value, 0.0)]] if math.isfinite(low) else None
-                    ax.errorbar([value], [row], xerr=spread, fmt="o", color=colour, markersize=4, capsize=2)
-            ax.set_xlabel(title)
-            ax.grid(axis="x", linewidth=0.3)
-        axes[2].axvspan(0.9, 1.1, color="#dddddd", zorder=0)
-        axes[2].set_xscale("log")
-        axes[0].set_yticks(range(len(names)), names, fontsize=7)
-        axes[0].invert_yaxis()
-        alt = "Share of episodes that were reached: " + "; ".join(
-            f"{name} {100 * n.reached[0]:.0f} %" for name, n in zip(names, found.values(), strict=True)
-        )
-        return drawn("conditions", figure, alt + ".")
-
-
-# -- one episode -----------------------------------------------------------------------------------------------------
 
 
 @dataclass

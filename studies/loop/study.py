@@ -14,10 +14,9 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import polars as pl
-import scipy
 from pydantic import Field
 
-from phibench.datasets.common.progress import Steps
+from phibench.benchmark.scores.intervals import clopper_pearson, percentile_interval
 from phibench.datasets.film.moving_camera import INFO, bake_rooms
 from phibench.estimator.geometry.rig_parameters import PRIOR_SIGMA, STROKE_PARAMETERS
 from phibench.robot.loop.arena import baked_arenas
@@ -27,17 +26,31 @@ from phibench.scenes.frames import Array
 from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.motion.vehicle import PARAMETERS, Vehicle
 from phibench.scenes.random_streams import generator
-from phibench.studies.findings import Finding, Row, number
-from phibench.studies.framework import Settings, Study, StudyDatasets, StudyResult
-from phibench.studies.loop.drawings import condition_drawing, process_drawing
+from phibench.studies.framework import (
+    COLOURS,
+    Drawing,
+    Ends,
+    Finding,
+    Numbers,
+    Row,
+    Settings,
+    Study,
+    StudyDatasets,
+    StudyResult,
+    canvas,
+    drawn,
+    error_bars,
+    number,
+    rms,
+    text_table,
+)
+from phibench.studies.loop.drawings import process_drawing
 
 BASE, STREAM = "base", "study loop"
-_FINDINGS = ("reached", "time", "way", "strokes", "pull of 1 / D", "error of D")
 _NO_EFFECT = ("rim_radius_m", "vertex_radius_m", "conic", "mirror_tilt_x_rad", "mirror_tilt_y_rad")  # of a sphere
 _FEWEST = 3  # episodes of an interval
 
 PolicyName = Literal["paper", "greedy", "drive-only", "random", "oracle"]
-_Numbers = Annotated[tuple[float, ...], Field(strict=False)]
 
 
 class LoopSettings(Settings):
@@ -45,12 +58,12 @@ class LoopSettings(Settings):
 
     episodes: int = Field(ge=2, le=2000, description="of each condition")
     policies: Annotated[tuple[PolicyName, ...], Field(strict=False)] = Field(description="compared at the base")
-    powers: _Numbers = Field(description="of the laser, relative to 1 mW")
+    powers: Numbers = Field(description="of the laser, relative to 1 mW")
     lights: Annotated[tuple[int, ...], Field(strict=False)] = Field(description="beside the target")
-    misalignments: _Numbers = Field(description="sizes, 1 is a rig as built by hand")
+    misalignments: Numbers = Field(description="sizes, 1 is a rig as built by hand")
     rigs: int = Field(ge=1, le=100, description="drawn for each size")
-    slip_sigmas: _Numbers = Field(description="standard deviation of the slip from run to run")
-    track_noises: _Numbers = Field(description="random part of a track's way, per root of a metre")
+    slip_sigmas: Numbers = Field(description="standard deviation of the slip from run to run")
+    track_noises: Numbers = Field(description="random part of a track's way, per root of a metre")
     sensitivity_episodes: int = Field(ge=0, le=500, description="of each end of each vehicle parameter's range")
     window_episodes: int = Field(ge=0, le=500, description="with windows around the spots")
     frame_episodes: int = Field(ge=0, le=100, description="with whole frames")
@@ -156,12 +169,33 @@ def covariance(size: float) -> Array:
 class ConditionSummary:
     """Numbers of one condition: (value, low, high) each, 95 %; NaN where there are too few episodes."""
 
-    reached: tuple[float, float, float]
-    time_s: tuple[float, float, float]
-    driven_m: tuple[float, float, float]
-    strokes: tuple[float, float, float]
-    pull: tuple[float, float, float]
-    error: tuple[float, float, float]
+    reached: Ends
+    time_s: Ends
+    driven_m: Ends
+    strokes: Ends
+    pull: Ends
+    error: Ends
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """Name of a number in a finding, its column's head, unit, and factor to it."""
+
+    name: str
+    head: str
+    unit: str
+    scale: float = 1.0
+
+
+QUANTITIES = {
+    "reached": Quantity("reached", "reached, %", "%", 100.0),
+    "time_s": Quantity("time", "time, s", "s"),
+    "driven_m": Quantity("way", "way, m", "m"),
+    "strokes": Quantity("strokes", "strokes", "1"),
+    "pull": Quantity("pull", "pull", "1"),
+    "error": Quantity("rms error of D", "rms error of D, %", "%", 100.0),
+}
+"""By field of a summary."""
 
 
 def summary(episodes: Sequence[Episode]) -> ConditionSummary:
@@ -170,41 +204,29 @@ def summary(episodes: Sequence[Episode]) -> ConditionSummary:
     The share has the exact interval of Clopper and Pearson, as every rate of this package.
     """
     reached = [episode for episode in episodes if episode.reached]
-    low, high = scipy.stats.binomtest(len(reached), len(episodes)).proportion_ci(method="exact")
-    pulls = np.array([episode.pull for episode in episodes if math.isfinite(episode.pull)])
-    errors = np.array(
-        [episode.stated_m / episode.distance_m - 1.0 for episode in episodes if math.isfinite(episode.stated_m)]
-    )
-    return ConditionSummary(
-        (len(reached) / len(episodes), float(low), float(high)),
-        interval([episode.time_s for episode in reached]),
-        interval([episode.driven_m for episode in reached]),
-        interval([episode.strokes for episode in reached]),
-        interval(pulls, rms),
-        interval(errors, rms),
-    )
+    share = (len(reached) / len(episodes), *clopper_pearson(len(reached), len(episodes), 0.95))
+    pulls = [episode.pull for episode in episodes if math.isfinite(episode.pull)]
+    stated = [episode for episode in episodes if math.isfinite(episode.stated_m)]
+    errors = [episode.stated_m / episode.distance_m - 1.0 for episode in stated]
+    means = {
+        name: interval([getattr(episode, name) for episode in reached]) for name in ("time_s", "driven_m", "strokes")
+    }
+    return ConditionSummary(share, pull=interval(pulls, rms), error=interval(errors, rms), **means)
 
 
-def rms(values: Array, axis: int = -1) -> Array:
-    """Root mean square."""
-    return np.asarray(np.sqrt(np.mean(np.square(values), axis=axis)))
-
-
-def interval(values: Sequence[float] | Array, statistic: Callable[..., Any] = np.mean) -> tuple[float, float, float]:
-    """Value of a statistic with its percentile bootstrap interval of 95 %."""
+def interval(values: Sequence[float] | Array, statistic: Callable[..., Any] = np.mean) -> Ends:
+    """Value of a statistic with its interval."""
     x = np.asarray(values, float)
+    value = float(statistic(x)) if len(x) else math.nan
     if len(x) < _FEWEST:
-        return (float(statistic(x)) if len(x) else math.nan, math.nan, math.nan)
-    value = float(statistic(x))
+        return value, math.nan, math.nan
     if np.ptp(x) == 0.0:  # equal values: nothing to draw anew
         return value, value, value
-    ends = scipy.stats.bootstrap(
-        (x,), statistic, n_resamples=2000, method="percentile", rng=generator(STREAM, "bootstrap")
-    ).confidence_interval
-    return value, float(ends.low), float(ends.high)
+    low, high = percentile_interval([x], statistic, 2000, generator(STREAM, "bootstrap"))
+    return value, float(low[0]), float(high[0])
 
 
-def delay(episodes: Sequence[Episode], base: Sequence[Episode]) -> tuple[float, float, float]:
+def delay(episodes: Sequence[Episode], base: Sequence[Episode]) -> Ends:
     """Mean difference in time from the base, over episodes that both reached."""
     times = {episode.number: episode.time_s for episode in base if episode.reached}
     return interval(
@@ -220,17 +242,13 @@ Runs = dict[Condition, list[Episode]]
 def run(settings: LoopSettings, datasets: StudyDatasets) -> StudyResult:
     """Run the study."""
     todo = [*conditions(settings), *pixel_conditions(settings, datasets)]
-    runs: Runs = {}
-    with Steps(datasets.console, "loop", len(todo)) as steps:
-        for condition in todo:
-            runs[condition] = condition.run()
-            steps.advance()
+    runs: Runs = {condition: condition.run() for condition in datasets.each(todo, "loop")}
     base = next(rows for condition, rows in runs.items() if condition.policy == "paper" and condition.group == "policy")
     main = {condition: summary(rows) for condition, rows in runs.items() if condition.group != "vehicle"}
     shown = {"Conditions: value and interval of 95 %": condition_table(main)}
     if settings.sensitivity_episodes:
         shown["Vehicle: ends of every range"] = vehicle_table(runs, base)
-    drawings = (condition_drawing({(c.group, c.name): s for c, s in main.items()}), process_drawing())
+    drawings = (condition_drawing(main), process_drawing())
     return StudyResult({"table": frame(runs)}, tuple(_findings(runs, main, base)), drawings, shown, _notes(settings))
 
 
@@ -247,59 +265,69 @@ def frame(runs: Runs) -> pl.DataFrame:
 def _findings(runs: Runs, main: dict[Condition, ConditionSummary], base: Sequence[Episode]) -> Iterator[Finding]:
     for condition, found in main.items():
         where = f"{condition.group} {condition.name}"
-        share = Finding.ranged(f"reached, {where}", found.reached, "%", 100.0)
-        yield share.judged(">=", 95.0) if where == "policy paper" else share  # the others are compared, not required
-        yield Finding.ranged(f"time, {where}", found.time_s, "s")
-        yield Finding.ranged(f"way, {where}", found.driven_m, "m")
-        yield Finding.ranged(f"strokes, {where}", found.strokes, "1")
-        yield Finding.ranged(f"pull, {where}", found.pull, "1")
-        yield Finding.ranged(f"rms error of D, {where}", found.error, "%", 100.0)
+        for field, of in QUANTITIES.items():
+            finding = Finding.ranged(f"{of.name}, {where}", getattr(found, field), of.unit, of.scale)
+            # the others are compared, not required
+            yield finding.judged(">=", 95.0) if (field, where) == ("reached", "policy paper") else finding
     for condition, episodes in runs.items():
         if condition.group == "vehicle":
             yield Finding.ranged(f"later by, {condition.name}", delay(episodes, base), "s")
-            yield Finding(
-                f"reached, {condition.name}",
-                100.0 * sum(episode.reached for episode in episodes) / len(episodes),
-                unit="%",
-            )
+            share = sum(episode.reached for episode in episodes) / len(episodes)
+            yield Finding(f"reached, {condition.name}", 100.0 * share, unit="%")
 
 
 def condition_table(main: dict[Condition, ConditionSummary]) -> tuple[Row, ...]:
     """A row per condition."""
-    head = ("condition", "reached, %", "time, s", "way, m", "strokes", "pull", "rms error of D, %")
-    rows = [
-        (
-            f"{condition.group}: {condition.name}",
-            _cell(found.reached, 100.0),
-            _cell(found.time_s),
-            _cell(found.driven_m),
-            _cell(found.strokes),
-            _cell(found.pull),
-            _cell(found.error, 100.0),
-        )
-        for condition, found in main.items()
-    ]
+    head = ("condition", *(of.head for of in QUANTITIES.values()))
+    rows = (
+        (f"{c.group}: {c.name}", *(_cell(getattr(found, field), of.scale) for field, of in QUANTITIES.items()))
+        for c, found in main.items()
+    )
     return (head, *rows)
 
 
 def vehicle_table(runs: Runs, base: Sequence[Episode]) -> tuple[Row, ...]:
     """A row per end of a range."""
-    rows = [
-        (
-            c.name,
-            PARAMETERS[c.name.split(" ")[0]].unit,
-            f"{sum(episode.reached for episode in found)} of {len(found)}",
-            _cell(delay(found, base)),
-        )
-        for c, found in runs.items()
-        if c.group == "vehicle"
-    ]
-    return (("parameter", "unit", "reached", "later by, s"), *rows)
+    return text_table(
+        ((c.name, episodes) for c, episodes in runs.items() if c.group == "vehicle"),
+        {
+            "parameter": lambda end: end[0],
+            "unit": lambda end: PARAMETERS[end[0].split(" ")[0]].unit,
+            "reached": lambda end: f"{sum(episode.reached for episode in end[1])} of {len(end[1])}",
+            "later by, s": lambda end: _cell(delay(end[1], base)),
+        },
+    )
 
 
-def _cell(ends: tuple[float, float, float], scale: float = 1.0) -> str:
+def _cell(ends: Ends, scale: float = 1.0) -> str:
     value, low, high = (number(scale * x) for x in ends)
     return value if low == "-" else f"{value} ({low} to {high})"
+
+
+def condition_drawing(main: dict[Condition, ConditionSummary]) -> Drawing:
+    """Share that was reached, time and pull of every condition."""
+    names = [f"{condition.group}: {condition.name}" for condition in main]
+    groups = list(dict.fromkeys(condition.group for condition in main))
+    with canvas(11.0, 0.6 + 0.24 * len(names)) as figure:
+        axes = figure.subplots(1, 3, sharey=True)
+        titles = {"reached": "reached, %", "time_s": "time of those, s", "pull": "pull of 1 / D"}
+        for ax, (field, title) in zip(axes, titles.items(), strict=True):
+            for row, (condition, numbers) in enumerate(main.items()):
+                ends = QUANTITIES[field].scale * np.array(getattr(numbers, field))
+                colour = COLOURS[groups.index(condition.group) % len(COLOURS)]
+                if math.isfinite(ends[0]):
+                    spread = error_bars([ends]) if math.isfinite(ends[1]) else None
+                    ax.errorbar([ends[0]], [row], xerr=spread, fmt="o", color=colour, markersize=4, capsize=2)
+            ax.set_xlabel(title)
+            ax.grid(axis="x", linewidth=0.3)
+        axes[2].axvspan(0.9, 1.1, color="#dddddd", zorder=0)
+        axes[2].set_xscale("log")
+        axes[0].set_yticks(range(len(names)), names, fontsize=7)
+        axes[0].invert_yaxis()
+        alt = "Share of episodes that were reached: " + "; ".join(
+            f"{name} {100 * n.reached[0]:.0f} %" for name, n in zip(names, main.values(), strict=True)
+        )
+        return drawn("conditions", figure, alt + ".")
 
 
 def _notes(settings: LoopSettings) -> tuple[str, ...]:

@@ -1,162 +1,69 @@
-"""Study `mirror`: mirrors of other shapes beside each other, for the choice of one."""
+"""Study `mirror`: mirrors of other shapes beside each other, for the choice of one.
+
+The drawing comes last: resolution, bound of D, measured places, and cost of deviations.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import Annotated, Any, Literal
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import polars as pl
-from pydantic import BaseModel, ConfigDict, Field
 
 from phibench.datasets.common.errors import DatasetError
-from phibench.datasets.common.progress import Steps
 from phibench.datasets.frames.sensor_card import sensor_card
-from phibench.datasets.recipe.build import build_rig, idle_mirror_keys
-from phibench.datasets.recipe.mirror_tables import MirrorTable
-from phibench.datasets.recipe.tables import RigTable
-from phibench.scenes.frames import Array
 from phibench.scenes.rig import Rig
 from phibench.scenes.validation import SceneError
-from phibench.studies.framework import Settings, Study, StudyDatasets, StudyResult
-from phibench.studies.mirror.drawings import comparison_drawing
+from phibench.studies.framework import (
+    COLOURS,
+    LINES,
+    MARKERS,
+    Drawing,
+    Study,
+    StudyDatasets,
+    StudyResult,
+    canvas,
+    drawn,
+)
+from phibench.studies.mirror import measured_places, tables
 from phibench.studies.mirror.field import disc_shares, meridian, outline_radius_px
-from phibench.studies.mirror.measured_places import (
-    DIRECTIONS,
-    NOTHING,
-    BlurBounds,
-    blur_bounds,
-    errors,
-    floor_from_m,
-    measured,
-    place_bound,
-    tolerance,
-    usual,
-)
-from phibench.studies.mirror.tables import (
-    Compared,
-    PlaceMap,
-    bound_table,
-    cost_findings,
-    cost_table,
-    criteria_findings,
-    field_table,
-    pick_table,
-    place_findings,
-    ratio_findings,
-    reach_table,
-    resolution_table,
-    single_table,
-    tolerance_table,
-)
 
-_Angles = Annotated[tuple[Annotated[float, Field(ge=0.0, le=180.0)], ...], Field(strict=False, min_length=1)]
-_Metres = Annotated[tuple[Annotated[float, Field(ge=0.2, le=20.0)], ...], Field(strict=False, min_length=1)]
-_Heights = Annotated[tuple[Annotated[float, Field(ge=0.0, le=3.0)], ...], Field(strict=False, min_length=1)]
-_Blurs = Annotated[tuple[Annotated[float, Field(ge=0.3, le=10.0)], ...], Field(strict=False, min_length=2)]
-_Presets = Annotated[tuple[Literal["bayer-raw", "srgb8", "mjpeg"], ...], Field(strict=False, min_length=1)]
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+_FINDINGS = (tables.criteria_findings, tables.place_findings, tables.ratio_findings, tables.cost_findings)
 
 
-class MirrorEntry(BaseModel):
-    """A mirror; keys as in `[rig.mirror]` of a recipe, and a sphere, whose rim is its equator."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
-
-    shape: Literal["sphere", "ellipsoid", "paraboloid", "hyperboloid", "cone", "polynomial"]
-    vertex_radius_m: float | None = Field(default=None, gt=0.0, le=1.0)
-    conic: float | None = Field(default=None, ge=-100.0, le=100.0)
-    half_angle_deg: float | None = Field(default=None, ge=3.0, le=87.0)
-    even_terms: tuple[float, ...] | None = Field(default=None, max_length=8, strict=False)
-
-    def rig(self, rim_radius_m: float) -> Rig:
-        """Default rig with this mirror.
-
-        Raises
-        ------
-        SceneError
-            If there is no such mirror, or a key does not belong to its shape.
-        """
-        given = self.model_dump(exclude_none=True, exclude={"shape"})
-        if self.shape == "sphere":
-            if given:
-                raise SceneError(f'{next(iter(given))} has no effect on shape = "sphere"; remove it')
-            return build_rig(RigTable(radius_m=rim_radius_m))
-        table = MirrorTable(shape=self.shape, rim_radius_m=rim_radius_m, **given)
-        if faults := idle_mirror_keys("", table):
-            raise SceneError("; ".join(f"{fault.path.removeprefix('.')} {fault.text}" for fault in faults))
-        return build_rig(RigTable(mirror=table))
-
-
-class MirrorSettings(Settings):
-    """Numbers of the study."""
-
-    rim_radius_m: float = Field(gt=0.0, le=0.1, description="of every mirror")
-    stroke_m: float = Field(gt=0.0, le=3.0, description="of every pair")
-    presets: _Presets = Field(description="sensors of the bounds; the first is that of the comparison")
-    exposure_s: float = Field(gt=0.0, le=10.0, description="of the frames")
-    blurs_px: _Blurs = Field(description="rising blurs for which bounds are tabulated")
-    heights_m: _Heights = Field(description="of the spots, for the bounds")
-    depths_m: _Metres = Field(description="distances of the tables, rising")
-    curve_m: Annotated[tuple[float, float, float], Field(strict=False)] = Field(description="first, last, step")
-    spot_height_m: float = Field(ge=0.0, le=3.0, description="of the curves and of the misalignments")
-    misaligned_m: _Metres = Field(description="distances of the misalignments, rising")
-    angles_deg: _Angles = Field(description="theta of the resolution")
-    viewpoints_deg: Annotated[tuple[float, float], Field(strict=False)] = Field(description="theta of the viewpoints")
-    azimuths_deg: Annotated[tuple[float, ...], Field(strict=False, min_length=1)] = Field(
-        description="of places that the robot may hide; even steps from front to rear"
-    )
-    map_step_m: float = Field(ge=0.01, le=0.5, description="of the map of places")
-    map_height_m: float = Field(ge=0.5, le=5.0, description="of the map of places")
-    edge_px: float = Field(ge=0.0, le=50.0, description="least distance of a spot from the mirror's edge")
-    cost: float = Field(gt=0.0, lt=1.0, description="relative error of D that a tolerance allows")
-    mirrors: dict[str, MirrorEntry] = Field(min_length=2, description="by name; the first is the reference")
-
-    @property
-    def azimuths_rad(self) -> Array:
-        """Azimuths of places."""
-        return np.radians(self.azimuths_deg)
-
-    @property
-    def curve_depths_m(self) -> Array:
-        """Distances of the curves and of the map's columns."""
-        first, last, step = self.curve_m
-        return np.arange(first, last + 0.5 * step, step)
-
-
-_FINDINGS = (criteria_findings, place_findings, ratio_findings, cost_findings)
-
-
-def run(settings: MirrorSettings, datasets: StudyDatasets) -> StudyResult:
+def run(settings: tables.MirrorSettings, datasets: StudyDatasets) -> StudyResult:
     """Run the study; it renders nothing."""
     rigs = _rigs(settings)
-    with Steps(datasets.console, "mirror, bounds and mirrors", len(settings.presets) + len(rigs)) as steps:
-        tables: dict[str, BlurBounds] = {}
-        for preset in settings.presets:
-            tables[preset] = _bounds_of_spots(settings, preset, next(iter(rigs.values())))
-            steps.advance()
-        compared = {}
-        for name, rig in rigs.items():
-            compared[name] = compare(settings, rig, tables)
-            steps.advance()
+    first = next(iter(rigs.values()))
+    presets: tuple[str, ...] = settings.presets
+    by_preset = {p: _bounds_of_spots(settings, p, first) for p in datasets.each(presets, "mirror, bounds")}
+    compared = {name: compare(settings, rigs[name], by_preset) for name in datasets.each(list(rigs), "mirror, mirrors")}
     heights = list(dict.fromkeys((*settings.heights_m, settings.spot_height_m)))
     percent, spot = f"{100.0 * settings.cost:g} %", f"spots at {settings.spot_height_m:g} m"
     shown = {
-        "Pick a mirror": pick_table(compared, settings),
-        "Field of view and use of the image": field_table(compared),
-        "Resolution, pixels per degree of theta": resolution_table(compared, settings.angles_deg),
-        "Places that both images show": reach_table(compared, settings),
-        **{f"Bound of D, %, {preset}": bound_table(compared, preset, heights, settings.depths_m) for preset in tables},
-        f"Error of D, %, by deviations of usual size, {spot}": cost_table(compared, settings),
-        f"Deviation that costs {percent} of D at the costliest distance, {spot}": tolerance_table(compared),
-        f"Error of D, %, by one deviation of usual size, {spot}": single_table(compared, settings),
+        "Pick a mirror": tables.pick_table(compared, settings),
+        "Field of view and use of the image": tables.field_table(compared),
+        "Resolution, pixels per degree of theta": tables.resolution_table(compared, settings.angles_deg),
+        "Places that both images show": tables.reach_table(compared, settings),
+        **{
+            f"Bound of D, %, {preset}": tables.bound_table(compared, preset, heights, settings.depths_m)
+            for preset in presets
+        },
+        f"Error of D, %, by deviations of usual size, {spot}": tables.cost_table(compared, settings),
+        f"Deviation that costs {percent} of D at the costliest distance, {spot}": tables.tolerance_table(compared),
+        f"Error of D, %, by one deviation of usual size, {spot}": tables.single_table(compared, settings),
     }
     return StudyResult(
         {
             "table": bound_frame(compared),
-            "rays": ray_frame(compared),
+            "rays": _below_each_other(compared, ray_columns),
             "costs": cost_frame(compared),
-            "map": map_frame(compared),
+            "map": _below_each_other(compared, map_columns),
         },
         tuple(row for findings_of in _FINDINGS for row in findings_of(compared, settings)),
         (comparison_drawing(compared, settings),),
@@ -165,7 +72,7 @@ def run(settings: MirrorSettings, datasets: StudyDatasets) -> StudyResult:
     )
 
 
-def _rigs(settings: MirrorSettings) -> dict[str, Rig]:
+def _rigs(settings: tables.MirrorSettings) -> dict[str, Rig]:
     """Aligned rigs by name.
 
     Raises
@@ -191,13 +98,15 @@ def _rigs(settings: MirrorSettings) -> dict[str, Rig]:
     return rigs
 
 
-def _bounds_of_spots(settings: MirrorSettings, preset: str, rig: Rig) -> BlurBounds:
+def _bounds_of_spots(settings: tables.MirrorSettings, preset: str, rig: Rig) -> measured_places.BlurBounds:
     card = sensor_card(preset, exposure_s=settings.exposure_s)
     r, g, b = rig.camera.detector.laser_filter_response
-    return blur_bounds(card, (r, g, b), settings.blurs_px)
+    return measured_places.blur_bounds(card, (r, g, b), settings.blurs_px)
 
 
-def compare(settings: MirrorSettings, rig: Rig, tables: Mapping[str, BlurBounds]) -> Compared:
+def compare(
+    settings: tables.MirrorSettings, rig: Rig, by_preset: Mapping[str, measured_places.BlurBounds]
+) -> tables.Compared:
     """All that the study says of one mirror."""
     rays = meridian(rig)
     places = place_map(settings, rig)
@@ -205,18 +114,27 @@ def compare(settings: MirrorSettings, rig: Rig, tables: Mapping[str, BlurBounds]
     depths = sorted({*settings.depths_m, *settings.misaligned_m, *(settings.curve_depths_m.tolist())})
     seen = _seen(settings, rig, [(d, h) for h in heights for d in depths])
     bounds = {
-        (preset, h, d): place_bound(rig, table, d, h, settings.stroke_m) if seen[d, h] else NOTHING
-        for preset, table in tables.items()
+        (preset, h, d): measured_places.place_bound(rig, table, d, h, settings.stroke_m)
+        if seen[d, h]
+        else measured_places.NOTHING
+        for preset, table in by_preset.items()
         for h in heights
         for d in (depths if h == settings.spot_height_m else settings.depths_m)
     }
-    nothing = dict.fromkeys(DIRECTIONS, math.nan)
+    nothing = dict.fromkeys(measured_places.DIRECTIONS, math.nan)
     at, h = settings.spot_height_m, settings.stroke_m
     wrong = [d for d in settings.misaligned_m if seen[d, at]]
     spots = np.array([(d, 0.0, at) for d in wrong])
-    costs = {kind: errors(rig, kind, usual(kind), spots, h) for kind in DIRECTIONS} if wrong else {}
+    costs = (
+        {
+            kind: measured_places.errors(rig, kind, measured_places.usual(kind), spots, h)
+            for kind in measured_places.DIRECTIONS
+        }
+        if wrong
+        else {}
+    )
     sides = (0.0, 0.5 * math.pi, math.pi)
-    return Compared(
+    return tables.Compared(
         rays=rays,
         field_deg=rays.field_deg(settings.edge_px),
         rim_deg=rays.field_deg()[1],
@@ -226,34 +144,39 @@ def compare(settings: MirrorSettings, rig: Rig, tables: Mapping[str, BlurBounds]
         up=disc_shares(rig, rays, settings.stroke_m, settings.azimuths_rad),
         places=places,
         bounds=bounds,
-        floor_m=tuple(floor_from_m(rig, h, settings.edge_px, a, settings.curve_m[1]) for a in sides),
+        floor_m=tuple(measured_places.floor_from_m(rig, h, settings.edge_px, a, settings.curve_m[1]) for a in sides),
         costs=dict.fromkeys(settings.misaligned_m, nothing)
         | {d: {kind: float(column[i]) for kind, column in costs.items()} for i, d in enumerate(wrong)},
-        tolerances={k: tolerance(rig, k, spots, h, settings.cost) if wrong else math.nan for k in DIRECTIONS},
+        tolerances={
+            k: measured_places.tolerance(rig, k, spots, h, settings.cost) if wrong else math.nan
+            for k in measured_places.DIRECTIONS
+        },
     )
 
 
-def _seen(settings: MirrorSettings, rig: Rig, places: list[tuple[float, float]]) -> dict[tuple[float, float], bool]:
+def _seen(
+    settings: tables.MirrorSettings, rig: Rig, places: list[tuple[float, float]]
+) -> dict[tuple[float, float], bool]:
     """Distances and heights that a pair measures, from all azimuths."""
     points = np.array([(d, 0.0, h) for d, h in places])
-    fine = measured(rig, points, settings.stroke_m, settings.edge_px, settings.azimuths_rad)
+    fine = measured_places.measured(rig, points, settings.stroke_m, settings.edge_px, settings.azimuths_rad)
     return dict(zip(places, fine.tolist(), strict=True))
 
 
-def place_map(settings: MirrorSettings, rig: Rig) -> PlaceMap:
+def place_map(settings: tables.MirrorSettings, rig: Rig) -> tables.PlaceMap:
     """Map of the places that pairs measure from all azimuths."""
     depths = settings.curve_depths_m
     heights = np.arange(0.0, settings.map_height_m + 0.5 * settings.map_step_m, settings.map_step_m)
     D, Z = np.meshgrid(depths, heights)
     points = np.stack([D.ravel(), np.zeros(D.size), Z.ravel()], axis=-1)
-    fine = measured(rig, points, settings.stroke_m, settings.edge_px, settings.azimuths_rad)
-    return PlaceMap(depths, heights, fine.reshape(D.shape))
+    fine = measured_places.measured(rig, points, settings.stroke_m, settings.edge_px, settings.azimuths_rad)
+    return tables.PlaceMap(depths, heights, fine.reshape(D.shape))
 
 
 # -- tables of numbers -------------------------------------------------------------------------------------------------
 
 
-def bound_frame(found: Mapping[str, Compared]) -> pl.DataFrame:
+def bound_frame(found: Mapping[str, tables.Compared]) -> pl.DataFrame:
     """A row per mirror, sensor, height and distance."""
     rows: list[dict[str, Any]] = [
         {
@@ -272,33 +195,33 @@ def bound_frame(found: Mapping[str, Compared]) -> pl.DataFrame:
     return pl.DataFrame(rows)
 
 
-def ray_frame(found: Mapping[str, Compared]) -> pl.DataFrame:
-    """A row per mirror and ray of the meridian."""
-    return pl.concat(
-        [
-            pl.DataFrame(
-                {
-                    "radius_px": c.rays.radius_px,
-                    "theta_deg": np.degrees(c.rays.theta_rad),
-                    "px_per_deg": np.radians(1.0) * c.rays.px_per_rad,
-                    "px_per_deg_of_azimuth": np.radians(1.0) * c.rays.radius_px,
-                    "viewpoint_m": c.rays.viewpoint_m,
-                }
-            ).select(pl.lit(name).alias("mirror"), pl.all())
-            for name, c in found.items()
-        ]
-    )
+def _below_each_other(
+    found: Mapping[str, tables.Compared], columns: Callable[[tables.Compared], dict[str, Any]]
+) -> pl.DataFrame:
+    return pl.concat([pl.DataFrame({"mirror": name, **columns(c)}) for name, c in found.items()])
 
 
-def cost_frame(found: Mapping[str, Compared]) -> pl.DataFrame:
+def ray_columns(compared: tables.Compared) -> dict[str, Any]:
+    """A row per ray of the meridian."""
+    rays = compared.rays
+    return {
+        "radius_px": rays.radius_px,
+        "theta_deg": np.degrees(rays.theta_rad),
+        "px_per_deg": np.radians(1.0) * rays.px_per_rad,
+        "px_per_deg_of_azimuth": np.radians(1.0) * rays.radius_px,
+        "viewpoint_m": rays.viewpoint_m,
+    }
+
+
+def cost_frame(found: Mapping[str, tables.Compared]) -> pl.DataFrame:
     """A row per mirror, distance and kind of deviation: error of D at the usual size, and tolerance."""
     rows = [
         {
             "mirror": name,
             "depth_m": d,
             "deviation": kind,
-            "parameters": ", ".join(DIRECTIONS[kind]),
-            "usual": usual(kind),
+            "parameters": ", ".join(measured_places.DIRECTIONS[kind]),
+            "usual": measured_places.usual(kind),
             "error_relative": error,
             "tolerance": compared.tolerances[kind],
         }
@@ -309,23 +232,17 @@ def cost_frame(found: Mapping[str, Compared]) -> pl.DataFrame:
     return pl.DataFrame(rows)
 
 
-def map_frame(found: Mapping[str, Compared]) -> pl.DataFrame:
-    """A row per mirror and place of the map."""
-    return pl.concat(
-        [
-            pl.DataFrame(
-                {
-                    "depth_m": np.tile(c.places.depths_m, len(c.places.heights_m)),
-                    "height_m": np.repeat(c.places.heights_m, len(c.places.depths_m)),
-                    "measured": c.places.measured.ravel(),
-                }
-            ).select(pl.lit(name).alias("mirror"), pl.all())
-            for name, c in found.items()
-        ]
-    )
+def map_columns(compared: tables.Compared) -> dict[str, Any]:
+    """A row per place of the map."""
+    places = compared.places
+    return {
+        "depth_m": np.tile(places.depths_m, len(places.heights_m)),
+        "height_m": np.repeat(places.heights_m, len(places.depths_m)),
+        "measured": places.measured.ravel(),
+    }
 
 
-def _notes(settings: MirrorSettings) -> tuple[str, ...]:
+def _notes(settings: tables.MirrorSettings) -> tuple[str, ...]:
     return (
         "Bounds are for a 1 mW spot on a flat white wall that faces the axis, the rig known exactly. They leave full "
         f"pixels out, and are those of frames with {1e3 * settings.exposure_s:g} ms.",
@@ -336,11 +253,90 @@ def _notes(settings: MirrorSettings) -> tuple[str, ...]:
     )
 
 
+# -- drawing -----------------------------------------------------------------------------------------------------------
+
+_LEAST = 1e-2  # per cent: what costs less is not drawn
+
+
+def comparison_drawing(found: Mapping[str, tables.Compared], settings: tables.MirrorSettings) -> Drawing:
+    """The four panels."""
+    from matplotlib.lines import Line2D
+
+    with canvas(10.0, 8.0) as figure:
+        (left, right), (low, last) = figure.subplots(2, 2)
+        _resolution(left, found)
+        _bounds(right, found, settings)
+        _places(low, found)
+        _costs(last, found, settings)
+        handles = [Line2D([], [], label=n, marker=MARKERS[i], **_style(i)) for i, n in enumerate(found)]
+        left.legend(handles=handles, frameon=False)
+        far = settings.misaligned_m[-1]
+        parts = "; ".join(
+            f"{name} {100.0 * value:.2g} %"
+            for name, c in found.items()
+            if np.isfinite(value := c.bounds[settings.presets[0], settings.spot_height_m, far].relative)
+        )
+        alt = (
+            "Four panels: pixels per degree against theta; bound of D against D; outlines of the places that are "
+            f"measured; error of D by deviations of the usual size. Bounds at {far:g} m: {parts}."
+        )
+        return drawn("mirror", figure, alt, "png")
+
+
+def _style(i: int) -> dict[str, Any]:
+    return {"color": COLOURS[i % len(COLOURS)], "linestyle": LINES[i % len(LINES)]}
+
+
+def _resolution(ax: Axes, found: Mapping[str, tables.Compared]) -> None:
+    for i, c in enumerate(found.values()):
+        inside = np.degrees(c.rays.theta_rad) <= c.field_deg[1]
+        ax.plot(np.degrees(c.rays.theta_rad)[inside], np.radians(1.0) * c.rays.px_per_rad[inside], **_style(i))
+    ax.axvline(90.0, color="grey", linewidth=0.8)
+    ax.set_yscale("log")
+    ax.set_xlabel("theta from straight down, deg (90: horizon)")
+    ax.set_ylabel("resolution, px/deg")
+
+
+def _bounds(ax: Axes, found: Mapping[str, tables.Compared], settings: tables.MirrorSettings) -> None:
+    preset = settings.presets[0]
+    for i, c in enumerate(found.values()):
+        depths = sorted(d for p, h, d in c.bounds if (p, h) == (preset, settings.spot_height_m))
+        sigma = [100.0 * c.bounds[preset, settings.spot_height_m, d].relative for d in depths]
+        ax.plot(depths, sigma, **_style(i))
+    ax.set_yscale("log")
+    ax.set_xlabel("distance D, m")
+    ax.set_ylabel(f"bound of D, %, {preset}, spots at {settings.spot_height_m:g} m")
+
+
+def _places(ax: Axes, found: Mapping[str, tables.Compared]) -> None:
+    for i, c in enumerate(found.values()):
+        padded = np.pad(c.places.measured.astype(float), 1)
+        D, Z = (
+            np.concatenate([[2 * x[0] - x[1]], x, [2 * x[-1] - x[-2]]]) for x in (c.places.depths_m, c.places.heights_m)
+        )
+        ax.contour(D, Z, padded, levels=[0.5], colors=[COLOURS[i]], linestyles=[LINES[i % len(LINES)]], linewidths=1.5)
+    ax.set_xlabel("distance D, m")
+    ax.set_ylabel("height of the spot, m: measured inside")
+
+
+def _costs(ax: Axes, found: Mapping[str, tables.Compared], settings: tables.MirrorSettings) -> None:
+    middle = settings.misaligned_m[len(settings.misaligned_m) // 2]
+    kinds = list(measured_places.DIRECTIONS)
+    for i, c in enumerate(found.values()):
+        cost = np.array([100.0 * c.costs[middle][kind] for kind in kinds])
+        cost = np.where((cost >= _LEAST) & np.isfinite(cost), cost, np.nan)
+        ax.plot(cost, np.arange(len(kinds)), MARKERS[i], color=COLOURS[i], markersize=5, linestyle="")
+    ax.set_yticks(np.arange(len(kinds)), kinds, fontsize=7)
+    ax.invert_yaxis()
+    ax.set_xscale("log")
+    ax.set_xlabel(f"error of D at {middle:g} m by a deviation of usual size, %")
+
+
 STUDY = Study(
     "mirror",
     "Which mirror",
     "For equal rim, camera and stroke: which mirror sees what, how well does it measure D there, and how exactly must "
     "it be mounted?",
-    MirrorSettings,
+    tables.MirrorSettings,
     run,
 )

@@ -1,16 +1,22 @@
-"""Tables and findings of the study `mirror`: one row per mirror, and the table from which a mirror is picked."""
+"""Settings, tables and findings of the study `mirror`: one row per mirror, and the table from which one is picked."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Annotated, Literal
 
 import numpy as np
+from pydantic import Field
 
+from phibench.datasets.recipe.build import build_rig, idle_mirror_keys
+from phibench.datasets.recipe.mirror_tables import MirrorTable
+from phibench.datasets.recipe.tables import RigTable
 from phibench.scenes.frames import Array, BoolArray
-from phibench.studies.findings import Finding, Row, number
+from phibench.scenes.rig import Rig
+from phibench.scenes.validation import SceneError
+from phibench.studies.framework import Finding, Heights, Metres, Presets, Row, Settings, number, text_table
 from phibench.studies.mirror.field import DiscShares, Meridian
 from phibench.studies.mirror.measured_places import (
     DIRECTIONS,
@@ -26,30 +32,72 @@ _NONE, _LOST = "-", "lost"
 _FEW = 2  # names that a cell holds
 # as people state tolerances
 _SHOWN_UNITS = {"m": ("mm", 1e3), "rad": ("deg", math.degrees(1.0)), "px": ("px", 1.0), "1": ("", 1.0)}
+_Angles = Annotated[tuple[Annotated[float, Field(ge=0.0, le=180.0)], ...], Field(strict=False, min_length=1)]
+_Blurs = Annotated[tuple[Annotated[float, Field(ge=0.3, le=10.0)], ...], Field(strict=False, min_length=2)]
 
 
-class Asked(Protocol):
-    """Settings that the tables read."""
+class MirrorEntry(Settings):
+    """A mirror; keys as in `[rig.mirror]` of a recipe, and a sphere, whose rim is its equator."""
+
+    shape: Literal["sphere", "ellipsoid", "paraboloid", "hyperboloid", "cone", "polynomial"]
+    vertex_radius_m: float | None = Field(default=None, gt=0.0, le=1.0)
+    conic: float | None = Field(default=None, ge=-100.0, le=100.0)
+    half_angle_deg: float | None = Field(default=None, ge=3.0, le=87.0)
+    even_terms: tuple[float, ...] | None = Field(default=None, max_length=8, strict=False)
+
+    def rig(self, rim_radius_m: float) -> Rig:
+        """Default rig with this mirror.
+
+        Raises
+        ------
+        SceneError
+            If there is no such mirror, or a key does not belong to its shape.
+        """
+        given = self.model_dump(exclude_none=True, exclude={"shape"})
+        if self.shape == "sphere":
+            if given:
+                raise SceneError(f'{next(iter(given))} has no effect on shape = "sphere"; remove it')
+            return build_rig(RigTable(radius_m=rim_radius_m))
+        table = MirrorTable(shape=self.shape, rim_radius_m=rim_radius_m, **given)
+        if faults := idle_mirror_keys("", table):
+            raise SceneError("; ".join(f"{fault.path.removeprefix('.')} {fault.text}" for fault in faults))
+        return build_rig(RigTable(mirror=table))
+
+
+class MirrorSettings(Settings):
+    """Numbers of the study."""
+
+    rim_radius_m: float = Field(gt=0.0, le=0.1, description="of every mirror")
+    stroke_m: float = Field(gt=0.0, le=3.0, description="of every pair")
+    presets: Presets = Field(description="sensors of the bounds; the first is that of the comparison")
+    exposure_s: float = Field(gt=0.0, le=10.0, description="of the frames")
+    blurs_px: _Blurs = Field(description="rising blurs for which bounds are tabulated")
+    heights_m: Heights = Field(description="of the spots, for the bounds")
+    depths_m: Metres = Field(description="distances of the tables, rising")
+    curve_m: Annotated[tuple[float, float, float], Field(strict=False)] = Field(description="first, last, step")
+    spot_height_m: float = Field(ge=0.0, le=3.0, description="of the curves and of the misalignments")
+    misaligned_m: Metres = Field(description="distances of the misalignments, rising")
+    angles_deg: _Angles = Field(description="theta of the resolution")
+    viewpoints_deg: Annotated[tuple[float, float], Field(strict=False)] = Field(description="theta of the viewpoints")
+    azimuths_deg: Annotated[tuple[float, ...], Field(strict=False, min_length=1)] = Field(
+        description="of places that the robot may hide; even steps from front to rear"
+    )
+    map_step_m: float = Field(ge=0.01, le=0.5, description="of the map of places")
+    map_height_m: float = Field(ge=0.5, le=5.0, description="of the map of places")
+    edge_px: float = Field(ge=0.0, le=50.0, description="least distance of a spot from the mirror's edge")
+    cost: float = Field(gt=0.0, lt=1.0, description="relative error of D that a tolerance allows")
+    mirrors: dict[str, MirrorEntry] = Field(min_length=2, description="by name; the first is the reference")
 
     @property
-    def depths_m(self) -> tuple[float, ...]:
-        """Distances of the tables."""
+    def azimuths_rad(self) -> Array:
+        """Azimuths of places."""
+        return np.radians(self.azimuths_deg)
 
     @property
-    def misaligned_m(self) -> tuple[float, ...]:
-        """Distances of the misalignments."""
-
-    @property
-    def presets(self) -> tuple[str, ...]:
-        """Sensors; the first is compared."""
-
-    @property
-    def spot_height_m(self) -> float:
-        """Height of the compared spots."""
-
-    @property
-    def cost(self) -> float:
-        """Relative error of D that a tolerance allows."""
+    def curve_depths_m(self) -> Array:
+        """Distances of the curves and of the map's columns."""
+        first, last, step = self.curve_m
+        return np.arange(first, last + 0.5 * step, step)
 
 
 @dataclass(frozen=True)
@@ -119,29 +167,20 @@ class Compared:
 
 def field_table(found: Mapping[str, Compared]) -> tuple[Row, ...]:
     """Field of view, use of the image down, theta up to which the robot is seen down and up, and viewpoints."""
-    heads = (
-        "mirror",
-        "theta, deg",
-        "outline, deg",
-        "outline, px",
-        "robot, % of pixels",
-        "below horizon, %",
-        "above, %",
-        "robot to, deg",
-        "the same up, deg",
-        "viewpoints, mm",
-    )
-    return heads, *(
-        (
-            name,
-            f"{c.field_deg[0]:.0f} to {c.field_deg[1]:.0f}",
-            f"{c.rim_deg:.0f}",
-            f"{c.outline_px:.0f}",
-            *(f"{100.0 * x:.1f}" for x in (c.down.robot, c.down.below_horizon, c.down.above_horizon)),
-            *(_pair(shares.robot_theta_deg) for shares in (c.down, c.up)),
-            _cell(1e3 * c.spread_m, ".1f"),
-        )
-        for name, c in found.items()
+    return text_table(
+        found.items(),
+        {
+            "mirror": lambda m: m[0],
+            "theta, deg": lambda m: f"{m[1].field_deg[0]:.0f} to {m[1].field_deg[1]:.0f}",
+            "outline, deg": lambda m: f"{m[1].rim_deg:.0f}",
+            "outline, px": lambda m: f"{m[1].outline_px:.0f}",
+            "robot, % of pixels": lambda m: f"{100.0 * m[1].down.robot:.1f}",
+            "below horizon, %": lambda m: f"{100.0 * m[1].down.below_horizon:.1f}",
+            "above, %": lambda m: f"{100.0 * m[1].down.above_horizon:.1f}",
+            "robot to, deg": lambda m: _pair(m[1].down.robot_theta_deg),
+            "the same up, deg": lambda m: _pair(m[1].up.robot_theta_deg),
+            "viewpoints, mm": lambda m: _cell(1e3 * m[1].spread_m, ".1f"),
+        },
     )
 
 
@@ -154,21 +193,21 @@ def resolution_table(found: Mapping[str, Compared], angles_deg: Sequence[float])
     )
 
 
-def reach_table(found: Mapping[str, Compared], asked: Asked) -> tuple[Row, ...]:
+def reach_table(found: Mapping[str, Compared], settings: MirrorSettings) -> tuple[Row, ...]:
     """Nearest spot on the floor before, beside and behind the robot; lowest and highest spot by distance."""
     heads = (
         "mirror",
         "floor before, m",
         "beside, m",
         "behind, m",
-        *(f"heights at {d:g} m, m" for d in asked.depths_m),
+        *(f"heights at {d:g} m, m" for d in settings.depths_m),
         "share of the map, %",
     )
     return heads, *(
         (
             name,
             *(_cell(nearest, ".2f") for nearest in c.floor_m),
-            *(_pair(c.places.heights_at(d), ".2f") for d in asked.depths_m),
+            *(_pair(c.places.heights_at(d), ".2f") for d in settings.depths_m),
             f"{100.0 * c.places.share:.0f}",
         )
         for name, c in found.items()
@@ -187,22 +226,22 @@ def bound_table(
     )
 
 
-def cost_table(found: Mapping[str, Compared], asked: Asked) -> tuple[Row, ...]:
+def cost_table(found: Mapping[str, Compared], settings: MirrorSettings) -> tuple[Row, ...]:
     """Errors of D of all deviations together and of those that no calibration knows, by distance."""
-    heads = ("mirror, deviations", *(f"{d:g} m" for d in asked.misaligned_m))
+    heads = ("mirror, deviations", *(f"{d:g} m" for d in settings.misaligned_m))
     groups = {"all": ALL_KINDS, "beyond calibration": UNCALIBRATED}
     return heads, *(
-        (f"{name}, {label}", *(_error(together(c.costs[d], kinds)) for d in asked.misaligned_m))
+        (f"{name}, {label}", *(_error(together(c.costs[d], kinds)) for d in settings.misaligned_m))
         for label, kinds in groups.items()
         for name, c in found.items()
     )
 
 
-def single_table(found: Mapping[str, Compared], asked: Asked) -> tuple[Row, ...]:
+def single_table(found: Mapping[str, Compared], settings: MirrorSettings) -> tuple[Row, ...]:
     """Error of D by each kind of deviation alone, by mirror and distance."""
-    heads = ("deviation, mirror", *(f"{d:g} m" for d in asked.misaligned_m))
+    heads = ("deviation, mirror", *(f"{d:g} m" for d in settings.misaligned_m))
     return heads, *(
-        (f"{kind}, {name}", *(_error(c.costs[d][kind]) for d in asked.misaligned_m))
+        (f"{kind}, {name}", *(_error(c.costs[d][kind]) for d in settings.misaligned_m))
         for kind in ALL_KINDS
         for name, c in found.items()
     )
@@ -267,10 +306,10 @@ class Criterion:
     small: bool = True
 
 
-def criteria(asked: Asked) -> tuple[Criterion, ...]:
+def criteria(settings: MirrorSettings) -> tuple[Criterion, ...]:
     """Criteria by which mirrors are compared."""
-    near, far, last = asked.misaligned_m[0], asked.misaligned_m[-1], asked.depths_m[-1]
-    preset, z = asked.presets[0], asked.spot_height_m
+    near, far, last = settings.misaligned_m[0], settings.misaligned_m[-1], settings.depths_m[-1]
+    preset, z = settings.presets[0], settings.spot_height_m
     return (
         Criterion("seen above the horizon", "deg", lambda c: c.field_deg[1] - 90.0, small=False),
         Criterion("floor beside the robot from", "m", lambda c: c.floor_m[1]),
@@ -279,7 +318,7 @@ def criteria(asked: Asked) -> tuple[Criterion, ...]:
         *(Criterion(f"resolution at {a:g} deg", "px/deg", _resolution(a), small=False) for a in (60.0, 85.0)),
         *(Criterion(f"bound of D at {d:g} m", "%", _bound(preset, z, d)) for d in dict.fromkeys((near, far, last))),
         Criterion(
-            f"mirror aside that costs {100.0 * asked.cost:g} %",
+            f"mirror aside that costs {100.0 * settings.cost:g} %",
             "mm",
             lambda c: 1e3 * c.tolerances["mirror aside"],
             small=False,
@@ -315,10 +354,10 @@ def _largest_blur(compared: Compared, preset: str, height_m: float) -> float:
     return max(known) if known else math.nan
 
 
-def pick_table(found: Mapping[str, Compared], asked: Asked) -> tuple[Row, ...]:
+def pick_table(found: Mapping[str, Compared], settings: MirrorSettings) -> tuple[Row, ...]:
     """Criteria as rows, mirrors as columns, and the best and the worst of them."""
     rows: list[Row] = [("criterion", "unit", *found, "best", "worst")]
-    for criterion in criteria(asked):
+    for criterion in criteria(settings):
         values = {name: criterion.value(c) for name, c in found.items()}
         rows.append(
             (criterion.label, criterion.unit, *(_short(x) for x in values.values()), *_ends(values, criterion.small))
@@ -349,9 +388,9 @@ def _names(names: Sequence[str]) -> str:
 # -- findings ----------------------------------------------------------------------------------------------------------
 
 
-def criteria_findings(found: Mapping[str, Compared], asked: Asked) -> Iterator[Finding]:
+def criteria_findings(found: Mapping[str, Compared], settings: MirrorSettings) -> Iterator[Finding]:
     """Best and worst value of each criterion, of the mirrors that have one."""
-    for criterion in criteria(asked):
+    for criterion in criteria(settings):
         known = sorted((x, name) for name, c in found.items() if math.isfinite(x := criterion.value(c)))
         if known:
             ends = (known[0], known[-1]) if criterion.small else (known[-1], known[0])
@@ -359,10 +398,10 @@ def criteria_findings(found: Mapping[str, Compared], asked: Asked) -> Iterator[F
                 yield Finding(f"{criterion.label}, {word}: {name}", value, unit=criterion.unit)
 
 
-def ratio_findings(found: Mapping[str, Compared], asked: Asked) -> Iterator[Finding]:
+def ratio_findings(found: Mapping[str, Compared], settings: MirrorSettings) -> Iterator[Finding]:
     """Bounds of the first mirror over those of the others, and its tolerance of being aside over theirs."""
     first, *others = found
-    preset, z, far = asked.presets[0], asked.spot_height_m, asked.misaligned_m[-1]
+    preset, z, far = settings.presets[0], settings.spot_height_m, settings.misaligned_m[-1]
     for name in others:
         bound = _bound(preset, z, far)
         ratio = bound(found[first]) / bound(found[name])
@@ -374,21 +413,21 @@ def ratio_findings(found: Mapping[str, Compared], asked: Asked) -> Iterator[Find
             yield Finding(f"allowed mirror aside, {first} over {name}", ratio)
 
 
-def place_findings(found: Mapping[str, Compared], asked: Asked) -> Iterator[Finding]:
+def place_findings(found: Mapping[str, Compared], settings: MirrorSettings) -> Iterator[Finding]:
     """Nearest distance with a bound, and the pixels that are spent on what is above the horizon."""
     for name, c in found.items():
         seen = [
-            d for (_, h, d), bound in c.bounds.items() if h == asked.spot_height_m and math.isfinite(bound.relative)
+            d for (_, h, d), bound in c.bounds.items() if h == settings.spot_height_m and math.isfinite(bound.relative)
         ]
-        yield Finding(f"nearest D of spots at {asked.spot_height_m:g} m: {name}", min(seen, default=None), unit="m")
+        yield Finding(f"nearest D of spots at {settings.spot_height_m:g} m: {name}", min(seen, default=None), unit="m")
     for name, c in found.items():
         yield Finding(f"pixels above the horizon: {name}", 100.0 * c.down.above_horizon, unit="%")
 
 
-def cost_findings(found: Mapping[str, Compared], asked: Asked) -> Iterator[Finding]:
+def cost_findings(found: Mapping[str, Compared], settings: MirrorSettings) -> Iterator[Finding]:
     """Allowed error, and errors that no calibration knows: least and largest of all mirrors."""
-    yield Finding("error of D that a tolerance allows", 100.0 * asked.cost, unit="%")
-    for d in asked.misaligned_m:
+    yield Finding("error of D that a tolerance allows", 100.0 * settings.cost, unit="%")
+    for d in settings.misaligned_m:
         known = [x for c in found.values() if math.isfinite(x := _together(d, UNCALIBRATED)(c))]
         if known:
             yield Finding(f"beyond calibration, at {d:g} m: least of all mirrors", min(known), unit="%")

@@ -15,12 +15,13 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from phibench.benchmark.scores.intervals import percentile_interval
 from phibench.datasets.common.errors import DatasetError
 from phibench.estimator.geometry.sensitivities import PARAMETERS as ANALYTIC
 from phibench.scenes.frames import Array
 from phibench.scenes.misalignment import PARAMETERS, Misalignment
 from phibench.scenes.rig import Rig
-from phibench.studies.findings import Finding
+from phibench.studies.framework import Finding
 from phibench.studies.misaligned_rigs import ALL, Places, errors, errors_of_many
 
 _ADDITIVE = 0.9  # sum of the first-order indices from which errors add
@@ -153,13 +154,12 @@ def evaluated(model: Callable[[Array], Array], p: int, n: int, rng: np.random.Ge
 def with_intervals(
     values: Values, powers: Array, resamples: int, rng: np.random.Generator
 ) -> tuple[Array, Array, Array]:
-    """`indices_of`, and the ends of 95 % intervals, in the same shape.
+    """`indices_of`, and the ends of 95 % intervals, in the same shape: points are drawn again.
 
-    Points are drawn again (percentiles); scipy's own bootstrap of its result takes no generator.
+    The bootstrap of scipy's own result takes no generator.
     """
-    n = values.A.shape[1]
-    drawn = np.stack([indices_of(values.taken(rng.integers(0, n, (n,))), powers) for _ in range(resamples)])
-    low, high = np.quantile(drawn, [0.025, 0.975], axis=0)  # an interval of 95 %
+    points = np.arange(values.A.shape[1])
+    low, high = percentile_interval([points], lambda i: indices_of(values.taken(i), powers), resamples, rng)
     return indices_of(values, powers), low, high
 
 

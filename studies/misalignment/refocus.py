@@ -17,7 +17,7 @@ from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.scenes.camera import Camera, refocused
 from phibench.scenes.frames import Array, as_vector
 from phibench.scenes.rig import Rig
-from phibench.studies.findings import Finding
+from phibench.studies.framework import Finding
 from phibench.studies.misaligned_rigs import seen_px
 
 LENS_M, FOCUS_M = 4e-3, (0.46, 0.23)

@@ -7,7 +7,7 @@ given part of D. Findings and the small tables of the report are made from both.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,7 +20,7 @@ from phibench.scenes.frames import Array
 from phibench.scenes.misalignment import PARAMETERS, Misalignment
 from phibench.scenes.rig import Rig
 from phibench.scenes.validation import SceneError
-from phibench.studies.findings import Finding
+from phibench.studies.framework import Finding
 from phibench.studies.misaligned_rigs import (
     ALL,
     CALIBRATED,
@@ -74,14 +74,7 @@ def tolerance_rows(
     coarse : for the calibrated one, which takes a second a value
     parameters : names
     """
-
-    def by_nominal(m: Misalignment) -> Array:
-        return errors(nominal, m, places)
-
-    def by_calibrated(m: Misalignment) -> Array:
-        return calibrated_or_lost(nominal, m, places, calibrate)[None]
-
-    for names, of, how in ((NOMINAL, by_nominal, search), ((CALIBRATED,), by_calibrated, coarse)):
+    for (names, of), how in zip(errors_by(nominal, places, calibrate), (search, coarse), strict=True):
         aligned = of(Misalignment())
         for parameter in parameters:
             values = tolerance(nominal, parameter, of, aligned, how)
@@ -89,6 +82,14 @@ def tolerance_rows(
                 for j, depth in enumerate(places.depths_m):
                     for k, statistic in enumerate(STATISTICS):
                         yield _row(parameter, estimator, float(depth), places, statistic, values[k, i, j])
+
+
+def errors_by(nominal: Rig, places: Places, calibrate: Calibrate) -> tuple[tuple[tuple[str, ...], Errors], ...]:
+    """Relative errors (estimators, d, a) by misalignment: of all estimators with the nominal rig, and calibrated."""
+    return (
+        (NOMINAL, lambda m: errors(nominal, m, places)),
+        ((CALIBRATED,), lambda m: calibrated_or_lost(nominal, m, places, calibrate)[None]),
+    )
 
 
 def signs(nominal: Rig, parameter: str, size: float) -> tuple[float, ...]:
@@ -186,9 +187,6 @@ def _row(
     }
 
 
-PLACE = ("depth_m", "azimuth_deg")
-
-
 def study_table(
     nominal: Rig, strokes: Sequence[Places], calibrate: Calibrate, parameters: Sequence[str] = ALL
 ) -> pl.DataFrame:
@@ -201,9 +199,17 @@ def study_table(
     whole_relative : change of it by the misalignment
     first_order_relative : slope times value; null for the calibrated estimator
     """
-    values = _values(nominal, parameters)
-    parts = [_nominal(nominal, places, values) for places in strokes]
-    return pl.concat([*parts, _calibrated(nominal, strokes[0], calibrate, values)])
+    usual_sizes = {name: PARAMETERS[name].study for name in parameters}
+    # as far as such a rig can be
+    values = [(name, sign * size) for name, size in usual_sizes.items() for sign in signs(nominal, name, size)]
+    nominal_rows = (
+        frame
+        for places in strokes
+        for frame in _changes(
+            places, values, *errors_by(nominal, places, calibrate)[0], slopes(nominal, places, parameters=parameters)
+        )
+    )
+    return pl.concat([*nominal_rows, *_changes(strokes[0], values, *errors_by(nominal, strokes[0], calibrate)[1])])
 
 
 def rendered_table(found: Sequence[Rendered], places: Places) -> pl.DataFrame:
@@ -211,55 +217,26 @@ def rendered_table(found: Sequence[Rendered], places: Places) -> pl.DataFrame:
     frames = []
     for estimate in found:
         for name, change, predicted in zip(NOMINAL, estimate.change, estimate.predicted, strict=True):
-            frames.append(
-                _frame(
-                    estimate.parameter,
-                    estimate.value,
-                    name,
-                    places,
-                    {"rendered_relative": change, "whole_relative": predicted},
-                )
-            )
+            columns = {"rendered_relative": change, "whole_relative": predicted}
+            frames.append(_frame(estimate.parameter, estimate.value, name, places, columns))
     return pl.concat(frames)
 
 
-Values = Sequence[tuple[str, float]]
-
-
-def _nominal(nominal: Rig, places: Places, values: Values) -> pl.DataFrame:
-    names = list(dict.fromkeys(name for name, _ in values))
-    slope, aligned = slopes(nominal, places, parameters=names), errors(nominal, Misalignment(), places)
-    frames = []
+def _changes(
+    places: Places,
+    values: Sequence[tuple[str, float]],
+    names: Sequence[str],
+    of: Errors,
+    slope: Mapping[str, Array] | None = None,
+) -> Iterator[pl.DataFrame]:
+    """Rows of some estimators; null in place of first orders where there is no slope."""
+    aligned = of(Misalignment())
     for parameter, value in values:
-        changes = errors(nominal, Misalignment(**{parameter: value}), places)
-        for i, name in enumerate(NOMINAL):
-            columns = {
-                "error_relative": changes[i],
-                "whole_relative": changes[i] - aligned[i],
-                "first_order_relative": slope[parameter][i] * value,
-            }
-            frames.append(_frame(parameter, value, name, places, columns))
-    return pl.concat(frames)
-
-
-def _calibrated(nominal: Rig, places: Places, calibrate: Calibrate, values: Values) -> pl.DataFrame:
-    aligned = calibrated_or_lost(nominal, Misalignment(), places, calibrate)
-    frames = []
-    for parameter, value in values:
-        changes = calibrated_or_lost(nominal, Misalignment(**{parameter: value}), places, calibrate)
-        columns = {
-            "error_relative": changes,
-            "whole_relative": changes - aligned,
-            "first_order_relative": np.full(changes.shape, np.nan),
-        }
-        frames.append(_frame(parameter, value, CALIBRATED, places, columns))
-    return pl.concat(frames)
-
-
-def _values(nominal: Rig, parameters: Sequence[str]) -> list[tuple[str, float]]:
-    """Parameters at plus and minus their usual size, as far as such a rig can be."""
-    usual = {name: PARAMETERS[name].study for name in parameters}
-    return [(name, sign * size) for name, size in usual.items() for sign in signs(nominal, name, size)]
+        changed = of(Misalignment(**{parameter: value}))
+        first = np.full(changed.shape, np.nan) if slope is None else slope[parameter] * value
+        for name, error, before, linear in zip(names, changed, aligned, first, strict=True):
+            columns = {"error_relative": error, "whole_relative": error - before, "first_order_relative": linear}
+            yield _frame(parameter, value, name, places, columns)
 
 
 def _frame(parameter: str, value: float, estimator: str, places: Places, columns: dict[str, Array]) -> pl.DataFrame:
@@ -322,8 +299,9 @@ def cost_findings(ranks: Sequence[Rank]) -> Iterator[Finding]:
     """Costliest parameters of one estimator at the usual size, at the nearest and the farthest D."""
     for rank in ranks[:_LISTED]:
         for i in (0, -1):
-            size = shown(rank.parameter, PARAMETERS[rank.parameter].study)
-            label = f"change of D, {rank.estimator}: {rank.parameter} {size}, D = {rank.depths_m[i]:g} m"
+            label = (
+                f"change of D, {rank.estimator}: {rank.parameter} {usual(rank.parameter)}, D = {rank.depths_m[i]:g} m"
+            )
             yield Finding(label, 100.0 * rank.rms[i], unit="%")
 
 
@@ -418,6 +396,11 @@ def shown(parameter: str, value: float) -> str:
     """A value with a unit that people use."""
     scale, unit = _SCALES[PARAMETERS[parameter].unit]
     return f"{scale * value:.3g} {unit}".strip()
+
+
+def usual(parameter: str) -> str:
+    """Its usual size with a unit that people use."""
+    return shown(parameter, PARAMETERS[parameter].study)
 
 
 def percent(relative: float) -> str:

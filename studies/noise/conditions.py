@@ -20,8 +20,6 @@ import polars as pl
 
 from phibench.benchmark.scores.answer_errors import Rules
 from phibench.benchmark.scores.records import record_table
-from phibench.datasets.common.parallel import parallel_map
-from phibench.datasets.common.progress import Steps
 from phibench.datasets.read import Dataset, open_dataset
 from phibench.estimator.interface import Answer, Outcome, Pair
 from phibench.estimator.methods.raw_likelihood import joint_of
@@ -31,7 +29,6 @@ from phibench.scenes.frames import as_vector
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.random_streams import Name, generator
 from phibench.scenes.rig import POSITIONS, Rig
-from phibench.studies.framework import StudyDatasets
 from phibench.studies.image_cutout import (
     Shot,
     SpotPair,
@@ -132,7 +129,6 @@ def applied(factor: str, preset: str, rig: Rig, level: float) -> tuple[Shot, Rig
 
 
 NAMES: tuple[Name, ...] = ("study", "noise")
-KEPT = ("du_px", "dv_px", "distance_px", "radial_px", "phi_error_rad", "depth_relative", "detected", "depth_found")
 _MARGIN_PX = 32  # around a spot: what the chain's stages and JPEG's units look at
 _REACH_PX = 1.7  # places are drawn from a square of twice as many pixels
 _RAD_PER_PX = 7.6e-3  # of elevation, on the default rig
@@ -165,7 +161,7 @@ class Cell:
 
 
 def cell_records(cell: Cell) -> pl.DataFrame:
-    """Records of all methods of a cell: `scores.records.COLUMNS` with method, factor and level."""
+    """Records of all methods of a cell: `scores.record_columns.COLUMNS` with method, factor and level."""
     rig, places = _places(cell)
     shot = applied(cell.factor, cell.preset, rig, cell.level)[0]
     truths, pairs = [], []
@@ -201,16 +197,6 @@ def answered(pair: Pair, methods: Sequence[str]) -> dict[str, tuple[Answer, floa
         answer = joint_of(seen, separate[0]) if name == "joint_fit" and separate else method(seen)
         answers[name] = (answer, time.perf_counter() - start)
     return answers
-
-
-def all_records(cells: Sequence[Cell], datasets: StudyDatasets) -> pl.DataFrame:
-    """Records of many cells, computed by the workers of the data sets."""
-    with Steps(datasets.console, "noise", len(cells)) as steps:
-        tables = []
-        for table in parallel_map(cell_records, cells, datasets.workers):
-            tables.append(table)
-            steps.advance()
-    return pl.concat(tables)
 
 
 @lru_cache(maxsize=1)

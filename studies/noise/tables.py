@@ -15,10 +15,10 @@ import polars as pl
 
 from phibench.benchmark.scores.answer_errors import Rules
 from phibench.benchmark.scores.intervals import Estimate, Statistic, estimates
-from phibench.benchmark.scores.metrics import MetricEstimate, measure, prepared
+from phibench.benchmark.scores.metrics import measure, prepared
 from phibench.scenes.frames import Array
 from phibench.scenes.random_streams import generator
-from phibench.studies.findings import Finding, Row
+from phibench.studies.framework import Finding, Row, ends_text, text_table
 from phibench.studies.noise.conditions import BASE, FACTORS, NAMES, rms_by_place, within_place_px
 
 METRICS = (
@@ -120,14 +120,9 @@ def _row(records: pl.DataFrame, rules: Rules, key: tuple[Any, ...]) -> dict[str,
     measured = measure(prepared(records), rules, *NAMES, *map(str, key[:-1]), names=METRICS)
     scatter, bias = scatter_and_bias_px(records)
     row: dict[str, Any] = {"places": records["sample_id"].n_unique(), "images": len(records)}
-    for name, value in measured.items():
-        row |= _columns(name, value)
+    for name, metric in measured.items():
+        row |= dict(zip((name, f"{name}_low", f"{name}_high"), metric.estimate.ends, strict=True))
     return {**row, "scatter_px": scatter, "bias_px": bias, "saturated": records["saturated"].mean()}
-
-
-def _columns(name: str, measured: MetricEstimate) -> dict[str, float]:
-    value = measured.estimate
-    return {name: value.value, f"{name}_low": value.low, f"{name}_high": value.high}
 
 
 def _slope(
@@ -228,9 +223,7 @@ def ranking_findings(found: Sequence[Elasticity], sample: str, preset: str) -> I
     """Elasticities of the reference method about the base, largest first, and the lead of the first factor."""
     lead, mine = f"{preset}, {sample}", ranked(found, sample, preset, REFERENCE[preset])
     for e in mine:
-        value = e.estimate
-        elasticity = Finding(f"{lead}: d ln rms / d ln {name_of(e)}", value.value, value.low, value.high)
-        yield elasticity.judged("!=", 0.0)
+        yield Finding(f"{lead}: d ln rms / d ln {name_of(e)}", *e.estimate.ends).judged("!=", 0.0)
     if len(mine) > 1:
         first, second = mine[:2]
         label = f"{lead}: size of the slope for {name_of(first)} less that for {name_of(second)}"
@@ -251,36 +244,40 @@ def name_of(e: Elasticity) -> str:
 
 def base_table(table: pl.DataFrame, sample: str, preset: str) -> tuple[Row, ...]:
     """Small table of the base case, best method first."""
-    head = ("method", "found", "rms, mpx", "scatter", "bias", "rms / bound", "phi, mrad", "D, %", "bias of D, %")
-    rows = table.filter(_case(sample, preset), pl.col("factor") == BASE).sort("rms_px")
-    return (head, *(_base_row(row) for row in rows.iter_rows(named=True)))
+    return text_table(
+        table.filter(_case(sample, preset), pl.col("factor") == BASE).sort("rms_px").to_dicts(),
+        {
+            "method": lambda row: row["method"],
+            "found": lambda row: f"{100 * row['detection_rate']:.0f} %",
+            "rms, mpx": lambda row: ends_text(_ends(row, "rms_px", 1e3)),
+            "scatter": lambda row: ends_text((1e3 * row["scatter_px"],)),
+            "bias": lambda row: ends_text((1e3 * row["bias_px"],)),
+            "rms / bound": lambda row: ends_text(ratio_of(row)),
+            "phi, mrad": lambda row: ends_text(_ends(row, "rms_phi_rad", 1e3)),
+            "D, %": lambda row: ends_text(_ends(row, "rms_depth_relative", 100.0)),
+            "bias of D, %": lambda row: ends_text(_ends(row, "bias_depth_relative", 100.0)),
+        },
+    )
 
 
 def ranking_table(found: Sequence[Elasticity], sample: str, preset: str) -> tuple[Row, ...]:
     """Elasticities of the reference method beside those of the bound."""
-    head = ("factor", "from", "to", "d ln rms / d ln factor", "of the bound")
-    mine = ranked(found, sample, preset, REFERENCE[preset])
-    return (head, *((name_of(e), f"{e.low:.3g}", f"{e.high:.3g}", _signed(e), f"{e.bound:+.2f}") for e in mine))
+    return text_table(
+        ranked(found, sample, preset, REFERENCE[preset]),
+        {
+            "factor": name_of,
+            "from": lambda e: f"{e.low:.3g}",
+            "to": lambda e: f"{e.high:.3g}",
+            "d ln rms / d ln factor": _signed,
+            "of the bound": lambda e: f"{e.bound:+.2f}",
+        },
+    )
 
 
 def ratio_of(row: dict[str, Any]) -> tuple[float, float, float]:
     """Rms over bound with its interval: the reciprocal of the efficiency."""
     value, low, high = (row[f"efficiency_px{end}"] for end in ("", "_low", "_high"))
     return _reciprocal(value), _reciprocal(high), _reciprocal(low)
-
-
-def _base_row(row: dict[str, Any]) -> Row:
-    return (
-        row["method"],
-        f"{100 * row['detection_rate']:.0f} %",
-        _with(row, "rms_px", 1e3, ""),
-        _number(1e3 * row["scatter_px"]),
-        _number(1e3 * row["bias_px"]),
-        _ratio(row),
-        _with(row, "rms_phi_rad", 1e3, ""),
-        _with(row, "rms_depth_relative", 100.0, ""),
-        _with(row, "bias_depth_relative", 100.0, ""),
-    )
 
 
 def _ends(row: dict[str, Any], name: str, scale: float) -> tuple[float, float, float]:
@@ -321,33 +318,7 @@ def _apart(first: Elasticity, second: Elasticity) -> bool:
 
 
 def _signed(e: Elasticity) -> str:
-    value = e.estimate
-    interval = f" ({value.low:+.2f} to {value.high:+.2f})" if math.isfinite(value.low) else " (no interval)"
-    return f"{value.value:+.2f}{interval}"
-
-
-def _with(row: dict[str, Any], name: str, scale: float, unit: str) -> str:
-    """Value with its interval."""
-    value, low, high = (row[f"{name}{end}"] for end in ("", "_low", "_high"))
-    if not _is_number(value):
-        return "-"
-    text = f"{scale * value:.3g} {unit}".rstrip()
-    return f"{text} ({scale * low:.3g} to {scale * high:.3g})" if _is_number(low) else text
-
-
-def _ratio(row: dict[str, Any]) -> str:
-    value, low, high = ratio_of(row)
-    if not math.isfinite(value):
-        return "-"
-    return f"{_count(value)} ({_count(low)} to {_count(high)})" if math.isfinite(low) else _count(value)
-
-
-def _count(value: float) -> str:
-    return f"{value:.3g}"
-
-
-def _number(value: float) -> str:
-    return f"{value:.3g}" if math.isfinite(value) else "-"
+    return ends_text(e.estimate.ends, "+.2f") + ("" if math.isfinite(e.estimate.low) else " (no interval)")
 
 
 def _is_number(value: Any) -> bool:

@@ -6,10 +6,8 @@ frames keeps their part. The rest (photons, read noise, rounding) falls as 1 / n
 
 from __future__ import annotations
 
-import io
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 import polars as pl
@@ -18,13 +16,13 @@ from phibench.benchmark.pair_sets.dataset_pairs import SpotInImage
 from phibench.benchmark.pair_sets.dataset_pairs import spot_bounds as bounds_of_spot
 from phibench.benchmark.scores.answer_errors import Rules
 from phibench.benchmark.scores.intervals import Clusters, Estimate, estimates, rate, rms_of, rms_ratio_of
-from phibench.benchmark.scores.score_tables import TextTable, cell_parts
+from phibench.benchmark.scores.score_tables import cell_parts
 from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.common.shown_text import TextTable
 from phibench.datasets.exposures.pair_draws import CachedSample, FrameCounts
 from phibench.datasets.frames.request import Exposure
 from phibench.datasets.frames.source import FrameSource
 from phibench.datasets.read import Dataset, Sample
-from phibench.datasets.store.files import write_bytes
 from phibench.estimator.geometry.least_squares_depth import depth_general
 from phibench.estimator.methods.draw_pairs import pairs_of
 from phibench.scenes.frames import Array
@@ -196,13 +194,6 @@ def budget_table(rows: pl.DataFrame, wide: bool = False) -> TextTable:
     confidence = "; 95 % intervals over samples" if wide else ""
     note = "" if wide else "95 % intervals: --wide."
     return TextTable(f"Relative errors of D in %{confidence}", heads, body, "L" + "r" * (len(heads) - 1), note)
-
-
-def write_rows(rows: pl.DataFrame, path: Path) -> Path:
-    """Write rows of `run_experiments` as Parquet, atomically."""
-    buffer = io.BytesIO()
-    rows.write_parquet(buffer, compression="zstd", statistics=False)
-    return write_bytes(path, buffer.getvalue())
 
 
 def _parts(rows: pl.DataFrame) -> Iterator[tuple[str, pl.DataFrame]]:

@@ -22,6 +22,7 @@ import numpy as np
 import polars as pl
 
 from phibench.benchmark.pair_sets.dataset_pairs import DatasetPairs
+from phibench.benchmark.scores.intervals import NORMAL_95
 from phibench.calibration.outline.outline_result import mean_outline
 from phibench.calibration.rig.bundle import Bundle, calibrate
 from phibench.calibration.rig.from_dataset import frame_outline, frame_spots
@@ -41,8 +42,6 @@ CALIBRATION = "calibration"
 """Experiment of a recipe whose spots stand at known distances."""
 LEAST_SPOTS = 2
 """Calibration spots without which a rig counts as not calibrated; those that are not found are left out."""
-WITHIN = 1.959963984540054
-"""Standard deviations of a normal error that hold 95 %."""
 _NO_MATRIX = np.full((2, 2), np.nan)
 
 COLUMNS: dict[str, str] = {
@@ -197,9 +196,9 @@ def _estimate(pair: Pair, separate: Answer, bundle: Bundle, depth_m: float) -> d
     here_m, spot_m, interval_m = float(depth.depth_m), float(depth.sigma_spot_m), joint.interval_depth_m
     if joint.depth_m is not None and joint.sigma_depth_m is not None:
         here_m, spot_m = joint.depth_m, joint.sigma_depth_m
-    low_m, high_m = interval_m or (here_m - WITHIN * spot_m, here_m + WITHIN * spot_m)
+    low_m, high_m = interval_m or (here_m - NORMAL_95 * spot_m, here_m + NORMAL_95 * spot_m)
     # the calibration widens both sides of an interval that need not be even
-    below, above = (np.hypot(x, WITHIN * calibration_m) for x in (here_m - low_m, high_m - here_m))
+    below, above = (np.hypot(x, NORMAL_95 * calibration_m) for x in (here_m - low_m, high_m - here_m))
     error = here_m - depth_m
     return {
         "estimate_m": here_m,

@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 import polars as pl
 
+from phibench.benchmark.scores.intervals import NORMAL_95
 from phibench.calibration.rig.bundle import Bundle
 from phibench.calibration.rig.spots import method_for
 from phibench.datasets.common.errors import DatasetError
@@ -50,7 +51,6 @@ COLUMNS = (
 """The last three: standard deviations of D from pixels and encoder alone, of these frames and, for a raw film, of as
 many frames in two bursts at the ends of its stroke; errors of D by one standard deviation of each independent part of
 the calibration, a list."""
-WITHIN = 1.959963984540054  # 95 % of a normal distribution
 _DRAWS = 4000  # of `closure_interval`: its ends are good to 1 %
 
 
@@ -323,7 +323,7 @@ def summary(rows: pl.DataFrame) -> pl.DataFrame:
         pl.len().alias("films"),
         (relative**2).mean().sqrt().alias("rms"),
         (claim**2).mean().sqrt().alias("predicted"),
-        (pl.col("pull").abs() <= WITHIN).mean().alias("within_95"),
+        (pl.col("pull").abs() <= NORMAL_95).mean().alias("within_95"),
         (pl.col("pull") ** 2).mean().sqrt(),
         ((pl.col("film_pixels_m") / pl.col("depth_m")) ** 2).mean().sqrt().alias("pixels"),
         # median over films: one of a short stroke has as much say as one of a long one

@@ -9,12 +9,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
-from phibench.benchmark.scores.score_tables import TextTable
 from phibench.calibration.rig.file import Calibration
+from phibench.datasets.common.shown_text import TextTable
+from phibench.datasets.read import Dataset, Sample
 from phibench.estimator.geometry.least_squares_depth import GeneralDepth, depth_general
 from phibench.estimator.geometry.paper_depth import find_published
 from phibench.estimator.geometry.rig_parameters import stroke_of
@@ -29,29 +30,6 @@ GENERAL = "general"
 """Row of `depth_general`, which takes a calibration's covariance."""
 CENTROID_SIGMA_PX = 0.02
 """Of `find_spot` on noise-free frames: the pixels' share in the predicted error of `GENERAL` from "frame"."""
-
-
-class EstimatedSample(Protocol):
-    """Part of a sample of `phibench.datasets.read` that scoring needs."""
-
-    @property
-    def row(self) -> Any:
-        """Manifest row."""
-
-    @property
-    def nominal_rig(self) -> Rig:
-        """Nominal rig, at the down position."""
-
-    def expected_image(self, position: str, laser: bool = True) -> Array:
-        """Image without noise, shape (3, H, W), electrons per second."""
-
-
-class EstimatedDataset(Protocol):
-    """Part of a data set of `phibench.datasets.read` that scoring needs."""
-
-    @property
-    def samples(self) -> Sequence[Any]:
-        """All samples, visible or not."""
 
 
 @dataclass(frozen=True)
@@ -116,7 +94,7 @@ class _Nominal:
     covariance: Array | None = None
 
     @classmethod
-    def of(cls, sample: EstimatedSample, calibration: Calibration | None) -> _Nominal:
+    def of(cls, sample: Sample, calibration: Calibration | None) -> _Nominal:
         """Nominal numbers, or those of a calibration."""
         if calibration is None:
             return cls(sample.nominal_rig, sample.row.nominal_stroke_m)
@@ -124,7 +102,7 @@ class _Nominal:
         return cls(calibration.rig, stroke_m, calibration.covariance)
 
 
-def score(dataset: EstimatedDataset, calibration: Calibration | None = None) -> tuple[Score, ...]:
+def score(dataset: Dataset, calibration: Calibration | None = None) -> tuple[Score, ...]:
     """Score all estimators on all samples, from true pixels and from noise-free frames.
 
     Parameters
@@ -240,7 +218,7 @@ def as_records(items: Iterable[Score | RelativeErrors]) -> list[dict[str, object
     return [{key: _json_value(value) for key, value in asdict(item).items()} for item in items]
 
 
-def _pixels(sample: EstimatedSample, source: str) -> _Pixels:
+def _pixels(sample: Sample, source: str) -> _Pixels:
     nowhere = np.full(2, np.nan)  # estimators then give NaN, and the fault says why
     for position in POSITIONS:
         spot = getattr(sample.row, position)

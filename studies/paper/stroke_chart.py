@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from phibench.benchmark.reports.figures import COLOURS, LINES, STYLE, encoded, styled
-from phibench.benchmark.scores.score_tables import TextTable
 from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.common.shown_text import TextTable
 from phibench.datasets.store.files import write_bytes
 from phibench.estimator.limits.best_stroke import BestStroke
 from phibench.estimator.limits.stroke_curve import (

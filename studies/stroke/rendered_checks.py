@@ -14,9 +14,7 @@ from functools import cached_property
 import numpy as np
 
 from phibench.benchmark.scores.answer_errors import Rules
-from phibench.benchmark.scores.intervals import Clusters, estimates, rms_of
-from phibench.datasets.common.parallel import parallel_map
-from phibench.datasets.common.progress import Steps
+from phibench.benchmark.scores.intervals import Clusters, Estimate, estimates, rms_of
 from phibench.estimator.geometry.least_squares_depth import depth_general
 from phibench.estimator.geometry.mirror_image import image_of
 from phibench.estimator.geometry.rig_parameters import (
@@ -37,8 +35,7 @@ from phibench.scenes.laser import LaserSpot, beam_diameter_m
 from phibench.scenes.random_streams import Name, generator
 from phibench.scenes.rig import POSITIONS, Rig, Stroke
 from phibench.scenes.room import Room
-from phibench.studies.findings import Finding, Row
-from phibench.studies.framework import StudyDatasets
+from phibench.studies.framework import Finding, Row, ends_text, text_table
 from phibench.studies.image_cutout import Shot, SpotPair, cut_region, cut_rig, drawn_pair, without_off
 
 METHOD = {"bayer-raw": "raw_maximum_likelihood", "srgb8": "chain_fit", "mjpeg": "chain_fit"}
@@ -93,35 +90,18 @@ class RenderedOutcome:
     check: RenderedCheck
     errors_m: tuple[float, ...]
 
-    @property
-    def rms_m(self) -> float:
-        """Root mean square error; NaN without a pair."""
-        return math.sqrt(float(np.mean(np.square(self.errors_m)))) if self.errors_m else math.nan
-
     @cached_property
-    def interval_m(self) -> tuple[float, float]:
-        """95 % interval of the rms, by bootstrap: errors of rigs as built have long tails."""
+    def rms_m(self) -> Estimate:
+        """Root mean square error with its interval, by bootstrap: errors of rigs as built have long tails."""
         n = len(self.errors_m)
         rms = rms_of(Clusters(np.arange(n), n), np.square(self.errors_m))
         # ends good to some per cent
-        (estimate,) = estimates([rms], n, Rules(resamples=999), generator(*_NAMES, "interval"))
-        return estimate.low, estimate.high
+        return estimates([rms], n, Rules(resamples=999), generator(*_NAMES, "interval"))[0]
 
     @property
     def fits(self) -> bool:
         """The predicted error lies in the interval of the measured one."""
-        low, high = self.interval_m
-        return low <= self.check.predicted_m <= high
-
-
-def run_checks(checks: Sequence[RenderedCheck], datasets: StudyDatasets) -> list[RenderedOutcome]:
-    """Measure, with the workers of the data sets."""
-    with Steps(datasets.console, "stroke, frames", len(checks)) as steps:
-        outcomes = []
-        for outcome in parallel_map(measured, checks, datasets.workers):
-            outcomes.append(outcome)
-            steps.advance()
-    return outcomes
+        return self.rms_m.low <= self.check.predicted_m <= self.rms_m.high
 
 
 def measured(check: RenderedCheck) -> RenderedOutcome:
@@ -255,7 +235,7 @@ def check_findings(checks: Sequence[RenderedOutcome]) -> Iterator[Finding]:
 
 def _checked(name: str, checks: Sequence[RenderedOutcome]) -> Iterator[Finding]:
     lead, cells = f"frames, {name}", f"of {len(checks)} cells"
-    ratios = [c.rms_m / c.check.predicted_m for c in checks]
+    ratios = [c.rms_m.value / c.check.predicted_m for c in checks]
     yield Finding(f"{lead}: measured rms over predicted sigma, mean", math.exp(float(np.mean(np.log(ratios)))))
     for word, value in (("smallest", min(ratios)), ("largest", max(ratios))):
         yield Finding(f"{lead}: measured rms over predicted sigma, {word}", value)
@@ -277,8 +257,18 @@ def best_table(found: Found, tolerances: Sequence[str], depths_m: Sequence[float
 
 def check_table(checks: Sequence[RenderedOutcome]) -> tuple[Row, ...]:
     """Measured against predicted."""
-    head = ("tolerance", "D, m", "h / best", "h, m", "predicted, mm", "measured rms, mm", "pairs")
-    return (head, *(_check_row(c) for c in checks))
+    return text_table(
+        checks,
+        {
+            "tolerance": lambda c: c.check.tolerance,
+            "D, m": lambda c: f"{c.check.depth_m:g}",
+            "h / best": lambda c: f"{c.check.factor:g}",
+            "h, m": lambda c: f"{c.check.stroke_m:.3f}",
+            "predicted, mm": lambda c: f"{1e3 * c.check.predicted_m:.3g}",
+            "measured rms, mm": lambda c: ends_text(c.rms_m.ends, scale=1e3),
+            "pairs": lambda c: str(len(c.errors_m)),
+        },
+    )
 
 
 def theta_rad(rig: Rig, depth_m: float, height_m: float, stroke_m: float) -> float:
@@ -304,15 +294,8 @@ def _best_of(check: RenderedOutcome, checks: Sequence[RenderedOutcome]) -> Rende
 
 
 def _surely_better(a: RenderedOutcome, b: RenderedOutcome) -> bool:
-    return a.interval_m[1] < b.interval_m[0]
+    return a.rms_m.high < b.rms_m.low
 
 
 def _cells(best: BestStroke) -> tuple[str, str, str]:
     return f"{best.stroke_m:.2f}", f"{1e3 * best.sigma_m:.3g}", ", ".join(best.limits)
-
-
-def _check_row(c: RenderedOutcome) -> Row:
-    low, high = c.interval_m
-    rms = f"{1e3 * c.rms_m:.3g} ({1e3 * low:.3g} to {1e3 * high:.3g})"
-    where = (f"{c.check.depth_m:g}", f"{c.check.factor:g}", f"{c.check.stroke_m:.3f}")
-    return (c.check.tolerance, *where, f"{1e3 * c.check.predicted_m:.3g}", rms, str(len(c.errors_m)))

@@ -1,4 +1,7 @@
-"""Study `stroke`: the stroke that measures a distance best."""
+"""Study `stroke`: the stroke that measures a distance best.
+
+The drawings come last: the best stroke by distance, error by stroke, measured beside predicted.
+"""
 
 from __future__ import annotations
 
@@ -13,32 +16,31 @@ from pydantic import Field
 from phibench.calibration.outline.limb_image import PoseMeasurement
 from phibench.calibration.rig.bundle import calibrate
 from phibench.datasets.common.errors import DatasetError
-from phibench.datasets.common.progress import Steps
 from phibench.datasets.frames.sensor_card import SensorCard, sensor_card
 from phibench.estimator.geometry.rig_parameters import PARAMETERS, prior_sigmas
-from phibench.estimator.limits.best_stroke import BestStroke, best_stroke, spot_bound
+from phibench.estimator.limits.best_stroke import best_stroke, spot_bound
 from phibench.estimator.limits.processed_bound import SpotSigma
 from phibench.estimator.limits.stroke_curve import StrokeCurve, Surroundings, stroke_curve, stroke_grid
 from phibench.estimator.spots.spot_prediction import Laser
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import Rig
-from phibench.studies.framework import Settings, Study, StudyDatasets, StudyResult
-from phibench.studies.stroke.drawings import best_drawing, check_drawing, curves_drawing
-from phibench.studies.stroke.rendered_checks import (
-    RenderedCheck,
-    RenderedOutcome,
-    best_findings,
-    best_table,
-    check_findings,
-    check_table,
-    growth_findings,
-    limit_findings,
-    reason_findings,
-    run_checks,
+from phibench.studies.framework import (
+    COLOURS,
+    MARKERS,
+    Drawing,
+    Metres,
+    Settings,
+    Study,
+    StudyDatasets,
+    StudyResult,
+    canvas,
+    drawn,
+    error_bars,
+    line_style,
 )
+from phibench.studies.stroke import rendered_checks
 
 AS_BUILT, CALIBRATED, EXACT = "as built", "calibrated by the outline", "pixels alone"
-_Depths = Annotated[tuple[Annotated[float, Field(ge=0.2, le=20.0)], ...], Field(strict=False, min_length=1)]
 _Preset = Literal["bayer-raw", "srgb8", "mjpeg"]
 _Range = Annotated[tuple[float, float], Field(strict=False)]
 _QUALITY = 85  # of the charts' JPEG, if their preset has one: that of the study's figures
@@ -49,7 +51,7 @@ class CheckSettings(Settings):
     """Frames that are drawn and evaluated."""
 
     preset: _Preset = Field(description="of the sensor")
-    depths_m: _Depths = Field(description="distances")
+    depths_m: Metres = Field(description="distances")
     factors: Annotated[tuple[float, ...], Field(strict=False, min_length=1)] = Field(description="of the best stroke")
     strokes_m: _Range = Field(description="between which the best stroke is sought")
     power_mw: float = Field(gt=0.0, le=10.0, description="of the laser; weak enough that no pixel is full")
@@ -60,14 +62,14 @@ class StrokeSettings(Settings):
     """Settings of the study."""
 
     preset: _Preset = Field(description="sensor of the charts")
-    depths_m: _Depths = Field(description="distances of the chart")
+    depths_m: Metres = Field(description="distances of the chart")
     spot_height_m: float = Field(ge=0.0, le=3.0, description="above the floor")
     strokes_m: _Range = Field(description="of the carriage")
     outline_sigma_um: Annotated[tuple[float, float, float], Field(strict=False)] = Field(
         description="sphere centre from the outline: across, across, along the axis"
     )
-    paper_depths_m: _Depths = Field(description="distances of the paper's tables 1 to 3")
-    paper_strokes_m: _Depths = Field(description="longest stroke of each of these tables")
+    paper_depths_m: Metres = Field(description="distances of the paper's tables 1 to 3")
+    paper_strokes_m: Metres = Field(description="longest stroke of each of these tables")
     check: CheckSettings
 
 
@@ -79,22 +81,20 @@ def run(settings: StrokeSettings, datasets: StudyDatasets) -> StudyResult:
     longest = _paper(settings)
     depths = sorted({*settings.depths_m, *longest})
     best_by_case = {}
-    with Steps(datasets.console, "stroke, curves", len(rigs) * len(depths)) as steps:
-        for name, C in rigs.items():
-            for d in depths:
-                best_by_case[name, d] = best_stroke(
-                    d, rig, covariance_rig=C, strokes_m=settings.strokes_m, around=around, card=card, spot=spot
-                )
-                steps.advance()
-    checks = run_checks(planned(settings, rig, {k: rigs[k] for k in (AS_BUILT, EXACT)}), datasets)
+    for name, d in datasets.each([(name, d) for name in rigs for d in depths], "stroke, curves"):
+        best_by_case[name, d] = best_stroke(
+            d, rig, covariance_rig=rigs[name], strokes_m=settings.strokes_m, around=around, card=card, spot=spot
+        )
+    todo = planned(settings, rig, {k: rigs[k] for k in (AS_BUILT, EXACT)})
+    checks = datasets.map(rendered_checks.measured, todo, "stroke, frames")
     names, top = tuple(rigs), settings.strokes_m[1]
-    findings = [row for name in names for row in best_findings(best_by_case, name, tuple(longest))]
-    findings += [row for d in longest for row in growth_findings(best_by_case, d, names, top)]
+    findings = [row for name in names for row in rendered_checks.best_findings(best_by_case, name, tuple(longest))]
+    findings += [row for d in longest for row in rendered_checks.growth_findings(best_by_case, d, names, top)]
     built = best_by_case[AS_BUILT, next(iter(longest))]
     if math.isfinite(built.stroke_m):
-        findings += reason_findings(rig, built.depth_m, settings.spot_height_m, (built.stroke_m, top))
-    findings += limit_findings(_free_curves(rig, settings.depths_m, spot, card, around))
-    findings += check_findings(checks)
+        findings += rendered_checks.reason_findings(rig, built.depth_m, settings.spot_height_m, (built.stroke_m, top))
+    findings += rendered_checks.limit_findings(_free_curves(rig, settings.depths_m, spot, card, around))
+    findings += rendered_checks.check_findings(checks)
     return StudyResult(
         {"table": best_frame(best_by_case), "curves": curve_frame(best_by_case), "checks": check_frame(checks)},
         tuple(findings),
@@ -104,8 +104,8 @@ def run(settings: StrokeSettings, datasets: StudyDatasets) -> StudyResult:
             check_drawing(checks),
         ),
         {
-            f"Best strokes, {settings.preset}": best_table(best_by_case, names, depths),
-            f"Frames, {settings.check.preset}: rms error of D with 95 % interval": check_table(checks),
+            f"Best strokes, {settings.preset}": rendered_checks.best_table(best_by_case, names, depths),
+            f"Frames, {settings.check.preset}: rms error of D with 95 % interval": rendered_checks.check_table(checks),
         },
         _notes(settings, checks),
     )
@@ -139,7 +139,7 @@ def tolerances(rig: Rig, outline_sigma_um: Sequence[float]) -> dict[str, Array]:
     }
 
 
-def planned(settings: StrokeSettings, rig: Rig, rigs: Mapping[str, Array]) -> list[RenderedCheck]:
+def planned(settings: StrokeSettings, rig: Rig, rigs: Mapping[str, Array]) -> list[rendered_checks.RenderedCheck]:
     """Cells of the check that lie within the limits."""
     wanted, card = settings.check, sensor_card(settings.check.preset)
     taken = (wanted.preset, wanted.power_mw, wanted.draws)
@@ -154,14 +154,14 @@ def planned(settings: StrokeSettings, rig: Rig, rigs: Mapping[str, Array]) -> li
             strokes = np.array([f * best.stroke_m for f in wanted.factors])
             curve = stroke_curve(rig, d, strokes, exposure_s=card.exposure_s, stroke_sigma_m=0.0, **options)
             checks += [
-                RenderedCheck(name, d, float(h), f, float(s), rows, settings.spot_height_m, *taken)
+                rendered_checks.RenderedCheck(name, d, float(h), f, float(s), rows, settings.spot_height_m, *taken)
                 for f, h, s in zip(wanted.factors, strokes, curve.allowed_sigma_m, strict=True)
                 if math.isfinite(s)
             ]
     return checks
 
 
-def best_frame(found: Mapping[tuple[str, float], BestStroke]) -> pl.DataFrame:
+def best_frame(found: rendered_checks.Found) -> pl.DataFrame:
     """A row per tolerance and distance."""
     keys = ("depth_m", "stroke_m", "sigma_m", "sigma_spot_m", "sigma_calibration_m", "sigma_higher_order_m")
     rows = [
@@ -177,29 +177,27 @@ def best_frame(found: Mapping[tuple[str, float], BestStroke]) -> pl.DataFrame:
     return pl.DataFrame(rows)
 
 
-def curve_frame(found: Mapping[tuple[str, float], BestStroke]) -> pl.DataFrame:
+def curve_frame(found: rendered_checks.Found) -> pl.DataFrame:
     """A row per tolerance, distance and stroke."""
-    return pl.concat([_curve(name, best) for (name, _), best in found.items()])
+    names = ("sigma_m", "sigma_spot_m", "sigma_calibration_m", "sigma_higher_order_m")
+    frames = [
+        pl.DataFrame(
+            {"stroke_m": c.strokes_m, **{key: getattr(c, key) for key in names}, "cause": c.causes}
+        ).with_columns(tolerance=pl.lit(name), depth_m=pl.lit(depth))
+        for (name, depth), c in ((case, best.curve) for case, best in found.items())
+    ]
+    return pl.concat(frames)
 
 
-def check_frame(checks: Sequence[RenderedOutcome]) -> pl.DataFrame:
+def check_frame(checks: Sequence[rendered_checks.RenderedOutcome]) -> pl.DataFrame:
     """A row per cell of the check."""
     keys = ("tolerance", "depth_m", "stroke_m", "factor", "predicted_m")
     rows = [
-        {**{key: getattr(c.check, key) for key in keys}, "rms_m": c.rms_m, "pairs": len(c.errors_m)}
-        | dict(zip(("rms_low_m", "rms_high_m"), c.interval_m, strict=True))
+        {**{key: getattr(c.check, key) for key in keys}, "rms_m": c.rms_m.value, "pairs": len(c.errors_m)}
+        | {"rms_low_m": c.rms_m.low, "rms_high_m": c.rms_m.high}
         for c in checks
     ]
     return pl.DataFrame(rows)
-
-
-def _curve(name: str, best: BestStroke) -> pl.DataFrame:
-    c = best.curve
-    names = ("sigma_m", "sigma_spot_m", "sigma_calibration_m", "sigma_higher_order_m")
-    columns = {name: getattr(c, name) for name in names}
-    return pl.DataFrame({"stroke_m": c.strokes_m, **columns, "cause": c.causes}).with_columns(
-        tolerance=pl.lit(name), depth_m=pl.lit(best.depth_m)
-    )
 
 
 def _free_curves(
@@ -211,7 +209,7 @@ def _free_curves(
     return {d: stroke_curve(rig, d, grid, spot, exact, around, card.exposure_s, 0.0) for d in ends}
 
 
-def _notes(settings: StrokeSettings, checks: Sequence[RenderedOutcome]) -> tuple[str, ...]:
+def _notes(settings: StrokeSettings, checks: Sequence[rendered_checks.RenderedOutcome]) -> tuple[str, ...]:
     notes = [
         "Predictions are for a round spot over a flat white wall at 1 mW and 1/60 s, rms over 8 "
         f"azimuths; frames of the check are {settings.check.preset} at {settings.check.power_mw:g} mW, before a "
@@ -226,6 +224,84 @@ def _notes(settings: StrokeSettings, checks: Sequence[RenderedOutcome]) -> tuple
     if lost:
         notes.append(f"{lost} pairs of the check without a spot in both images are left out.")
     return tuple(notes)
+
+
+# -- drawings ----------------------------------------------------------------------------------------------------------
+
+
+def best_drawing(found: rendered_checks.Found, tolerances: Sequence[str], depths_m: Sequence[float]) -> Drawing:
+    """Best stroke and its error against the distance."""
+    with canvas(10.0, 4.0) as figure:
+        left, right = figure.subplots(1, 2)
+        for i, tolerance in enumerate(tolerances):
+            best = [found[tolerance, d] for d in depths_m]
+            h, sigma = (np.array([getattr(b, name) for b in best]) for name in ("stroke_m", "sigma_m"))
+            bound = np.array([bool(b.limits) for b in best])
+            for ax, y in ((left, h), (right, 100.0 * sigma / np.array(depths_m))):
+                ax.plot(depths_m, y, label=tolerance, **line_style(i))
+                # hollow: a limit stopped it
+                ax.plot(np.array(depths_m)[bound], y[bound], "o", color="white", markersize=3.0, zorder=5)
+        left.set_ylabel("best stroke h, m")
+        right.set_ylabel("sigma of D at the best stroke, %")
+        right.set_yscale("log")
+        for ax in (left, right):
+            ax.set_xlabel("distance D, m")
+        left.legend(frameon=False, title="white centre: at a limit")
+        ends = {t: (found[t, depths_m[0]], found[t, depths_m[-1]]) for t in tolerances}
+        alt = "Best stroke and its relative error against the distance. " + "; ".join(
+            f"{t}: {a.stroke_m:.2f} m at D = {a.depth_m:g} m to {b.stroke_m:.2f} m at {b.depth_m:g} m"
+            for t, (a, b) in ends.items()
+        )
+        return drawn("best", figure, alt + ".")
+
+
+def curves_drawing(
+    found: rendered_checks.Found, tolerances: Sequence[str], longest_m: Mapping[float, float]
+) -> Drawing:
+    """Predicted error against the stroke, a panel per distance of the paper."""
+    with canvas(11.0, 3.8) as figure:
+        axes = figure.subplots(1, len(longest_m), squeeze=False)[0]
+        for ax, (depth, longest) in zip(axes, longest_m.items(), strict=True):
+            for i, tolerance in enumerate(tolerances):
+                best = found[tolerance, depth]
+                sigma = np.where(np.isfinite(best.curve.allowed_sigma_m), best.curve.allowed_sigma_m, np.nan)
+                style = {**line_style(i), "marker": ""}
+                ax.plot(best.curve.strokes_m, 1e3 * sigma, label=tolerance, **style)
+                ax.plot(best.stroke_m, 1e3 * best.sigma_m, MARKERS[i], color=COLOURS[i])
+            ax.axvline(longest, color="grey", linestyle=":", label="longest stroke in the paper's table")
+            ax.set_title(f"D = {depth:g} m")
+            ax.set_xscale("log")
+            ax.set_yscale("log")
+            ax.set_xlabel("stroke h, m")
+        axes[0].set_ylabel("predicted sigma of D, mm")
+        axes[0].legend(frameon=False, fontsize=7)
+        alt = "Predicted error of D against the stroke; markers at the smallest: " + "; ".join(
+            f"D = {d:g} m, {t} {found[t, d].stroke_m:.2f} m" for d in longest_m for t in tolerances
+        )
+        return drawn("curves", figure, alt + ".")
+
+
+def check_drawing(checks: Sequence[rendered_checks.RenderedOutcome]) -> Drawing:
+    """Measured rms beside the prediction."""
+    names = tuple(dict.fromkeys(c.check.tolerance for c in checks))
+    with canvas(10.0, 3.8) as figure:
+        for ax, name in zip(figure.subplots(1, len(names), squeeze=False)[0], names, strict=True):
+            for i, depth in enumerate(dict.fromkeys(c.check.depth_m for c in checks)):
+                mine = [c for c in checks if c.check.tolerance == name and c.check.depth_m == depth]
+                h = [c.check.stroke_m for c in mine]
+                ends = 1e3 * np.array([c.rms_m.ends for c in mine])
+                ax.plot(h, [1e3 * c.check.predicted_m for c in mine], color=COLOURS[i], linewidth=1.0)
+                label = f"D = {depth:g} m"
+                ax.errorbar(h, ends[:, 0], error_bars(ends), fmt=MARKERS[i], color=COLOURS[i], capsize=2, label=label)
+            ax.set_title(f"{name}: points frames, lines predicted")
+            ax.set_xscale("log")
+            ax.set_yscale("log")
+            ax.set_xlabel("stroke h, m")
+            ax.set_ylabel("error of D, mm rms")
+            ax.legend(frameon=False, fontsize=8)
+        ratios = [c.rms_m.value / c.check.predicted_m for c in checks]
+        alt = f"Rms error of D in frames over the predicted: from {min(ratios):.2f} to {max(ratios):.2f}."
+        return drawn("checks", figure, alt)
 
 
 STUDY = Study(

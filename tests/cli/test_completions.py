@@ -12,8 +12,8 @@ from typing import get_args
 
 import pytest
 
-from phibench.cli import completions
 from phibench.cli import main as cli
+from phibench.cli import options
 
 Python = Callable[..., subprocess.CompletedProcess[str]]
 
@@ -35,10 +35,10 @@ def test_values_that_are_completed_are_those_that_there_are(capsys: pytest.Captu
 
     assert completed(["score", "x", "--preset", ""], capsys) == list(get_args(Preset))
     assert completed(["score", "x", "--method", ""], capsys)[: len(KNOWN)] == list(KNOWN)
-    assert completions.POLICIES == tuple(POLICIES)
-    assert completions.PARTS == tuple(part.name for part in PARTS)
-    assert {f"{completions.TITLE}{part}" for part in completions.PARTS} == {part.title for part in PARTS}
-    assert completions.METHOD_PACKAGES == GROUP
+    assert options.POLICIES == tuple(POLICIES)
+    assert options.PARTS == tuple(part.name for part in PARTS)
+    assert {f"{options.TITLE}{part}" for part in options.PARTS} == {part.title for part in PARTS}
+    assert options.METHOD_PACKAGES == GROUP
 
 
 @pytest.mark.parametrize(

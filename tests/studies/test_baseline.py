@@ -32,8 +32,7 @@ from phibench.studies.baseline.tables import (
     published_curve,
     seen,
 )
-from phibench.studies.findings import Finding
-from phibench.studies.framework import read_settings
+from phibench.studies.framework import Finding, read_settings
 from phibench.studies.run import run_study
 
 DEPTH_M = np.array([1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, 4.2, 2.2, 3.2])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import polars as pl
@@ -30,8 +31,7 @@ from phibench.studies.cause.study import (
     scale_findings,
 )
 from phibench.studies.cause.tables import DECIDED, FLOOR, alike, coverage, fit_of, left_out_score
-from phibench.studies.findings import Finding
-from phibench.studies.framework import read_settings
+from phibench.studies.framework import Finding, read_settings
 from phibench.studies.run import run_study
 
 DATA = published_experiments()
@@ -44,12 +44,17 @@ def settings() -> CauseSettings:
 
 
 @pytest.mark.parametrize(
-    "prior",
-    [Prior(rayleigh=2.0), Prior(normal=[1.0, 2.0]), Prior(uniform=[-1.0, 3.0]), Prior(log_uniform=[0.02, 3.0])],
+    ("prior", "law"),
+    [
+        (Prior(rayleigh=2.0), scipy.stats.rayleigh(scale=2.0)),
+        (Prior(normal=[1.0, 2.0]), scipy.stats.norm(1.0, 2.0)),
+        (Prior(uniform=[-1.0, 3.0]), scipy.stats.uniform(-1.0, 4.0)),
+        (Prior(log_uniform=[0.02, 3.0]), scipy.stats.loguniform(0.02, 3.0)),
+    ],
 )
-def test_priors_turn_shares_into_values_and_back(prior: Prior) -> None:
+def test_values_of_priors_have_their_laws(prior: Prior, law: Any) -> None:
     shares = np.linspace(0.01, 0.99, 7)
-    assert prior.share_of(prior.of_share(shares)) == pytest.approx(shares)
+    assert law.cdf(prior.of_share(shares)) == pytest.approx(shares)
 
 
 @pytest.mark.parametrize(

@@ -15,8 +15,19 @@ from rich.console import Console
 from phibench.benchmark.reports.report import write_report
 from phibench.cli.main import main
 from phibench.datasets.common.errors import DatasetError
-from phibench.studies.findings import Finding, findings_table, markdown_table, number
-from phibench.studies.framework import Settings, Study, StudyDatasets, StudyResult, canvas, drawn, read_settings
+from phibench.studies.framework import (
+    Finding,
+    Settings,
+    Study,
+    StudyDatasets,
+    StudyResult,
+    canvas,
+    drawn,
+    findings_table,
+    markdown_table,
+    number,
+    read_settings,
+)
 from phibench.studies.run import find_study, publish_study, read_study, section, write_study
 
 

@@ -32,15 +32,18 @@ from phibench.studies.isotropy.lines import (
     hidden_by,
     hidden_share,
     moved,
-)
-from phibench.studies.isotropy.noise import AzimuthNoise, bound_m, circle, flat_pair, isotropy, sideways
-from phibench.studies.isotropy.study import (
-    STUDY,
-    edge_findings,
-    grid_findings,
     occlusion_findings,
-    scatter_findings,
 )
+from phibench.studies.isotropy.noise import (
+    AzimuthNoise,
+    bound_m,
+    circle,
+    flat_pair,
+    isotropy,
+    scatter_findings,
+    sideways,
+)
+from phibench.studies.isotropy.study import STUDY, edge_findings, grid_findings
 
 RIG = default_rig()
 GRID = PanoramaGrid(1440, -0.35, 0.35)
@@ -130,7 +133,7 @@ def test_isotropy_is_denied_as_rarely_as_stated() -> None:
     """300 sets of equal scatter, false alarms 5 %: 15 +- 3.8 expected, 4 sigma allowed; Brown-Forsythe errs low."""
     rng = generator("test", "isotropy", "alarms")
     ones = np.ones(12)
-    alarms = sum(not isotropy(_noise(rng, ones, ones), 0.05).isotropic for _ in range(300))
+    alarms = sum(isotropy(_noise(rng, ones, ones), 0.05).p_value < 0.05 for _ in range(300))
     assert 2 <= alarms <= 30
 
 
@@ -139,10 +142,10 @@ def test_isotropy_is_denied_where_scatter_differs_and_explained_by_the_bound() -
     rng = generator("test", "isotropy", "power")
     sigmas = np.linspace(1.0, 2.0, 12)
     with_bound = [isotropy(_noise(rng, sigmas, sigmas), 0.01) for _ in range(20)]
-    assert not any(one.isotropic for one in with_bound)
-    assert sum(one.explained for one in with_bound) >= 18
+    assert not any(one.p_value >= one.false_alarm for one in with_bound)
+    assert sum(one.p_value_over_bound >= one.false_alarm for one in with_bound) >= 18
     without = [isotropy(_noise(rng, sigmas, np.ones(12)), 0.01) for _ in range(20)]
-    assert not any(one.explained for one in without)
+    assert not any(one.p_value_over_bound >= one.false_alarm for one in without)
     assert without[0].ratio == pytest.approx(2.0)
 
 

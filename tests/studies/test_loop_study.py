@@ -17,9 +17,9 @@ from phibench.robot.loop.robot_pixels import Window
 from phibench.robot.loop.simulator import REACHED, WRONG, Setup
 from phibench.scenes.motion.vehicle import PARAMETERS
 from phibench.scenes.random_streams import generator
-from phibench.studies.framework import StudyDatasets, read_settings
+from phibench.studies.framework import StudyDatasets, read_settings, rms
 from phibench.studies.loop.drawings import episode_steps, pasted, phases, picture, show_episode
-from phibench.studies.loop.study import STUDY, conditions, delay, interval, misaligned, rms, summary
+from phibench.studies.loop.study import STUDY, conditions, delay, interval, misaligned, summary
 
 TINY = """
 episodes = 2

@@ -42,8 +42,8 @@ from phibench.studies.mirror.measured_places import (
     unhidden,
     usual,
 )
-from phibench.studies.mirror.study import STUDY, MirrorSettings
-from phibench.studies.mirror.tables import PlaceMap, pick_table
+from phibench.studies.mirror.study import STUDY
+from phibench.studies.mirror.tables import MirrorSettings, PlaceMap, pick_table
 
 SHAPES = ("sphere", "ellipsoid", "paraboloid", "hyperboloid", "cone")
 STROKE_M = 0.425

@@ -24,8 +24,7 @@ from phibench.render.sensor.light import Region
 from phibench.render.sensor.settings import sensor
 from phibench.scenes.random_streams import generator
 from phibench.scenes.rig import POSITIONS, Rig
-from phibench.studies.findings import Finding
-from phibench.studies.framework import StudyDatasets, read_settings
+from phibench.studies.framework import Finding, StudyDatasets, read_settings
 from phibench.studies.image_cutout import Shot, SpotPair, bounds_of, cut_region, cut_rig, drawn_pair
 from phibench.studies.noise.conditions import BASE, FACTORS, OFF, applied
 from phibench.studies.noise.study import STUDY

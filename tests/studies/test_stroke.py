@@ -16,8 +16,7 @@ from phibench.estimator.limits.best_stroke import LARGEST, BestStroke
 from phibench.estimator.limits.stroke_curve import CEILING, FREE, StrokeCurve
 from phibench.scenes.random_streams import generator
 from phibench.scenes.rig import Rig
-from phibench.studies.findings import Finding
-from phibench.studies.framework import StudyDatasets, read_settings
+from phibench.studies.framework import Finding, StudyDatasets, read_settings
 from phibench.studies.stroke.rendered_checks import (
     RenderedCheck,
     RenderedOutcome,
@@ -91,7 +90,7 @@ def test_intervals_of_an_rms_cover() -> None:
 
 
 def _inside(checked: RenderedOutcome) -> bool:
-    low, high = checked.interval_m
+    low, high = checked.rms_m.low, checked.rms_m.high
     return bool(low <= 1.0 <= high) and checked.fits
 
 

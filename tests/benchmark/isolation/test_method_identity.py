@@ -10,8 +10,7 @@ from pathlib import Path
 import pytest
 from helpers.sandbox_pairs import GOOD, HEADER, SmallPairs, method_file
 
-from phibench.benchmark.isolation.loaded_packages import package_sha256, packages_of
-from phibench.benchmark.isolation.opened_files import OpenedFiles
+from phibench.benchmark.isolation.method_provenance import OpenedFiles, package_sha256, packages_of
 from phibench.benchmark.isolation.resolve import RunLimits, code_of_function
 from phibench.benchmark.isolation.runner import Harness, ran_here
 
@@ -77,7 +76,7 @@ def test_hidden_files_bytecode_and_what_is_gone(tmp_path: Path) -> None:
 
 @linux
 def test_more_folders_than_are_watched_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("phibench.benchmark.isolation.opened_files._FOLDERS", 2)
+    monkeypatch.setattr("phibench.benchmark.isolation.method_provenance._FOLDERS", 2)
     for name in "abc":
         (tmp_path / name).mkdir()
     opened = OpenedFiles([("", tmp_path)])

@@ -12,7 +12,8 @@ from helpers.oracles import random_rig, true_pixel
 from scipy.linalg import cholesky, solve_triangular
 
 from phibench.benchmark.scores.answer_errors import MATCH_PX, Rules, kept, phi_of
-from phibench.benchmark.scores.records import COLUMNS, COUNTED, record_table, records, with_missed
+from phibench.benchmark.scores.record_columns import COLUMNS, COUNTED
+from phibench.benchmark.scores.records import record_table, records, with_missed
 from phibench.datasets.common.errors import DatasetError
 from phibench.estimator.geometry.phi import CONVENTIONS, outline_circle
 from phibench.estimator.geometry.triangulate import depth_exact

@@ -13,8 +13,8 @@ from scipy import integrate, stats
 from phibench.benchmark.pair_sets.dataset_pairs import BOX_PX, tracks_of
 from phibench.benchmark.scores.answer_errors import MATCH_PX, Rules
 from phibench.benchmark.scores.metrics import measure, prepared
+from phibench.benchmark.scores.record_columns import LEAST_RATIO, THRESHOLDS, perfect_log
 from phibench.benchmark.scores.records import records
-from phibench.benchmark.scores.track_columns import LEAST_RATIO, THRESHOLDS, perfect_log
 from phibench.estimator.interface import Answer, Outcome, Spot
 from phibench.estimator.pair_set import PairTruth
 

@@ -9,11 +9,12 @@ import polars as pl
 import pytest
 from rich.console import Console
 
-from phibench.benchmark.scores.score_tables import show_grid
+from phibench.benchmark.scores.intervals import NORMAL_95
 from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.common.shown_text import show_grid
 from phibench.scenes.random_streams import generator
 from phibench.studies.paper.experiment_bounds import budget, budget_table, budgets
-from phibench.studies.paper.experiment_tables import COLUMNS, WITHIN
+from phibench.studies.paper.experiment_tables import COLUMNS
 
 SAMPLES, DRAWS = 60, 4
 
@@ -37,7 +38,7 @@ def rows(claimed: float = 1.0) -> pl.DataFrame:
             "sigma_m": predicted,
             "bound_m": 0.8 * sigma * depth,
             "nominal_error": np.full(len(depth), 0.05),
-            "within_95": np.abs(error) <= WITHIN * predicted,
+            "within_95": np.abs(error) <= NORMAL_95 * predicted,
             "status": ["ok"] * len(depth),
         }
     )

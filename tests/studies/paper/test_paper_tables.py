@@ -14,7 +14,7 @@ from helpers.oracles import paper_cases, true_pixel
 from rich.console import Console
 from scipy.special import ndtr
 
-from phibench.benchmark.scores.score_tables import show_grid
+from phibench.datasets.common.shown_text import show_grid
 from phibench.estimator.geometry.paper_depth import find_published, load_published
 from phibench.estimator.geometry.triangulate import ESTIMATORS
 from phibench.scenes.rig import Rig
