@@ -143,6 +143,8 @@ class Measurement:
     sensor : SensorChoice
     notes : tuple of str
         Sentences for the person: sensor, rig, frames, doubts.
+    doubts : tuple of str
+        Those of them on why D may be wrong by far more than its sigma says; none of a sound pair.
     """
 
     depth: GeneralDepth
@@ -155,6 +157,7 @@ class Measurement:
     pair: Pair = field(repr=False)
     sensor: SensorChoice
     notes: tuple[str, ...]
+    doubts: tuple[str, ...]
 
     @property
     def depth_m(self) -> float:
@@ -165,11 +168,6 @@ class Measurement:
     def sigma_m(self) -> float:
         """Standard deviation of D, of all that is known to be uncertain."""
         return float(self.depth.sigma_m)
-
-    @property
-    def doubts(self) -> tuple[str, ...]:
-        """Sentences on why D may be wrong by far more than its sigma says; none of a sound pair."""
-        return tuple(note for note in self.notes if note.startswith(_DOUBTFUL_SPOTS))
 
 
 def measure(photos: PairPhotos, stroke_m: float, setting: KnownNumbers) -> Measurement:
@@ -237,11 +235,13 @@ def _measured(test: ChainTest, stroke_m: float, setting: KnownNumbers) -> Measur
         raise contradiction(found.pair, photos, describe(int(depth.status)))
     if test.doubt and (fault := exchanged_colours(found.pair, photos)):
         raise fault
-    tests = _doubt(depth), _torn(down, "down"), _torn(up, "up"), *_moved(found.pair, photos), _foreign(test)
-    notes = (chosen.note, test.note, *found.notes, frames_note(photos), *tests)
-    told = tuple(text for text in notes if text)
-    nominal = setting.known.rig
-    return Measurement(depth, down, up, found.rig, found.stroke_m, found.limb[0], nominal, found.pair, chosen, told)
+    gap, is_one = _gap(depth), float(depth.p_value) >= DOUBTFUL_P
+    faults_of_spots = _torn(down, "down"), _torn(up, "up"), *_moved(found.pair, photos), _foreign(test)
+    notes = chosen.note, test.note, *found.notes, frames_note(photos), gap, *faults_of_spots
+    doubts = "" if is_one else gap, *faults_of_spots
+    told, doubted = (tuple(text for text in texts if text) for texts in (notes, doubts))
+    rig, limb, nominal = found.rig, found.limb[0], setting.known.rig
+    return Measurement(depth, down, up, rig, found.stroke_m, limb, nominal, found.pair, chosen, told, doubted)
 
 
 _Limb = tuple[tuple[Outline, ...], str]
@@ -333,7 +333,7 @@ def _shifted(
 
 
 def _foreign(test: ChainTest) -> str:
-    return f"{_DOUBTFUL_SPOTS}s went through another chain than the file's: {test.doubt}" if test.doubt else ""
+    return f"doubtful: the spots went through another chain than the file's: {test.doubt}" if test.doubt else ""
 
 
 # -- rig -------------------------------------------------------------------------------------------------------------
@@ -469,13 +469,10 @@ def seen_spots(answer: Answer) -> dict[str, SeenSpot]:
     return {name: SeenSpot(np.array(spot.uv_px), np.array(spot.covariance_px2)) for name, spot in both.items()}
 
 
-_DOUBTFUL_SPOTS = "doubtful: the spot"
-
-
 def _moved(pair: Pair, photos: PairPhotos) -> Iterator[str]:
     """Sentences on laser-off pictures that are shifted: edges of the room then count as light of the spot."""
     for position, shift in moved_between(pair):
-        yield f"{_DOUBTFUL_SPOTS} {position} lies on edges: {moved_note(photos, position, shift)}"
+        yield f"doubtful: the spot {position} lies on edges: {moved_note(photos, position, shift)}"
 
 
 def _torn(spot: SeenSpot, position: str) -> str:
@@ -484,17 +481,17 @@ def _torn(spot: SeenSpot, position: str) -> str:
         return ""
     u, v = spot.uv_px
     return (
-        f"{_DOUBTFUL_SPOTS} {position} at ({u:.0f}, {v:.0f}) px has not the shape of one, {100.0 * spot.unlike:.0f} % "
+        f"doubtful: the spot {position} at ({u:.0f}, {v:.0f}) px has not the shape of one, {100.0 * spot.unlike:.0f} % "
         "of its light do not fit; the beam may meet an edge or graze a surface, turn the laser a little"
     )
 
 
-def _doubt(depth: GeneralDepth) -> str:
+def _gap(depth: GeneralDepth) -> str:
     """Sentence on the test."""
     p, chi2 = float(depth.p_value), float(depth.chi2)
     if p >= DOUBTFUL_P:
         return f"one point: chi^2 {chi2:.2f} for one degree of freedom (p = {p:.2g})"
     return (
-        f"{_DOUBTFUL_SPOTS}s are not images of one point, chi^2 {chi2:.1f} for one degree of freedom (p = {p:.1e}); "
+        f"doubtful: the spots are not images of one point, chi^2 {chi2:.1f} for one degree of freedom (p = {p:.1e}); "
         "one may be a reflection, the rig may have turned between the pictures, or the calibration is another rig's"
     )

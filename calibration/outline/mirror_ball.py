@@ -223,19 +223,12 @@ def unwrap(light: NDArray[np.float32], ball: Ball, surroundings_m: float, width_
     for first in range(0, width // 2, _ROWS_AT_ONCE):
         rows = slice(first, min(first + _ROWS_AT_ONCE, width // 2))
         fine = slice(rows.start * parts, rows.stop * parts)
-        uv, shown = table.pixels(_directions(grid, fine))
+        uv, shown = table.pixels(grid.directions(fine))
         values = unrolled(light, uv)
         cells = (rows.stop - rows.start, parts, width, parts)
         result[rows] = values.reshape(*cells, 3).mean(axis=(1, 3))
         seen[rows] = shown.reshape(cells).all(axis=(1, 3))
     return BallPanorama(result, seen, ball)
-
-
-def _directions(grid: PanoramaGrid, rows: slice) -> Array:
-    """Unit vectors of some rows of a grid, shape (n, W, 3)."""
-    turn, up = grid.azimuths_rad[None, :], grid.elevations_rad[rows, None]
-    flat = np.cos(up)
-    return np.stack(np.broadcast_arrays(flat * np.cos(turn), flat * np.sin(turn), np.sin(up)), axis=-1)
 
 
 class _Angles:

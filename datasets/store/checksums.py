@@ -19,7 +19,7 @@ from phibench.datasets.rooms.room_files import RoomFiles
 from phibench.datasets.rooms.room_sources import EXPORTED
 from phibench.datasets.store import schema
 from phibench.datasets.store.documents import read_info, read_manifest
-from phibench.datasets.store.files import require_file, sha256, write_text
+from phibench.datasets.store.files import require_file, sha256
 from phibench.datasets.store.leftovers import TEMPORARY_PREFIX
 from phibench.datasets.store.schema import DatasetInfo
 from phibench.datasets.store.stored_rooms import read_rooms
@@ -89,13 +89,6 @@ def strays(folder: Path) -> list[str]:
     known = {*read_checksums(folder), *schema.NOT_DATA}
     names = (path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
     return sorted(name for name in names if name not in known and TEMPORARY_PREFIX not in name)
-
-
-def write_checksums(folder: Path) -> Path:
-    """Hash all data files."""
-    return write_text(
-        folder / schema.CHECKSUMS, checksums_text({name: sha256(folder / name) for name in data_files(folder)})
-    )
 
 
 def checksums_text(hashes: Mapping[str, str]) -> str:

@@ -28,7 +28,7 @@ from phibench.datasets.common.input_files import NAME_LENGTH, InputFile, first_f
 from phibench.datasets.plan.plan import Plan, PosePlan
 from phibench.datasets.recipe.tables import Recipe
 from phibench.datasets.store import schema
-from phibench.datasets.store.files import read_rows, sha256, write_bytes
+from phibench.datasets.store.files import read_rows, sha256
 from phibench.datasets.store.provenance import provenance
 from phibench.datasets.store.schema import (
     READABLE_VERSIONS,
@@ -247,12 +247,6 @@ def _pose_info(pose: PosePlan) -> PoseInfo:
 
 
 # The manifest, as lines of JSON and as a flat table.
-
-
-def write_manifest(folder: Path, rows: Sequence[ManifestRow]) -> None:
-    """Write both forms."""
-    for name, data in manifest_documents(rows).items():
-        write_bytes(folder / name, data)
 
 
 def manifest_documents(rows: Sequence[ManifestRow]) -> dict[str, bytes]:

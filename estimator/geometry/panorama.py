@@ -92,9 +92,9 @@ class PanoramaGrid:
         """Of the rows, shape (H,), falling."""
         return np.asarray(self.high_rad - (np.arange(self.height_px) + 0.5) * self.step_rad, float)
 
-    def directions(self) -> Array:
-        """Unit vectors, shape (H, W, 3), world."""
-        turn, up = self.azimuths_rad[None, :], self.elevations_rad[:, None]
+    def directions(self, rows: slice = slice(None)) -> Array:
+        """Unit vectors of all rows or some, shape (H, W, 3), world."""
+        turn, up = self.azimuths_rad[None, :], self.elevations_rad[rows, None]
         flat = np.cos(up)
         return np.stack(np.broadcast_arrays(flat * np.cos(turn), flat * np.sin(turn), np.sin(up)), axis=-1)
 

@@ -121,7 +121,7 @@ def _minima(data: SpotData, start_px: Array) -> _Minima:
     theta[:, :2] += np.tile(grid, (n, 1))
     for _ in range(_SCREENING_STEPS):
         theta = _step(theta, *_scores(many, theta))
-    value = _misfit(many, theta).reshape(n, -1)
+    value = many.misfit(_in_region(many, theta)).reshape(n, -1)
     order = np.argsort(value, axis=1)[:, :_BEST_MINIMA]
     each = np.arange(n)[:, None]
     best = theta.reshape(n, -1, k)[each, order]
@@ -132,7 +132,7 @@ def _minima(data: SpotData, start_px: Array) -> _Minima:
     _, fisher = _scores(flat, polished)
     shape = (n, order.shape[1])
     covariance = covariance_bound(fisher).reshape(*shape, 2, 2)
-    values = _misfit(flat, polished).reshape(shape)
+    values = flat.misfit(_in_region(flat, polished)).reshape(shape)
     again = np.argsort(values, axis=1)
     return _Minima(polished.reshape(*shape, k)[each, again], covariance[each, again], values[each, again])
 
@@ -162,13 +162,6 @@ def _scores(data: SpotData, theta: Array) -> tuple[Array, Array]:
     weighted = flat * weight.reshape(n, 1, -1)
     score = (weighted @ (data.regions.x_e - mean).reshape(n, -1, 1))[..., 0]
     return score, weighted @ np.swapaxes(flat, 1, 2)
-
-
-def _misfit(data: SpotData, theta: Array) -> Array:
-    """-2 log likelihood, shape (n,); infinite where it is not finite."""
-    mean, _ = data.pixels.at(_in_region(data, theta))
-    value = np.sum(data.regions.used * data.law.misfit(data.regions.x_e, mean), axis=(1, 2))
-    return np.where(np.isfinite(value), value, np.inf)
 
 
 def _in_region(data: SpotData, theta: Array) -> Array:
@@ -227,7 +220,7 @@ def _joint_scores(rig: Rig, h: Array, down: SpotData, up: SpotData, psi: Array) 
 
 def _joint_misfit(rig: Rig, h: Array, down: SpotData, up: SpotData, psi: Array) -> Array:
     theta_down, theta_up, _, _ = _split(rig, h, psi, down.unknowns)
-    return _misfit(down, theta_down) + _misfit(up, theta_up)
+    return down.misfit(_in_region(down, theta_down)) + up.misfit(_in_region(up, theta_up))
 
 
 def _polished(rig: Rig, h: Array, down: SpotData, up: SpotData, psi: Array) -> tuple[Array, BoolArray, Array]:

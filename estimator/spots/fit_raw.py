@@ -80,6 +80,12 @@ class SpotData:
         """Number of unknowns of a spot."""
         return self.pixels.unknowns
 
+    def misfit(self, theta: Array) -> Array:
+        """-2 log likelihood of unknowns, shape (n,), for which of the minima is the deepest; infinite for no number."""
+        mean, _ = self.pixels.at(theta)
+        value = np.sum(self.regions.used * self.law.misfit(self.regions.x_e, mean), axis=(1, 2))
+        return np.where(np.isfinite(value), value, np.inf)
+
 
 def spot_data(regions: SpotRegions, law: PixelLaw, blur: SpotBlur, model: SpotModel | None = None) -> SpotData:
     """Data of regions; parameters as for `fit_law`."""
@@ -210,7 +216,7 @@ def _screened(data: SpotData, guess: Array) -> Array:
     theta[:, :2] += np.tile(grid, (n, 1))
     for _ in range(_SCREENING_STEPS):
         theta, _ = _step(many, theta)
-    best = np.argmin(_misfit(many, theta).reshape(n, -1), axis=1)
+    best = np.argmin(many.misfit(theta).reshape(n, -1), axis=1)
     return np.column_stack([theta.reshape(n, len(grid), 3)[np.arange(n), best], guess[:, 3:]])
 
 
@@ -245,13 +251,6 @@ def _polished(data: SpotData, theta: Array) -> tuple[Array, BoolArray]:
         if moving.size == 0:
             break
     return theta, ~np.isin(np.arange(len(theta)), moving)
-
-
-def _misfit(data: SpotData, theta: Array) -> Array:
-    """-2 log likelihood, shape (n,): which of the minima is the deepest."""
-    mean, _ = data.pixels.at(theta)
-    value = np.sum(data.regions.used * data.law.misfit(data.regions.x_e, mean), axis=(1, 2))
-    return np.where(np.isfinite(value), value, np.inf)
 
 
 # -- result ----------------------------------------------------------------------------------------------------------

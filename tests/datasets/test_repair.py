@@ -7,14 +7,14 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from helpers.damage import AMBIENT, OTHER_SPOT, SPOT, TRUTH, flip_a_bit, swap, truncate
+from helpers.damage import AMBIENT, OTHER_SPOT, SPOT, TRUTH, flip_a_bit, swap, truncate, write_checksums
 from helpers.folders import contents
 from helpers.processes import quiet, within
 
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.merge_repair import repair
 from phibench.datasets.store import schema
-from phibench.datasets.store.checksums import checksums_text, read_checksums, write_checksums
+from phibench.datasets.store.checksums import checksums_text, read_checksums
 from phibench.datasets.store.files import sha256
 from phibench.datasets.verify import verify
 

@@ -15,7 +15,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.damage import AMBIENT, OTHER_SPOT, SPOT, TRUTH, flip_a_bit, sign, swap, truncate, unseen_flips
+from helpers.damage import (
+    AMBIENT,
+    OTHER_SPOT,
+    SPOT,
+    TRUTH,
+    flip_a_bit,
+    sign,
+    swap,
+    truncate,
+    unseen_flips,
+    write_checksums,
+    write_manifest,
+)
 from helpers.processes import within
 from PIL import Image
 from rich.console import Console
@@ -26,8 +38,7 @@ from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.read import open_dataset
 from phibench.datasets.show import show
 from phibench.datasets.store import checksums, pictures, schema
-from phibench.datasets.store.checksums import write_checksums
-from phibench.datasets.store.documents import read_manifest, write_manifest
+from phibench.datasets.store.documents import read_manifest
 from phibench.datasets.store.layers import (
     read_ambient,
     read_ambient_variance,

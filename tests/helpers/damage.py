@@ -1,13 +1,17 @@
 """Damage to the files of a data set."""
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from phibench.datasets.build.journal import FolderHead, Journal
 from phibench.datasets.store import schema
-from phibench.datasets.store.checksums import read_checksums, write_checksums
+from phibench.datasets.store.checksums import checksums_text, data_files, read_checksums
+from phibench.datasets.store.documents import manifest_documents
+from phibench.datasets.store.files import sha256, write_bytes, write_text
+from phibench.datasets.store.schema import ManifestRow
 from phibench.datasets.verify import file_faults
 
 AMBIENT, TRUTH = schema.view_file("h0.000", "ambient"), schema.view_file("h0.500", "truth")
@@ -30,6 +34,18 @@ def swap(folder: Path, a: str, b: str) -> None:
     (folder / a).rename(folder / "aside")
     (folder / b).rename(folder / a)
     (folder / "aside").rename(folder / b)
+
+
+def write_manifest(folder: Path, rows: Sequence[ManifestRow]) -> None:
+    """Write both forms."""
+    for name, data in manifest_documents(rows).items():
+        write_bytes(folder / name, data)
+
+
+def write_checksums(folder: Path) -> None:
+    """Hash all data files."""
+    hashes = {name: sha256(folder / name) for name in data_files(folder)}
+    write_text(folder / schema.CHECKSUMS, checksums_text(hashes))
 
 
 def sign(folder: Path) -> None:

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 from helpers import inline_workers, refusing_workers
+from helpers.damage import write_checksums
 from helpers.folders import contents
 from helpers.inline_workers import make_inline
 from helpers.processes import SMALLEST, quiet
@@ -32,7 +33,6 @@ from phibench.datasets.read import open_finished
 from phibench.datasets.recipe.load import load_recipe, parse_recipe
 from phibench.datasets.show import summary
 from phibench.datasets.store import schema
-from phibench.datasets.store.checksums import write_checksums
 from phibench.datasets.verify import verify
 from phibench.render.optics.certificate import certify
 

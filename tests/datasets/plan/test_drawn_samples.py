@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import polars
 import pytest
+from helpers.damage import write_checksums, write_manifest
 from helpers.drawn_values import shipped
 from helpers.folders import contents, done
 from helpers.inline_workers import InlineWorkerPool
@@ -26,8 +27,7 @@ from phibench.datasets.recipe.load import load_recipe
 from phibench.datasets.rooms.room_sources import room_of
 from phibench.datasets.show import contact_sheet
 from phibench.datasets.store import schema
-from phibench.datasets.store.checksums import write_checksums
-from phibench.datasets.store.documents import read_manifest, write_manifest
+from phibench.datasets.store.documents import read_manifest
 from phibench.datasets.store.layers import read_exr
 from phibench.datasets.verify import verify
 from phibench.render.optics.truth import spot_truth

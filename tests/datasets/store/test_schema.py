@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers.damage import write_manifest
 from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
@@ -16,7 +17,7 @@ from phibench.datasets.build.spot_task import make_spot
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.plan.plan import make_plan
 from phibench.datasets.recipe.load import load_recipe
-from phibench.datasets.store.documents import differences, from_json, read_manifest, to_json, to_table, write_manifest
+from phibench.datasets.store.documents import differences, from_json, read_manifest, to_json, to_table
 from phibench.datasets.store.schema import ManifestRow, columns, flat, row_line
 from phibench.scenes.catalog import c310_rig, lab
 from phibench.scenes.rig import Rig

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from helpers.damage import sign
+from helpers.damage import sign, write_checksums
 from helpers.inline_workers import InlineWorkerPool
 from helpers.processes import SMALLEST, quiet
 
@@ -20,7 +20,7 @@ from phibench.datasets.read import open_dataset, open_finished
 from phibench.datasets.recipe.load import load_recipe
 from phibench.datasets.rooms.room_sources import NamedRoom, room_of
 from phibench.datasets.store import schema
-from phibench.datasets.store.checksums import data_files, read_checksums, write_checksums
+from phibench.datasets.store.checksums import data_files, read_checksums
 from phibench.datasets.store.documents import from_json, to_json
 from phibench.datasets.verify import verify
 
