@@ -232,6 +232,8 @@ class Outcome:
         One sentence about the failure, with the method's own line where there is one.
     output : str
         Last lines of what the method printed for this pair.
+    dense : DenseAnswer or None
+        Answer for a dense pair, which has no `answer`.
     """
 
     number: int
@@ -240,3 +242,4 @@ class Outcome:
     failure: str = ""
     message: str = ""
     output: str = ""
+    dense: Any = None

@@ -23,7 +23,7 @@ from phibench.datasets.frames.sensor_card import card_of
 from phibench.datasets.frames.source import FrameSource
 from phibench.datasets.read import Dataset
 from phibench.estimator.dense.dense_interface import DensePair
-from phibench.estimator.geometry.mirror_image import image_of
+from phibench.estimator.geometry.mirror_image import image_of, up_image
 from phibench.estimator.geometry.rig_parameters import stroke_of
 from phibench.estimator.interface import Image
 from phibench.estimator.methods.draw_pairs import DrawnPairs
@@ -234,11 +234,37 @@ def dense_pairs(
     if frames < 1:
         raise DatasetError(f"frames = {frames}: must be 1 or above")
     chosen = dataset if calibration is None else of_calibration(dataset, calibration)
+    for sample in chosen:
+        require_curve(sample.nominal_rig, sample.row.nominal_stroke_m, sample.row.sample_id)
     draws_of_spots = dataset_pairs(chosen, preset, draws).pair_draws
     numbered = [replace(draw, number=k) for k, draw in enumerate(_distinct(chosen, draws_of_spots))]
     if pairs is not None and pairs < 1:
         raise DatasetError(f"pairs = {pairs}: must be 1 or above")
     return DensePairs(chosen, tuple(numbered[:pairs]), frames, calibration)
+
+
+_ASKED_M = 2.0  # a distance in every room
+_RINGS, _TURNS = (0.2, 0.4, 0.6, 0.8), 8
+
+
+def require_curve(rig: Rig, stroke_m: float, name: str) -> None:
+    """Refuse a rig whose up image shows no point that the down image shows.
+
+    Raises
+    ------
+    DatasetError
+        In one sentence.
+    """
+    outline = rig.outline_px(_TURNS)
+    middle = outline.mean(axis=0)
+    pixels = np.concatenate([middle + share * (outline - middle) for share in _RINGS])
+    pixels = pixels[rig.camera.contains(pixels)]
+    up = up_image(rig, stroke_m, pixels, np.full(len(pixels), 1.0 / _ASKED_M)).uv_px
+    if not rig.camera.contains(up).any():  # False for NaN
+        raise DatasetError(
+            f"sample '{name}': no pixel of the down image has an epipolar curve in the up image, h = {stroke_m:g} m, "
+            f"mirror {rig.mirror.shape}: dense depth needs a mirror that shows the same points from both positions"
+        )
 
 
 def _reopened(opened: Any, folder: Path, *others: Any) -> DensePairs:

@@ -138,7 +138,11 @@ class EasyCamera:
         for region in lights:
             rows, columns = region.spot_e.shape
             mean[region.v0_px : region.v0_px + rows, region.u0_px : region.u0_px + columns] += region.spot_e
-        dn = self._digitised(mean, generator("easy pairs", "noise", *stream))
+        return self.developed(mean, stream)
+
+    def developed(self, mean_e: Array, stream: tuple[Name, ...]) -> NDArray[Any]:
+        """One frame of expected electrons behind each pixel's filter, shape (H, W)."""
+        dn = self._digitised(mean_e, generator("easy pairs", "noise", *stream))
         return dn if self.card.output == "raw" else self._processed(dn)
 
     def _room(self) -> Array:

@@ -27,6 +27,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from phibench.benchmark.isolation.answers import AnswerError, checked
+from phibench.benchmark.isolation.dense_answers import checked_planes, most_bytes
 from phibench.benchmark.isolation.isolation import Access, Isolation
 from phibench.benchmark.isolation.method_provenance import MOST_NAMES, OpenedFiles
 from phibench.benchmark.isolation.readable_files import access_of
@@ -34,6 +35,7 @@ from phibench.benchmark.isolation.resolve import MethodError, Reference, RunLimi
 from phibench.benchmark.isolation.supervisor import HUNG_UP, KILL_SECONDS, processes_in
 from phibench.benchmark.isolation.transport import (
     LEAST_BYTES,
+    AnyPair,
     Connection,
     MemoryFile,
     TransportError,
@@ -44,11 +46,12 @@ from phibench.benchmark.isolation.transport import (
 from phibench.benchmark.isolation.worker import lacks_memory
 from phibench.datasets.common.parallel import ONE_THREAD
 from phibench.datasets.store.leftovers import OwnedFolder
-from phibench.estimator.interface import FAILURES, Outcome, Pair
+from phibench.estimator.dense.dense_interface import DensePair
+from phibench.estimator.interface import FAILURES, Outcome
 from phibench.scenes.validation import printable_line
 
 _KEPT_BYTES = 65536  # of what a method prints: its end tells why it failed
-_NO_PAIR: Pair | None = None
+_NO_PAIR: AnyPair | None = None
 _READS = 16  # of 64 kB at a time
 _LOOK_MS = 500  # between looks at whether anybody listens
 _LINES, _LINE_LENGTH = 20, 200  # of the output that an outcome keeps
@@ -270,7 +273,7 @@ class MethodProcess:
             places.insert(0, ("", Path(self._reference.place).parent))
         return OpenedFiles(places, [Path(path) for path in self._access.hidden])
 
-    def ask(self, pair: Pair, method: int = 0) -> Outcome:
+    def ask(self, pair: AnyPair, method: int = 0) -> Outcome:
         """Give a method one pair; never raises for what the method does."""
         try:
             outcome = self._asked(pair, method)
@@ -284,11 +287,11 @@ class MethodProcess:
             message = advised(message, self._isolation, outcome.output, self._access.hidden)
         return replace(outcome, message=message)
 
-    def ask_each(self, pair: Pair) -> tuple[Outcome, ...]:
+    def ask_each(self, pair: AnyPair) -> tuple[Outcome, ...]:
         """Give one pair to the methods, one after the other."""
         return tuple(self.ask(pair, method) for method in range(len(self._references)))
 
-    def _asked(self, pair: Pair, method: int) -> Outcome:
+    def _asked(self, pair: AnyPair, method: int) -> Outcome:
         size = needed_bytes(pair)
         if self._process is not None and not self._process.is_ready(size):
             self.end()
@@ -414,14 +417,15 @@ class GuestProcess:
         """Tell that a pair of so many bytes can be asked, and that nothing is left of the one before."""
         return size <= self._memory.size and self._connection.is_silent()
 
-    def ask(self, pair: Pair, limits: RunLimits, file: str, method: int = 0) -> Outcome:
+    def ask(self, pair: AnyPair, limits: RunLimits, file: str, method: int = 0) -> Outcome:
         """Answer or failure of a method for one pair."""
         nonce, before, self.stages = secrets.token_hex(8), self._output.count(), {}
         message = again(nonce, method) if self._held is pair else pack(pair, self._memory, nonce, method)
         self._held = pair if self._shares else _NO_PAIR
         start = time.monotonic()  # by this clock alone: the method's process could tell any time
         try:
-            reply = self.exchange(message, nonce, pair.number, limits.seconds)
+            most = most_bytes(pair.shape) if isinstance(pair, DensePair) else _REPLY_BYTES
+            reply = self.exchange(message, nonce, pair.number, limits.seconds, most)
         except TimeoutError:
             output = last_lines(self._output.text(since=before))  # before the stack is printed, too
             late = f"no answer after {limits.seconds:g} s{self._place(file)}"
@@ -436,11 +440,13 @@ class GuestProcess:
         outcome = outcome_of(pair, reply, seconds)
         return replace(outcome, output=last_lines(self._output.text(since=before)))
 
-    def exchange(self, message: bytes, nonce: str, number: int, seconds: float) -> dict[str, Any]:
-        """Reply to a message that repeats its nonce and number, within so many seconds; raises as `_reply`."""
+    def exchange(
+        self, message: bytes, nonce: str, number: int, seconds: float, most: int = _REPLY_BYTES
+    ) -> dict[str, Any]:
+        """Reply of at most so many bytes to a message, which repeats nonce and number, in time; raises as `_reply`."""
         end = time.monotonic() + seconds
         self._connection.send(message, seconds)
-        return self._reply(nonce, end, number)
+        return self._reply(nonce, end, number, most)
 
     def kill(self) -> None:
         """End the process with all that it started and give back what it held; never raises."""
@@ -457,7 +463,7 @@ class GuestProcess:
         self._output.close()
         self._give_back()
 
-    def _reply(self, nonce: str, end: float, number: int | None = None) -> dict[str, Any]:
+    def _reply(self, nonce: str, end: float, number: int | None = None, most: int = _REPLY_BYTES) -> dict[str, Any]:
         """Reply to a question; what else comes on the line is dropped.
 
         Raises
@@ -470,14 +476,14 @@ class GuestProcess:
         for _ in range(_MOST_STALE):
             left = max(end - time.monotonic(), 1e-3)  # 0 would mean to wait for ever
             try:
-                reply = json.loads(self._connection.receive(left, _REPLY_BYTES))
+                reply = json.loads(self._connection.receive(left, most))
             except (ValueError, RecursionError):  # no JSON, or brackets without end
                 continue
             if isinstance(reply, dict) and (reply.get("nonce"), reply.get("number")) == (nonce, number):
                 return reply
         raise TransportError("too many replies that belong to no question")
 
-    def _dead(self, pair: Pair, limits: RunLimits, file: str, before: int) -> Outcome:
+    def _dead(self, pair: AnyPair, limits: RunLimits, file: str, before: int) -> Outcome:
         failure, message = "crash", self.death(file)
         text = self._output.text(since=before)
         if lacks_memory(text):
@@ -518,12 +524,14 @@ def _names(reply: dict[str, Any]) -> frozenset[str]:
     return frozenset(name for name in names if isinstance(name, str) and name == printable_line(name))
 
 
-def outcome_of(pair: Pair, reply: dict[str, Any], seconds: float) -> Outcome:
+def outcome_of(pair: AnyPair, reply: dict[str, Any], seconds: float) -> Outcome:
     """Outcome of a pair from the reply of `worker.reply_of`; what is no answer is the failure "invalid"."""
     failure, message = reply.get("failure"), reply.get("message", "")
     if failure in FAILURES and isinstance(message, str):
         return Outcome(pair.number, None, seconds, failure, printable_line(message, _MESSAGE_LENGTH))
     try:
+        if isinstance(pair, DensePair):
+            return Outcome(pair.number, None, seconds, dense=checked_planes(reply["answer"], pair.shape))
         return Outcome(pair.number, checked(reply["answer"]), seconds)
     except (AnswerError, KeyError) as error:
         text = str(error) if isinstance(error, AnswerError) else "the reply holds neither answer nor failure"

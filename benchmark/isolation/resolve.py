@@ -12,22 +12,20 @@ from __future__ import annotations
 
 import ast
 import hashlib
+import importlib
 import inspect
 import math
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 from phibench.benchmark.isolation.method_provenance import package_sha256
 from phibench.datasets.common.input_files import MIB, InputFile
 from phibench.datasets.store.files import sha256, write_text
 from phibench.datasets.store.provenance import code_behind
 from phibench.scenes.validation import close_names, printable_line
-
-if TYPE_CHECKING:
-    from phibench.estimator.methods.registry import BuiltIn
 
 
 class MethodError(ValueError):
@@ -66,6 +64,11 @@ class Reference:
     modules: tuple[tuple[str, str], ...] = ()
     sees: Literal["image", "pair", ""] = ""
 
+    @property
+    def shares(self) -> bool:
+        """True if it runs in one process with others of its kind: those that share the search for a spot."""
+        return self.kind == "built-in" and self.place == SPOTS.registry
+
     def document(self) -> dict[str, Any]:
         """Provenance, as JSON can hold it; of a file its name alone, not where it lies."""
         place = printable_line(Path(self.place).name) if self.kind == "file" else self.place
@@ -88,10 +91,53 @@ class Reference:
         return next((file.name for file, hashed in files if not file.is_file() or sha256(file) != hashed), "")
 
 
-GROUP = "phibench.methods"
+@dataclass(frozen=True)
+class Seat:
+    """Task that methods are written for.
+
+    Attributes
+    ----------
+    command : str
+        That writes, checks and lists them.
+    function : str
+        Name of an example's function.
+    group : str
+        Entry points of installed packages.
+    registry : str
+        Module whose `KNOWN` holds the built-in ones by name.
+    example : str
+        File beside this one that `command` new writes, in which the user's file is called as `file`.
+    file : str
+    """
+
+    command: str
+    function: str
+    group: str
+    registry: str
+    example: str
+    file: str
 
 
-def resolve(reference: str) -> Reference:
+SPOTS = Seat(
+    "phibench method",
+    "extract",
+    "phibench.methods",
+    "phibench.estimator.methods.registry",
+    "example_method.py",
+    "my_phi.py",
+)
+DENSE = Seat(
+    "phibench dense",
+    "depth",
+    "phibench.dense_methods",
+    "phibench.estimator.dense.dense_methods",
+    "../dense/example_dense.py",
+    "my_depth.py",
+)
+GROUP = SPOTS.group
+
+
+def resolve(reference: str, seat: Seat = SPOTS) -> Reference:
     """Find a method.
 
     Raises
@@ -100,44 +146,42 @@ def resolve(reference: str) -> Reference:
         If the file or its function is missing, the file is not Python, the name is unknown, or two methods share it.
     """
     if reference.endswith(".py") or ".py:" in reference:
-        return _of_file(reference)
-    from phibench.estimator.methods.registry import KNOWN  # a second of imports that a method in a file does not need
-
-    points = [point for point in installed() if point.name == reference]
-    if reference in KNOWN:
+        return _of_file(reference, seat)
+    # a second of imports that a method in a file does not need
+    known = importlib.import_module(seat.registry).KNOWN
+    points = [point for point in installed(seat) if point.name == reference]
+    if reference in known:
         if points:
             raise MethodError(f"method '{reference}' is built in, and {_owner(points[0])} registers another")
-        return _built_in(KNOWN[reference])
+        return _built_in(known[reference], seat)
     if len(points) > 1:
         raise MethodError(f"method '{reference}' is registered by {' and by '.join(map(_owner, points))}: remove one")
     if not points:
-        raise MethodError(_unknown(reference, list(KNOWN)))
+        raise MethodError(_unknown(reference, list(known), seat))
     hashed = package_sha256(points[0].dist, points[0].module)
     return Reference(reference, "package", points[0].value, sha256=hashed, version=_owner(points[0]))
 
 
-def installed() -> tuple[EntryPoint, ...]:
+def installed(seat: Seat = SPOTS) -> tuple[EntryPoint, ...]:
     """Entry points of installed packages, by name; none of them is imported."""
-    return tuple(sorted(entry_points(group=GROUP), key=lambda point: point.name))
+    return tuple(sorted(entry_points(group=seat.group), key=lambda point: point.name))
 
 
-def _built_in(method: BuiltIn) -> Reference:
+def _built_in(method: Any, seat: Seat) -> Reference:
     if not method.installed:
         raise MethodError(f"method '{method.name}' needs {method.package}: pip install {method.package}")
-    module = "phibench.estimator.methods.registry"
-    return Reference(
-        method.name, "built-in", module, sha256=code_behind(module), sees="pair" if method.joint else "image"
-    )
+    sees: Literal["image", "pair"] = "image" if seat is SPOTS and not method.joint else "pair"
+    return Reference(method.name, "built-in", seat.registry, sha256=code_behind(seat.registry), sees=sees)
 
 
-def _of_file(reference: str) -> Reference:
+def _of_file(reference: str, seat: Seat) -> Reference:
     text, colon, function = reference.rpartition(":")
     if not colon or not function.isidentifier():
         file = Path(text if colon else reference).name
-        raise MethodError(f"method '{reference}': say which function is meant, such as {file}:extract")
+        raise MethodError(f"method '{reference}': say which function is meant, such as {file}:{seat.function}")
     path = Path(text).absolute()
     if not path.is_file():
-        advice = f"`phibench method new {text}` writes an example"
+        advice = f"`{seat.command} new {text}` writes an example"
         what = "is a folder" if path.is_dir() else "is not there"
         raise MethodError(f"method '{reference}': the file {path} {what}; {advice}")
     if path.name != printable_line(path.name):
@@ -235,11 +279,12 @@ def _owner(point: EntryPoint) -> str:
     return "an unknown package" if point.dist is None else f"{point.dist.name} {point.dist.version}"
 
 
-def _unknown(name: str, built_in: list[str]) -> str:
-    known = [*built_in, *(point.name for point in installed())]
+def _unknown(name: str, built_in: list[str], seat: Seat) -> str:
+    known = [*built_in, *(point.name for point in installed(seat))]
     guess = close_names(name, known)
-    advice = f"did you mean '{guess[0]}'?" if guess else "`phibench method list` lists what there is."
-    return f"no method '{name}': {advice} A method of your own is given as file and function, my_phi.py:extract"
+    advice = f"did you mean '{guess[0]}'?" if guess else f"`{seat.command} list` lists what there is."
+    own = f"{seat.file}:{seat.function}"
+    return f"no method '{name}': {advice} A method of your own is given as file and function, {own}"
 
 
 @dataclass(frozen=True)
@@ -283,10 +328,7 @@ class RunLimits:
         return f"more memory than {limit}: {detail}"
 
 
-_EXAMPLE = Path(__file__).with_name("example_method.py")
-
-
-def write_example(path: Path) -> Path:
+def write_example(path: Path, seat: Seat = SPOTS) -> Path:
     """Write the example method to a file that is not there yet.
 
     Raises
@@ -295,7 +337,8 @@ def write_example(path: Path) -> Path:
         If the name does not end in .py, or there is something of that name.
     """
     if path.suffix != ".py":
-        raise MethodError(f"{path}: the file of a method must end in .py, such as my_phi.py")
+        raise MethodError(f"{path}: the file of a method must end in .py, such as {seat.file}")
     if path.exists():
         raise MethodError(f"{path} is there already and is not overwritten: give another name or remove it")
-    return write_text(path, _EXAMPLE.read_text(encoding="utf-8").replace("my_phi.py", path.name))
+    example = Path(__file__).parent / seat.example
+    return write_text(path, example.read_text(encoding="utf-8").replace(seat.file, path.name))

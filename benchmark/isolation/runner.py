@@ -16,17 +16,25 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import TypeVar
+from typing import Any, Protocol, TypeVar
 
 from phibench.benchmark.isolation.isolation import Isolation
 from phibench.benchmark.isolation.method_provenance import loaded_names, packages_of
 from phibench.benchmark.isolation.process import MethodProcess, outcome_of
 from phibench.benchmark.isolation.resolve import MethodError, Reference, RunLimits, resolve
-from phibench.benchmark.isolation.worker import reply_of, require_method
-from phibench.estimator.interface import Method, Outcome, Pair
+from phibench.benchmark.isolation.transport import AnyPair
+from phibench.benchmark.isolation.worker import reply_of, require_method, text_of
+from phibench.estimator.interface import Outcome
 from phibench.estimator.pair_set import PairSet, tell_answered, truth_folders
 
 T = TypeVar("T")
+
+
+class ShownPairs(Protocol):
+    """Pairs of either task as methods see them."""
+
+    def pair(self, number: int) -> AnyPair:
+        """Images of a pair."""
 
 
 @dataclass(frozen=True)
@@ -150,7 +158,7 @@ class Harness:
         """Output of each method for the first pair on which it failed and printed something; "" if there is none."""
         return [found[min(found)] if found else "" for found in self._failed]
 
-    def outcomes(self, pairs: PairSet, numbers: Sequence[int]) -> Iterator[tuple[Outcome, ...]]:
+    def outcomes(self, pairs: ShownPairs, numbers: Sequence[int]) -> Iterator[tuple[Outcome, ...]]:
         """Outcomes of every method for some pairs, in the order of `numbers`.
 
         Pairs are made one at a time and given out in this order, whatever the number of workers: a set need not be
@@ -182,8 +190,8 @@ class Harness:
 
 
 def _together(references: Sequence[Reference]) -> list[list[int]]:
-    """Places of the methods that have a process together: the built-in ones; every other has its own."""
-    built_in = [place for place, reference in enumerate(references) if reference.kind == "built-in"]
+    """Places of the methods that have a process together: the built-in ones of spots; every other has its own."""
+    built_in = [place for place, reference in enumerate(references) if reference.shares]
     return [[place] for place in range(len(references)) if place not in built_in] + [built_in] * bool(built_in)
 
 
@@ -256,7 +264,7 @@ class _MethodPool:
     def stages(self) -> list[dict[str, float]]:
         return [process.stages for process in self._processes]
 
-    def ask(self, pair: Pair, turns: _Turns, place: int) -> tuple[Outcome, ...]:
+    def ask(self, pair: AnyPair, turns: _Turns, place: int) -> tuple[Outcome, ...]:
         with turns.turn(place):
             process = self._free.get()
         try:
@@ -297,7 +305,7 @@ def _outcomes(harness: Harness, pairs: PairSet, numbers: Sequence[int]) -> Itera
             yield outcome
 
 
-def asked_here(method: Method) -> Callable[[PairSet, Sequence[int]], Iterator[tuple[Outcome]]]:
+def asked_here(method: Callable[[Any], Any]) -> Callable[[ShownPairs, Sequence[int]], Iterator[tuple[Outcome]]]:
     """Ask a function in this process, without limits: `Harness.outcomes` for one method in a notebook or debugger.
 
     What it raises is the failure of that pair; Ctrl-C ends the run.
@@ -309,14 +317,14 @@ def asked_here(method: Method) -> Callable[[PairSet, Sequence[int]], Iterator[tu
     """
     require_method(method, function_name(method))
 
-    def one(pair: Pair) -> tuple[Outcome]:
-        reply = reply_of(lambda: method(pair))
+    def one(pair: AnyPair) -> tuple[Outcome]:
+        reply = reply_of(lambda: method(pair), text=text_of(pair))
         return (outcome_of(pair, reply, reply["seconds"]),)
 
     return lambda pairs, numbers: (one(pairs.pair(number)) for number in numbers)
 
 
-def function_name(method: Method) -> str:
+def function_name(method: Callable[[Any], Any]) -> str:
     """Name under which a function is scored."""
     return str(getattr(method, "__name__", type(method).__name__))
 

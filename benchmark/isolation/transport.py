@@ -32,6 +32,7 @@ from typing import Any
 
 import numpy as np
 
+from phibench.estimator.dense.dense_interface import DensePair
 from phibench.estimator.interface import Image, Pair
 
 _LENGTH = struct.Struct("!Q")
@@ -114,7 +115,7 @@ class Connection:
 
 
 _ALIGNED = 64  # bytes of a cache line; any type of pixel may begin there
-_IMAGES = ("down", "up", "down_off", "up_off")
+AnyPair = Pair | DensePair
 _FRAMES_OF = "frames of "  # before an image's name: its single frames
 _IN_MEMORY = Path("/dev/shm")
 LEAST_BYTES = 1 << 26
@@ -183,7 +184,7 @@ def aligned(count: int) -> int:
     return -(-max(count, 1) // _ALIGNED) * _ALIGNED
 
 
-def needed_bytes(pair: Pair) -> int:
+def needed_bytes(pair: AnyPair) -> int:
     """Memory that the images of a pair take."""
     return sum(aligned(image.nbytes) for image in _arrays(pair).values())
 
@@ -215,7 +216,7 @@ class ReceivedPair:
 
     Attributes
     ----------
-    pair : Pair
+    pair : Pair or DensePair
         Its images lie in immutable memory of this process.
     data : bytes
         That memory.
@@ -227,7 +228,7 @@ class ReceivedPair:
         Which of the process's methods is asked.
     """
 
-    pair: Pair
+    pair: AnyPair
     data: bytes
     original: mmap.mmap
     nonce: str = ""
@@ -240,18 +241,19 @@ class ReceivedPair:
         return bool(np.array_equal(here, there))
 
 
-def _arrays(pair: Pair) -> dict[str, Image]:
+def _arrays(pair: AnyPair) -> dict[str, Image]:
     """Images of a pair by name, and the single frames behind them where there are several."""
     return {**pair.images, **{_FRAMES_OF + name: stack for name, stack in (pair.frames or {}).items()}}
 
 
-def pack(pair: Pair, memory: MemoryFile, nonce: str = "", method: int = 0) -> bytes:
-    """Images into the memory file, all else into the message; nothing but the fields of `Pair` goes along."""
-    plain = Pair(**{field.name: getattr(pair, field.name) for field in fields(Pair)})
+def pack(pair: AnyPair, memory: MemoryFile, nonce: str = "", method: int = 0) -> bytes:
+    """Images into the memory file, all else into the message; nothing but the fields of the pair's kind goes along."""
+    kind = DensePair if isinstance(pair, DensePair) else Pair
+    plain: Any = kind(**{field.name: getattr(pair, field.name) for field in fields(kind)})
     images = {name: np.ascontiguousarray(image) for name, image in _arrays(plain).items()}
     views = [image.data.cast("B") for image in images.values()]
     layout = [(name, image.dtype.str, image.shape) for name, image in images.items()]
-    nothing: dict[str, Any] = dict.fromkeys((*_IMAGES, "frames"))
+    nothing: dict[str, Any] = dict.fromkeys((*kind.IMAGE_NAMES, "frames"))
     rest = replace(plain, **nothing)
     return pickle.dumps((rest, layout, memory.write(views), nonce, method), protocol=5)
 

@@ -31,10 +31,12 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from phibench.benchmark.isolation.answers import answer_text, to_bytes
+from phibench.benchmark.isolation.dense_answers import planes_text
 from phibench.benchmark.isolation.method_provenance import loaded_names
 from phibench.benchmark.isolation.resolve import MethodError, Reference, RunLimits
 from phibench.benchmark.isolation.transport import Connection, ReceivedPair, SharedPages, TransportError, unpack
-from phibench.estimator.interface import Answer, Method
+from phibench.estimator.dense.dense_interface import DensePair
+from phibench.estimator.interface import Method
 from phibench.scenes.validation import close_names
 
 if TYPE_CHECKING:
@@ -77,9 +79,9 @@ def load(reference: Reference) -> Method:
         If the file has changed, the import fails, the function is missing, is no function, or does not take one pair.
     """
     if reference.kind == "built-in":
-        from phibench.estimator.methods.registry import KNOWN  # a second of imports that a user's method need not have
-
-        return KNOWN[reference.name]
+        # a second of imports that a user's method need not have
+        method: Method = importlib.import_module(reference.place).KNOWN[reference.name]
+        return method
     function = function_of_file(reference) if reference.kind == "file" else _from_package(reference)
     require_method(function, _title(reference))
     return function
@@ -194,7 +196,7 @@ def require_method(function: Any, title: str) -> None:
         In one sentence.
     """
     if not callable(function):
-        raise MethodError(f"{title} is of type {type(function).__name__}, not a function: write def extract(pair): ...")
+        raise MethodError(f"{title} is of type {type(function).__name__}, not a function: write {_call(title)}")
     if inspect.isclass(function):
         raise MethodError(f"{title} is a class: give a function, or an object that can be called with a pair")
     try:
@@ -204,9 +206,15 @@ def require_method(function: Any, title: str) -> None:
     try:
         signature.bind(object())
     except TypeError:
-        raise MethodError(f"{title}{signature} must take one pair and nothing else: def extract(pair): ...") from None
+        raise MethodError(f"{title}{signature} must take one pair and nothing else: {_call(title)}") from None
     if inspect.iscoroutinefunction(function) or inspect.isgeneratorfunction(function):
-        raise MethodError(f"{title} is a coroutine or generator: it must return an Answer itself")
+        raise MethodError(f"{title} is a coroutine or generator: it must return its answer itself")
+
+
+def _call(title: str) -> str:
+    """First line of a method: of a file's its own name, else that of the example."""
+    name = title.rpartition(":")[2] if ":" in title else "extract"
+    return f"def {name}(pair): ..."
 
 
 _READ_ONLY = "read-only"  # in numpy's words: "assignment destination is read-only", "output array is read-only"
@@ -260,7 +268,7 @@ def _shared(received: ReceivedPair) -> ReceivedPair:
     from phibench.estimator.methods.locate import SharedPair
 
     pair = received.pair
-    return received if isinstance(pair, SharedPair) else replace(received, pair=SharedPair.of(pair))
+    return received if isinstance(pair, SharedPair | DensePair) else replace(received, pair=SharedPair.of(pair))
 
 
 def _answer(
@@ -284,12 +292,14 @@ def _count_modules() -> int:
 
 
 def _reply(method: Method, received: ReceivedPair, limits: RunLimits, limit_bytes: int, file: str) -> dict[str, Any]:
-    def ask() -> Answer:
-        with limited(limit_bytes):
-            return method(received.pair)
+    pair: Any = received.pair
 
-    work = getattr(received.pair, "work", None)
-    reply = reply_of(ask, file, BaseException, limits) if work is None else _reply_with_stages(ask, work, limits)
+    def ask() -> Any:
+        with limited(limit_bytes):
+            return method(pair)
+
+    work, text = getattr(pair, "work", None), text_of(pair)
+    reply = reply_of(ask, file, BaseException, limits, text) if work is None else _reply_with_stages(ask, work, limits)
     for stream in (sys.stdout, sys.stderr):  # what belongs to this pair must be in the pipe before the reply
         with suppress(Exception):  # the method has closed or replaced it
             stream.flush()
@@ -298,7 +308,7 @@ def _reply(method: Method, received: ReceivedPair, limits: RunLimits, limit_byte
     return reply
 
 
-def _reply_with_stages(ask: Callable[[], Answer], work: SharedWork, limits: RunLimits) -> dict[str, Any]:
+def _reply_with_stages(ask: Callable[[], Any], work: SharedWork, limits: RunLimits) -> dict[str, Any]:
     """Reply of a built-in method, with CPU-seconds by stage and the wall clock of the results that it found there."""
     work.stages, work.reused_seconds, start = {}, 0.0, time.process_time()
     reply = reply_of(ask, "", BaseException, limits)
@@ -306,11 +316,17 @@ def _reply_with_stages(ask: Callable[[], Answer], work: SharedWork, limits: RunL
     return {**reply, "stages": work.stages, "own_seconds": own, "reused_seconds": work.reused_seconds}
 
 
+def text_of(pair: object) -> Callable[[object], dict[str, Any]]:
+    """Encoder of the answers that a kind of pair asks for."""
+    return planes_text if isinstance(pair, DensePair) else answer_text
+
+
 def reply_of(
-    ask: Callable[[], Answer],
+    ask: Callable[[], Any],
     file: str = "",
     caught: type[BaseException] = Exception,
     limits: RunLimits | None = None,
+    text: Callable[[object], dict[str, Any]] = answer_text,
 ) -> dict[str, Any]:
     """Answer or failure of one pair, with its time, as a document.
 
@@ -320,10 +336,11 @@ def reply_of(
     file : file of the method, whose line an error names
     caught : what counts as the method's error; anything else passes
     limits : under which the method runs; None if there are none
+    text : encodes the answer
     """
     start = time.perf_counter()
     try:
-        reply: dict[str, Any] = {"failure": "", "answer": answer_text(ask())}
+        reply: dict[str, Any] = {"failure": "", "answer": text(ask())}
     except caught as error:
         reply = _of_exception(error, file, limits)
     return {**reply, "seconds": time.perf_counter() - start}

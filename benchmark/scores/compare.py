@@ -10,7 +10,7 @@ two methods of the same law, any metric at all is called different in at most 1 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -102,7 +102,7 @@ def compare(first: Path, second: Path, seed: int = 0) -> list[Difference]:
     """
     a, b = read_score(first), read_score(second)
     refuse_different(a, b, str(first), str(second))
-    return compare_records(read_records(first, a), read_records(second, b), _rules(a.rules), "compare", seed)
+    return compare_records(read_records(first, a), read_records(second, b), rules_of(a.rules), "compare", seed)
 
 
 def compare_records(first: pl.DataFrame, second: pl.DataFrame, rules: Rules, *stream: Name) -> list[Difference]:
@@ -115,9 +115,54 @@ def compare_records(first: pl.DataFrame, second: pl.DataFrame, rules: Rules, *st
     """
     a, b = _common(first, second, rules)
     differences = [_difference(name, a, b, rules, *stream) for name in COMPARED]
+    return _judged(differences, {name: METRICS[name].better for name in COMPARED}, rules)
+
+
+StatisticOf = Callable[[Clusters, pl.DataFrame], Statistic]
+
+
+def compared(
+    metrics: Mapping[str, tuple[pl.DataFrame, pl.DataFrame, StatisticOf]],
+    better: Mapping[str, str],
+    rules: Rules,
+    *stream: Name,
+) -> list[Difference]:
+    """Differences of any metrics, each of two tables of the same records and what makes a statistic of one.
+
+    Tables have a column `sample_id`. `better` is "lower" or "higher" by metric; of others no verdict is given.
+    """
+    differences = []
+    for name, (a, b, statistic_of_rows) in metrics.items():
+        clusters = Clusters.of(a["sample_id"].to_list())
+        if clusters.n == 0:
+            differences.append(Difference(name, np.nan, np.nan, _NOTHING, 0, 0, np.nan, "too few samples"))
+            continue
+        both = Clusters(np.concatenate([clusters.index, clusters.n + clusters.index]), 2 * clusters.n)
+        tested = statistic_of_rows(both, pl.concat([a, b]))
+        drawn = _drawn(name, statistic_of_rows(clusters, a), statistic_of_rows(clusters, b), clusters, rules, *stream)
+        item = replace(drawn, n=len(a))
+        if clusters.n >= rules.least_compared and better[name] in ("lower", "higher"):
+            chance = exchange_chance(tested, clusters.n, rules, generator(*stream, name, "exchange"))
+            item = replace(item, chance=chance, better="no difference shown")
+        differences.append(item)
+    return _judged(differences, better, rules)
+
+
+def _drawn(
+    name: str, ours: Statistic, theirs: Statistic, clusters: Clusters, rules: Rules, *stream: Name
+) -> Difference:
+    """Difference of two statistics with its interval, without a verdict."""
+    everything = np.ones((1, clusters.n))
+    (drawn,) = estimates([_minus(theirs, ours)], clusters.n, rules, generator(*stream, name))
+    first, second = (float(statistic(everything)[0]) for statistic in (ours, theirs))
+    return Difference(name, first, second, drawn, 0, clusters.n, np.nan, "too few samples")
+
+
+def _judged(differences: Sequence[Difference], better: Mapping[str, str], rules: Rules) -> list[Difference]:
+    """Differences with a verdict where the exact test, corrected for their number, shows one."""
     shown = holm([item.chance for item in differences], 1.0 - rules.confidence)
     return [
-        replace(item, better=_verdict(item)) if is_shown else item
+        replace(item, better=_verdict(item, better[item.name])) if is_shown else item
         for item, is_shown in zip(differences, shown, strict=True)
     ]
 
@@ -205,7 +250,8 @@ def _short(value: Any) -> str:
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
-def _rules(numbers: dict[str, float]) -> Rules:
+def rules_of(numbers: Mapping[str, float]) -> Rules:
+    """Rules of a score as its document has them."""
     whole = {name: int(numbers[name]) for name in ("resamples", "least_samples", "least_compared")}
     return Rules(**{**numbers, **whole})  # type: ignore[arg-type]
 
@@ -229,15 +275,13 @@ def _difference(name: str, a: pl.DataFrame, b: pl.DataFrame, rules: Rules, *stre
     if clusters.n == 0:
         return Difference(name, np.nan, np.nan, _NOTHING, 0, 0, np.nan, "too few samples")
     ours, theirs = (statistic_of(metric, clusters, table) for table in (a, b))
-    everything = np.ones((1, clusters.n))
-    (drawn,) = estimates([_minus(theirs, ours)], clusters.n, rules, generator(*stream, name))
-    difference = trusted(metric, drawn, clusters.n)
-    first, second = (float(statistic(everything)[0]) for statistic in (ours, theirs))
+    drawn = _drawn(name, ours, theirs, clusters, rules, *stream)
+    item = replace(drawn, difference=trusted(metric, drawn.difference, clusters.n), n=len(a))
     if clusters.n < rules.least_compared:
-        return Difference(name, first, second, difference, len(a), clusters.n, np.nan, "too few samples")
+        return item
     tested = _tested(metric, clusters, pl.concat([a, b], how="vertical_relaxed"))
     chance = exchange_chance(tested, clusters.n, rules, generator(*stream, name, "exchange"))
-    return Difference(name, first, second, difference, len(a), clusters.n, chance, "no difference shown")
+    return replace(item, chance=chance, better="no difference shown")
 
 
 def _tested(metric: Metric, clusters: Clusters, joined: pl.DataFrame) -> Statistic:
@@ -265,5 +309,5 @@ def _minus(second: Statistic, first: Statistic) -> Statistic:
     return difference
 
 
-def _verdict(item: Difference) -> Verdict:
-    return "second" if (item.second < item.first) == (METRICS[item.name].better == "lower") else "first"
+def _verdict(item: Difference, better: str) -> Verdict:
+    return "second" if (item.second < item.first) == (better == "lower") else "first"

@@ -14,7 +14,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Protocol, Self, TypeVar
 
 import polars as pl
 from pydantic import AfterValidator, Field, model_validator
@@ -358,12 +358,37 @@ def finite(value: float | None) -> float | None:
     return value if value is not None and math.isfinite(value) else None
 
 
+D = TypeVar("D", bound=Document)
+
+
 def parquet_path(path: Path) -> Path:
     """Path of the records of a score."""
     return path.with_suffix(".parquet")
 
 
-def write_score(path: Path, document: ScoreDocument, records: pl.DataFrame) -> ScoreDocument:
+def score_files(out: Path | None, cards: Sequence[MethodCard]) -> list[Path | None]:
+    """One file per method: `out` itself for one, with the method's name added for several.
+
+    Raises
+    ------
+    DatasetError
+        If the name is none of a JSON file, or two methods have the same.
+    """
+    if out is None:
+        return [None] * len(cards)  # nothing is kept
+    if out.suffix != ".json":
+        raise DatasetError(f"--out {out}: a score is a JSON file; give a name that ends in .json")
+    if len(cards) == 1:
+        return [out]
+    # of a reference such as my_phi.py:extract, a colon is no letter of a file's name
+    names = ["".join(c if c.isalnum() or c in "-_." else "-" for c in card.name) for card in cards]
+    if len(set(names)) != len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise DatasetError(f"--method: two methods are called {twice}; score them in two runs with an --out for each")
+    return [out.with_name(f"{out.stem}-{name}.json") for name in names]
+
+
+def write_score(path: Path, document: D, records: pl.DataFrame) -> D:
     """Write records, then the document that names their hash; both complete or not at all."""
     if path.suffix != ".json":
         raise DatasetError(f"{path}: a score is a JSON file; give a name that ends in .json")
@@ -410,25 +435,42 @@ def _parquet(records: pl.DataFrame) -> bytes:
 
 
 def read_score(path: Path) -> ScoreDocument:
-    """Read a score.
+    """Read a score; raises as `read_document`."""
+    return read_document(path, ScoreDocument, KIND, VERSION, "phibench score --method ... --out")
+
+
+def read_document(path: Path, model: type[D], kind: str, version: int, command: str) -> D:
+    """Read a score of a kind.
 
     Raises
     ------
     DatasetError
-        If the file is no score, or one of another version; in one sentence.
+        If the file is no such score, or one of another version; in one sentence.
     """
-    file = InputFile(path, "give a file that `phibench score --method ... --out` wrote")
+    file = InputFile(path, f"give a file that `{command}` wrote")
     raw = file.json()
-    if raw.get("kind") != KIND:
-        raise DatasetError(f"{path} is no score: give a JSON file that `phibench score --method ... --out` wrote")
-    if raw.get("version") != VERSION:
-        version = printable_line(str(raw.get("version")), 60)
-        raise DatasetError(f"{path} has version {version}, this program reads {VERSION}: score again")
-    return file.validated(ScoreDocument, raw)
+    if raw.get("kind") != kind:
+        raise DatasetError(f"{path} is no score: give a JSON file that `{command}` wrote")
+    if raw.get("version") != version:
+        held = printable_line(str(raw.get("version")), 60)
+        raise DatasetError(f"{path} has version {held}, this program reads {version}: score again")
+    return file.validated(model, raw)
 
 
-def read_records(path: Path, document: ScoreDocument) -> pl.DataFrame:
-    """Records of the score at `path`.
+class HasRecords(Protocol):
+    """Document that names the file of its records."""
+
+    @property
+    def records(self) -> str:
+        """Name of the Parquet file."""
+
+    @property
+    def records_sha256(self) -> str:
+        """Its hash."""
+
+
+def read_records(path: Path, document: HasRecords, types: Mapping[str, pl.DataType] = COLUMN_TYPES) -> pl.DataFrame:
+    """Records of the score at `path`, with columns of these types.
 
     Raises
     ------
@@ -440,4 +482,4 @@ def read_records(path: Path, document: ScoreDocument) -> pl.DataFrame:
         raise DatasetError(f"{target} is missing: it belongs to {path.name}; keep both together, or score again")
     if sha256(target) != document.records_sha256:
         raise DatasetError(f"{target} is not the file that {path.name} was written with: score again")
-    return InputFile(target, "score again").table(COLUMN_TYPES)
+    return InputFile(target, "score again").table(dict(types))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from importlib.util import find_spec
 
+from phibench.datasets.common.errors import DatasetError
 from phibench.estimator.dense.dense_interface import DenseAnswer, DenseMethod, DensePair
 from phibench.estimator.dense.panorama_matchers import dense_flow, dense_sgbm, dense_sgbm_exact, dense_sift
 from phibench.estimator.dense.sweep import dense_sweep
@@ -33,6 +34,9 @@ class DenseBuiltIn:
     source: str
     accepts: tuple[str, ...] = KINDS
 
+    package = "phibench[dense]"
+    """Extra that brings OpenCV."""
+
     @property
     def installed(self) -> bool:
         """OpenCV can be imported."""
@@ -46,7 +50,15 @@ class DenseBuiltIn:
         return "" if kind in self.accepts else f"takes {', '.join(self.accepts)}, not {kind}"
 
     def __call__(self, pair: DensePair) -> DenseAnswer:
-        """Answer for the pair."""
+        """Answer for the pair.
+
+        Raises
+        ------
+        DatasetError
+            If this pair cannot be taken; in one sentence.
+        """
+        if why := self.refusal(pair):
+            raise DatasetError(f"{self.name}: {why}")
         return self.function(pair)
 
 
@@ -85,3 +97,6 @@ _ALL = (
 
 DENSE_METHODS: dict[str, DenseBuiltIn] = {method.name: method for method in _ALL}
 """All of them, also where OpenCV is missing: `refusal` says so."""
+
+KNOWN = DENSE_METHODS
+"""The name by which `benchmark.isolation.resolve` looks in every registry of methods."""

@@ -26,6 +26,7 @@ from cyclopts import App, CycloptsError
 from phibench.cli.calibration import align, calibrate
 from phibench.cli.captures import import_, measure, sensor
 from phibench.cli.dataset import dataset
+from phibench.cli.dense import dense
 from phibench.cli.film import film, loop
 from phibench.cli.options import DATA, INSTALLATION, KEEPERS, METHODS, SENSOR, START, answer_to_old_spelling
 from phibench.cli.publish import export, fetch, release, seal, submission
@@ -50,7 +51,7 @@ app = App(
     suppress_keyboard_interrupt=False,
     result_action="return_value",
 )
-for _group in (recipe, dataset, film, room, scene, method, seal, submission, sensor, loop, study):
+for _group in (recipe, dataset, film, room, scene, method, dense, seal, submission, sensor, loop, study):
     app.command(_group)
 app.command(start, group=START)
 app.command(demo, group=START)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -24,7 +23,7 @@ from phibench.cli.options import (
 )
 
 if TYPE_CHECKING:
-    from phibench.benchmark.scores.document import MethodCard, ScoreDocument
+    from phibench.benchmark.scores.document import ScoreDocument
     from phibench.estimator.pair_set import PairSet
 
 Rank = Annotated[
@@ -143,7 +142,7 @@ def score(
         JSON file for the score, records beside it as Parquet; with several methods their names are added to it.
     """
     from phibench.benchmark.isolation.resolve import resolve
-    from phibench.benchmark.scores.document import MethodCard, records_kept
+    from phibench.benchmark.scores.document import MethodCard, records_kept, score_files
     from phibench.benchmark.scores.score import run_and_score, saved_each
     from phibench.benchmark.scores.score_tables import print_scores
     from phibench.datasets.common.errors import DatasetError
@@ -156,7 +155,7 @@ def score(
             f"The paper's tables are `phibench paper {directory}`"
         )
     run_limits, form = limits.of_run, output.form
-    files = _files(out, [MethodCard.of(name, **resolve(name).document()) for name in method])
+    files = score_files(out, [MethodCard.of(name, **resolve(name).document()) for name in method])
     for target in filter(None, files):
         require_writable(target)
     pair_set, console, number = choice.of(directory), progress_console(), _seed(bootstrap_seed)
@@ -264,24 +263,6 @@ def results(
     elif out is None and html is None:
         sys.stdout.write(results_page(parts, rank))
     return 0
-
-
-def _files(out: Path | None, cards: Sequence[MethodCard]) -> list[Path | None]:
-    """One file per method: `out` itself for one, with the method's name added for several."""
-    from phibench.datasets.common.errors import DatasetError
-
-    if out is None:
-        return [None] * len(cards)  # nothing is kept
-    if out.suffix != ".json":
-        raise DatasetError(f"--out {out}: a score is a JSON file; give a name that ends in .json")
-    if len(cards) == 1:
-        return [out]
-    # of a reference such as my_phi.py:extract, a colon is no letter of a file's name
-    names = ["".join(c if c.isalnum() or c in "-_." else "-" for c in card.name) for card in cards]
-    if len(set(names)) != len(names):
-        twice = next(name for name in names if names.count(name) > 1)
-        raise DatasetError(f"--method: two methods are called {twice}; score them in two runs with an --out for each")
-    return [out.with_name(f"{out.stem}-{name}.json") for name in names]
 
 
 def _seed(seed: int) -> int:

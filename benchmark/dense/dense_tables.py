@@ -1,0 +1,98 @@
+"""Tables of dense scores: methods side by side, strata of one, and differences of two."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import polars as pl
+
+from phibench.benchmark.dense.dense_document import DENSE_METRICS, DenseScore
+from phibench.benchmark.scores.compare import Difference
+from phibench.benchmark.scores.document import Value
+from phibench.benchmark.scores.score_tables import cell_parts
+from phibench.datasets.common.shown_text import TextTable, text_of
+
+_SHOWN = {
+    "recall": "recall",
+    "answered": "answered",
+    "median_relative": "median",
+    "mean_relative": "mean",
+    "above_5": "above 5",
+    "above_10": "above 10",
+    "matching": "matching",
+    "central": "central",
+    "calibration": "rig",
+}
+_OF_STRATA = ("recall", "answered", "median_relative", "above_10", "central")
+_ROUNDING = 1e-9  # relative: what is below shows as 0
+_NOTE = (
+    "Errors are of D, relative. matching: answer against perfect matches through the same rig; central: what the "
+    "central model adds to perfect matches; rig: perfect matches through the given rig."
+)
+
+
+def _cell(name: str, value: Value, wide: bool = False) -> str:
+    if value.value is not None and abs(value.value) < _ROUNDING:
+        return "0"
+    shown, interval = cell_parts(value.estimate, 100.0 if DENSE_METRICS[name].unit == "1" else 1.0, 2, significant=True)
+    return f"{shown}\n{interval}" if wide and interval else shown
+
+
+def dense_board(scores: Sequence[DenseScore], wide: bool = False) -> TextTable:
+    """One row per method, the best recall first."""
+    first = scores[0]
+    ordered = sorted(scores, key=lambda score: -(score.metrics["recall"].value or 0.0))
+    rows = [(score.method.name, *(_cell(name, score.metrics[name], wide) for name in _SHOWN)) for score in ordered]
+    title = f"{first.pairs} dense pairs of '{first.pair_set.get('name')}', {first.pixels} pixels that both images show"
+    heads = ("method", *(f"{text}\n%" for text in _SHOWN.values()))
+    return TextTable(title, heads, tuple(rows), "L" + "r" * len(_SHOWN), _NOTE)
+
+
+def dense_strata_table(score: DenseScore) -> TextTable:
+    """One row per stratum."""
+    rows = [
+        (part.by, part.label, f"{part.pixels / 1000.0:.0f}", *(_cell(name, part.metrics[name]) for name in _OF_STRATA))
+        for part in score.strata
+    ]
+    heads = ("by", "part", "pixels\n1000", *(f"{_SHOWN[name]}\n%" for name in _OF_STRATA))
+    return TextTable(f"{score.method.name}, by part", heads, tuple(rows), "ll" + "r" * (1 + len(_OF_STRATA)))
+
+
+def dense_metrics_table(score: DenseScore) -> TextTable:
+    """Every metric with its interval, in SI units."""
+    rows = []
+    for name, value in score.metrics.items():
+        shown, interval = cell_parts(value.estimate, 1.0, 3, significant=True)
+        rows.append((name, shown, interval, value.unit, value.text))
+    return TextTable(
+        f"{score.method.name}, every metric", ("metric", "value", "95 %", "unit", "what"), tuple(rows), "lrrlL"
+    )
+
+
+def dense_differences(differences: Sequence[Difference], first: str, second: str) -> TextTable:
+    """Paired differences of two scores."""
+    rows = []
+    for item in differences:
+        factor = 100.0 if DENSE_METRICS[item.name].unit == "1" else 1.0
+        shown, interval = cell_parts(item.difference, factor, 2, significant=True)
+        unit = "%" if factor > 1.0 else DENSE_METRICS[item.name].unit
+        name = f"{item.name.removesuffix('_m')}, {unit}"
+        values = (f"{factor * value:.3g}" for value in (item.first, item.second))
+        verdict = {"first": first, "second": second}.get(item.better, item.better)
+        rows.append((name, *values, shown, interval, verdict))
+    heads = ("metric", "first", "second", "difference", "95 %", "better")
+    return TextTable(f"second, {second}, minus first, {first}", heads, tuple(rows), "lrrrrL")
+
+
+def dense_failures(records: pl.DataFrame) -> list[str]:
+    """Sentences on the pairs on which a method failed, the message of the first of each kind."""
+    failed = records.filter((pl.col("by") == "all") & (pl.col("failure") != ""))
+    lines = []
+    for (kind,), rows in failed.group_by(["failure"], maintain_order=True):
+        lines.append(f"{len(rows)} pairs failed ({kind}), such as '{rows['sample_id'][0]}': {rows['message'][0]}")
+    return lines
+
+
+def dense_text(scores: Sequence[DenseScore]) -> str:
+    """The table of methods as text."""
+    return text_of(dense_board(scores))

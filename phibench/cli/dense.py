@@ -1,0 +1,219 @@
+"""Commands `phibench dense ...`: methods that give D for every pixel, written, checked, scored and compared."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from textwrap import indent
+from typing import Annotated, Literal
+
+from cyclopts import App, Parameter
+
+from phibench.cli.options import (
+    DEFAULT_PRESET,
+    LIMITS,
+    METHODS,
+    BootstrapSeed,
+    DataFolder,
+    Limits,
+    OwnOrPreset,
+    PairsAtOnce,
+    Preset,
+    Whole,
+)
+
+dense = App(
+    name="dense",
+    group=METHODS,
+    help="Dense depth, the laser off: D of every pixel of the mirror, scored against exact truth (docs/dense.md).",
+)
+DenseMethods = Annotated[
+    list[str] | None,
+    Parameter(
+        name="--method",
+        negative="",
+        help="A dense method: a name that `phibench dense list` shows, or FILE.py:FUNCTION. May be given again.",
+    ),
+]
+
+
+@dense.command(name="list")
+def list_() -> int:
+    """List the dense methods: built in, and of installed packages."""
+    from phibench.benchmark.isolation.resolve import DENSE, installed
+    from phibench.estimator.dense.dense_methods import KNOWN
+
+    for method in KNOWN.values():
+        missing = "" if method.installed else f" (needs {method.package}: pip install {method.package})"
+        print(f"{method.name}: {method.description}{missing}")
+    for point in installed(DENSE):
+        print(f"{point.name}: {point.value}")
+    print("your own: a file and a function in it, my_depth.py:depth; `phibench dense new my_depth.py` writes one")
+    return 0
+
+
+@dense.command
+def new(path: Path) -> int:
+    """Write an example method that works, to begin with.
+
+    Parameters
+    ----------
+    path
+        Python file to write; one that is there is not touched.
+    """
+    from phibench.benchmark.isolation.resolve import DENSE, write_example
+
+    written = write_example(path, DENSE)
+    print(f"{written}: try it with `phibench dense check {written}:depth`")
+    return 0
+
+
+@dense.command
+def check(
+    reference: Annotated[str, Parameter(name="--method")],
+    *,
+    preset: Preset = DEFAULT_PRESET,
+    limits: Limits = LIMITS,
+    show_output: Annotated[bool, Parameter(negative="")] = False,
+) -> int:
+    """Try a dense method on three easy pairs and say what is wrong; exit code 1 if something is.
+
+    Parameters
+    ----------
+    reference
+        File and function, my_depth.py:depth, or a name that `phibench dense list` shows.
+    preset
+        What the camera delivers: "mjpeg", "yuyv", "srgb8", "bayer-raw" or "mono-raw".
+    show_output
+        Also show what the method prints: the last 20 lines of every pair.
+    """
+    from phibench.benchmark.dense.dense_check import PAIRS, check_dense
+    from phibench.benchmark.isolation.resolve import DENSE, resolve
+    from phibench.datasets.common.progress import Steps, progress_console
+
+    resolve(reference, DENSE)  # one that is not there is told before anything begins
+    with Steps(progress_console(), "easy pairs", PAIRS, announce=True) as steps:
+        done = check_dense(reference, preset, limits.of_run, told=steps.reach)
+    for number, text in done.printed if show_output else ():
+        print(f"printed for pair {number}:\n{indent(text, '    ')}")
+    if done.printed and not show_output:
+        print("the method prints something: --show-output shows it")
+    for note in done.notes:
+        print(note)
+    for fault in done.faults:
+        print(f"wrong: {fault}")
+    sound = "nothing wrong on three easy pairs (conventions only: every surface has a pattern)"
+    print(f"{reference}: {sound if done.ok else f'{len(done.faults)} wrong'}")
+    return 0 if done.ok else 1
+
+
+@dense.command
+def score(
+    directory: DataFolder,
+    *,
+    method: DenseMethods = None,
+    preset: OwnOrPreset = None,
+    draws: Whole | None = None,
+    pairs: Whole | None = None,
+    frames: Whole = 1,
+    calibration: Path | None = None,
+    bootstrap_seed: BootstrapSeed = 0,
+    workers: PairsAtOnce = 1,
+    limits: Limits = LIMITS,
+    out: Path | None = None,
+    wide: Annotated[bool, Parameter(negative="")] = False,
+) -> int:
+    """Score dense methods on the pairs of a data set.
+
+    Parameters
+    ----------
+    preset
+        Preset of the sensor; by default those of the data set's recipe.
+    draws
+        Draws of the noise per sample; by default the recipe's.
+    pairs
+        Only so many pairs.
+    frames
+        Frames of each image.
+    calibration
+        File of `phibench calibrate`: its rig's samples, with the calibrated rig and stroke.
+    out
+        JSON file for the score, records beside it as Parquet; with several methods their names are added to it.
+    wide
+        With intervals below the values.
+    """
+    from phibench.benchmark.dense.dense_score import chosen_pairs, run_dense, saved_dense
+    from phibench.benchmark.dense.dense_tables import dense_board, dense_failures
+    from phibench.benchmark.isolation.resolve import DENSE, resolve
+    from phibench.benchmark.scores.document import MethodCard, score_files
+    from phibench.datasets.common.errors import DatasetError
+    from phibench.datasets.common.shown_text import show_grid, table_console
+    from phibench.datasets.store.files import require_writable
+
+    if not method:
+        raise DatasetError("`phibench dense score` scores methods: give --method, such as --method my_depth.py:depth")
+    files = score_files(out, [MethodCard.of(name, **resolve(name, DENSE).document()) for name in method])
+    for target in filter(None, files):
+        require_writable(target)
+    chosen = chosen_pairs(directory, preset, draws, pairs, frames, calibration)
+    scored = run_dense(method, chosen, workers, None, bootstrap_seed, limits.of_run)
+    for one, file in zip(scored, files, strict=True):
+        if file is not None:
+            saved_dense(one, file)
+    console = table_console(wide)
+    show_grid(console, dense_board([one.document for one in scored], wide))
+    for one in scored:
+        for line in dense_failures(one.records):
+            print(f"{one.document.method.name}: {line}")
+    for file in filter(None, files):
+        print(f"written: {file}")
+    return 0
+
+
+@dense.command
+def compare(first: Path, second: Path, *, bootstrap_seed: BootstrapSeed = 0) -> int:
+    """Compare two dense scores of the same pairs, pair by pair.
+
+    Parameters
+    ----------
+    first
+        JSON file that `dense score --out` wrote, with its Parquet file beside it.
+    second
+        Another one, of the same pairs.
+    """
+    from phibench.benchmark.dense.dense_score import compare_dense, read_dense
+    from phibench.benchmark.dense.dense_tables import dense_differences
+    from phibench.datasets.common.shown_text import show_grid, table_console
+
+    differences = compare_dense(first, second, bootstrap_seed)
+    names = (f"{read_dense(path).method.name} ({path.name})" for path in (first, second))
+    show_grid(table_console(False), dense_differences(differences, *names))
+    if all(item.better == "too few samples" for item in differences):
+        print("Too few samples for a verdict: 30 are the least (docs/scoring.md, Paired comparison).")
+    return 0
+
+
+@dense.command
+def show(*files: Path, by: Literal["methods", "parts", "metrics"] = "methods") -> int:
+    """Show dense scores: methods side by side, or each one's parts or metrics.
+
+    Parameters
+    ----------
+    files
+        JSON files that `dense score --out` wrote.
+    by
+        methods: one row each; parts: by D, elevation, texture, edges, stroke and room; metrics: all, with intervals.
+    """
+    from phibench.benchmark.dense.dense_score import read_dense
+    from phibench.benchmark.dense.dense_tables import dense_board, dense_metrics_table, dense_strata_table
+    from phibench.datasets.common.shown_text import show_grid, table_console
+
+    scores, console = [read_dense(path) for path in files], table_console(by == "metrics")
+    if not scores:
+        print("give one score or more: JSON files of `phibench dense score --out`", file=sys.stderr)
+        return 1
+    if by == "methods":
+        show_grid(console, dense_board(scores))
+    for score in scores if by != "methods" else ():
+        show_grid(console, dense_strata_table(score) if by == "parts" else dense_metrics_table(score))
+    return 0

@@ -1,0 +1,233 @@
+"""Dense scores: from methods in processes of their own to files, tables and comparisons."""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+import pytest
+from helpers.processes import quiet
+
+from phibench.benchmark.dense.dense_document import DENSE_METRICS
+from phibench.benchmark.dense.dense_pairs import dense_pairs, require_curve
+from phibench.benchmark.dense.dense_records import COLUMN_TYPES
+from phibench.benchmark.dense.dense_score import DenseScored, compare_dense, read_dense, run_dense, score_dense
+from phibench.benchmark.dense.dense_tables import dense_board, dense_metrics_table, dense_strata_table
+from phibench.benchmark.isolation.answers import AnswerError
+from phibench.benchmark.isolation.dense_answers import checked_planes, most_bytes, planes_text
+from phibench.benchmark.isolation.resolve import DENSE, MethodError, resolve
+from phibench.benchmark.scored_dataset import open_dataset
+from phibench.cli.main import main
+from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.common.shown_text import text_of
+from phibench.estimator.dense.dense_interface import DenseAnswer, DensePair
+from phibench.scenes.catalog import default_rig
+from phibench.scenes.frames import Pose
+
+METHODS = """
+import numpy as np
+from phibench.estimator.dense.dense_interface import DenseAnswer
+
+def flat(pair):
+    return DenseAnswer(depth_m=np.full(pair.shape, 2.0, np.float32), sigma_depth_m=np.full(pair.shape, 0.5, np.float32))
+
+def colour(pair):
+    return DenseAnswer(depth_m=pair.down.mean(axis=2) * pair.down[..., 0] + 1.0)
+
+def small(pair):
+    return DenseAnswer(depth_m=np.ones((10, 20)))
+
+def writes(pair):
+    pair.down[0, 0] = 0
+"""
+
+
+@pytest.fixture(scope="module")
+def methods(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    file = tmp_path_factory.mktemp("methods") / "mine.py"
+    file.write_text(METHODS, encoding="utf-8")
+    return file
+
+
+def flat(pair: DensePair) -> DenseAnswer:
+    return DenseAnswer(np.full(pair.shape, 2.0, np.float32), sigma_depth_m=np.full(pair.shape, 0.5, np.float32))
+
+
+@pytest.fixture(scope="module")
+def scored(tiny_dataset: Path) -> DenseScored:
+    return score_dense(tiny_dataset, flat, "mjpeg", console=quiet())
+
+
+def test_the_oracle_scores_nothing(tiny_dataset: Path) -> None:
+    """A function that knows the truth: every error is below 1e-9, every recall 1."""
+    opened = open_dataset(tiny_dataset)
+    pairs = dense_pairs(opened, "mjpeg")
+    truths = [pairs.truth(number).found.uv_px for number in range(len(pairs))]
+    found = score_dense(opened, lambda pair: DenseAnswer(target_uv_px=truths[pair.number]), "mjpeg", console=quiet())
+    metrics = found.document.metrics
+    for name in ("median_relative", "rms_relative", "mae_m", "rmse_m", "disparity_rmse_deg", "matching", "above_2"):
+        assert metrics[name].value < 1e-9, name
+    assert metrics["recall"].value == metrics["answered"].value == 1.0
+    assert {part.by for part in found.document.strata} >= {"depth", "elevation", "texture", "edge", "stroke"}
+
+
+def test_a_process_of_its_own_answers_as_the_function_does(
+    tiny_dataset: Path, methods: Path, scored: DenseScored, tmp_path: Path
+) -> None:
+    names = [f"{methods}:{name}" for name in ("flat", "small", "writes")]
+    one, small, writes = run_dense(names, dense_pairs(open_dataset(tiny_dataset), "mjpeg"), console=quiet())
+    different = [name for name in one.records.columns if name not in ("seconds", "message")]
+    assert one.records.select(different).equals(scored.records.select(different))
+    assert one.document.results_sha256 == scored.document.results_sha256
+    assert one.document.method.sha256
+    assert one.document.isolation
+    assert small.document.failures == {"invalid": 2}
+    assert "the answer has (10, 20) pixels, the down image (180, 320)" in small.records["message"][0]
+    assert writes.document.failures == {"mutated": 2}
+
+
+def test_a_method_that_wants_colours_is_told_so_on_raw_images(tiny_dataset: Path, methods: Path) -> None:
+    pairs = dense_pairs(open_dataset(tiny_dataset), "bayer-raw", pairs=1)
+    (found,) = run_dense([f"{methods}:colour"], pairs, console=quiet())
+    assert found.document.failures == {"error": 1}
+    assert "images of 'bayer-raw' are raw, (H, W) without colours" in found.records["message"][0]
+
+
+def test_built_in_methods_run_in_processes_of_their_own(tiny_dataset: Path) -> None:
+    pairs = dense_pairs(open_dataset(tiny_dataset), "mjpeg", pairs=1)
+    assert not resolve("dense_sgbm", DENSE).shares
+    central, exact = run_dense(["dense_sgbm", "dense_sgbm_exact"], pairs, console=quiet())
+    assert central.document.failures == exact.document.failures == {}
+    assert central.document.method.kind == "built-in"
+    # the same matches: they differ by what the central model adds
+    assert central.records["answered"][0] == pytest.approx(exact.records["answered"][0], abs=0.02)
+    assert central.records["median"][0] != exact.records["median"][0]
+
+
+def test_metrics_are_means_over_pairs(scored: DenseScored) -> None:
+    whole = scored.records.filter(pl.col("by") == "all")
+    assert scored.records.schema == COLUMN_TYPES
+    assert len(whole) == 2
+    value = {name: scored.document.metrics[name].value for name in DENSE_METRICS}
+    assert value["median_relative"] == pytest.approx(whole["median"].to_numpy().mean(), rel=1e-12)
+    assert value["rms_relative"] == pytest.approx(np.sqrt(whole["square"].to_numpy().mean()), rel=1e-12)
+    assert value["coverage"] == pytest.approx(whole["coverage"].to_numpy().mean(), rel=1e-12)
+    assert scored.document.metrics["recall"].note == "under 5 samples"
+
+
+def test_a_score_comes_back_from_its_file(tiny_dataset: Path, scored: DenseScored, tmp_path: Path) -> None:
+    from phibench.benchmark.dense.dense_score import saved_dense
+
+    kept = saved_dense(scored, tmp_path / "a.json")
+    assert read_dense(tmp_path / "a.json") == kept.document
+    other = saved_dense(score_dense(tiny_dataset, half_right, "mjpeg", console=quiet()), tmp_path / "b.json")
+    (recall, *_) = compare_dense(tmp_path / "a.json", tmp_path / "b.json")
+    assert recall.name == "recall"
+    assert recall.first == kept.document.metrics["recall"].value
+    assert recall.second == other.document.metrics["recall"].value
+    assert recall.better == "too few samples"
+    for table in (dense_board([kept.document]), dense_strata_table(kept.document), dense_metrics_table(kept.document)):
+        assert "flat" in text_of(table)
+    document = json.loads((tmp_path / "a.json").read_text())
+    (tmp_path / "a.json").write_text(json.dumps({**document, "kind": "phibench score"}))
+    with pytest.raises(DatasetError, match="is no score"):
+        read_dense(tmp_path / "a.json")
+
+
+def half_right(pair: DensePair) -> DenseAnswer:
+    return DenseAnswer(np.full(pair.shape, 1.5))
+
+
+def test_scores_of_other_pairs_do_not_compare(scored: DenseScored, tiny_dataset: Path, tmp_path: Path) -> None:
+    from phibench.benchmark.dense.dense_score import saved_dense
+
+    saved_dense(scored, tmp_path / "a.json")
+    saved_dense(score_dense(tiny_dataset, flat, "srgb8", console=quiet()), tmp_path / "b.json")
+    with pytest.raises(DatasetError, match="different pair sets \\(presets\\)"):
+        compare_dense(tmp_path / "a.json", tmp_path / "b.json")
+
+
+def test_a_mirror_without_an_epipolar_curve_is_refused() -> None:
+    rig = default_rig()
+    require_curve(rig, 0.4, "one")
+    aside = Pose("camera", "sphere", (5.0, 0.0, 0.26))
+    with pytest.raises(DatasetError, match="no pixel of the down image has an epipolar curve"):
+        require_curve(dataclasses.replace(rig, T_camera_sphere=aside), 0.4, "one")
+
+
+# What a hostile process may send.
+
+GOOD: dict[str, Any] = planes_text(DenseAnswer(np.ones((2, 3)), sigma_depth_m=np.ones((2, 3), np.float32)))
+
+
+def test_planes_come_back_with_their_types() -> None:
+    answer = checked_planes(json.loads(json.dumps(GOOD)), (2, 3))
+    assert answer.depth_m is not None
+    assert answer.sigma_depth_m is not None
+    assert (answer.depth_m.dtype, answer.sigma_depth_m.dtype) == (np.float64, np.float32)
+    assert len(json.dumps(planes_text(DenseAnswer(np.ones((50, 60)))))) < most_bytes((50, 60))
+
+
+def forged(**fields: Any) -> dict[str, Any]:
+    return {"planes": {"depth_m": {**GOOD["planes"]["depth_m"], **fields}}}
+
+
+@pytest.mark.parametrize(
+    ("document", "words"),
+    [
+        ({"wrong": "the method returned None"}, "returned None"),
+        ({}, "cannot be read: KeyError"),
+        ({"planes": 3}, "cannot be read: TypeError"),
+        ({"planes": {}}, "neither given"),
+        (forged(type="O"), "is no plane of float32 or float64"),
+        (forged(shape=[2, 1 << 20]), "is no plane"),
+        (forged(shape=[2, 2]), "has 48 bytes"),
+        (forged(shape=[2, True]), "is no plane"),
+        (forged(base64="not base64!"), "cannot be read"),
+        (forged(base64=base64.b64encode(np.full(6, -1.0).tobytes()).decode()), "0 or below at 6"),
+        (forged(shape=[3, 2]), "Rows come first"),
+    ],
+)
+def test_a_forged_answer_is_one_sentence(document: dict[str, Any], words: str) -> None:
+    with pytest.raises(AnswerError, match=words) as caught:
+        checked_planes(document, (2, 3))
+    assert "\n" not in str(caught.value)
+
+
+# The command line.
+
+
+def test_the_commands_of_the_seat(tiny_dataset: Path, methods: Path, tmp_path: Path, capsys: Any) -> None:
+    out = tmp_path / "s.json"
+    command = ["dense", "score", str(tiny_dataset), "--preset", "mjpeg", "--pairs", "1", "--out", str(out)]
+    assert main([*command, "--method", f"{methods}:flat"]) == 0
+    assert "recall" in capsys.readouterr().out
+    for by in ("methods", "parts", "metrics"):
+        assert main(["dense", "show", str(out), "--by", by]) == 0
+        assert "mine:flat" in capsys.readouterr().out
+    assert main(["dense", "compare", str(out), str(out)]) == 0
+    assert "Too few samples" in capsys.readouterr().out
+    assert main(["dense", "list"]) == 0
+    assert main(["dense", "new", str(tmp_path / "mine.py")]) == 0
+    assert "mine.py:depth" in (tmp_path / "mine.py").read_text(encoding="utf-8")
+    assert main(["dense", "show"]) == 1
+
+
+@pytest.mark.slow
+def test_the_example_method_passes_its_check(tmp_path: Path, capsys: Any) -> None:
+    """Three pairs of 12 s beside other work, in a process of its own."""
+    assert main(["dense", "new", str(tmp_path / "mine.py")]) == 0
+    assert main(["dense", "check", f"{tmp_path / 'mine.py'}:depth", "--seconds", "300"]) == 0
+    assert "nothing wrong" in capsys.readouterr().out
+
+
+def test_names_of_no_method_are_answered_with_the_seats_own_words(tmp_path: Path) -> None:
+    with pytest.raises(MethodError, match=r"`phibench dense list` lists what there is\. .*my_depth\.py:depth"):
+        resolve("nothing", DENSE)
+    with pytest.raises(MethodError, match="`phibench dense new"):
+        resolve(f"{tmp_path / 'absent.py'}:depth", DENSE)
