@@ -37,7 +37,7 @@ from phibench.benchmark.release.benchmark import (
     read_manifest_file,
     same_but_drawn,
 )
-from phibench.benchmark.release.secret_seed import secret_seed
+from phibench.benchmark.sealed.sealed_set import secret_seed
 from phibench.datasets.build.forecast import megabytes
 from phibench.datasets.build.parts import bring_all
 from phibench.datasets.build.tasks import BuildTask, Made

@@ -2,7 +2,7 @@
 
 Nothing is believed that can be computed again. The file itself says which numbers follow from which: counts, metrics,
 intervals and flags from its records. With the data set at hand the whole score is built again from the answers
-(`rebuilt_score`). With the method at hand it is run again (`method_check`). How long it took there is not checked.
+(`rebuilt_score`). With the method at hand it is run again. How long it took there is not checked.
 """
 
 from __future__ import annotations
@@ -31,8 +31,17 @@ from phibench.benchmark.scores.document import (
 )
 from phibench.benchmark.scores.record_columns import COLUMN_TYPES
 from phibench.benchmark.scores.records import missed_relative, with_missed
-from phibench.benchmark.sealed.method_check import check_card, check_run
-from phibench.benchmark.sealed.rebuilt_score import ABSOLUTE, GIVEN, RELATIVE, alike, differences, rebuilt, short
+from phibench.benchmark.sealed.rebuilt_score import (
+    ABSOLUTE,
+    GIVEN,
+    RELATIVE,
+    alike,
+    check_card,
+    check_run,
+    differences,
+    rebuilt,
+    short,
+)
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import InputFile
 from phibench.datasets.common.progress import Steps, progress_console

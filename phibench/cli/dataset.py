@@ -146,7 +146,7 @@ def make(
 
 def _secret(path: Path, seed: int | None, make_it: bool) -> int | None:
     """Seed of a file; a dry run draws none, and takes the recipe's."""
-    from phibench.benchmark.release.secret_seed import secret_seed as seed_of
+    from phibench.benchmark.sealed.sealed_set import secret_seed as seed_of
     from phibench.datasets.common.errors import DatasetError
 
     if seed is not None:

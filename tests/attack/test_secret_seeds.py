@@ -13,7 +13,7 @@ from helpers.sealed_sets import SECRET_SEED
 
 from phibench.benchmark.export.export_make import export
 from phibench.benchmark.export.pair_rows import ExportRequest
-from phibench.benchmark.release.secret_seed import secret_seed
+from phibench.benchmark.sealed.sealed_set import secret_seed
 from phibench.cli.main import main
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.exposures.draw import draw_frames

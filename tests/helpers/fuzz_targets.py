@@ -23,7 +23,7 @@ from PIL import Image
 from phibench.benchmark.isolation.resolve import MethodError, resolve
 from phibench.benchmark.release import fetch
 from phibench.benchmark.release.benchmark import read_manifest_file
-from phibench.benchmark.release.secret_seed import secret_seed
+from phibench.benchmark.sealed.sealed_set import secret_seed
 from phibench.calibration.captures.pair_list import read_pair_list
 from phibench.calibration.captures.picture_files import read_photo
 from phibench.calibration.captures.rig_file import read_rig_file

@@ -215,7 +215,7 @@ def test_what_a_score_says_of_its_method_has_a_form(honest: Honest, tmp_path: Pa
 
 
 def test_the_code_is_that_of_the_program(honest: Honest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("phibench.benchmark.sealed.method_check.program_version", lambda: "phibench 0.2.0")
+    monkeypatch.setattr("phibench.benchmark.sealed.rebuilt_score.program_version", lambda: "phibench 0.2.0")
     document = read_score(honest.path).model_copy(update={"program": "phibench 0.2.0"})
     for changes, count in (({}, 0), ({"code_sha256": "0" * 64}, 1)):
         write_score(tmp_path / "mine.json", document.model_copy(update=changes), honest.again.records)
