@@ -169,20 +169,6 @@ def markdown_table(rows: Sequence[Row]) -> str:
     return "\n".join(table_lines(head, body, [" --- "] * len(head)))
 
 
-def print_table(rows: Sequence[Row]) -> None:
-    """Print a table on the terminal; long labels are wrapped."""
-    from rich.console import Console
-    from rich.table import Table
-
-    head, *body = rows
-    table = Table(*head)
-    for column in table.columns[1:]:
-        column.no_wrap = True
-    for row in body:
-        table.add_row(*row)
-    Console(markup=False, emoji=False).print(table)
-
-
 # -- data sets and drawings --------------------------------------------------------------------------------------------
 
 

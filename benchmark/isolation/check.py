@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from textwrap import indent
 
 import numpy as np
 
@@ -47,6 +48,16 @@ class Check:
     def ok(self) -> bool:
         """True if there is no fault."""
         return not self.faults
+
+    def lines(self, reference: str, sound: str, show_output: bool) -> Iterator[str]:
+        """Lines for a person: what was printed, notes, faults, and the verdict, `sound` where there is no fault."""
+        for number, text in self.printed if show_output else ():
+            yield f"printed for pair {number}:\n{indent(text, '    ')}"
+        if self.printed and not show_output:
+            yield "the method prints something: --show-output shows it"
+        yield from self.notes
+        yield from (f"wrong: {fault}" for fault in self.faults)
+        yield f"{reference}: {sound if self.ok else f'{len(self.faults)} wrong'}"
 
 
 def check_method(

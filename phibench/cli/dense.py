@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from textwrap import indent
 from typing import Annotated, Literal
 
 from cyclopts import App, Parameter
@@ -15,6 +14,7 @@ from phibench.cli.options import (
     METHODS,
     BootstrapSeed,
     DataFolder,
+    Flag,
     Limits,
     OwnOrPreset,
     PairsAtOnce,
@@ -74,7 +74,7 @@ def check(
     *,
     preset: Preset = DEFAULT_PRESET,
     limits: Limits = LIMITS,
-    show_output: Annotated[bool, Parameter(negative="")] = False,
+    show_output: Flag = False,
 ) -> int:
     """Try a dense method on three easy pairs and say what is wrong; exit code 1 if something is.
 
@@ -94,16 +94,9 @@ def check(
     resolve(reference, DENSE)  # one that is not there is told before anything begins
     with Steps(progress_console(), "easy pairs", PAIRS, announce=True) as steps:
         done = check_dense(reference, preset, limits.of_run, told=steps.reach)
-    for number, text in done.printed if show_output else ():
-        print(f"printed for pair {number}:\n{indent(text, '    ')}")
-    if done.printed and not show_output:
-        print("the method prints something: --show-output shows it")
-    for note in done.notes:
-        print(note)
-    for fault in done.faults:
-        print(f"wrong: {fault}")
     sound = "nothing wrong on three easy pairs (conventions only: every surface has a pattern)"
-    print(f"{reference}: {sound if done.ok else f'{len(done.faults)} wrong'}")
+    for line in done.lines(reference, sound, show_output):
+        print(line)
     return 0 if done.ok else 1
 
 
@@ -121,7 +114,7 @@ def score(
     workers: PairsAtOnce = 1,
     limits: Limits = LIMITS,
     out: Path | None = None,
-    wide: Annotated[bool, Parameter(negative="")] = False,
+    wide: Flag = False,
 ) -> int:
     """Score dense methods on the pairs of a data set.
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from textwrap import indent
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import App, Parameter
@@ -133,16 +132,9 @@ def check(
     resolve(reference)  # one that is not there is told before anything begins
     with Steps(progress_console(), "easy pairs", PAIRS, announce=True) as steps:
         done = check_method(reference, preset, limits.of_run, told=steps.reach)
-    for number, text in done.printed if show_output else ():
-        print(f"printed for pair {number}:\n{indent(text, '    ')}")
-    if done.printed and not show_output:
-        print("the method prints something: --show-output shows it")
-    for note in done.notes:
-        print(note)
-    for fault in done.faults:
-        print(f"wrong: {fault}")
     sound = "nothing wrong on ten easy pairs (conventions only: no lamps, no faint spots)"
-    print(f"{reference}: {sound if done.ok else f'{len(done.faults)} wrong'}")
+    for line in done.lines(reference, sound, show_output):
+        print(line)
     return 0 if done.ok else 1
 
 

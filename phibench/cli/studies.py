@@ -302,11 +302,13 @@ def _command(name: str, sentence: str) -> None:
         publish
             Folder of the pages of the studies (docs/studies): NAME.json there is replaced. Full studies only.
         """
-        from phibench.studies.framework import findings_table, print_table
+        from phibench.datasets.common.shown_text import TextTable, show_grid, table_console
+        from phibench.studies.framework import findings_table
         from phibench.studies.run import FINDINGS, run_study
 
         result = run_study(name, out, quick, settings, data, workers, publish=publish)
-        print_table(findings_table(result.findings))
+        heads, *rows = findings_table(result.findings)
+        show_grid(table_console(wide=False), TextTable("Findings", heads, tuple(rows), "L" + "l" * (len(heads) - 1)))
         for note in result.notes:
             print(f"note: {note}")
         tables, drawings = len(result.tables), len(result.drawings)
