@@ -20,7 +20,7 @@ from phibench.calibration.rig.file import Calibration
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.exposures.pair_draws import PairDraw
 from phibench.datasets.frames.sensor_card import card_of
-from phibench.datasets.frames.source import FrameSource
+from phibench.datasets.frames.source import Frame, FrameSource
 from phibench.datasets.read import Dataset
 from phibench.estimator.dense.dense_interface import DensePair
 from phibench.estimator.geometry.mirror_image import image_of, up_image
@@ -152,6 +152,12 @@ class DensePairs:
             rig, stroke_m = self._given(sample.nominal_rig, sample.row.nominal_stroke_m)
             card = card_of(source.sides["down"].chain.sensor)
             return DensePair.of_frames(number, frames, rig=rig, stroke_m=stroke_m, card=card)
+
+    def frames(self, number: int) -> dict[str, Frame]:
+        """First frame of each image of a pair, with the camera's JPEG file."""
+        with self._drawn.named(number):
+            pair_draw, _, source = self._drawn.drawn_from(number)
+            return {position: source.frame(position, pair_draw.draw, False) for position in ("down", "up")}
 
     def truth(self, number: int) -> DenseTruth:
         """Exact answer for every pixel.

@@ -16,6 +16,7 @@ from phibench.cli.options import (
     DataFolder,
     Flag,
     Limits,
+    OutFolder,
     OwnOrPreset,
     PairsAtOnce,
     Preset,
@@ -160,6 +161,37 @@ def score(
             print(f"{one.document.method.name}: {line}")
     for file in filter(None, files):
         print(f"written: {file}")
+    return 0
+
+
+@dense.command
+def export(
+    directory: DataFolder,
+    *,
+    out: OutFolder,
+    preset: OwnOrPreset = None,
+    draws: Whole | None = None,
+    pairs: Whole | None = None,
+) -> int:
+    """Write dense pairs for other tools: camera frames, and exact D and counterparts as 32-bit planes (OpenEXR).
+
+    Parameters
+    ----------
+    preset
+        Preset of the sensor; by default those of the data set's recipe.
+    draws
+        Draws of the noise per sample; by default the recipe's.
+    pairs
+        Only so many pairs.
+    """
+    from phibench.benchmark.dense.dense_export import export_dense
+    from phibench.benchmark.dense.dense_score import chosen_pairs
+    from phibench.datasets.common.progress import Steps, progress_console
+
+    chosen = chosen_pairs(directory, preset, draws, pairs)
+    with Steps(progress_console(), "dense pairs", len(chosen)) as steps:
+        written = export_dense(chosen, out, steps.reach)
+    print(f"{written}: {len(chosen)} dense pairs, dense.jsonl lists them")
     return 0
 
 

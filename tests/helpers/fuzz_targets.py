@@ -20,6 +20,7 @@ from helpers.strange_releases import TITLE, tiny_release
 from helpers.valid_files import ROOT, TEXT, Kind, compact, digest, png
 from PIL import Image
 
+from phibench.benchmark.dense.dense_export import read_dense_index
 from phibench.benchmark.isolation.resolve import MethodError, resolve
 from phibench.benchmark.release import fetch
 from phibench.benchmark.release.benchmark import read_manifest_file
@@ -102,6 +103,7 @@ def _small_rig() -> Rig:
     return replace(rig, camera=replace(rig.camera, width_px=64, height_px=48, cx_px=31.5, cy_px=23.5))
 
 
+_DENSE = b'{"name": "a", "pair_set": "b", "files": {"a-up.png": "c"}}\n'
 DESCRIPTOR = """n 8 64 48
 d 1000000
 i a.png
@@ -170,6 +172,7 @@ def further_kinds(folder: Path) -> dict[str, Kind]:
         Kind("frame.png", png(), lambda path: read_frame(path, CaptureNotes())),
         Kind("descriptor.txt", DESCRIPTOR.encode(), open_descriptor),
         Kind("method.py", b"def extract(pair):\n    return None\n", _method),
+        Kind("dense.jsonl", _DENSE, lambda path: read_dense_index(path.parent)),
         Kind("network.onnx", _network(), lambda path: Network(path, CROP)),
         Kind("linear.hdr", b"#?RADIANCE\n", is_linear),
         Kind("room.glb", b"glTF", lambda path: RoomFiles(path.parent).sha256(path.name)),
@@ -177,7 +180,7 @@ def further_kinds(folder: Path) -> dict[str, Kind]:
     return {kind.name: kind for kind in every}
 
 
-ALWAYS_READ = ("linear.hdr", "room.glb", "limit.txt")
+ALWAYS_READ = ("linear.hdr", "room.glb", "limit.txt", "dense.jsonl")
 """Of any content there is an answer: bytes are hashed or looked at, and a limit that is none is the usual one."""
 
 SIGNED = {"network.onnx": lambda data: data[:-64] + digest(data[:-64]).encode()}

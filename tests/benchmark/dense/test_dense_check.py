@@ -16,14 +16,14 @@ from phibench.estimator.geometry.mirror_image import image_of
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.estimator.interface import Outcome
 
-PAIRS = EasyDensePairs(count=2)
+PAIRS = EasyDensePairs(count=1)
 SHAPE = (720, 1280)
 NOISE = 0.03
 
 
 @pytest.fixture(scope="module")
 def truths() -> list[EasyTruth]:
-    return [PAIRS.truth(number) for number in range(2)]
+    return [PAIRS.truth(number) for number in range(1)]
 
 
 def plane(truth: EasyTruth, values: np.ndarray) -> np.ndarray:
@@ -193,9 +193,9 @@ def test_a_wrong_sigma_is_named(sigma: Callable[[EasyTruth], np.ndarray], words:
 
 
 def test_failures_and_silence_are_told(truths: list[EasyTruth]) -> None:
-    outcomes = [Outcome(k, None, 0.1, "error", "ValueError: takes colour") for k in range(2)]
-    assert judged_dense(outcomes, truths).faults == ("2 of 2 pairs failed (error): ValueError: takes colour",)
-    silent = [DenseAnswer(np.full(SHAPE, np.nan))] * 2
+    outcomes = [Outcome(k, None, 0.1, "error", "ValueError: takes colour") for k in range(1)]
+    assert judged_dense(outcomes, truths).faults == ("1 of 1 pairs failed (error): ValueError: takes colour",)
+    silent = [DenseAnswer(np.full(SHAPE, np.nan))] * 1
     (found,) = judged(truths, silent).faults
     assert found.startswith("0.0 % of the pixels are answered")
 
