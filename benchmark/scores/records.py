@@ -16,10 +16,12 @@ import polars as pl
 
 from phibench.benchmark.scores.answer_errors import (
     Rules,
+    SpotBoundsOfImages,
     best_constant,
     from_centre_px,
     in_ray_units,
     kept,
+    pair_bounds,
     phi_of,
     phi_variance,
     pixel_errors,
@@ -28,7 +30,6 @@ from phibench.benchmark.scores.answer_errors import (
     whitened,
 )
 from phibench.benchmark.scores.intervals import NORMAL_95
-from phibench.benchmark.scores.pair_bounds import SpotBoundsOfImages, pair_bounds
 from phibench.benchmark.scores.record_columns import COLUMNS, OF_FRAMES, TYPES
 from phibench.datasets.common.errors import DatasetError
 from phibench.estimator.geometry.least_squares_depth import nominal_depth
