@@ -84,6 +84,7 @@ DENSE_METRICS: dict[str, DenseMetric] = {
     "matching": _share("matching", "lower", "median |answer - perfect match through the given rig| / D"),
     "matching_central": _share("matching_central", "none", "the same, and perfect matches by the central model"),
     "central": _share("central", "none", "median |central model - given rig| / D of perfect matches"),
+    "central_p90": _share("central_p90", "none", "90 % of these differences are below"),
     "calibration": _share("calibration", "none", "median |given rig - truth| / D of perfect matches"),
     "seconds": DenseMetric("seconds", "s", "none", "inside the method, a pair"),
 }

@@ -66,6 +66,7 @@ COLUMNS: dict[str, str] = {
     "seam_m": "left-right consistency: mean difference between D across the panorama's seam and that of the truth",
     "calibration": "median |relative error| of perfect matches through the rig that was given",
     "central": "median |difference| between perfect matches by the central model and by that rig",
+    "central_p90": "of the same difference, 90 % are below",
     "matching": "median |difference| between the answers and perfect matches through that rig",
     "matching_central": "the same, and perfect matches by the central model",
     "ause": "area between the curves of sparsification by the claimed sigma and by the error",
@@ -259,7 +260,10 @@ def _split(relative: Array, calibration: Array, central: Array) -> dict[str, flo
         return {}
     parts = {"calibration": calibration, "central": central - calibration}
     parts |= {"matching": relative - calibration, "matching_central": relative - central}
-    return {name: float(np.nanmedian(np.abs(part))) for name, part in parts.items() if np.isfinite(part).any()}
+    found = {name: float(np.nanmedian(np.abs(part))) for name, part in parts.items() if np.isfinite(part).any()}
+    if "central" in found:
+        found["central_p90"] = float(np.nanquantile(np.abs(parts["central"]), 0.9))
+    return found
 
 
 def _claims(relative: Array, sigma: Array) -> dict[str, float]:

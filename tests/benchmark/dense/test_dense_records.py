@@ -99,7 +99,11 @@ def test_a_hyperboloid_in_its_focus_is_central_and_a_sphere_is_not(errors: Truth
     seen = focus.truth.scored
     assert seen.sum() > 5000
     assert np.nanmax(np.abs(focus.central[seen])) < ROUNDING
-    assert np.nanmedian(np.abs(errors.central[errors.truth.scored])) > 1e-3
+    sphere = np.abs(errors.central[errors.truth.scored])
+    assert np.median(sphere) > 1e-3
+    row = pair_records(errors, DenseAnswer(errors.truth.depth_m), 0.1).row(0, named=True)
+    assert row["central"] == pytest.approx(np.median(sphere), rel=1e-6)
+    assert row["central_p90"] == pytest.approx(np.quantile(sphere, 0.9), rel=1e-6)
 
 
 def test_the_error_of_a_rig_is_the_calibrations_part(errors: TruthErrors) -> None:
@@ -134,3 +138,24 @@ def test_the_seam_compares_both_of_its_sides(truth: DenseTruth, errors: TruthErr
     depth[: middle + 1] += 0.3
     row = pair_records(errors, DenseAnswer(depth), 0.1).row(0, named=True)
     assert row["seam_m"] == pytest.approx(0.3, rel=1e-9)
+
+
+CENTRAL = {
+    "sphere": (0.554, 0.470, 0.325),
+    "paraboloid": (0.294, 0.249, 0.172),
+    "hyperboloid off axis": (0.0194, 0.0187, 0.0161),
+    "hyperboloid": (0.0, 0.0, 0.0),
+}
+"""Median cost of the central model in the lab, % of D, at strokes of 0.10, 0.425 and 1.40 m: docs/dense.md."""
+
+
+@pytest.mark.parametrize("shape", CENTRAL)
+def test_what_the_central_model_costs(shape: str) -> None:
+    """Of perfect matches through the exact rig, a quarter of the pixels along each side."""
+    name, *off = shape.split(maxsplit=1)
+    rig = default_rig() if name == "sphere" else revolved(name, aligned=not off)
+    for stroke_m, expected in zip((0.1, 0.425, 1.4), CENTRAL[shape], strict=True):
+        errors = TruthErrors(truth_of(smaller(rig), stroke_m))
+        cost = 100.0 * np.abs(errors.central - errors.calibration)[errors.truth.scored]
+        print(f"{shape}, h = {stroke_m} m: median {np.median(cost):.3g} %, 90 % below {np.quantile(cost, 0.9):.3g} %")
+        assert np.median(cost) == pytest.approx(expected, rel=5e-3, abs=100.0 * ROUNDING)
