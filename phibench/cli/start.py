@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 from cyclopts import App, Parameter
 
 from phibench.cli.options import DEFAULT_PRESET, LIMITS, START, Flag, Limits, Preset, methods, recipes
-
-if TYPE_CHECKING:
-    from rich.table import Table
 
 _FIRST = (
     ("phibench demo", "five pairs, three methods, one page: what a score is"),
@@ -96,13 +93,23 @@ method = App(name="method", group=START, help="Write, check and list methods, wh
 @method.command(name="list")
 def list_methods() -> int:
     """List the methods: built in, optional, and of installed packages."""
-    from phibench.datasets.common.shown_text import wide_console
+    from phibench.benchmark.isolation.resolve import installed
+    from phibench.datasets.common.shown_text import TextTable, show_grid, wide_console
+    from phibench.estimator.methods.registry import KNOWN
+    from phibench.estimator.spots.image_planes import KINDS
 
-    console = wide_console(120)
-    console.print(_method_table())
-    console.print(
-        "your own: a file and a function in it, my_phi.py:extract; `phibench method new my_phi.py` writes one"
-    )
+    rows = []
+    for known in KNOWN.values():
+        needs = [text for text, need in (("off frames", known.needs_off), ("boxes", known.needs_boxes)) if need]
+        takes = " + ".join(["every image" if known.accepts == KINDS else ", ".join(known.accepts), *needs])
+        origin = (known.package or "built in") + ("" if known.installed else ": not installed")
+        rows.append((known.name, origin, takes, known.description))
+    for point in installed():  # a package that is not imported: what it takes is not known
+        owner = point.value if point.dist is None else f"{point.dist.name} {point.dist.version}"
+        rows.append((point.name, owner, "", point.value))
+    heads = ("method", "from", "takes", "what it does")
+    show_grid(wide_console(120), TextTable("Methods", heads, tuple(rows), "lLLL"))
+    print("your own: a file and a function in it, my_phi.py:extract; `phibench method new my_phi.py` writes one")
     return 0
 
 
@@ -152,30 +159,3 @@ def new(path: Path) -> int:
     written = write_example(path)
     print(f"{written}: try it with `phibench method check {written}:extract`")
     return 0
-
-
-def _method_table() -> Table:
-    from rich.table import Table
-
-    from phibench.benchmark.isolation.resolve import installed
-    from phibench.estimator.methods.registry import KNOWN
-
-    table = Table("method", "from", "takes", "what it does")
-    for method in KNOWN.values():
-        needs = [text for text, need in (("off frames", method.needs_off), ("boxes", method.needs_boxes)) if need]
-        takes = " + ".join([_kinds(method.accepts), *needs])
-        origin = "built in" if not method.package else method.package
-        if method.installed:
-            table.add_row(method.name, origin, takes, method.description)
-        else:
-            table.add_row(method.name, f"{origin}: not installed", takes, method.description, style="dim")
-    for point in installed():  # a package that is not imported: what it takes is not known
-        owner = point.value if point.dist is None else f"{point.dist.name} {point.dist.version}"
-        table.add_row(point.name, owner, "", point.value)
-    return table
-
-
-def _kinds(accepts: tuple[str, ...]) -> str:
-    from phibench.estimator.spots.image_planes import KINDS
-
-    return "every image" if accepts == KINDS else ", ".join(accepts)

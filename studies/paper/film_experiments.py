@@ -310,15 +310,20 @@ def processed_stroke(
 # What came out.
 
 
+def _answered(rows: pl.DataFrame) -> pl.DataFrame:
+    """Rows with a depth and its sigma, and their pulls."""
+    good = rows.filter(pl.col("error_m").is_finite() & pl.col("sigma_m").is_finite())
+    true, error, sigma = (good[name].to_numpy() for name in ("depth_m", "error_m", "sigma_m"))
+    return good.with_columns(pl.Series("pull", depth_pull(true + error, sigma, true)))
+
+
 def summary(rows: pl.DataFrame) -> pl.DataFrame:
     """Per way: films, rms of the relative error, its prediction, pull, share within 95 %, gain of the film.
 
     Pulls are those of `depth_pull`.
     """
     relative, claim = pl.col("error_m") / pl.col("depth_m"), pl.col("sigma_m") / pl.col("depth_m")
-    good = rows.filter(pl.col("error_m").is_finite() & pl.col("sigma_m").is_finite())
-    true, error, sigma = (good[name].to_numpy() for name in ("depth_m", "error_m", "sigma_m"))
-    good = good.with_columns(pl.Series("pull", depth_pull(true + error, sigma, true)))
+    good = _answered(rows)
     return good.group_by("way", maintain_order=True).agg(
         pl.len().alias("films"),
         (relative**2).mean().sqrt().alias("rms"),
@@ -338,9 +343,7 @@ def closure_interval(rows: pl.DataFrame, common_end: bool = False) -> tuple[floa
     `common_end`, half of their variance, that of the lower end, is common to all films of one target and camera, as
     far as it comes from the pattern or from what rounding hides of a room. The truth lies between.
     """
-    good = rows.filter(pl.col("error_m").is_finite() & pl.col("sigma_m").is_finite())
-    true, error, sigma = (good[name].to_numpy() for name in ("depth_m", "error_m", "sigma_m"))
-    good = good.with_columns(pl.Series("pull", depth_pull(true + error, sigma, true)))
+    good = _answered(rows)
     D, sigma = good["depth_m"].to_numpy(), good["sigma_m"].to_numpy()
     common = np.array(good["calibration_m"].to_list()).reshape(len(D), -1)
     own = np.sqrt(np.maximum(sigma**2 - np.sum(common**2, axis=1), 0.0)) / D
