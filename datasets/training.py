@@ -14,7 +14,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,6 +50,11 @@ class PairDataset(ShortForm):
     positions "u_px", "v_px", "phi_ray_rad" and "visible" with "down_" or "up_" before, and "u0_px" and "v0_px", the
     image's first column and row on the sensor.
 
+    With task="dense" (docs/dense.md) item k has "down" and "up" with the laser off, "sample_id" and "stroke_m", and for
+    the pixels of the down image, shape (H, W): "depth_m", float32, NaN where no surface of the room is seen; "up_px",
+    shape (H, W, 2), the place of the same point in the up image, NaN where it is not seen there; "cause", int16, why
+    not, as `Correspondence.cause`.
+
     Parameters
     ----------
     folder : str or Path
@@ -62,6 +67,8 @@ class PairDataset(ShortForm):
         Their ids; all by default.
     laser_off : bool
         Also "down_off" and "up_off".
+    task : "spot" or "dense"
+        Items with the place of a spot, or with the truth of all pixels.
 
     Raises
     ------
@@ -76,10 +83,18 @@ class PairDataset(ShortForm):
         *,
         samples: Sequence[str] | None = None,
         laser_off: bool = False,
+        task: Literal["spot", "dense"] = "spot",
         **options: Any,
     ) -> None:
         self.folder, self.options = Path(folder), FrameOptions(preset, options)
-        self.laser_off, self.epoch = laser_off, 0
+        self.laser_off, self.epoch, self.task = laser_off, 0, task
+        if task not in ("spot", "dense"):
+            raise DatasetError(f"task '{task}': give 'spot' or 'dense'")
+        if task == "dense" and (laser_off or self.options.region is not None or is_frames_set(self.folder)):
+            raise DatasetError(
+                f"{folder}: dense items are whole frames with the laser off and the truth of their pixels. Leave "
+                "laser_off and region out, and give a data set with layers, no frames set"
+            )
         self._files = _files_of(self.folder, self.options) if is_frames_set(self.folder) else None
         if self._files is not None:
             known = list(dict.fromkeys(row.truth.sample_id for row in self._files.rows))
@@ -97,6 +112,7 @@ class PairDataset(ShortForm):
             "pairs": f"{len(self)}, one draw per epoch",
             "preset": self.options.preset,
             "laser off": self.laser_off,
+            "task": self.task,
             "epoch": self.epoch,
         }
 
@@ -112,6 +128,10 @@ class PairDataset(ShortForm):
             return _held_item(self._files, self.sample_ids[_place(index, len(self))], self.epoch, self.laser_off)
         source = _source(self.folder, self.sample_ids[_place(index, len(self))], _Hashed(self.options))
         row = _opened(self.folder)[source.names[2]].row
+        if self.task == "dense":
+            frames = {position: source.frame(position, self.epoch, laser=False).image for position in POSITIONS}
+            planes = {name: plane.copy() for name, plane in _dense_planes(self.folder, row.sample_id).items()}
+            return {"sample_id": row.sample_id, "stroke_m": row.stroke_m, **frames, **planes}
         item: Item = {"sample_id": row.sample_id, "depth_m": row.centre_depth_m, "stroke_m": row.stroke_m}
         for position in POSITIONS:
             frame, truth = source.frame(position, self.epoch), row.position(position)
@@ -124,6 +144,17 @@ class PairDataset(ShortForm):
 
 
 _TRUTH = ("u_px", "v_px", "phi_ray_rad", "visible")
+
+
+@lru_cache(maxsize=_OPENED_SOURCES)
+def _dense_planes(folder: Path, sample_id: str) -> Item:
+    """Truth of a pair's pixels, which items of several epochs have copies of."""
+    found = _opened(folder)[sample_id].correspondence("down")
+    return {
+        "depth_m": np.where(found.of_room, found.depth_m, np.nan).astype(np.float32),
+        "up_px": found.uv_px.astype(np.float32),
+        "cause": found.cause,
+    }
 
 
 def _files_of(folder: Path, options: FrameOptions) -> PairFiles[FramesRow]:

@@ -192,3 +192,30 @@ def test_bad_crops_are_refused(tiny_dataset: Path, tmp_path: Path) -> None:
         crops(tiny_dataset, region=64)
     with pytest.raises(DatasetError, match="there is nothing to crop"):
         SpotCrops([], [FrameOptions()], 10)
+
+
+def test_dense_items_are_the_laser_off_frames_with_the_truth_of_pixels(tiny_dataset: Path) -> None:
+    pairs = PairDataset(tiny_dataset, "mjpeg", task="dense")
+    spots = PairDataset(tiny_dataset, "mjpeg", laser_off=True)
+    item, spot = pairs[0], spots[0]
+    assert np.array_equal(item["down"], spot["down_off"])
+    assert np.array_equal(item["up"], spot["up_off"])
+    found = open_dataset(tiny_dataset)[item["sample_id"]].correspondence()
+    assert np.array_equal(np.isfinite(item["depth_m"]), found.of_room)
+    # float32: 6e-8, relative
+    np.testing.assert_allclose(item["up_px"], found.uv_px, rtol=6e-8, equal_nan=True)
+    np.testing.assert_allclose(item["depth_m"][found.of_room], found.depth_m[found.of_room], rtol=6e-8)
+    assert np.array_equal(item["cause"], found.cause)
+    assert item["depth_m"].dtype == np.float32
+    pairs.set_epoch(1)
+    assert (pairs[0]["down"] != item["down"]).any()
+    item["cause"][0, 0] += 1  # an item is its own
+    assert np.array_equal(pairs[0]["cause"], found.cause)
+
+
+@pytest.mark.parametrize("wrong", [{"laser_off": True}, {"region": 32}])
+def test_dense_items_are_whole_frames(tiny_dataset: Path, wrong: dict[str, Any]) -> None:
+    with pytest.raises(DatasetError, match="dense items are whole frames with the laser off"):
+        PairDataset(tiny_dataset, "mjpeg", task="dense", **wrong)
+    with pytest.raises(DatasetError, match="give 'spot' or 'dense'"):
+        PairDataset(tiny_dataset, "mjpeg", task="deep")  # type: ignore[arg-type]
