@@ -159,6 +159,8 @@ class TruthErrors:
         parts = [("all", "all", t.scored), *self._by_edges()]
         near = _near_jumps(t.depth_m) & t.scored
         parts += [("edge", "within 3 px of a jump of D", near), ("edge", "elsewhere", t.scored & ~near)]
+        shiny = t.found.glossy & t.scored
+        parts += [("gloss", "glossy", shiny), ("gloss", "matt", t.scored & ~shiny)] if shiny.any() else []
         return [part for part in parts if part[0] == "all" or part[2].sum() >= _LEAST_PIXELS]
 
     def _by_edges(self) -> Iterator[tuple[str, str, BoolArray]]:

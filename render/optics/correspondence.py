@@ -50,6 +50,8 @@ class Correspondence:
         Room point of each pixel; NaN where the pixel shows none.
     depth_m : array
         D of these points.
+    glossy : bool array
+        The point's surface has a coat that reflects.
     object_names : tuple of str
         By object id.
     """
@@ -58,6 +60,7 @@ class Correspondence:
     cause: NDArray[np.int16]
     point_world_m: Array
     depth_m: Array
+    glossy: BoolArray
     object_names: tuple[str, ...]
 
     @property
@@ -85,14 +88,15 @@ def correspondence(room: Room, view: View, other: View) -> Correspondence:
     """Counterparts in `other` of the pixels of `view`, the same rig at two places."""
     camera = view.rig.camera
     shape = camera.height_px, camera.width_px
-    planes = _Planes(np.full((shape[0] * shape[1], 5), np.nan), np.full(shape[0] * shape[1], NOTHING, np.int16))
+    count = shape[0] * shape[1]
+    planes = _Planes(np.full((count, 5), np.nan), np.full(count, NOTHING, np.int16), np.zeros(count, bool))
     geometries = room_geometry(room, view), room_geometry(room, other)
     names = tuple(part.name for part in geometries[1].shapes)
     first_own = len(room.surfaces) + len(room.furniture)
     first_held = len(names) - len(view.holder_shapes)
     for pixel in _disc_pixels(view):
         shown = _shown(view, geometries[0], pixel)
-        planes.values[shown.pixel, 2:] = shown.points_m
+        planes.values[shown.pixel, 2:], planes.glossy[shown.pixel] = shown.points_m, shown.glossy
         planes.cause[shown.pixel] = np.where(shown.object_id < first_held, ROBOT, HOLDER)
         mine = shown[np.flatnonzero(shown.object_id < first_own)]
         uv, planes.cause[mine.pixel] = _places(other, geometries[1], mine)
@@ -104,27 +108,30 @@ def correspondence(room: Room, view: View, other: View) -> Correspondence:
         cause=planes.cause.reshape(shape),
         point_world_m=points,
         depth_m=depth_m(points, view.rig.at(0.0).sphere_centre_m),
+        glossy=planes.glossy.reshape(shape),
         object_names=names,
     )
 
 
 @dataclass(frozen=True)
 class _Planes:
-    """Values (u, v, x, y, z) and causes of all pixels, row by row; they are filled block by block."""
+    """Values (u, v, x, y, z), causes and gloss of all pixels, row by row; they are filled block by block."""
 
     values: Array
     cause: NDArray[np.int16]
+    glossy: BoolArray
 
 
 @dataclass(frozen=True)
 class _Shown:
-    """Points that N pixels show: pixel numbers, points, object ids, and on which side of the face the mirror is."""
+    """Points that N pixels show: pixel numbers, points, object ids, the side of the face that is seen, its gloss."""
 
     pixel: IntArray
     points_m: Array
     object_id: IntArray
     normals: Array
     front: BoolArray
+    glossy: BoolArray
 
     def __getitem__(self, index: IntArray) -> _Shown:
         return _Shown(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
@@ -149,7 +156,8 @@ def _shown(view: View, room: RoomGeometry, pixel: IntArray) -> _Shown:
     points = way.starts_m[seen] + hits.distance_m[seen, None] * way.directions[seen]
     normals = room.table.normal[hits.patch[seen]]
     front = np.einsum("ni,ni->n", normals, way.directions[seen]) < 0.0
-    return _Shown(pixel[on[seen]], points, hits.object_id[seen], normals, front)
+    glossy = room.table.coat[hits.patch[seen]] > 0.0
+    return _Shown(pixel[on[seen]], points, hits.object_id[seen], normals, front, glossy)
 
 
 def _places(other: View, room: RoomGeometry, shown: _Shown) -> tuple[Array, NDArray[np.int16]]:

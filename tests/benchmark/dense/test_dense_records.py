@@ -159,3 +159,12 @@ def test_what_the_central_model_costs(shape: str) -> None:
         cost = 100.0 * np.abs(errors.central - errors.calibration)[errors.truth.scored]
         print(f"{shape}, h = {stroke_m} m: median {np.median(cost):.3g} %, 90 % below {np.quantile(cost, 0.9):.3g} %")
         assert np.median(cost) == pytest.approx(expected, rel=5e-3, abs=100.0 * ROUNDING)
+
+
+def test_glossy_and_matt_surfaces_are_strata_where_there_are_both(truth: DenseTruth) -> None:
+    upper = np.arange(truth.depth_m.shape[0])[:, None] < truth.depth_m.shape[0] // 2
+    shiny = replace(truth, found=replace(truth.found, glossy=np.broadcast_to(upper, truth.depth_m.shape)))
+    parts = {label: mask for by, label, mask in TruthErrors(shiny).strata if by == "gloss"}
+    assert np.array_equal(parts["glossy"], upper & truth.scored)
+    assert np.array_equal(parts["matt"], ~upper & truth.scored)
+    assert "gloss" not in {by for by, _, _ in TruthErrors(truth).strata}

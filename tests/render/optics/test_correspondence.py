@@ -265,3 +265,16 @@ def test_a_shifted_mirror_is_noticed() -> None:
     points = np.array([[2.0, 1.0, 0.6], [-1.0, 2.0, 1.5]])
     right, wrong = (places_by_minimisation(view, points)[0] for view in (up, moved.at(STROKE_M)))
     assert np.abs(right - wrong).max() > TOLERANCE_PX
+
+
+def test_glossy_surfaces_are_told() -> None:
+    """The floor alone gets a coat."""
+    room, rig = lab(()), small(default_rig())
+    floor = replace(room.surfaces[0], coat=1.5)
+    assert floor.name == "floor"
+    found = correspondence(replace(room, surfaces=(floor, *room.surfaces[1:])), *at_both(rig))
+    on_floor = np.abs(found.point_world_m[..., 2]) < 1e-9
+    # where solids stand on the floor, a point of theirs may be at its height
+    assert (found.glossy & ~on_floor).sum() == 0
+    assert (on_floor & ~found.glossy).sum() < 0.01 * on_floor.sum()
+    assert not correspondence(room, *at_both(rig)).glossy.any()
