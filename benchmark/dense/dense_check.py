@@ -25,7 +25,7 @@ from phibench.estimator.interface import Outcome
 from phibench.scenes.frames import Array
 
 PAIRS = 3
-_LEAST_ANSWERED = 0.02  # of the pixels: fewer tell nothing
+_LEAST_ANSWERED = 50  # pixels of those that are looked at: fewer tell nothing; sparse features give some hundred
 _APART = 0.08  # |log| from which a rule's D and the truth differ, so that the answers can tell
 _LEAST_APART = 0.02  # of the pixels
 _EXPLAINED = 0.5  # of the median |log|, or of the distance of places, may remain under a rule that is named
@@ -366,8 +366,8 @@ def target_fault(answers: _Answers, target_px: Array) -> str:
 
 def _faults(answers: _Answers) -> Iterator[str]:
     known = np.isfinite(answers.depth_m) if answers.target_px is None else np.isfinite(answers.target_px).all(axis=1)
-    if known.mean() < _LEAST_ANSWERED:
-        yield f"{100.0 * known.mean():.1f} % of the pixels are answered, although all have a pattern"
+    if known.sum() < _LEAST_ANSWERED:
+        yield f"{known.sum()} of {known.size} pixels are answered, although all have a pattern"
         return  # what is said of the few would mislead
     target = answers.target_px
     fault = depth_fault(answers) if target is None else target_fault(answers, target)
@@ -402,7 +402,7 @@ def _notes(answers: _Answers, seconds: Sequence[float]) -> Iterator[str]:
     true = answers.truth(_true_depth)
     error = np.abs(answers.depth_m / true - 1.0)
     known = np.isfinite(error)
-    yield f"{100.0 * known.mean():.0f} % of the pixels answered"
+    yield f"{100.0 * known.mean():.2g} % of the pixels answered"
     if known.any():
         beyond = 100.0 * np.mean(error[known] > 0.1)
         yield f"error of D: median {100.0 * np.median(error[known]):.2f} %, above 10 % in {beyond:.0f} % of them"
