@@ -45,7 +45,7 @@ class DenseBuiltIn:
     def refusal(self, pair: DensePair) -> str:
         """Reason that this pair cannot be taken; "" if it can."""
         if not self.installed:
-            return "install OpenCV: pip install 'phibench[dense]'"
+            return "needs OpenCV: pip install 'phibench[dense]'"
         kind = kind_of(pair.card)
         return "" if kind in self.accepts else f"takes {', '.join(self.accepts)}, not {kind}"
 
