@@ -104,7 +104,8 @@ def exact(mi: ModuleType, room: Room, surfaces: Surfaces, points: Shown) -> tupl
     start = MM_PER_M * (points.world - surfaces.view.sphere_centre_m) + _LIFT_MM * normal
     place, way = ([mi.Float(aligned(a[:, i])) for i in range(3)] for a in (start, normal))
     coat = mi.Float(aligned(table.coat[points.patch])) if surfaces.has_coats else None
-    texels = Texels(TexelGrid.of(table, 1.0), mi.Point3f(*place), mi.Vector3f(*way), start, normal, coat)
+    order = np.arange(len(start))
+    texels = Texels(TexelGrid.of(table, 1.0), mi.Point3f(*place), mi.Vector3f(*way), start, normal, coat, order)
     surfaces.set_light(texels.grid, np.zeros((texels.grid.count, 3)))
     lamps = direct_light(mi, surfaces, texels, None, _LAMP_RAYS, 77)
     surfaces.set_light(TexelGrid.of(table, FINE.texel_m), bake(RIG.at(0.0), room, FINE).irradiance_w_m2)

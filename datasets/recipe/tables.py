@@ -232,12 +232,12 @@ class AmbientTable(Table):
         default=0.1, ge=0.01, le=2.0, description="texels for light that comes from surfaces; texel_m if that is more"
     )
     lamp_rays: int = Field(
-        default=64, ge=1, le=65536, description="shadow rays per texel and lamp, twice, where shadows end"
+        default=64, ge=1, le=65536, description="shadow rays per texel and lamp, twice, where shadows end; the mean"
     )
     bounces: int = Field(default=12, ge=0, le=100, description="passes of bounced light before the last one")
-    bounce_rays: int = Field(default=64, ge=1, le=65536, description="rays in such a pass, per texel of 0.2 m")
+    bounce_rays: int = Field(default=64, ge=1, le=65536, description="rays in such a pass, per texel of 0.1 m")
     final_rays: int = Field(
-        default=384, ge=1, le=65536, description="rays per texel in the last pass, twice; fewer on smaller faces"
+        default=128, ge=1, le=65536, description="rays per texel in the last pass, twice; more where noise asks"
     )
 
 

@@ -1,38 +1,52 @@
 """Light of surfaces on a room's texels: what arrives by one bounce or more.
 
 Every texel sends rays over the hemisphere, cosine-weighted, and looks up what the faces send out. For the bounces the
-rays are traced once, over a coarse grid: what they meet stays the same, and only the irradiance changes.
+rays are traced once, over a coarse grid: what they meet stays the same, and only the irradiance changes. Two halves of
+them tell where the last gather, over the fine grid, needs its rays; it has none of theirs, so that nothing is biased.
 A ray that meets a coat follows either the coat's mirrored ray or the ground, by chance, with weights that keep the
 mean.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, fields, replace
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from types import ModuleType
 from typing import Any
 
 import numpy as np
+from scipy import ndimage
 
 from phibench.render.optics.faces import IntArray
 from phibench.render.room.camera_plugin import MM_PER_M
 from phibench.render.room.subpixel_grid import points, shifts
 from phibench.render.room.surfaces import LookUp, Surfaces, aligned
 from phibench.render.room.texel_grid import TexelGrid
-from phibench.render.room.texel_points import Texels, covered_texels, nearest_free, transmitted, vector
-from phibench.scenes.frames import Array
+from phibench.render.room.texel_points import (
+    Net,
+    Texels,
+    by_count,
+    chosen,
+    covered_texels,
+    nearest_free,
+    powers_of_two,
+    transmitted,
+    vector,
+)
+from phibench.scenes.frames import Array, BoolArray
 
 BOUNCE_TEXEL_M = 0.1
 """Texels of the bounces. With 0.2 m the ceiling of a furnished room is 1.1 % too dark, with 0.1 m 0.2 %."""
-_LANES = 1 << 18  # rays at a time, 40 MB
-BLOCK = 8
-"""Rays of a texel come in blocks, each of which adds up by itself."""
-_FEWEST = 16  # rays of the smallest texels
-_AIMED = 2  # rays of a block that aim at bright texels
+FEWEST = 8
+"""Rays of the smallest texels."""
+_AIMED = 4  # one more ray for so many, where there are bright texels to aim at
 _BRIGHT_AREA, _BRIGHT_LIGHT = 0.02, 0.25  # of a room, and of what it sends out: more of it from less is called bright
 _PICKS = 4096
+_AROUND = 5  # texels over which noise is averaged
+_SPAN = 8.0  # between the rays of a texel and the mean, at most
+_DARK = 0.2  # of the median light: what is darker need not be known better
+_COHERENT = 128  # rays of a texel: of fewer, those of neighbours are too far from parallel
 _MIRRORED_SHARE = 0.25  # of the rays that meet a coat, at least: a lamp in it is 20 times as bright as the ground
 
 
@@ -48,108 +62,226 @@ def gathered(
 ) -> Array:
     """Irradiance from all surfaces by the present map, shape (texels, 3): pi x mean radiance.
 
-    Lamps are left out; `lamps` says whether those count that a coat mirrors. `rays` of each texel are multiples of
-    `BLOCK`, as `rays_by_area` has them. Some aim at the bright texels of the map.
+    Lamps are left out; `lamps` says whether those count that a coat mirrors. `rays` of each texel are powers of two, as
+    `rays_by_area` has them, or 0. More of them aim at the bright texels of the map.
     """
-    found = _found(mi, surfaces, texels, rays, seed, bright, lamps)
-    return _irradiance((_light(surfaces, one) for one in found), rays)
+    import drjit as dr
+
+    total = np.zeros((len(texels), 3))
+    if rays.any():
+        sent = _Rays(mi, surfaces, texels, rays, seed, bright, lamps)
+        dark = dr.zeros(mi.Color3f, len(sent.texels))
+        (light,) = sent.loop((dark,), lambda _, found, light: (light + surfaces.light(found),))
+        total[sent.texels] = sent.irradiance(light)
+    return total
 
 
 def rays_by_area(grid: TexelGrid, rays: int, texel_m: float) -> IntArray:
     """Rays of each texel, shape (texels,): `rays` for squares of `texel_m` and in proportion for smaller ones.
 
-    Rounded up to blocks of `BLOCK`. A window of an image shows many small texels or few large ones: its mean has as
-    many rays for the same area.
+    The nearest power of two. A window of an image shows many small texels or few large ones: its mean has as many rays
+    for the same area.
     """
-    most = -(-rays // BLOCK)
-    blocks = np.ceil(rays / BLOCK * grid.areas_m2() / texel_m**2 - 1e-9)
-    return BLOCK * np.clip(blocks, min(_FEWEST // BLOCK, most), most).astype(np.int64)
+    most = powers_of_two(np.array(float(rays)))
+    return np.clip(powers_of_two(rays * grid.areas_m2() / texel_m**2), np.minimum(FEWEST, most), most)
 
 
 def bounced_light(
     mi: ModuleType, surfaces: Surfaces, fine: TexelGrid, lit: Array, texel_m: float, bounces: int, rays: int, seed: int
-) -> Array:
-    """Bounced irradiance of the fine texels, shape (texels, 3), from passes over a coarse grid."""
+) -> tuple[Array, TexelGrid, Array]:
+    """Bounced irradiance of the fine texels, shape (texels, 3), from passes over a coarse grid.
+
+    Also that grid, and two halves of the last pass on it, shape (2, texels, 3): they tell where rays are needed.
+    """
     coarse_m = max(BOUNCE_TEXEL_M, texel_m)
     coarse = TexelGrid.of(surfaces.table, coarse_m)
-    each = rays_by_area(coarse, rays, coarse_m)
     texels = Texels.of(mi, surfaces, coarse)
-    free = nearest_free(covered_texels(mi, surfaces, texels, texel_m), coarse)
-    direct, bounced = coarser(fine, coarse, lit), np.zeros((coarse.count, 3))
+    covered = covered_texels(mi, surfaces, texels, texel_m)
+    free = nearest_free(covered, coarse)
+    direct, bounced = np.maximum(coarser(fine, coarse, lit), 0.0), np.zeros((2, coarse.count, 3))
     surfaces.set_light(coarse, direct)
-    found = list(_found(mi, surfaces, texels, each, seed, BrightTexels.of(mi, surfaces, coarse, direct), False))
+    bright = BrightTexels.of(mi, surfaces, coarse, direct)
+    each = needed_rays(rays_by_area(coarse, rays, coarse_m), covered, free)
+    kept = _Kept.of(mi, _Rays(mi, surfaces, texels, each, seed, bright, False))
     for _ in range(bounces):
-        surfaces.set_light(coarse, direct + bounced)
-        bounced = _irradiance((_light(surfaces, part) for part in found), each)[free]
-    return finer(coarse, fine, bounced)
+        surfaces.set_light(coarse, direct + bounced.mean(axis=0))
+        bounced[:, kept.rays.texels] = kept.light(mi, surfaces)
+        bounced = bounced[:, free]
+    return finer(coarse, fine, bounced.mean(axis=0)), coarse, bounced
 
 
-def _irradiance(blocks: Iterable[Array], rays: IntArray) -> Array:
-    """Irradiance of texels from the sums of radiance over their blocks of rays, shape (texels, 3)."""
-    count = rays // BLOCK
-    sums = np.add.reduceat(np.concatenate(list(blocks)), np.cumsum(count) - count, axis=0)
-    return np.asarray(np.pi / rays[:, None] * sums)
+def rays_by_noise(rays: IntArray, grid: TexelGrid, halves: Array) -> IntArray:
+    """Rays of each texel, as many in all as `rays`, the most where two halves of others differ most: powers of two.
+
+    Equal noise everywhere would need them as the square; the least sum of squares, in proportion to the noise.
+    """
+    error, level = np.empty(grid.count), np.empty(grid.count)
+    square, mean = ((halves[0] - halves[1]) ** 2).sum(axis=-1), halves.sum(axis=(0, -1))
+    for texels in grid.alike:
+        for values, out in ((square, error), (mean, level)):
+            out[texels] = ndimage.uniform_filter(values[texels], size=(1, _AROUND, _AROUND), mode="nearest")
+    noise = np.sqrt(np.maximum(error, 0.0)) / np.maximum(level, _DARK * np.median(level) + 1e-30)
+    share = noise / max(float(np.sum(rays * noise) / max(rays.sum(), 1)), 1e-30)
+    return np.where(rays > 0, powers_of_two(rays * np.clip(share, 1.0 / _SPAN, _SPAN)), 0)
 
 
-def _light(surfaces: Surfaces, found: LookUp) -> Array:
-    """Sums of the radiance that rays met, shape (blocks of rays, 3)."""
-    import drjit as dr
-
-    value = surfaces.light(found)
-    dr.eval(value)  # its bands together: each would look up all three
-    return np.stack([np.array(dr.block_sum(value[k], BLOCK), dtype=float) for k in range(3)], axis=-1)
+def needed_rays(rays: IntArray, covered: BoolArray, free: IntArray) -> IntArray:
+    """Rays without those of covered texels that take the value of a free one; few where all of a grid are covered."""
+    used = np.zeros(len(rays), dtype=bool)
+    used[free] = True
+    return np.where(used, np.where(covered, np.minimum(rays, FEWEST), rays), 0)
 
 
-def _found(
-    mi: ModuleType,
-    surfaces: Surfaces,
-    texels: Texels,
-    rays: IntArray,
-    seed: int,
-    bright: BrightTexels | None,
-    lamps: bool,
-) -> Iterator[LookUp]:
-    """Light that the rays of all texels meet, some at a time."""
-    import drjit as dr
+class _Rays:
+    """Rays of texels, as many of each as it needs: cosine-weighted ones, and those that aim.
 
-    key, count = dr.opaque(mi.UInt32, seed), rays // BLOCK
-    owner = np.repeat(np.arange(len(rays)), count)
-    number = np.arange(len(owner)) - np.repeat(np.cumsum(count) - count, count)
-    for first in range(0, len(owner), _LANES // BLOCK):
-        owners, numbers = (mi.UInt32(aligned(a[first : first + _LANES // BLOCK], np.uint32)) for a in (owner, number))
-        lane = dr.arange(mi.UInt32, dr.width(owners) * BLOCK)
-        block, place = lane // BLOCK, lane % BLOCK
-        texel, number_of = dr.gather(mi.UInt32, owners, block), dr.gather(mi.UInt32, numbers, block)
-        lane += dr.opaque(mi.UInt32, first * BLOCK)
-        aims = 0 if bright is None else _AIMED
-        index = number_of * (BLOCK - aims) + place - aims
-        x = points(mi, shifts(mi, texel, 2 if texels.spread is None else 3, key), index)
-        normal = dr.gather(mi.Vector3f, texels.normals, texel)
-        way = mi.Frame3f(normal).to_world(mi.warp.square_to_cosine_hemisphere(mi.Point2f(x[0], x[1])))
-        start, aim = dr.gather(mi.Point3f, texels.points, texel), None
-        if texels.spread is not None:
-            start = texels.spread.start(mi, start, texel, x[2])
-        if bright is not None:
-            aimed = place < aims
-            aim = bright.aim(mi, start, points(mi, shifts(mi, texel, 3, key + 2), number_of * aims + place), aimed)
-            way = dr.select(aimed, aim.way, way)
-        cos = dr.dot(way, normal)
+    Those of most rays come first, and neighbours beside each other.
+    """
+
+    def __init__(
+        self,
+        mi: ModuleType,
+        surfaces: Surfaces,
+        texels: Texels,
+        rays: IntArray,
+        seed: int,
+        bright: BrightTexels | None,
+        lamps: bool,
+    ) -> None:
+        import drjit as dr
+
+        self._mi, self._surfaces, self._bright, self._lamps = mi, surfaces, bright, lamps
+        self.texels = by_count(texels.order, rays)
+        count = rays[self.texels]
+        self._lanes = mi.UInt32(aligned(self.texels, np.uint32))
+        self._point, self._normal, self._coat = chosen(mi, texels, self._lanes)
+        self._frame, self._spread = mi.Frame3f(self._normal), texels.spread
+        self.counts: list[IntArray] = [count] if bright is None else [count, np.maximum(count // _AIMED, 1)]
+        self._all = np.sum(self.counts, axis=0)
+        key = dr.opaque(mi.UInt32, seed)
+        self._nets = [Net.of(mi, self._lanes, each, 3, key + 2 * k) for k, each in enumerate(self.counts)]
+        self._coherent = bool(count.mean() >= _COHERENT)
+        self._chance = shifts(mi, self._lanes, 1, key + 1)
+        self._share = mi.Float(0.0) if bright is None else mi.Float(aligned(self.counts[1] / self._all))
+        dr.eval(self._frame, self._chance)
+
+    def loop(self, state: tuple[Any, ...], step: Callable[..., tuple[Any, ...]]) -> tuple[Any, ...]:
+        """State after a step for every ray: `step` gets the ray's place among all, its light, and the state."""
+        for aims, (ends, rows) in enumerate(self.rows()):
+
+            def body(i: Any, *state: Any, aims: int = aims, rows: Any = rows) -> tuple[Any, ...]:
+                return i + 1, *step(self.place(rows, i), self._look(i, bool(aims)), *state)
+
+            state = self.while_rays(ends, body, state)
+        return state
+
+    def while_rays(self, ends: Any, body: Callable[..., tuple[Any, ...]], state: tuple[Any, ...]) -> tuple[Any, ...]:
+        """State after the rays of all texels, which are `ends`."""
+        import drjit as dr
+
+        _, *state = dr.while_loop((dr.zeros(self._mi.UInt32, dr.width(ends)), *state), lambda i, *_: i < ends, body)
+        return tuple(state)
+
+    def rows(self) -> Iterator[tuple[Any, Any]]:
+        """Numbers of rays, and where each row of rays begins that have the same number."""
+        mi, first = self._mi, 0
+        for count in self.counts:
+            widths = np.searchsorted(-count, -np.arange(count[0]))  # texels that have more rays
+            yield (
+                mi.UInt32(aligned(count, np.uint32)),
+                mi.UInt32(aligned(first + np.cumsum(widths) - widths, np.uint32)),
+            )
+            first += int(count.sum())
+
+    def place(self, rows: Any, index: Any) -> Any:
+        """Place of a ray of each texel among all: row by row."""
+        import drjit as dr
+
+        return dr.gather(self._mi.UInt32, rows, index) + dr.arange(self._mi.UInt32, len(self.texels))
+
+    def _look(self, index: Any, aims: bool) -> LookUp:
+        """Light that one ray of every texel meets, with its weight."""
+        import drjit as dr
+
+        mi, surfaces, bright = self._mi, self._surfaces, self._bright
+        x = self._nets[aims].points(mi, index)
+        start, aim = self._point, None
+        if aims:
+            assert bright is not None
+            aim = bright.aim(mi, start, x)
+            way = aim.way
+        else:
+            way = self._frame.to_world(mi.warp.square_to_cosine_hemisphere(mi.Point2f(x[0], x[1])))
+            if self._spread is not None:
+                start = self._spread.start(mi, start, self._lanes, x[2])
+        cos = dr.dot(way, self._normal)
         ray = mi.Ray3f(start, way)
-        t, patch, valid = surfaces.hit(ray, cos > 0.0, coherent=False)
+        t, patch, valid = surfaces.hit(ray, cos > 0.0, coherent=self._coherent)
         if aim is not None:
-            valid &= ~aim.aimed | (aim.faces & (patch == aim.patch))
+            valid &= aim.faces & (patch == aim.patch)
         met = _Met(patch, ray(t), way, valid, mi.Bool(False), mi.Float(1.0), t)
-        if surfaces.has_coats:
-            met = _beyond_coats(mi, surfaces, met, shifts(mi, lane, 1, key + 1)[0], aim)
+        if surfaces.has_coats and not aims:  # rays that aim at a texel are for its ground alone
+            met = _beyond_coats(surfaces, met, points(mi, self._chance, index)[0])
         weight = met.weight
-        if texels.coat is not None:
-            weight = weight * transmitted(surfaces, dr.gather(mi.Float, texels.coat, texel), cos)
-        found = surfaces.ground(met.patch, met.place, met.way, met.valid, met.mirrored & lamps)
+        if self._coat is not None:
+            weight = weight * transmitted(surfaces, self._coat, cos)
+        found = surfaces.ground(met.patch, met.place, met.way, met.valid, met.mirrored & self._lamps)
         if bright is not None:
-            weight = weight * bright.weight(mi, surfaces, found, met.length, cos, way, patch, met.mirrored)
-        found = replace(found, factor=weight * found.factor, emitted=weight * found.emitted)
-        dr.eval(*(getattr(found, field.name) for field in fields(found)))
-        yield found
+            weight = weight * bright.weight(mi, surfaces, found, self._share, met.length, cos, way, patch, met.mirrored)
+        return replace(found, factor=weight * found.factor, emitted=weight * found.emitted)
+
+    def irradiance(self, light: Any) -> Array:
+        """Irradiance from sums of radiance, shape (texels, 3)."""
+        import drjit as dr
+
+        dr.eval(light)  # its bands together: each would run the loop anew
+        values = np.stack([np.array(light[k], dtype=float) for k in range(3)], axis=-1)
+        return np.asarray(np.pi / self._all[:, None] * values)
+
+
+@dataclass(frozen=True)
+class _Kept:
+    """Which texel each ray meets, and what it sends out per irradiance: what stays from bounce to bounce."""
+
+    rays: _Rays
+    texel: Any
+    factor: Any
+
+    @staticmethod
+    def of(mi: ModuleType, rays: _Rays) -> _Kept:
+        """Trace rays."""
+        import drjit as dr
+
+        texel = dr.zeros(mi.UInt32, int(np.sum([count.sum() for count in rays.counts])))
+        factor = dr.zeros(mi.Color3f, dr.width(texel))
+
+        def step(at: Any, found: LookUp, lanes: Any) -> tuple[Any]:
+            dr.scatter(texel, dr.select(found.active, found.nearest(), 0), at)
+            dr.scatter(factor, dr.select(found.active, found.factor, 0.0), at)
+            return (lanes,)
+
+        rays.loop((dr.zeros(mi.UInt32, len(rays.texels)),), step)
+        dr.eval(texel, factor)
+        return _Kept(rays, texel, factor)
+
+    def light(self, mi: ModuleType, surfaces: Surfaces) -> Array:
+        """Irradiance of the rays' texels by the present map, by half of the rays each, shape (2, texels, 3)."""
+        import drjit as dr
+
+        state: tuple[Any, ...] = tuple(dr.zeros(mi.Color3f, len(self.rays.texels)) for _ in (0, 1))
+        for ends, rows in self.rays.rows():
+
+            def body(i: Any, one: Any, other: Any, ends: Any = ends, rows: Any = rows) -> Any:
+                at = self.rays.place(rows, i)
+                light = dr.gather(mi.Color3f, self.factor, at) * surfaces.irradiance(
+                    dr.gather(mi.UInt32, self.texel, at)
+                )
+                earlier = 2 * i < ends
+                return i + 1, one + dr.select(earlier, light, 0.0), other + dr.select(earlier, 0.0, light)
+
+            state = self.rays.while_rays(ends, body, state)
+        dr.eval(state)
+        return 2.0 * np.stack([self.rays.irradiance(one) for one in state])
 
 
 @dataclass(frozen=True)
@@ -168,27 +300,17 @@ class _Met:
     length: Any
 
 
-def _beyond_coats(mi: ModuleType, surfaces: Surfaces, met: _Met, chance: Any, aim: _Aim | None) -> _Met:
-    """Rays that a coat mirrors, by chance, meet what is in it instead: the weights keep the mean.
-
-    Rays that aim at a texel are for its ground alone.
-    """
+def _beyond_coats(surfaces: Surfaces, met: _Met, chance: Any) -> _Met:
+    """Rays that a coat mirrors, by chance, meet what is in it instead: the weights keep the mean."""
     import drjit as dr
 
     onward, coated, reflectance = surfaces.mirrored(met.patch, met.place, met.way, met.valid)
-    if aim is not None:
-        coated &= ~aim.aimed
     share = dr.maximum(reflectance, _MIRRORED_SHARE)
     follows = coated & (chance < share)
     weight = dr.select(follows, reflectance / share, dr.select(coated, 1.0 / (1.0 - share), 1.0))
-    patch, place, way, valid = mi.UInt32(met.patch), mi.Point3f(met.place), mi.Vector3f(met.way), mi.Bool(met.valid)
-    dr.eval(onward, follows, weight, patch, place, way, valid, met.length)  # once: each would trace the rays anew
-    chosen = dr.compress(follows)
-    if dr.width(chosen):
-        rays = mi.Ray3f(dr.gather(mi.Point3f, onward.o, chosen), dr.gather(mi.Vector3f, onward.d, chosen))
-        t, other, found = surfaces.hit(rays, coherent=False)
-        for old, new in ((patch, other), (place, rays(t)), (way, rays.d), (valid, found)):
-            dr.scatter(old, new, chosen)
+    t, patch, found = surfaces.hit(onward, follows, coherent=False)
+    patch, place = dr.select(follows, patch, met.patch), dr.select(follows, onward(t), met.place)
+    way, valid = dr.select(follows, onward.d, met.way), dr.select(follows, found, met.valid)
     return _Met(patch, place, way, valid, follows, weight, met.length)
 
 
@@ -197,9 +319,8 @@ def _beyond_coats(mi: ModuleType, surfaces: Surfaces, met: _Met, chance: Any, ai
 
 @dataclass(frozen=True)
 class _Aim:
-    """Ways to points of bright texels: which rays take theirs, their patches, and whether they are seen from there."""
+    """Ways to points of bright texels, their patches, and whether they are seen from there."""
 
-    aimed: Any
     way: Any
     patch: Any
     faces: Any
@@ -209,7 +330,7 @@ class _Aim:
 class BrightTexels:
     """Texels that send out much of a room's light from little of its area, such as a ceiling above a lamp.
 
-    Rays by chance meet them rarely: 1 % of them bring a third of a wall's light. Some rays of every block aim at them,
+    Rays by chance meet them rarely: 1 % of them bring a third of a wall's light. Some rays of every texel aim at them,
     and all rays have the weight that both ways of drawing a direction together give it (the balance heuristic: Veach
     and Guibas, SIGGRAPH 1995). Weights stay below 1 / (1 - c), c the part that aims.
 
@@ -254,26 +375,38 @@ class BrightTexels:
         own_places, own_across, own_up, own_normals = (vector(mi, one) for one in (places, across, up, normals))
         return BrightTexels(picks, own_places, own_across, own_up, own_normals, patches, mi.Float(aligned(density)))
 
-    def aim(self, mi: ModuleType, start: Any, x: list[Any], aimed: Any) -> _Aim:
+    def aim(self, mi: ModuleType, start: Any, x: list[Any]) -> _Aim:
         """Ways from starts to bright texels, by three uniform deviates."""
         import drjit as dr
 
-        one = dr.gather(mi.UInt32, self.picks, dr.minimum(mi.UInt32(x[0] * _PICKS), _PICKS - 1), aimed)
+        one = dr.gather(mi.UInt32, self.picks, dr.minimum(mi.UInt32(x[0] * _PICKS), _PICKS - 1))
         middle, across, up, normal = (
-            dr.gather(mi.Vector3f, of, one, aimed) for of in (self.middles, self.across, self.up, self.normals)
+            dr.gather(mi.Vector3f, of, one) for of in (self.middles, self.across, self.up, self.normals)
         )
         way = middle + (x[1] - 0.5) * across + (x[2] - 0.5) * up - mi.Vector3f(start)
         way /= dr.norm(way)
-        return _Aim(aimed, way, dr.gather(mi.UInt32, self.patches, one, aimed), dr.dot(normal, way) < 0.0)
+        return _Aim(way, dr.gather(mi.UInt32, self.patches, one), dr.dot(normal, way) < 0.0)
 
     def weight(
-        self, mi: ModuleType, surfaces: Surfaces, found: LookUp, t: Any, cos: Any, way: Any, patch: Any, mirrored: Any
+        self,
+        mi: ModuleType,
+        surfaces: Surfaces,
+        found: LookUp,
+        share: Any,
+        t: Any,
+        cos: Any,
+        way: Any,
+        patch: Any,
+        mirrored: Any,
     ) -> Any:
-        """Weights of rays of length t (mm) that met a texel, aimed or not; what a coat mirrors is never aimed at."""
+        """Weights of rays of length t (mm) that met a texel, aimed, as `share` of them are, or not.
+
+        What a coat mirrors is never aimed at.
+        """
         import drjit as dr
 
         density = dr.gather(mi.Float, self.density, found.nearest(), found.active & ~mirrored)
-        share, cos_there = _AIMED / BLOCK, dr.maximum(surfaces.cosine(patch, way), 1e-6)
+        cos_there = dr.maximum(surfaces.cosine(patch, way), 1e-6)
         by_aim = density * dr.square(t) * dr.pi / (cos_there * dr.maximum(cos, 1e-6))  # over what chance has
         return 1.0 / (1.0 - share + share * dr.select(mirrored, 0.0, by_aim))
 
@@ -292,6 +425,8 @@ def finer(coarse: TexelGrid, fine: TexelGrid, values: Array) -> Array:
 
 
 def _resampled(old: TexelGrid, new: TexelGrid, values: Array, matrix: Callable[[int, int], Array]) -> Array:
+    if np.array_equal(old.columns, new.columns) and np.array_equal(old.rows, new.rows):
+        return values
     out = np.zeros((new.count, 3))
     alike: dict[tuple[int, ...], list[tuple[int, int]]] = {}
     for (part, *size), (to, *wanted) in zip(old.grids(), new.grids(), strict=True):

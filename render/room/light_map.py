@@ -30,7 +30,15 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from phibench.render.optics.faces import IntArray, face_table
-from phibench.render.room.bounced_light import BrightTexels, bounced_light, finer, gathered, rays_by_area
+from phibench.render.room.bounced_light import (
+    BrightTexels,
+    bounced_light,
+    finer,
+    gathered,
+    needed_rays,
+    rays_by_area,
+    rays_by_noise,
+)
 from phibench.render.room.lamp_light import direct_light, lamps_in_coats
 from phibench.render.room.mirror_intersection import mirror_body
 from phibench.render.room.mirror_light import mirror_light
@@ -60,7 +68,7 @@ class BakeSettings:
     lamp_rays: int = 64
     bounces: int = 12
     bounce_rays: int = 64
-    final_rays: int = 384
+    final_rays: int = 128
 
 
 @dataclass(frozen=True)
@@ -103,15 +111,18 @@ def bake(view: View, room: Room, settings: BakeSettings) -> LightMap:
         return LightMap(none, none, np.zeros(0, dtype=bool))
     fine, covered = _spread_texels(mi, surfaces, grid, settings.texel_m)
     surfaces.set_light(fine.grid, np.zeros((len(fine), 3)))
-    direct = direct_light(mi, surfaces, fine, room.sun, settings.lamp_rays, _SEED)
     free = nearest_free(covered, fine.grid)
+    needed = needed_rays(np.ones(len(fine), dtype=np.int64), covered, free) > 0
+    direct = direct_light(mi, surfaces, fine, room.sun, settings.lamp_rays, _SEED, needed=needed)
     one, other = ((half + lamps_in_coats(mi, surfaces, fine, _SEED + 20 + k))[free] for k, half in enumerate(direct))
     lamps, noise = smoothed(fine.grid, one, other, _KEPT_OF_LAMPS)
-    lit = lamps + bounced_light(
+    bounced, coarse, pilot = bounced_light(
         mi, surfaces, fine.grid, lamps, settings.texel_m, settings.bounces, settings.bounce_rays, _SEED + 10
     )
+    lit = lamps + bounced
     surfaces.set_light(fine.grid, lit)
-    mean, sigma = _indirect(mi, surfaces, fine, free, settings, BrightTexels.of(mi, surfaces, fine.grid, lit))
+    bright = BrightTexels.of(mi, surfaces, fine.grid, lit)
+    mean, sigma = _indirect(mi, surfaces, fine, covered, free, settings, bright, (coarse, pilot))
     dr.flush_malloc_cache()  # arrays that Dr.Jit keeps for the next time, of other sizes than a view's
     total = np.maximum(mean, 0.0) + np.maximum(lamps, 0.0)  # a straight line through noise may end below 0
     return LightMap(total.astype(np.float32), np.hypot(noise, sigma).astype(np.float32), covered)
@@ -129,18 +140,25 @@ def _indirect(
     mi: ModuleType,
     surfaces: Surfaces,
     fine: Texels,
+    covered: BoolArray,
     free: IntArray,
     settings: BakeSettings,
     bright: BrightTexels | None,
+    pilot: tuple[TexelGrid, Array],
 ) -> tuple[Array, Array]:
-    """Irradiance by all surfaces, from the present map, and its standard error, shape (texels, 3) each."""
+    """Irradiance by all surfaces, from the present map, and its standard error, shape (texels, 3) each.
+
+    The pilot, a grid and two halves, shares no ray with what it places: rays that decide for themselves err.
+    """
     texels, largest_m = fine, max(settings.indirect_texel_m, settings.texel_m)
     if settings.indirect_texel_m > settings.texel_m:
         grid = TexelGrid.of(surfaces.table, settings.indirect_texel_m)
-        texels, hidden = _spread_texels(mi, surfaces, grid, settings.texel_m)
-        free = nearest_free(hidden, grid)
+        texels, covered = _spread_texels(mi, surfaces, grid, settings.texel_m)
+        free = nearest_free(covered, grid)
     # two independent halves: half their difference is the standard error of their mean
-    rays = rays_by_area(texels.grid, settings.final_rays, largest_m)
+    rays = needed_rays(rays_by_area(texels.grid, settings.final_rays, largest_m), covered, free)
+    coarse, values = pilot
+    rays = rays_by_noise(rays, texels.grid, np.stack([finer(coarse, texels.grid, half) for half in values]))
     halves = [gathered(mi, surfaces, texels, rays, 2 + 3 * i, bright, lamps=False)[free] for i in (0, 1)]
     mean, sigma = smoothed(texels.grid, halves[0], halves[1], _KEPT_OF_SURFACES)
     if texels is fine:
@@ -230,11 +248,11 @@ def smoothed(grid: TexelGrid, a: Array, b: Array, kept: int) -> tuple[Array, Arr
 def _best(a: Array, b: Array, kept: int) -> tuple[Array, Array]:
     """Mean and variance of grids, each texel with the reach that serves it best; shape (grids, rows, columns, 3)."""
     # the reach 0, in which a itself is compared with b
-    best, least = [a, b], _around(2.0 * (a - b) ** 2).sum(axis=-1)
+    best, least = [a, b], _around(2.0 * ((a - b) ** 2).sum(axis=-1, keepdims=True))[..., 0]
     changed = np.zeros((*least.shape, 1), dtype=bool)
     for reach in _REACHES:
         one, other = (_fit(half, reach) for half in (a, b))
-        error = _around((one - b) ** 2 + (other - a) ** 2).sum(axis=-1)
+        error = _around(((one - b) ** 2 + (other - a) ** 2).sum(axis=-1, keepdims=True))[..., 0]
         better = (error < least)[..., None]
         best = [np.where(better, new, old) for new, old in zip((one, other), best, strict=True)]
         least = np.minimum(least, error)

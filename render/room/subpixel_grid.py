@@ -197,8 +197,13 @@ _ROUNDS = 12  # of the Tiny Encryption Algorithm; with Mitsuba's usual 4, neighb
 
 def shifts(mi: ModuleType, lanes: Any, dimensions: int, seed: Any) -> list[Any]:
     """One uniform shift per lane for each dimension; `seed`, an integer or a Dr.Jit one, from a named stream."""
+    return [_uniform(mi, word) for word in hashed(mi, lanes, dimensions, seed)]
+
+
+def hashed(mi: ModuleType, lanes: Any, dimensions: int, seed: Any) -> list[Any]:
+    """32 random bits per lane for each dimension."""
     keys = [mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(d), _ROUNDS)[1] for d in range(dimensions)]
-    return [_uniform(mi, mi.sample_tea_32(lanes, key, _ROUNDS)[1]) for key in keys]
+    return [mi.sample_tea_32(lanes, key, _ROUNDS)[1] for key in keys]
 
 
 def paired_shifts(mi: ModuleType, lanes: Any, dimensions: int, seed: Any) -> list[Any]:

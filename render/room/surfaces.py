@@ -241,6 +241,13 @@ class Surfaces:
         # rays that meet nothing have no place: what is computed there may be no number
         return dr.select(found.active, found.factor * dr.maximum(irradiance, 0.0) + found.emitted, 0.0)
 
+    def irradiance(self, texel: Any) -> Any:
+        """Present irradiance of texels."""
+        import drjit as dr
+
+        found = dr.gather(self._mi.Vector4f, self._irradiance, texel)
+        return self._mi.Color3f(found.x, found.y, found.z)
+
     def _albedo(self, s: Any, t: Any, texture: Any, active: Any) -> Any:
         """Value of a texture at a place in its own units; `texture` is width, height, start, and 0.5 if smooth."""
         import drjit as dr

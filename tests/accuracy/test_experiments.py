@@ -26,7 +26,7 @@ def paper(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     text = (RECIPES / "paper-misaligned.toml").read_text(encoding="utf-8")
     raw = tomllib.loads(text)
     head = text[: text.index("[[experiments]]")]
-    coarse = {"count = 6": "count = 1", "texel_m = 0.05": "texel_m = 0.25", "final_rays = 384": "final_rays = 64"}
+    coarse = {"count = 6": "count = 1", "texel_m = 0.05": "texel_m = 0.25", "final_rays = 128": "final_rays = 64"}
     for old, new in coarse.items():
         assert old in head
         head = head.replace(old, new)

@@ -14,7 +14,7 @@ PARTS = (50, 68, 90)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("final_rays", [pytest.param(384, marks=pytest.mark.study), 128])
+@pytest.mark.parametrize("final_rays", [pytest.param(256, marks=pytest.mark.study), 128])
 def test_accuracy_of_the_stated_noise_of_a_light_map(final_rays: int) -> None:
     """Half of the difference's square is the variance of one bake, and the mean over all texels is stated within 20 %.
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from phibench.render.optics.faces import face_table
-from phibench.render.room.bounced_light import BLOCK, BrightTexels, gathered, rays_by_area
+from phibench.render.room.bounced_light import FEWEST, BrightTexels, gathered, rays_by_area, rays_by_noise
 from phibench.render.room.lamp_light import whole_lamp
 from phibench.render.room.surfaces import Surfaces
 from phibench.render.room.texel_grid import TexelGrid
@@ -45,7 +45,7 @@ def test_rays_that_aim_at_what_is_bright_find_its_light(
 ) -> None:
     """The mean is kept, 400 texels with 3 % each: 0.15 %. By chance alone a texel is off by more than half.
 
-    A quarter of 64 rays aims at a square of 0.4 m from 2 m and more: over it the integrand varies by some 10 %.
+    A quarter as many more than 64 rays aim at a square of 0.4 m from 2 m and more: the integrand varies by some 10 %.
     """
     surfaces, texels, light, exact = floor
     mi, rays = activate(), np.full(len(texels), RAYS)
@@ -64,13 +64,24 @@ def test_even_light_has_no_bright_texels(floor: tuple[Surfaces, Texels, np.ndarr
 
 
 def test_rays_follow_the_area() -> None:
-    """A square of the full size has all rays, a quarter of it a quarter, a hundredth the fewest: whole blocks."""
+    """A square of the full size has all rays, a quarter of it a quarter, a hundredth the fewest: powers of two."""
     shapes = [rectangle("face", (0, 0, 0), (0, 0, 1), (side, side)) for side in (0.8, 0.4, 0.08)]
     grid = TexelGrid.of(face_table(shapes), np.full(3, 0.4))
     rays = rays_by_area(grid, 100, 0.4)
-    assert rays.tolist() == [104] * 4 + [32] * 4 + [16] * 4
-    assert np.all(rays % BLOCK == 0)
-    assert rays_by_area(grid, 3, 0.4).tolist() == [8] * 12
+    assert rays.tolist() == [128] * 4 + [32] * 4 + [FEWEST] * 4
+    assert rays_by_area(grid, 3, 0.4).tolist() == [4] * 12
+
+
+def test_rays_go_where_halves_differ() -> None:
+    """A face whose halves differ by 4 % has four times the rays of one with 1 %, and all together as many as before."""
+    table = face_table([rectangle("face", (0, 0, 0), (0, 0, 1), (4.0, 4.0)) for _ in range(2)])
+    grid = TexelGrid.of(table, np.full(2, 0.4))
+    halves = np.full((2, grid.count, 3), 1.0)
+    halves[0, :100] += 0.04
+    halves[0, 100:] += 0.01
+    rays = rays_by_noise(np.full(200, 40), grid, halves)
+    assert rays.tolist() == [64] * 100 + [16] * 100
+    assert not rays_by_noise(np.zeros(200, dtype=int), grid, halves).any()
 
 
 def test_small_faces_have_finer_texels() -> None:
