@@ -241,7 +241,7 @@ class _Rays:
 
 @dataclass(frozen=True)
 class _Kept:
-    """Which texel each ray meets, and what it sends out per irradiance: what stays from bounce to bounce."""
+    """Texel that each ray meets, and what it sends out per irradiance: what stays from bounce to bounce."""
 
     rays: _Rays
     texel: Any
