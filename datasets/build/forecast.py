@@ -51,9 +51,10 @@ _PROBE_CPU_S = 0.042  # of `_probe` on the machine above
 _TRUST_S = 2.0  # the first guess weighs as much as tasks that should take this long
 
 # Bytes.
-_AMBIENT_BYTES_PX = 5.0  # six planes of halves; those of a small image compress less
-_TRUTH_BYTES_PX = 6.8  # six float32 planes; what is outside the mirror compresses to nothing
-_PREVIEW_BYTES_PX = 2.0  # PNG of 8 bits a colour
+_VIEW_BYTES = 50_000  # headers; a small image compresses less
+_AMBIENT_BYTES_PX = 4.4  # six planes of halves: 3.8 in `paper`, 5.0 in `bench-dev`
+_TRUTH_BYTES_PX = 6.4  # six float32 planes; what is outside the mirror compresses to nothing
+_PREVIEW_BYTES_PX = 0.6  # PNG of 8 bits a colour: 0.4 in `paper`, 0.8 in `bench-dev`
 _SPOT_BYTES = 8192
 _TEXEL_BYTES = 25.0  # six float32 and a bool
 _RESERVE = 1.1  # of a disc that is too small one learns too late
@@ -109,7 +110,7 @@ def forecast(plan: Plan, tasks: Collection[BuildTask]) -> Forecast:
     pixels = plan.rig.camera.width_px * plan.rig.camera.height_px
     size = {
         "bake": _TEXEL_BYTES * _texels(plan),
-        "view": pixels * (_AMBIENT_BYTES_PX + _TRUTH_BYTES_PX + _PREVIEW_BYTES_PX),
+        "view": _VIEW_BYTES + pixels * (_AMBIENT_BYTES_PX + _TRUTH_BYTES_PX + _PREVIEW_BYTES_PX),
         "spot": 2.0 * _SPOT_BYTES,
         "sample": 0.5 * pixels * _PREVIEW_BYTES_PX,
     }

@@ -101,7 +101,8 @@ class _Pairs:
             facing = (above > -reach) & (way @ lamp[9:12] < 0.0) & (True if needed is None else needed)
             seen = texels.order[facing[texels.order]]
             found.append(seen)
-            whole.append(whole_lamp(way[seen], texels.normals_world[seen], lamp))
+            if len(seen):  # Dr.Jit adds no arrays of size 0
+                whole.append(whole_lamp(way[seen], texels.normals_world[seen], lamp))
         number = np.repeat(np.arange(len(lamps)), [len(one) for one in found[1:]])
         return _Pairs(np.concatenate(found), number, np.concatenate(whole), lamps)
 

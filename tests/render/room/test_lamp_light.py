@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from phibench.render.optics.faces import face_table
-from phibench.render.room.lamp_light import lamps_in_coats, whole_lamp
+from phibench.render.room.lamp_light import direct_light, lamps_in_coats, whole_lamp
 from phibench.render.room.surfaces import Surfaces
 from phibench.render.room.texel_grid import TexelGrid
 from phibench.render.room.texel_points import Texels
@@ -88,3 +88,18 @@ def test_photons_bring_what_a_coat_mirrors_of_a_lamp() -> None:
     assert lit.sum() > 200
     assert found[lit].sum(axis=0) == pytest.approx(expected[lit].sum(axis=0), rel=0.01)
     assert np.median(np.abs(found / expected - 1.0)[lit]) < 0.06
+
+
+def test_a_lamp_that_faces_no_texel_gives_no_light() -> None:
+    """A lamp below a floor, beside none: both halves are 0, with a second lamp above it they are that one's alone."""
+    floor = rectangle("floor", (0, 0, 0), (0, 0, 1), (2.0, 2.0))
+    below = rectangle("below", (0, 0, -1.0), (0, 0, -1), (0.5, 0.5), radiance_w_m2_sr=(1.0, 1.0, 1.0))
+    above = rectangle("above", (0, 0, 1.0), (0, 0, -1), (0.5, 0.5), radiance_w_m2_sr=(1.0, 1.0, 1.0))
+    mi, light = activate(), []
+    for lamps in ([below], [below, above], [above]):
+        surfaces = Surfaces(mi, default_rig().at(0.0), face_table([floor, *lamps]))
+        texels = Texels.of(mi, surfaces, TexelGrid.of(surfaces.table, 0.5))
+        light.append(direct_light(mi, surfaces, texels, None, 16, 1)[0][:16])  # of the floor, which comes first
+    assert not light[0].any()
+    assert np.array_equal(light[1], light[2])
+    assert light[2].min() > 0.0
