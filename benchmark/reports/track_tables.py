@@ -67,20 +67,21 @@ def rig_known(document: ScoreDocument) -> str:
     return "calibrated" if document.pair_set.get("calibration") else "nominal"
 
 
-def _preset(document: ScoreDocument) -> str:
+def preset_name(document: ScoreDocument) -> str:
+    """Presets of a score in words."""
     return ", ".join(document.pair_set.get("presets", ())) or "pairs"
 
 
 def _by_preset(track: Track, documents: Sequence[ScoreDocument]) -> TextTable:
     numbers = NUMBERS[track]
-    presets = list(dict.fromkeys(map(_preset, documents)))
+    presets = list(dict.fromkeys(map(preset_name, documents)))
     rows: dict[tuple[str, str], dict[str, ScoreDocument]] = {}
     for document in documents:
         name = f"{document.method.name}{FLAGGED if document.flags else ''}"
-        rows.setdefault((name, rig_known(document)), {})[_preset(document)] = document
+        rows.setdefault((name, rig_known(document)), {})[preset_name(document)] = document
     order = sorted(rows.items(), key=lambda row: _mean_place(row[1], documents, track))
     made = [(*key, *(_cell(numbers.ranks, own.get(preset)) for preset in presets)) for key, own in order]
-    firsts = {preset: next(one for one in documents if _preset(one) == preset) for preset in presets}
+    firsts = {preset: next(one for one in documents if preset_name(one) == preset) for preset in presets}
     for name, metric in numbers.perfect.items():
         made.append((name, "", *(_cell(metric, firsts[preset]) for preset in presets)))
     note = "Ordered by the mean place over presets. Overlapping intervals settle no order: use `phibench compare`."
@@ -91,7 +92,7 @@ def _mean_place(own: Mapping[str, ScoreDocument], documents: Sequence[ScoreDocum
     """Mean over presets of the number of methods that are better; a preset that a method lacks tells nothing."""
     places = []
     for preset, document in own.items():
-        others = [_key(other, track) for other in documents if _preset(other) == preset]
+        others = [_key(other, track) for other in documents if preset_name(other) == preset]
         places.append(sum(other < _key(document, track) for other in others))
     return sum(places) / len(places)
 
@@ -107,8 +108,8 @@ def _key(document: ScoreDocument, track: Track) -> float:
 
 def _beside(track: Track, documents: Sequence[ScoreDocument]) -> TextTable:
     names = NUMBERS[track].beside
-    order = sorted(documents, key=lambda one: (_preset(one), _key(one, track)))
-    rows = [(_preset(one), one.method.name, *(_cell(name, one) for name in names)) for one in order]
+    order = sorted(documents, key=lambda one: (preset_name(one), _key(one, track)))
+    rows = [(preset_name(one), one.method.name, *(_cell(name, one) for name in names)) for one in order]
     heads = [f"{METRICS[name].text} / {METRICS[name].shown[1]}".removesuffix(" / 1") for name in names]
     return TextTable(f"Beside it, {track}", ("preset", "method", *heads), tuple(rows), "ll" + "r" * len(names))
 

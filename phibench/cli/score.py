@@ -227,6 +227,9 @@ def results(
     *files: Path,
     out: Path | None = None,
     html: Path | None = None,
+    records: Path | None = None,
+    dataset_id: str | None = None,
+    organization: str | None = None,
     against: str = "chain_fit",
     rank: Rank = "phi",
     bootstrap_seed: Whole = 0,
@@ -236,7 +239,7 @@ def results(
 ) -> int:
     """Write the page of results: every method on every preset, differences, strata, causes, from score files.
 
-    Without --out, --html or --json the page goes to the standard output.
+    Without --out, --html, --records or --json the page goes to the standard output.
 
     Parameters
     ----------
@@ -246,6 +249,12 @@ def results(
         Page in Markdown to write.
     html
         Page in HTML to write: one file, without network and scripts.
+    records
+        Folder for the same scores in the formats of Every Eval Ever and of the Hugging Face Hub.
+    dataset_id
+        Name of the data set on the Hub, ORGANIZATION/NAME, for the records.
+    organization
+        Who ran the scores, for the records.
     against
         Method that the others are compared with, sample by sample; the best one where it has no score.
     bootstrap_seed
@@ -253,14 +262,22 @@ def results(
     """
     from json import dumps
 
+    from phibench.benchmark.reports.eval_records import write_eval_records
     from phibench.benchmark.reports.results_page import read_parts, results_document, results_page, write_results
+    from phibench.datasets.common.errors import DatasetError
 
+    written = []
+    if records is not None:
+        if dataset_id is None or organization is None:
+            raise DatasetError("--records needs --dataset-id and --organization: whose scores, and of which data set")
+        written = write_eval_records(files, records, dataset_id, organization)
     parts = read_parts(files, against, rank, _seed(bootstrap_seed))
-    for path in write_results(parts, out, html, rank):  # files first: they are wanted even where the pipe is closed
+    # files first: they are wanted even where the pipe is closed
+    for path in [*written, *write_results(parts, out, html, rank)]:
         print(f"written: {path}", file=sys.stderr)
     if json:
         print(dumps(results_document(parts), allow_nan=False))
-    elif out is None and html is None:
+    elif out is None and html is None and records is None:
         sys.stdout.write(results_page(parts, rank))
     return 0
 

@@ -26,7 +26,7 @@ from phibench.benchmark.reports.report import Section, report_html, time_section
 from phibench.benchmark.reports.results_page import read_parts
 from phibench.benchmark.scores.answer_errors import Rules
 from phibench.benchmark.scores.causes import CAUSES
-from phibench.benchmark.scores.document import Flag, MethodCard, write_score
+from phibench.benchmark.scores.document import Flag, MethodCard, read_score, write_score
 from phibench.benchmark.scores.score import score_outcomes
 from phibench.cli import main as cli
 from phibench.datasets.common.errors import DatasetError
@@ -381,3 +381,42 @@ def test_the_report_says_where_the_time_went():
     times = {"mjpeg": {"draw": 0.5, "detect": 0.25}, "bayer-raw": {"draw": 0.4}}
     (table,) = time_section(times).tables
     assert table[1:] == (("draw", "500.0", "400.0"), ("detect", "250.0", ""), ("all", "750.0", "400.0"))
+
+
+def test_scores_in_the_formats_of_others(tmp_path, capsys):
+    """What each format requires, as its specification of November 2026 says it; numbers are the score's own."""
+    yaml = pytest.importorskip("yaml")
+    score, table = scored("half", shifted(0.5))
+    score = score.model_copy(update={"pair_set": {"presets": ["mjpeg"], "hinted": 0}})
+    write_score(tmp_path / "half.json", score, table)
+    score = read_score(tmp_path / "half.json")
+    words = ["results", str(tmp_path / "half.json"), "--records", str(tmp_path / "r"), "--dataset-id", "org/bench"]
+    assert cli.main([*words, "--organization", "Us"]) == 0
+    capsys.readouterr()
+    written = sorted((tmp_path / "r" / "every_eval_ever").glob("*.json"))
+    assert len(written) == 1
+    record = json.loads(written[0].read_text())
+    required = {"schema_version", "evaluation_id", "retrieved_timestamp", "source_metadata", "model_info"}
+    assert required | {"eval_library", "evaluation_results"} <= set(record)
+    assert set(record) <= required | {
+        "evaluation_timestamp",
+        "eval_library",
+        "evaluation_results",
+    }  # the schema allows no others
+    results = {one["evaluation_name"].split(",")[0]: one for one in record["evaluation_results"]}
+    for name, one in results.items():
+        metric, told = score.metrics[name], one["score_details"]
+        assert told["score"] == metric.value
+        assert one["metric_config"]["lower_is_better"] is (metric.better == "lower")
+        interval = told["uncertainty"].get("confidence_interval")
+        assert (interval is None) == (metric.low is None)
+        assert interval is None or (interval["lower"], interval["upper"]) == (metric.low, metric.high)
+        assert one["source_data"]["hf_repo"] == "org/bench"
+    assert {"find", "average_recall", "rms_px"} <= set(results)
+    (entries,) = [yaml.safe_load(path.read_text()) for path in (tmp_path / "r" / ".eval_results").glob("*.yaml")]
+    assert [entry["dataset"]["task_id"] for entry in entries] == ["find_mjpeg", "depth_mjpeg"]
+    assert all(entry["dataset"]["id"] == "org/bench" and isinstance(entry["value"], float) for entry in entries)
+    assert cli.main([*words[:-1], "bench", "--organization", "Us"]) == 2
+    assert "give ORGANIZATION/NAME" in capsys.readouterr().err
+    assert cli.main([*words[:-2]]) == 2
+    assert "--records needs --dataset-id and --organization" in capsys.readouterr().err
