@@ -7,9 +7,9 @@ is unknown, and both images tell of it: the noise of the up image counts by its 
 
     (grad a . e)^2 / (var_a + var_b / |det M|)
 
-over its pixels, and sigma of D is D^2 / sqrt(information). The mean a is in electrons and the noise that of the pixels
-before any processing. No method that takes the window for one q, and knows no more of the room, is better; one that
-takes larger windows or planes may be.
+over its pixels, saturated ones left out, and sigma of D is D^2 / sqrt(information). The mean a is in electrons and the
+noise that of the pixels before any processing. No method that takes the window for one q, and knows no more of the
+room, is better; one that takes larger windows or planes may be.
 """
 
 from __future__ import annotations
@@ -82,14 +82,17 @@ def matching_information(planes_e: Array, card: SensorCard, motion: EpipolarMoti
         Side, odd.
     """
     along = [
-        motion.px_m[..., 0] * correlate1d(plane, _SLOPE, axis=1) + motion.px_m[..., 1] * correlate1d(plane, _SLOPE, axis=0)
+        motion.px_m[..., 0] * correlate1d(plane, _SLOPE, axis=1)
+        + motion.px_m[..., 1] * correlate1d(plane, _SLOPE, axis=0)
         for plane in planes_e
     ]
     shape = planes_e.shape[1], planes_e.shape[2]
     filters = np.zeros(shape, int) if len(planes_e) == 1 else bayer_filters(np.zeros((1, 2), int), shape)[0]
     level, slope = (np.choose(filters, list(each)) for each in (planes_e, along))
     with np.errstate(divide="ignore", invalid="ignore"):
-        told = slope**2 / (variance_e2(level, card, alike=False) * (1.0 + 1.0 / motion.density))
+        told = np.where(level < card.saturation_e, slope**2, 0.0) / (
+            variance_e2(level, card, alike=False) * (1.0 + 1.0 / motion.density)
+        )
     return np.asarray(uniform_filter(np.nan_to_num(told), window_px, mode="constant") * window_px**2)
 
 

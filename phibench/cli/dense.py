@@ -165,6 +165,39 @@ def score(
 
 
 @dense.command
+def picture(
+    directory: DataFolder,
+    *,
+    method: str,
+    out: OutFolder,
+    sample: str | None = None,
+    preset: Preset = DEFAULT_PRESET,
+    limits: Limits = LIMITS,
+) -> int:
+    """Draw the answer for one sample: image, D, error and causes as panoramas, and the room from above.
+
+    Parameters
+    ----------
+    method
+        A name that `phibench dense list` shows, or FILE.py:FUNCTION.
+    sample
+        Id or number of the sample; the first by default.
+    preset
+        Preset of the sensor.
+    """
+    from phibench.benchmark.dense.dense_pictures import picture_of
+    from phibench.benchmark.dense.dense_score import chosen_pairs
+    from phibench.benchmark.isolation.resolve import DENSE, resolve
+    from phibench.datasets.store.files import write_bytes
+
+    resolve(method, DENSE)  # one that is not there is told before anything begins
+    drawn = picture_of(method, chosen_pairs(directory, preset, 1), sample, limits.of_run)
+    for name, data in (("panoramas.png", drawn.panoramas_png()), ("above.png", drawn.from_above_png())):
+        print(f"written: {write_bytes(out / name, data)}")
+    return 0
+
+
+@dense.command
 def export(
     directory: DataFolder,
     *,

@@ -5,9 +5,10 @@ Not a test file.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
+from helpers.dense_truths import smaller
 
 from phibench.datasets.frames.sensor_card import sensor_card
 from phibench.estimator.dense.dense_interface import DensePair
@@ -24,19 +25,7 @@ TILTED = Misalignment(tilt_x_rad=0.01, decentre_y_m=1e-3, stroke_tilt_y_rad=0.00
 
 def small_rig(misalignment: Misalignment | None = None) -> Rig:
     """Rig with the default's field of view and fewer pixels."""
-    rig = default_rig()
-    camera = rig.camera
-    small = replace(
-        camera,
-        width_px=round(camera.width_px / SMALL),
-        height_px=round(camera.height_px / SMALL),
-        pixel_pitch_um=camera.pixel_pitch_um * SMALL,
-        fx_px=camera.fx_px / SMALL,
-        fy_px=camera.fy_px / SMALL,
-        cx_px=(camera.cx_px + 0.5) / SMALL - 0.5,
-        cy_px=(camera.cy_px + 0.5) / SMALL - 0.5,
-    )
-    return replace(rig, camera=small).perturbed(misalignment or Misalignment())
+    return smaller(default_rig(), SMALL).perturbed(misalignment or Misalignment())
 
 
 @dataclass(frozen=True)

@@ -231,3 +231,18 @@ def test_names_of_no_method_are_answered_with_the_seats_own_words(tmp_path: Path
         resolve("nothing", DENSE)
     with pytest.raises(MethodError, match="`phibench dense new"):
         resolve(f"{tmp_path / 'absent.py'}:depth", DENSE)
+
+
+def test_the_picture_of_a_sample(tiny_dataset: Path, methods: Path, tmp_path: Path, capsys: Any) -> None:
+    """Both PNGs of a method of a file; a wrong sample, method or answer is a sentence, and nothing is written."""
+    command = ["dense", "picture", str(tiny_dataset), "--out", str(tmp_path / "out"), "--method"]
+    for words, said in (
+        ([f"{methods}:flat", "--sample", "nope"], "no sample 'nope'"),
+        (["nope"], "no method 'nope'"),
+        ([f"{methods}:small"], "invalid: the answer has (10, 20) pixels"),
+    ):
+        assert main([*command, *words]) == 2
+        assert said in capsys.readouterr().err
+    assert not list(tmp_path.glob("out/*.png"))
+    assert main([*command, f"{methods}:flat", "--sample", "1"]) == 0
+    assert sorted(file.name for file in (tmp_path / "out").iterdir()) == ["above.png", "panoramas.png"]

@@ -153,6 +153,8 @@ def test_without_texture_the_bound_is_infinite_and_grows_with_the_square_of_d() 
     far = dense_bound(rig, 0.4, CARD, printed, 2.0 * depth, 9)[360, 880]
     # twice as far, the place hardly moves with 1 / D in another way: by the parallax of near points, some per cent
     assert far / near == pytest.approx(4.0, rel=0.15)
+    full = CARD.full_well_e + printed
+    assert np.isinf(dense_bound(rig, 0.4, CARD, full, depth, 9)[360, 880])
     # a mosaic's pixels tell what their own filter sees: three equal planes are as good as no filter
     mosaic = sensor_card("bayer-raw")
     same = dense_bound(rig, 0.4, mosaic, np.repeat(printed, 3, axis=0), depth, 9)[360, 880]
