@@ -21,9 +21,10 @@ from phibench.datasets.frames.frame_files import suffix, write_frame
 from phibench.datasets.store.files import sha256
 from phibench.datasets.store.filling import filling, signed, write_documents
 from phibench.datasets.store.layers import write_exr
+from phibench.datasets.store.schema import TruthFolder
 from phibench.scenes.frames import Array
 
-INDEX = "dense.jsonl"
+INDEX = TruthFolder.DENSE_EXPORT.value
 PLANES = ("depth_m", "up_u_px", "up_v_px", "cause", "x_m", "y_m", "z_m")
 """D; place of the same room point in the up image; code of the cause, as `cause_names` of the index says; the point."""
 _KIND = "dense truth"

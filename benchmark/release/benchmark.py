@@ -95,7 +95,7 @@ _DEV = "a274640eda114303c9fa7a51185574048483b7e529d3f9916bdac10f89f7ac6b"
 PARTS = (
     ReleasePart("dev", "bench-dev", "pairs", _DEV),
     ReleasePart("test", "bench-test", "sealed", "32818cd99112fcf5f0125898b2ab538ab9d53cf02fd90089ec9d14457af67aaa"),
-    ReleasePart("paper", "paper", "pairs", "025ece80c9cfc9cce31e558089867a760568627e53154381c59bf926be27563d"),
+    ReleasePart("paper", "paper", "pairs", "2487ca0015be181c7164faaccdac0829078d996d81dc8719f9992951b34faa44"),
     ReleasePart(
         "mirrors", "bench-mirrors", "pairs", "45f352f98d2c12a779a89b805240481f519a09e92401dff9ae76ad529bce68fb"
     ),

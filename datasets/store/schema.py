@@ -341,6 +341,7 @@ class TruthFolder(StrEnum):
     FRAMES_SET = "frames_set.json"
     BAKED_ROOMS = "rooms.json"
     IMPORTED = "imported.json"
+    DENSE_EXPORT = "dense.jsonl"
     UNFINISHED = ".phibench-working"
     LOCKED = ".phibench-lock"
 
