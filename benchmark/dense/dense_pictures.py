@@ -206,9 +206,12 @@ def picture_of(
     MethodError
         If the method cannot be found or imported.
     """
-    ids = list(dict.fromkeys(draw.sample_id for draw in pairs.pair_draws))
-    wanted = ids[0 if sample is None else place_of(sample, ids, pairs.folders[0])]
-    number = next(k for k, draw in enumerate(pairs.pair_draws) if draw.sample_id == wanted)
+    drawn = [draw.sample_id for draw in pairs.pair_draws]
+    ids = [row.sample_id for row in pairs.dataset.rows]
+    wanted = drawn[0] if sample is None else ids[place_of(sample, ids, pairs.dataset.folder)]
+    if wanted not in drawn:
+        raise DatasetError(f"sample {wanted} has no dense pair in these frames; take another one")
+    number = drawn.index(wanted)
     with Harness([resolve(reference, DENSE)], limits, 1, pairs.folders) as harness:
         ((outcome,),) = harness.outcomes(pairs, [number])
     if outcome.dense is None:

@@ -38,6 +38,9 @@ COMMANDS: dict[str, Callable[[str, str, str], list[str]]] = {
         *("export", folder, "--to", "frames", "--sample", name, "--preset", "mono-raw", "--region", "32"),
         *("--workers", "1", "--out", out),
     ],
+    "dense picture": lambda folder, name, out: [
+        *("dense", "picture", folder, "--sample", name, "--method", "dense_sift", "--out", out),
+    ],
     "calibrate": lambda folder, name, out: [
         *("calibrate", folder, "--sample", name, "--preset", "layers", "--out", f"{out}.json"),
     ],
