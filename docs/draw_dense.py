@@ -28,7 +28,7 @@ from phibench.estimator.geometry.reflection import room_rays
 
 OUT = Path(__file__).resolve().parent
 SAMPLE = "table2-d3.180-h0.425"
-_COLOURS = 64  # of the files
+_GREY, _COLOURS = ("dense_curves", "dense_sweep"), 64
 _COLUMNS_DEG = (100.0, 20.0, -60.0, -140.0)  # azimuths of the curves
 _SWEPT_M = (1.0, 2.0, 4.5)
 _PIXEL_DEG = (-75.0, 7.0)  # azimuth and elevation: the chequered board
@@ -135,7 +135,10 @@ def main() -> None:
     }
     for name, data in pictures.items():
         file = OUT / f"{name}.png"
-        Image.open(io.BytesIO(data)).convert("RGB").quantize(_COLOURS).save(file, optimize=True)
+        picture_file = Image.open(io.BytesIO(data)).convert("RGB")
+        if name in _GREY:  # few colours are enough, and make it smaller; scales of colours would be spoiled
+            picture_file = picture_file.quantize(_COLOURS)
+        picture_file.save(file, optimize=True)
         print(f"{file.name}: {file.stat().st_size / 1e3:.0f} kB")
 
 
