@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import gaussian_laplace
-from scipy.optimize import least_squares
 
 from phibench.datasets.common.shown_text import ShortForm, short
 from phibench.estimator.geometry.status import Status, StatusArray, flag, keep
@@ -156,6 +155,8 @@ def _gaussian_fit(image: Array, start: Array) -> tuple[Array, bool]:
         return np.full(2, np.nan), False
     v, u = np.indices(image.shape).reshape(2, -1)
     data = image.ravel()
+
+    from scipy.optimize import least_squares  # a quarter of a second that no other method needs
 
     def residual(theta: Array) -> Array:
         r2 = (u - theta[0]) ** 2 + (v - theta[1]) ** 2

@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import brentq
 
 from phibench.render.sensor.electrons import (
     FixedPattern,
@@ -196,6 +195,8 @@ def auto_exposed(sensor: Sensor, light: Light) -> Sensor:
     """
     rates = light.ambient_electrons_per_s[:, ::_STEP_PX, ::_STEP_PX].astype(float)
     rates *= light.lamp_level * stop_factor(sensor, light)
+
+    from scipy.optimize import brentq  # a quarter of a second that a fixed exposure does not need
 
     def excess(log_gain_s: float) -> float:
         return mean_level(rates * np.exp(log_gain_s), sensor) - sensor.auto_exposure_level

@@ -13,6 +13,21 @@ from phibench.cli.main import main
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.read import open_dataset, place_of
 
+FLAT = """
+import numpy as np
+from phibench.estimator.dense.dense_interface import DenseAnswer
+
+def flat(pair):
+    return DenseAnswer(depth_m=np.full(pair.shape, 2.0))
+"""
+
+
+def flat_method(folder: Path) -> str:
+    """Reference of a method that takes no time."""
+    (folder / "mine.py").write_text(FLAT, encoding="utf-8")
+    return f"{folder / 'mine.py'}:flat"
+
+
 COMMANDS: dict[str, Callable[[str, str, str], list[str]]] = {
     "dataset show": lambda folder, name, out: ["dataset", "show", folder, "--sample", name, "--html", f"{out}.html"],
     "dataset frames": lambda folder, name, out: [
@@ -39,7 +54,7 @@ COMMANDS: dict[str, Callable[[str, str, str], list[str]]] = {
         *("--workers", "1", "--out", out),
     ],
     "dense picture": lambda folder, name, out: [
-        *("dense", "picture", folder, "--sample", name, "--method", "dense_sift", "--out", out),
+        *("dense", "picture", folder, "--sample", name, "--method", flat_method(Path(out).parent), "--out", out),
     ],
     "calibrate": lambda folder, name, out: [
         *("calibrate", folder, "--sample", name, "--preset", "layers", "--out", f"{out}.json"),

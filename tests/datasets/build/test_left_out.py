@@ -138,8 +138,7 @@ def test_it_is_whole_but_for_the_refused_samples(whole: Path, finished: Path) ->
     assert "left_out" not in json.loads((whole / schema.INFO).read_text())
 
 
-@pytest.mark.parametrize("newest_first", [False, True])
-@pytest.mark.parametrize("tasks_done", [1, 6, 11, 17])
+@pytest.mark.parametrize(("tasks_done", "newest_first"), [(1, False), (6, True), (11, False), (17, True)])
 def test_kills_and_the_order_of_tasks_change_no_byte(
     recipe: Path,
     finished: Path,

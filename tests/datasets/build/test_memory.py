@@ -31,22 +31,24 @@ for number in range(1, count + 1):
     pose = replace(plan.poses[0], pose_id="h0.000", offset_m=number / count, seed=number)
     outcome = perform(BuildTask("view", "", render_view, ("x", rig, room, pose, plan.recipe.ambient)), out)
     assert isinstance(outcome, Done), outcome
-    if number in (50, count):
+    if number in (8, count):  # Dr.Jit's pools have their size after six
         print(resident_mb(), outcome.peak_mb)
 """
 
 
 @pytest.mark.skipif(not Path("/proc/self/statm").is_file(), reason="needs /proc")
-@pytest.mark.parametrize("count", [80, pytest.param(500, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", [24, pytest.param(500, marks=pytest.mark.slow)])
 def test_many_views_in_one_process(
     tmp_path: Path, python: Callable[..., "subprocess.CompletedProcess[str]"], count: int
 ) -> None:
     child = python(CODE, str(Path(__file__).resolve().parents[2] / "tiny.toml"), str(tmp_path), str(count))
     assert child.returncode == 0, child.stderr
     (early, first_peak), (late, peak) = (map(float, line.split()) for line in child.stdout.splitlines())
-    print(f"\n{early:.0f} MB after 50 views, {late:.0f} MB after {count}, peak {peak:.0f} MB")
+    print(f"\n{early:.0f} MB after 8 views, {late:.0f} MB after {count}, peak {peak:.0f} MB")
     assert 100.0 < early
     assert late < 1.1 * early
+    # 0.01 MB a view found, 3 MB where the allocator was late; a kernel or a plane that stays is 0.7 MB or more
+    assert late < early + 0.3 * (count - 8)
     # planes of a view come and go, some 50 MB of these pixels and their blur: the peak is that of one view, not of many
     assert peak < 1.05 * first_peak
     assert peak < 1.4 * early

@@ -133,13 +133,13 @@ def test_two_directions_across_a_ray() -> None:
 def test_accuracy_pixel_gradient_against_differences_of_the_simulator() -> None:
     """Relative 1e-5 of the larger of u and v, every parameter, at rigs that are misaligned in all of them already."""
     checked, moving = 0, 0
-    for case in seen_cases(2, 5):
+    for case in seen_cases(3, 3):  # those of the next test, whose moved spots are kept
         point = np.array(case.spot.position_world_m)
         for index, view in enumerate(views(case, Misalignment())):
             analytic = pixel_gradient(view, image_of(view, point).uv_px, point)
             for k, name in enumerate(PARAMETERS):
                 found = slope(
-                    lambda x, c=case, n=name, i=index: chief_pixel(views(c, Misalignment(**{n: x}))[i], c.spot),
+                    lambda x, c=case, n=name, i=index: chief_pixels(c, Misalignment(**{n: x}))[i],
                     small(name),
                 )
                 # where nothing moves there is only rounding: 1e-12 px over the step
@@ -147,9 +147,9 @@ def test_accuracy_pixel_gradient_against_differences_of_the_simulator() -> None:
                 assert np.abs(found - analytic[:, k]).max() <= tolerance, (name, index, found, analytic[:, k])
                 moving += bool(np.any(analytic[:, k]))
                 checked += 1
-    assert checked == 5 * 2 * len(PARAMETERS)
+    assert checked == 3 * 2 * len(PARAMETERS)
     # stroke (4) and motion between the images (6) act on the up image alone; form errors turn with the mirror's tilt
-    assert moving == 5 * (38 + 38 - 10)
+    assert moving == 3 * (38 + 38 - 10)
 
 
 @pytest.mark.parametrize("estimator", ESTIMATORS)
@@ -190,14 +190,15 @@ def test_accuracy_depth_sensitivity_against_rendering() -> None:
     nominal, point = (case.nominal, case.nominal_stroke_m), np.array(case.spot.position_world_m)
     still = views(case, Misalignment())
     moves = np.stack([np.abs(pixel_gradient(view, image_of(view, point).uv_px, point)).max(axis=0) for view in still])
-    checked = 0
+    estimators, checked = ("exact", "paper_ray"), 0
+    gradients = {e: sensitivity(e, *nominal, case.rig, true_stroke(case), point).estimate_gradient for e in estimators}
+    by_pixels = {e: np.abs(PIXEL_GRADIENTS[e](*nominal, *chief_pixels(case, Misalignment()))).max() for e in estimators}
     for k, name in enumerate(PARAMETERS):
         step = min(0.1 / moves[:, k].max(), MISALIGNMENT[name].study)
         above, below = (rendered_pixels(case, Misalignment(**{name: sign * step})) for sign in (1.0, -1.0))
-        for estimator in ("exact", "paper_ray"):
+        for estimator in estimators:
             depths = [float(ESTIMATORS[estimator](*nominal, *pixels).depth_m) for pixels in (above, below)]
-            predicted = sensitivity(estimator, *nominal, case.rig, true_stroke(case), point).estimate_gradient[k]
-            by_pixel = np.abs(PIXEL_GRADIENTS[estimator](*nominal, *chief_pixels(case, Misalignment()))).max()
+            predicted, by_pixel = gradients[estimator][k], by_pixels[estimator]
             # what moves the spot across its azimuth changes D by little: 0.1 % of what the same way along it does
             tolerance = 0.01 * abs(predicted) + 1e-3 * by_pixel * moves[:, k].max()
             assert abs((depths[0] - depths[1]) / (2.0 * step) - predicted) <= tolerance, (name, estimator)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from phibench.datasets.frames.sensor_card import sensor_card
 from phibench.estimator.geometry.least_squares_depth import depth_general
 from phibench.estimator.geometry.mirror_image import blocked, first_blocker, image_of
 from phibench.estimator.geometry.rig_parameters import PARAMETERS, changed, prior_sigmas, stroke_of
+from phibench.estimator.limits import best_stroke as best_stroke_module
 from phibench.estimator.limits.best_stroke import (
     LARGEST,
     LEAST,
@@ -57,12 +59,6 @@ EXACT = np.zeros((P, P))
 SAME = SpotSigma((1.0, 1e9), (0.05, 0.05))
 """A spot that is known to 0.05 px whatever its strength."""
 OPEN = without_limits(Surroundings())
-
-
-@pytest.fixture(scope="module")
-def preset_spot() -> SpotSigma:
-    """The bound that `best_stroke` makes by itself: a second and more for each call."""
-    return spot_bound(RIG, sensor_card("mjpeg"))
 
 
 # -- flux ---------------------------------------------------------------------------------------------------------
@@ -325,8 +321,9 @@ def test_what_cannot_be_seen_has_no_stroke() -> None:
     assert cut.limits == (IMAGE_EDGE,)
 
 
-def test_strokes_whose_error_is_unknown_have_a_cause(preset_spot: SpotSigma) -> None:
+def test_strokes_whose_error_is_unknown_have_a_cause() -> None:
     """At 0.2 m and 1 mW a spot has more electrons than the bound's table; a free stroke has a finite error."""
+    preset_spot = spot_bound(RIG, sensor_card("mjpeg"))
     near = best_stroke(0.2, spot=preset_spot, covariance_rig=EXACT)
     assert math.isnan(near.stroke_m)
     assert TOO_BRIGHT in near.limits
@@ -391,13 +388,22 @@ def test_bad_numbers_end_in_a_sentence(call: object, words: tuple[str, ...]) -> 
 
 
 def test_default_spot_is_that_of_the_preset_and_the_default_rig_is_put_together_by_hand(
-    preset_spot: SpotSigma,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    by_hand = np.diag(prior_sigmas() ** 2)
+    """Bounds and errors of a rig take seconds: what they are asked for is kept here, and other tests hold them."""
+    bounds, covariances = [], []
+
+    def curve(*given: Any, covariance_rig: np.ndarray, **more: Any) -> Any:
+        covariances.append(covariance_rig)
+        return stroke_curve(*given, covariance_rig=EXACT, **more)
+
+    monkeypatch.setattr(best_stroke_module, "spot_bound", lambda *of: (bounds.append(of), SAME)[1])
+    monkeypatch.setattr(best_stroke_module, "stroke_curve", curve)
     found = best_stroke(2.0, strokes_m=(0.4, 0.5))
-    given = best_stroke(2.0, strokes_m=(0.4, 0.5), spot=preset_spot, covariance_rig=by_hand)
+    assert bounds == [(RIG, sensor_card("mjpeg"))]
+    assert all(np.array_equal(C, np.diag(prior_sigmas() ** 2)) for C in covariances)
+    given = best_stroke(2.0, RIG, strokes_m=(0.4, 0.5), spot=SAME, card=sensor_card("mjpeg"))
     assert (found.stroke_m, found.sigma_m) == (given.stroke_m, given.sigma_m)
-    card = sensor_card("bayer-raw")
-    raw = best_stroke(2.0, card=card, covariance_rig=EXACT, strokes_m=(0.4, 0.5))
-    of_raw = best_stroke(2.0, card=card, spot=spot_bound(RIG, card), covariance_rig=EXACT, strokes_m=(0.4, 0.5))
-    assert raw.sigma_m == of_raw.sigma_m
+    best_stroke(2.0, card=sensor_card("bayer-raw"), covariance_rig=EXACT, strokes_m=(0.4, 0.5))
+    assert bounds[1:] == [(RIG, sensor_card("bayer-raw"))]
+    assert not covariances[-1].any()

@@ -211,18 +211,24 @@ def test_a_pair_that_cannot_be_taken_gets_a_status() -> None:
     assert statuses(absent(pair)) == {"install no_such_package_here"}
 
 
-@pytest.mark.parametrize("name", [name for name, method in METHODS.items() if not method.package])
-def test_dark_images_boxes_outside_and_noise_are_no_exceptions(name: str) -> None:
+@cache
+def spoiled_pairs() -> tuple[Pair, ...]:
+    """The same for all methods, which look for their spots once."""
     pair = easy("bayer-raw", 0)
     black = np.full_like(pair.down, 64)
     outside = Box(5000, 5000, 64, 64)
     tiny = Box(400, 400, 2, 2)
-    for changed in (
+    return (
         replace(pair, down=black, up=black),
         replace(pair, box_down=outside, box_up=tiny),
         replace(pair, box_down=Box(-30, -30, 64, 64), box_up=Box(1260, 700, 64, 64)),  # cut by the image's corners
         replace(pair, down=black, up=black, box_down=None, box_up=None),
-    ):
+    )
+
+
+@pytest.mark.parametrize("name", [name for name, method in METHODS.items() if not method.package])
+def test_dark_images_boxes_outside_and_noise_are_no_exceptions(name: str) -> None:
+    for changed in spoiled_pairs():
         answer = METHODS[name](changed)
         for spot in (answer.down, answer.up):
             assert (spot.uv_px is None) == (spot.status != "ok")
@@ -440,7 +446,8 @@ def test_the_off_frame_is_the_background_where_the_room_has_structure() -> None:
     assert 0.35 < np.sqrt(np.mean(np.square(pulls))) < 1.8
 
 
-def test_pulls_of_the_likelihood() -> None:
+@pytest.mark.slow
+def test_accuracy_pulls_of_the_likelihood() -> None:
     """96 numbers of deviation 1: their rms is 1 +- 0.072, within 0.75 and 1.3 but for 1 in 1000 or less.
 
     Twice the noise without the covariance knowing would give 1.4 and more.

@@ -7,6 +7,7 @@ tiles of random grey. Spots are pixel-integrated Gaussians at exact positions.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -59,6 +60,13 @@ WHITE = np.array([1.0, 0.85, 0.42])
 Light2 = tuple[str, tuple[float, float], float, Array]  # image, (u, v), electrons behind red, colour
 
 
+@cache
+def tiled(name: str, contrast: float) -> Array:
+    """Tiles of random grey, blurred by the optics as the spot is."""
+    tiles = 1.0 + contrast * generator("detect", "room", name).uniform(-1.0, 1.0, (18, 32))
+    return gaussian_filter(np.kron(tiles, np.ones((10, 10))), 0.7)
+
+
 @dataclass(frozen=True)
 class Scene:
     """A room, a spot of so many electrons in each image, and other lights, always on or with the laser alone."""
@@ -75,11 +83,10 @@ class Scene:
         return image_of(RIG.at(0.0 if name == "down" else STROKE_M), np.array(self.point_m)).uv_px
 
     def light(self, name: str, laser: bool) -> Light:
-        rng, s = generator("detect", "room", name), self.s
-        grey = np.kron(1.0 + self.tiles * rng.uniform(-1.0, 1.0, (18, 32)), np.ones((10, 10)))
-        # the optics blur the room as they blur the spot
-        grey = gaussian_filter(grey, 0.7)
+        s = self.s
+        grey = tiled(name, self.tiles)
         if self.lamp is not None and name == "down":
+            grey = grey.copy()
             grey[self.lamp.slices] = 200.0  # all three bands are full
         room = 800.0 * WHITE[:, None, None] * grey / s.exposure_s
         lights = [*self.always, *(self.with_laser if laser else ())]

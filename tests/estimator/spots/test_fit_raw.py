@@ -92,9 +92,10 @@ def _named(value: object) -> str:
     ("s", "sigma_px", "collected_e", "background_e"),
     [
         (MONO, 0.7, 2000.0, 100.0),
-        (BAYER, 0.7, 500.0, 0.0),
         (BAYER, 0.7, 2000.0, 100.0),
-        (BAYER, 1.2, 20_000.0, 100.0),  # at 0.7 px the brightest red pixels would be full
+        pytest.param(BAYER, 0.7, 500.0, 0.0, marks=pytest.mark.slow),
+        # at 0.7 px the brightest red pixels would be full
+        pytest.param(BAYER, 1.2, 20_000.0, 100.0, marks=pytest.mark.slow),
     ],
     ids=_named,
 )

@@ -102,10 +102,10 @@ def test_full_pixels_are_left_out() -> None:
 
 @pytest.mark.parametrize(
     ("preset", "power_w"),
-    # MJPEG without full pixels takes long, and test_chain.py has it in short
-    [("srgb8", 3e-4), ("srgb8", 3e-3), pytest.param("mjpeg", 3e-4, marks=pytest.mark.slow), ("mjpeg", 3e-3)],
+    # MJPEG takes long, and test_chain_fit.py has it in short
+    [("srgb8", 3e-4), ("srgb8", 3e-3), *(pytest.param("mjpeg", w, marks=pytest.mark.slow) for w in (3e-4, 3e-3))],
 )
-def test_full_pixels_of_processed_frames(preset: str, power_w: float) -> None:
+def test_accuracy_full_pixels_of_processed_frames(preset: str, power_w: float) -> None:
     """As above, through the chain: 20 pairs, deviation of the mean 0.16; limits with false alarms of 1e-4.
 
     MJPEG's claims are a little too large: mean 0.66 and 0.86 over 30 pairs.
@@ -116,7 +116,8 @@ def test_full_pixels_of_processed_frames(preset: str, power_w: float) -> None:
     assert 0.33 < found.mean() < 1.7
 
 
-def test_the_joint_fit_takes_the_oblique_blur() -> None:
+@pytest.mark.slow
+def test_accuracy_the_joint_fit_takes_the_oblique_blur() -> None:
     """Errors of D over the claimed sigma, squared, 60 pairs at 1 m: deviation of the mean sqrt(2 / 60) = 0.18.
 
     With a round blur it is 1.5, and the joint fit worse than separate ones; limits with false alarms of 1e-3.
