@@ -41,7 +41,7 @@ _POLL_S = 0.005  # between looks for a task that has ended: short beside any tas
 _LEAST_S = 0.5  # between two looks for a scheduler that is still to start
 _CENSUS_S = 2.0  # counting the workers is a call to the scheduler: not before every task
 # glibc returns large arrays at once; a view's arrays of 45 MB would then fault every page anew, 1 s a view
-_MEMORY = {"MALLOC_TRIM_THRESHOLD_": f"{2**31}", "MALLOC_MMAP_THRESHOLD_": f"{2**30}", "MALLOC_TOP_PAD_": f"{2**26}"}
+MEMORY = {"MALLOC_TRIM_THRESHOLD_": f"{2**31}", "MALLOC_MMAP_THRESHOLD_": f"{2**30}", "MALLOC_TOP_PAD_": f"{2**26}"}
 _STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _MISSING = "dask.distributed is not installed: run `pip install 'phibench[cluster]'`"
 
@@ -173,7 +173,7 @@ class _Worker:
     def begin(self, task: BuildTask) -> None:
         """Send a task, the first one to a new process; if the worker has just died, `outcome` tells."""
         if self._process.pid is None:
-            with _signals_kept_from_children(), environment_of_children({**_MEMORY, **ONE_THREAD}):
+            with _signals_kept_from_children(), environment_of_children({**MEMORY, **ONE_THREAD}):
                 self._process.start()
                 self._far.close()  # ours: the pipe then ends with the worker
         with contextlib.suppress(OSError):  # a worker that died at once: `result` tells

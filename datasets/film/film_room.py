@@ -155,6 +155,7 @@ def _key_view(
         planes = render(parts.view(part, place), pose, seed_32(*film.names, "key", path.name))
         write_view(path, planes, film.region, {"film": film.film_id, "place": place, "part": part, "key": wanted})
         journal.add(Entry(name, wanted, {view_name(*pose): sha256(path)}))
+        return planes  # as the file holds them: `write_view` has read it back
     return read_view(path, film.region)
 
 
@@ -201,7 +202,7 @@ def _frame_between(
         return int(np.argmax(light))
     place = (at - places[0]) / (places[1] - places[0])
     # second differences of the views say where they bend; the half-way point of that interval is the worst
-    bend = np.abs(np.diff(views.astype(np.float32), n=2, axis=0)).mean(axis=(1, 2, 3))
+    bend = np.array([np.abs((c - b) - (b - a)).mean() for a, b, c in zip(views, views[1:], views[2:], strict=False)])
     interval = np.clip(np.floor(place).astype(int), 0, len(places) - 2)
     strength = 0.5 * (bend[np.clip(interval - 1, 0, len(bend) - 1)] + bend[np.clip(interval, 0, len(bend) - 1)])
     halfway = 1.0 - 2.0 * np.abs(place - np.floor(place) - 0.5)

@@ -189,7 +189,7 @@ def _real(name: str, plane: ArrayLike, kind: type[np.floating]) -> NDArray[Any]:
         raise DatasetError(f"plane '{name}' has type {array.dtype}: real numbers are needed")
     with np.errstate(over="ignore"):
         result = np.ascontiguousarray(array, dtype=kind)
-    if np.any(np.isinf(result) & np.isfinite(array)):
+    if array.dtype != kind and (endless := np.isinf(result)).any() and np.any(np.isfinite(array[endless])):
         largest = "float32 (3.4e38)" if kind is np.float32 else "float16 (65504)"
         raise DatasetError(f"plane '{name}' has a finite value beyond {largest}")
     return result

@@ -9,7 +9,7 @@ metres. NaN marks what does not exist.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -215,7 +215,9 @@ ANGLES = ("phi_ray_rad", "phi_normal_rad", "phi_incidence_rad", "azimuth_rad")
 TRUTH_PLANES = ("x_m", "y_m", "z_m", "depth_m", "path_m", *ANGLES, "object_id")
 
 
-def truth_layer(view: View, room: GeometryLike, finder: Finder | None = None) -> dict[str, Array]:
+def truth_layer(
+    view: View, room: GeometryLike, finder: Finder | None = None, names: Sequence[str] = TRUTH_PLANES
+) -> dict[str, Array]:
     """Trace every pixel centre through the mirror.
 
     Parameters
@@ -225,18 +227,17 @@ def truth_layer(view: View, room: GeometryLike, finder: Finder | None = None) ->
     finder : callable (origins, directions) -> faces, or None
         Guesses the face of each ray: index in the geometry's `table`, -1 for none. `RoomGeometry.resolve` checks the
         guesses; without a finder all rays are traced.
+    names : those of `TRUTH_PLANES` that are wanted
 
     Returns
     -------
     planes : dict of arrays, shape (height, width), float64
-        Keys are `TRUTH_PLANES`: world point hit, D, path lens centre -> mirror -> point, the three phi, azimuth and
+        By `names`: world point hit, D, path lens centre -> mirror -> point, the three phi, azimuth and
         object id. NaN (object id -1) where the ray misses the mirror or hits nothing.
     """
     camera, geometry = view.rig.camera, as_geometry(room)
-    planes = dict(
-        zip(TRUTH_PLANES, np.full((len(TRUTH_PLANES), camera.height_px, camera.width_px), np.nan), strict=True)
-    )
-    planes["object_id"][:] = -1.0
+    size = camera.height_px, camera.width_px
+    planes = {name: np.full(size, -1.0 if name == "object_id" else np.nan) for name in names}
     blocks = [_traced_rows(view, geometry, rows, columns) for rows, columns in _disc_blocks(view)]
     guesses: list[IntArray | None] = [None] * len(blocks)
     if finder is not None:
@@ -308,17 +309,14 @@ def _fill(planes: dict[str, Array], view: View, room: RoomGeometry, block: _Bloc
     seen = found.object_id >= 0
     distance = np.where(seen, found.distance_m, np.nan)
     world = points.T + distance * directions.T
-    angles = mirror_angles(block.normals, block.directions)
-    values = (
-        *world,
-        depth_m(world.T, view.rig.at(0.0).sphere_centre_m),
-        block.path_m + distance,
-        *(np.where(seen, angle, np.nan) for angle in (angles.phi_ray_rad, angles.phi_normal_rad)),
-        *(np.where(seen, angle, np.nan) for angle in (angles.phi_incidence_rad, angles.azimuth_rad)),
-        found.object_id,
-    )
-    for name, value in zip(TRUTH_PLANES, values, strict=True):
-        planes[name].reshape(-1)[block.pixel] = value
+    values: dict[str, Array] = dict(zip(("x_m", "y_m", "z_m"), world, strict=True))
+    values["depth_m"] = depth_m(world.T, view.rig.at(0.0).sphere_centre_m)
+    values["path_m"], values["object_id"] = block.path_m + distance, found.object_id.astype(float)
+    if not values.keys() >= planes.keys():
+        angles = mirror_angles(block.normals, block.directions)
+        values |= {name: np.where(seen, getattr(angles, name), np.nan) for name in ANGLES}
+    for name, plane in planes.items():
+        plane.reshape(-1)[block.pixel] = values[name]
 
 
 def disc_window(view: View) -> tuple[slice, slice]:

@@ -134,9 +134,12 @@ def cell_plane(grid: FilmGrid, whole: Stack, row: NDArray[np.intp], column: NDAr
     n, (count, height, width) = grid.cells, whole.shape
     plane = np.empty((count, height * n, width * n), dtype=np.float32)
     corner = (row * (width * n) + column) * n
+    for j in range(n):
+        plane[:, ::n, j::n] = whole
+    for i in range(1, n):
+        plane[:, i::n] = plane[:, ::n]
     for i in range(n):
         for j in range(n):
-            plane[:, i::n, j::n] = whole
             places = corner + (i * width * n + j)
             for k in range(count):
                 plane[k].reshape(-1)[places] = cut[k, i, j]

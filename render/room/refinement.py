@@ -198,7 +198,9 @@ def _second_pass(film: CellSampler, cells: Cells, box: Box, budget: float) -> No
     m = cells.grid.margin_px
     part = (slice(box[0].start, box[0].stop + 2 * m), slice(box[1].start, box[1].stop + 2 * m))
     inside = grown(cells.mirrored[part], 1)
-    wanted = [_strata(cells, half, part, inside, budget) for half in (1, 0)]
+    n = cells.grid.cells
+    seen = np.repeat(np.repeat(cells.contrast[part], n, axis=0), n, axis=1)
+    wanted = [_strata(cells, half, part, inside, seen, budget) for half in (1, 0)]
     computed = (cells.lamps >= 0) & ((wanted[0] > 1) | (wanted[1] > 1))
     for half, side in enumerate(wanted):
         side[computed] = _LAMP_SIDE
@@ -207,13 +209,17 @@ def _second_pass(film: CellSampler, cells: Cells, box: Box, budget: float) -> No
     _without_hidden_lamps(film, cells, 1)
 
 
-def _strata(cells: Cells, half: int, part: Box, inside: NDArray[np.bool_], budget: float) -> NDArray[np.int32]:
-    """Strata along a side that cells need by one half, shape (n, n, N); 1 where `inside`, a part of pixels, is not."""
+def _strata(
+    cells: Cells, half: int, part: Box, inside: NDArray[np.bool_], seen: Stack, budget: float
+) -> NDArray[np.int32]:
+    """Strata along a side that cells need by one half, shape (n, n, N); 1 where `inside`, a part of pixels, is not.
+
+    `seen` is the contrast of the scouts around each cell of the part.
+    """
     grid, n, m = cells.grid, cells.grid.cells, cells.grid.margin_px
     row, column, rank = cut_in(cells, part)
     own = sum_of_colours(cells.halves[half])[None]
     plane = cell_plane(grid, sum_of_colours(cells.whole[0][:, *part])[None], row, column, of_rank(own, rank))[0]
-    seen = np.repeat(np.repeat(cells.contrast[part], n, axis=0), n, axis=1)
     variance: Stack = np.float32(0.5 * _TRUE * _CUT) * np.square(np.maximum(contrast(plane), seen))
     allowed = allowed_of_sum(mean_of_nine(means_of_cells(plane, n)), grid, budget)
     tight = extreme(np.minimum, allowed, 1)

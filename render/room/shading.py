@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from itertools import pairwise
 from types import ModuleType
 from typing import Any
@@ -235,6 +236,25 @@ _MOST_BENDS = (0.04, 0.04, 0.1, 0.1)  # second differences over the film and ove
 _FLAT = 1e-9  # of the area that the same sides would span: a lamp seen edge on
 
 
+@dataclass(frozen=True)
+class _Square:
+    """Squares of the film as lamps see them: Dr.Jit arrays.
+
+    Attributes
+    ----------
+    corners : of a lamp's rectangle, in half sides of the square
+    tilt : by how much they move with the point of the lens
+    valid, crossed, within : masks
+        Whether the map is known; whether an outline may cross the square; whether the lamp covers all of it.
+    """
+
+    corners: list[tuple[Any, Any]]
+    tilt: list[tuple[Any, Any]]
+    valid: Any
+    crossed: Any
+    within: Any
+
+
 class LampOutlines:
     """Rectangles that emit, seen by an ideal mirror: how much of a square of the film each covers.
 
@@ -271,19 +291,41 @@ class LampOutlines:
         """Number of the lamp that is a patch, -1 where it is none; brighter lamps have higher numbers."""
         return np.asarray(self._lamp[patch])
 
-    def share(self, middle: list[Any], half: Any, points: Any, turn: list[Any], lamp: Any) -> tuple[Any, Any]:
-        """Light of a lamp on squares of the film, electrons/s per square pixel, and the part that it covers.
+    def outline(self, middle: list[Any], half: Any, lamp: Any) -> tuple[Any, Any, Any]:
+        """Light of lamps on squares of the film, electrons/s per square pixel; whether their outlines may cross these.
 
-        The light is that of a square which the lamp covers whole; 0 where the map is not known well enough.
+        The light is that of a square which the lamp covers whole; 0 where the map is not known well enough. Where no
+        point of the lens brings an outline into a square, the third mask tells whether the lamp covers it.
 
         Parameters
         ----------
         middle, half
             Middle (u, v) of squares and half of their sides, float64 pixels.
-        points, turn
-            Number of lens points, and two uniform deviates that turn their pattern.
         lamp
             Numbers of lamps, -1 for none.
+        """
+        import drjit as dr
+
+        mi = self._mi
+        ends, known, weight, radiance = self._ends(middle, half, lamp)
+        shape = self._square(ends)
+        light = weight * mi.Color3f(*(mi.Float(value) for value in radiance))
+        return dr.select(known & shape.valid, light, 0.0), shape.crossed, shape.within
+
+    def share(self, middle: list[Any], half: Any, points: Any, turn: list[Any], lamp: Any) -> Any:
+        """Part of squares of the film that lamps cover; arguments as for `outline`.
+
+        Parameters
+        ----------
+        points, turn
+            Number of lens points, and two uniform deviates that turn their pattern.
+        """
+        return self._mi.Float(self._covered(self._square(self._ends(middle, half, lamp)[0]), points, turn))
+
+    def _ends(self, middle: list[Any], half: Any, lamp: Any) -> tuple[list[tuple[Any, Any]], Any, Any, Any]:
+        """Places on lamps, whether all are known, weight of the middle ray, and radiance of the lamps.
+
+        The places are those of the middle, of -s, s, -t, t on the film, and of four points on the rim of the lens.
         """
         import drjit as dr
 
@@ -295,9 +337,7 @@ class LampOutlines:
         ends = [_place(dr, rows, ray) for ray in rays]
         for _, _, met in ends:
             known &= met
-        part, valid = self._covered([(a, b) for a, b, _ in ends], points, turn)
-        light = rays[0][2] * mi.Color3f(*(mi.Float(value) for value in rows[4]))
-        return dr.select(known & valid, light, 0.0), mi.Float(part)
+        return [(a, b) for a, b, _ in ends], known, rays[0][2], rows[4]
 
     def meets(self, ray: tuple[Any, Any, Any], lamp: Any) -> Any:
         """True where rays meet the plane of a lamp within the lamp, whatever hides it."""
@@ -316,14 +356,10 @@ class LampOutlines:
         row = [dr.gather(mi.Float64, column, index, known) for column in self._rows]
         return [mi.Vector3d(*row[3 * k : 3 * k + 3]) for k in range(5)], known
 
-    def _covered(self, ends: list[tuple[Any, Any]], points: Any, turn: list[Any]) -> tuple[Any, Any]:
-        """Part of squares, (s, t) in [-1, 1]^2, that a lamp covers, mean over the lens; whether the map is known.
-
-        `ends` are places on the lamp for the middle, for -s, s, -t, t, and for four points on the rim of the lens.
-        """
+    def _square(self, ends: list[tuple[Any, Any]]) -> _Square:
+        """Square of the film as a lamp sees it, by the places of `_ends`."""
         import drjit as dr
 
-        mi = self._mi
         middle, *others = ends
         slopes, bends = [], []
         for low, high in zip(others[::2], others[1::2], strict=True):
@@ -343,25 +379,30 @@ class LampOutlines:
             s, t = square(*bend)
             valid &= (dr.abs(s) < most) & (dr.abs(t) < most)
         corners = [square(p - a, q - b) for p, q in ((-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0))]
-        (xs, xt), (ys, yt) = (square(*one) for one in tilt)
         # a lamp's outline that no point of the lens brings into the square: one point tells all
         reach = [dr.abs(j) + dr.abs(k) + dr.sqrt(x * x + y * y) for j, k, x, y in zip(*slopes, strict=True)]
         apart = (dr.abs(a) > 1.0 + reach[0]) | (dr.abs(b) > 1.0 + reach[1])
         within = (dr.abs(a) < 1.0 - reach[0]) & (dr.abs(b) < 1.0 - reach[1])
-        points = dr.select(apart | within, 1, points)
+        return _Square(corners, [square(*one) for one in tilt], valid, ~(apart | within), within)
 
+    def _covered(self, square: _Square, points: Any, turn: list[Any]) -> Any:
+        """Part of squares, (s, t) in [-1, 1]^2, that a lamp covers, mean over the lens."""
+        import drjit as dr
+
+        mi = self._mi
+        (xs, xt), (ys, yt) = square.tilt
         first, angle0 = mi.Float64(turn[0]), 2.0 * math.pi * mi.Float64(turn[1])
 
         def body(i: Any, area: Any) -> tuple[Any, Any]:
             radius = dr.sqrt((mi.Float64(i) + first) / mi.Float64(points))
             angle = _GOLDEN_ANGLE * mi.Float64(i) + angle0
             x, y = radius * dr.cos(angle), radius * dr.sin(angle)
-            moved = [(s - x * xs - y * ys, t - x * xt - y * yt) for s, t in corners]
+            moved = [(s - x * xs - y * ys, t - x * xt - y * yt) for s, t in square.corners]
             return i + 1, area + dr.abs(sum(_swept(dr, moved[k], moved[(k + 1) % 4]) for k in range(4)))
 
-        start = (mi.UInt32(0), dr.zeros(mi.Float64, dr.width(a)))
+        start = (mi.UInt32(0), dr.zeros(mi.Float64, dr.width(xs)))
         _, area = dr.while_loop(start, lambda i, _: i < points, body)
-        return area / (4.0 * mi.Float64(dr.maximum(points, 1))), valid
+        return area / (4.0 * mi.Float64(dr.maximum(points, 1)))
 
 
 def _place(dr: ModuleType, lamp: list[Any], ray: tuple[Any, ...]) -> tuple[Any, Any, Any]:

@@ -373,21 +373,31 @@ class CellSampler:
 
         assert self.lamps is not None
         mi, n = self._mi, _PARTS
-        place = np.tile(np.arange(n * n), len(numbers))
-        lanes, points, column, row = (
-            mi.UInt32(aligned(values, np.uint32))
-            for values in (np.repeat(numbers, n * n), np.repeat(_LENS_POINTS * side, n * n), place % n, place // n)
-        )
-        corner, h = self._corner(lanes)
-        h = h / n
-        middle = [low + (mi.Float64(k) + 0.5) * h for low, k in zip(corner, (column, row), strict=True)]
-        turn = paired_shifts(mi, lanes * (n * n) + row * n + column, 2, dr.opaque(mi.UInt32, key))
-        which = mi.Int32(aligned(np.repeat(lamp, n * n), np.int32))
-        light, part = self.lamps.share(middle, 0.5 * h, points, turn, which)
-        dr.eval(light, part)
+        cell, place = np.repeat(np.arange(len(numbers)), n * n), np.tile(np.arange(n * n), len(numbers))
+
+        def square(chosen: Any) -> tuple[Any, ...]:
+            lanes, column, row = (
+                mi.UInt32(aligned(values, np.uint32))
+                for values in (numbers[cell[chosen]], place[chosen] % n, place[chosen] // n)
+            )
+            corner, h = self._corner(lanes)
+            h = h / n
+            middle = [low + (mi.Float64(k) + 0.5) * h for low, k in zip(corner, (column, row), strict=True)]
+            which = mi.Int32(aligned(lamp[cell[chosen]], np.int32))
+            return middle, 0.5 * h, which, lanes * (n * n) + row * n + column
+
+        *where, quarter = square(slice(None))
+        light, crossed, within = self.lamps.outline(*where)
+        dr.eval(light, crossed, within)
+        part = np.array(within, dtype=np.float32)
+        if (chosen := np.flatnonzero(np.array(crossed))).size and side.any():
+            middle, half, which, quarter = square(chosen)
+            points = mi.UInt32(aligned(_LENS_POINTS * side[cell[chosen]], np.uint32))
+            turn = paired_shifts(mi, quarter, 2, dr.opaque(mi.UInt32, key))
+            part[chosen] = np.array(self.lamps.share(middle, half, points, turn, which))
         lights = _planes(light).reshape(3, -1, n * n)
         known = (lights.sum(axis=0) > 0.0).all(axis=1)
-        return np.where(known, lights.mean(axis=2), np.float32(0.0)), np.array(part).reshape(-1, n * n).mean(axis=1)
+        return np.where(known, lights.mean(axis=2), np.float32(0.0)), part.reshape(-1, n * n).mean(axis=1)
 
     def _corner(self, lanes: Any, parts: int = 0) -> tuple[list[Any], Any]:
         """Corner (u, v) of cells, or parts of pixels, and their side, float64 pixels; opaque: one kernel for all."""
@@ -411,7 +421,7 @@ def _chunks(side: NDArray[np.int32]) -> tuple[NDArray[np.intp], NDArray[np.intp]
     cell = np.repeat(np.arange(len(side)), count)
     start = (np.arange(len(cell)) - np.repeat(np.cumsum(count) - count, count)) * _CHUNK
     stop = np.minimum(start + _CHUNK, samples[cell])
-    order = np.argsort(start - stop, kind="stable")
+    order = np.argsort((start - stop).astype(np.int16), kind="stable")  # by radix: ten times as fast as whole words
     return cell[order], start[order], stop[order]
 
 

@@ -1,0 +1,158 @@
+"""CPU time of light maps, and of views with all that is written of them, one thread, as a worker does them.
+
+python docs/measure_views.py bake lab
+python docs/measure_views.py bake worlds --rooms 20
+python docs/measure_views.py view paper
+python docs/measure_views.py view worlds
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import os
+import resource
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import ExitStack
+from itertools import islice
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+from unittest.mock import patch
+
+import numpy as np
+
+from phibench.datasets.build.bake_task import bake_room, bake_settings
+from phibench.datasets.build.view_task import render_view
+from phibench.datasets.build.workers import MEMORY
+from phibench.datasets.common.parallel import ONE_THREAD
+from phibench.datasets.plan.plan import make_plan
+from phibench.datasets.plan.room_draws import draw_rooms
+from phibench.datasets.recipe.load import load_recipe
+from phibench.datasets.store.schema import view_file
+from phibench.render.room.light_map import BakeSettings, bake
+from phibench.render.room.noise_budget import BUDGETS
+from phibench.render.room.subpixel_grid import CellSampler
+from phibench.render.setup.variant import activate
+from phibench.scenes.catalog import default_rig, lab
+from phibench.scenes.room import Room
+
+COARSE = BakeSettings(texel_m=0.5, lamp_rays=16, bounces=2, bounce_rays=8, final_rays=16)
+TASK = "phibench.datasets.build.view_task"
+PARTS = {
+    "light": ("phibench.render.room.ambient", ("view_surfaces", "render_ambient")),
+    "truth": ("phibench.render.optics.truth", ("truth_layer",)),
+    "layers' files": (TASK, ("write_ambient", "write_truth")),
+    "preview": (TASK, ("display_exposure_s", "to_srgb", "save_png")),
+}
+
+
+def rooms(what: str, count: int) -> Iterator[tuple[str, Room, BakeSettings]]:
+    """Name, room and settings of each bake."""
+    if what == "lab":
+        yield from (("lab", lab(()), BakeSettings()) for _ in range(count))
+        return
+    recipe = load_recipe(what)
+    for name, source in islice(draw_rooms(recipe).items(), count):
+        yield name, source.build(), bake_settings(recipe.ambient)
+
+
+def measure_bakes(what: str, count: int) -> None:
+    """Bake and print a line each, then the median."""
+    view, times = default_rig().at(0.0), []
+    bake(view, lab(()), COARSE)  # compiles the kernels
+    for name, room, settings in rooms(what, count):
+        before = time.process_time()
+        light = bake(view, room, settings)
+        times.append(time.process_time() - before)
+        free = ~light.covered
+        level, sigma = (np.asarray(a, float)[free] for a in (light.irradiance_w_m2, light.sigma_w_m2))
+        noise = np.sqrt(np.mean(sigma**2) / np.mean(level**2))
+        print(f"{name}: {len(level)} texels, {times[-1]:.2f} CPU-s, stated noise {100 * noise:.2f} % rms", flush=True)
+    print(f"median {np.median(times):.2f} CPU-s of {len(times)}")
+
+
+def measure_views(what: str, quality: str | None, repeat: int) -> None:
+    """Render the first view of a recipe several times; print the median CPU time of its parts, rays, sizes, memory."""
+    recipe = load_recipe(what)
+    ambient = recipe.ambient.model_copy(update={"quality": quality or recipe.ambient.quality})
+    plan = make_plan(recipe)
+    pose = plan.poses[0]
+    rig, source = plan.rigs[pose.rig], plan.rooms[pose.room]
+    with TemporaryDirectory() as folder:
+        out = Path(folder)
+        bake_room(out, plan.rig, pose.room, source, ambient)
+        print(f"memory after the bake {_memory_mb():.0f} MB")
+        runs = [_parts(lambda: render_view(out, what, rig, source, pose, ambient)) for _ in range(repeat + 1)]
+        files = [out / view_file(pose.pose_id, name) for name in ("ambient", "truth", "preview")]
+        print(", ".join(f"{file.name} {file.stat().st_size / 1e6:.2f} MB" for file in files))
+        count, was = 0, {name: getattr(CellSampler, name) for name in ("sample_once", "sample")}
+
+        def once(self: Any, numbers: Any, *rest: Any) -> Any:
+            nonlocal count
+            count += len(numbers)
+            return was["sample_once"](self, numbers, *rest)
+
+        def again(self: Any, numbers: Any, side: Any, *rest: Any) -> Any:
+            nonlocal count
+            count += int(np.sum(side.astype(int) ** 2))
+            return was["sample"](self, numbers, side, *rest)
+
+        with patch.object(CellSampler, "sample_once", once), patch.object(CellSampler, "sample", again):
+            render_view(out, what, rig, source, pose, ambient)
+    for name in (*PARTS, "all"):
+        times = [run[name] for run in runs[1:]]  # the first compiles kernels
+        print(f"{name}: median {np.median(times):.3f}, least {min(times):.3f} CPU-s")
+    print(f"{count / 1e6:.2f} million rays; memory {_memory_mb():.0f} MB")
+
+
+def _parts(work: Any) -> Counter[str]:
+    """CPU seconds of parts of some work, and of all of it."""
+    spent: Counter[str] = Counter()
+
+    def timed(part: str, function: Any) -> Any:
+        def call(*args: Any, **named: Any) -> Any:
+            before = time.process_time()
+            result = function(*args, **named)
+            spent[part] += time.process_time() - before
+            return result
+
+        return call
+
+    with ExitStack() as stack:
+        for part, (name, functions) in PARTS.items():
+            module = importlib.import_module(name)
+            for one in functions:
+                stack.enter_context(patch.object(module, one, timed(part, getattr(module, one))))
+        timed("all", work)()
+    return spent
+
+
+def _memory_mb() -> float:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+def main() -> None:
+    """Read the options and measure."""
+    wanted = {**ONE_THREAD, **MEMORY}
+    if any(os.environ.get(name) != value for name, value in wanted.items()):
+        os.execve(sys.executable, [sys.executable, *sys.argv], {**os.environ, **wanted})
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("which", choices=("bake", "view"))
+    parser.add_argument("what", help="a recipe; bakes also of `lab` at its own noise")
+    parser.add_argument("--rooms", type=int, default=5, help="bakes")
+    parser.add_argument("--repeat", type=int, default=5, help="renderings of a view")
+    parser.add_argument("--quality", choices=tuple(BUDGETS), help="of a view, over the recipe's")
+    options = parser.parse_args()
+    activate()
+    if options.which == "bake":
+        measure_bakes(options.what, options.rooms)
+    else:
+        measure_views(options.what, options.quality, options.repeat)
+
+
+if __name__ == "__main__":
+    main()
