@@ -254,9 +254,10 @@ def sealed(secret_dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> An
 @pytest.fixture(scope="session")
 def submitted(sealed: Any, method: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Submission of `method` to `sealed`."""
+    from phibench.benchmark.scores.document import Declared
     from phibench.benchmark.sealed.submission import submit
 
     out = tmp_path_factory.mktemp("submission") / "submission.json"
-    done = submit(sealed.public, method, out)
+    done = submit(sealed.public, method, out, declared=Declared("closed"))
     assert (done.pairs, done.answered) == (3, 2)
     return out

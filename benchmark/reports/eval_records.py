@@ -13,8 +13,9 @@ from pathlib import Path
 from typing import Any
 
 from phibench.benchmark.pair_sets.dataset_pairs import tracks_of
-from phibench.benchmark.reports.track_tables import NUMBERS, preset_name, rig_known
+from phibench.benchmark.reports.track_tables import NUMBERS, preset_name
 from phibench.benchmark.scores.document import MetricDescription, ScoreDocument, read_score
+from phibench.benchmark.scores.score_tables import rig_known
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.store.files import write_text
 
@@ -69,6 +70,7 @@ def every_eval_ever(document: ScoreDocument, dataset_id: str, organization: str,
     """Record of a score: each metric with its interval, what was scored, and by which program."""
     method = document.method
     details = {"reference": method.reference, "sha256": method.sha256 or "", "rig": rig_known(document)}
+    details["division"] = method.division
     names = [*(NUMBERS[track].ranks for track in tracks_of(document.pair_set)), *_ALSO]
     return {
         "schema_version": SCHEMA,
@@ -124,8 +126,9 @@ def hub_entries(document: ScoreDocument, dataset_id: str, when: datetime) -> lis
         name = NUMBERS[track].ranks
         value = document.metrics[name].value
         if value is not None:
+            word = f"rig {rig_known(document)}; {document.method.division} division"
             task = f"{track}_{file_word(preset_name(document))}"
-            note = f"{document.metrics[name].text}; rig {rig_known(document)}; {document.program}"
+            note = f"{document.metrics[name].text}; {word}; {document.program}"
             entries.append(
                 {
                     "dataset": {"id": dataset_id, "task_id": task},

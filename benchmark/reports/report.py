@@ -31,8 +31,10 @@ from phibench.benchmark.scores.compare import note_on_others, same_pairs
 from phibench.benchmark.scores.document import EncodedPicture, ScoreDocument, read_records, read_score
 from phibench.benchmark.scores.metrics import METRICS, RANKS, applies
 from phibench.benchmark.scores.score_tables import (
+    BY_WORD,
     FULL_OF_FALSE,
     HEADS,
+    division_and_rig,
     false_line,
     frames_line,
     head,
@@ -89,7 +91,8 @@ def tracks_section(documents: Sequence[ScoreDocument]) -> Section | None:
     if not tables:
         return None
     words = (
-        "localise: spots with a bound below 1 px, in boxes of 64 px. find and depth: whole frames.",
+        "localise: spots with a bound below 1 px, in boxes of 64 px. find and depth: whole frames. Division closed: "
+        "tuned on dev alone, by its author's word. Rig: what the method was given, or corrects itself.",
         "Ordered by the mean place over presets. Overlapping intervals settle no order: use phibench compare. A star: "
         "too few samples for an interval. The rows of a perfect method are Gaussian errors at the bound.",
     )
@@ -223,6 +226,8 @@ def report_html(
     environment.globals.update(
         applies=applies,
         head=head,
+        division_and_rig=division_and_rig,
+        by_word=BY_WORD,
         frames_line=frames_line,
         light_line=light_line,
         parts=shown_parts,

@@ -29,11 +29,13 @@ from phibench.benchmark.scores.compare import (
 from phibench.benchmark.scores.document import ScoreDocument, StratumScore, read_records, read_score
 from phibench.benchmark.scores.metrics import METRICS, applies
 from phibench.benchmark.scores.score_tables import (
+    BY_WORD,
     DIGITS,
     FLAGGED,
     cause_table,
     cell_parts,
     differences_json,
+    division_and_rig,
     frames_line,
     head,
     light_line,
@@ -161,9 +163,11 @@ def _board(part: ScoreGroup, title: str, names: Sequence[str]) -> TextTable:
     rows = []
     for score in part.scores:
         cells = (starred(shown_parts(m, score.metrics[m])) if applies(m, score.method.sees) else "" for m in names)
-        rows.append((f"{score.method.name}{FLAGGED if score.flags else ''}", *cells))
+        words = division_and_rig(score) if names is _BOARD else ()
+        rows.append((f"{score.method.name}{FLAGGED if score.flags else ''}", *words, *cells))
+    heads, columns = (BY_WORD, "lll") if names is _BOARD else ((), "l")
     note = " ".join(filter(None, (frames_line(part.scores[0]), light_line(part.scores[0]))))
-    return TextTable(title, ("method", *map(_head, names)), tuple(rows), "l" + "r" * len(names), note)
+    return TextTable(title, ("method", *heads, *map(_head, names)), tuple(rows), columns + "r" * len(names), note)
 
 
 def _differences(part: ScoreGroup) -> TextTable:
@@ -221,6 +225,7 @@ A blank: the metric is not that method's. A dash: nothing to compute it from.
 |---|---|
 | Ranking | rms errors with missed spots and false detections counted, the best rank of {quantity} first; found, false |
 | Errors of found spots and depths | each method over what it has found itself: who finds less has easier spots |
+| the same: division, rig | what a method was tuned on and what it knows of the rig ([rules](submission.md#divisions)) |
 | Efficiency and claims | rms at the bound over rms; deviation of pulls, 1 is right; coverage of D, 95 is right |
 | the same: beyond 5 sigma | share of claims off by more than 5 sigma, 0 is right; pulls leave out errors of 3 px |
 | Method minus | paired differences on the same samples; two stars: shown by an exact test, Holm over 16 metrics |

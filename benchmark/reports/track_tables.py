@@ -1,7 +1,7 @@
 """Tables of the tracks: one row per method, one column per preset, the track's number with its interval.
 
-They come first in a report and in results. What a method knows of the rig stands beside its name: whoever is given a
-calibration does not compete with whoever is not.
+They come first in a report and in results. Division and what a method knows of the rig stand beside its name: whoever
+is given a calibration does not compete with whoever is not.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from phibench.benchmark.pair_sets.dataset_pairs import TRACKS, Track, tracks_of
 from phibench.benchmark.scores.document import ScoreDocument
 from phibench.benchmark.scores.metrics import METRICS
-from phibench.benchmark.scores.score_tables import FLAGGED, shown_parts, starred
+from phibench.benchmark.scores.score_tables import BY_WORD, FLAGGED, rig_known, shown_parts, starred
 from phibench.datasets.common.shown_text import TextTable
 
 
@@ -62,11 +62,6 @@ def track_tables(documents: Sequence[ScoreDocument]) -> list[TextTable]:
     return tables
 
 
-def rig_known(document: ScoreDocument) -> str:
-    """Rig that a method is given: "nominal" or "calibrated"."""
-    return "calibrated" if document.pair_set.get("calibration") else "nominal"
-
-
 def preset_name(document: ScoreDocument) -> str:
     """Presets of a score in words."""
     return ", ".join(document.pair_set.get("presets", ())) or "pairs"
@@ -75,17 +70,17 @@ def preset_name(document: ScoreDocument) -> str:
 def _by_preset(track: Track, documents: Sequence[ScoreDocument]) -> TextTable:
     numbers = NUMBERS[track]
     presets = list(dict.fromkeys(map(preset_name, documents)))
-    rows: dict[tuple[str, str], dict[str, ScoreDocument]] = {}
+    rows: dict[tuple[str, str, str], dict[str, ScoreDocument]] = {}
     for document in documents:
         name = f"{document.method.name}{FLAGGED if document.flags else ''}"
-        rows.setdefault((name, rig_known(document)), {})[preset_name(document)] = document
+        rows.setdefault((name, document.method.division, rig_known(document)), {})[preset_name(document)] = document
     order = sorted(rows.items(), key=lambda row: _mean_place(row[1], documents, track))
     made = [(*key, *(_cell(numbers.ranks, own.get(preset)) for preset in presets)) for key, own in order]
     firsts = {preset: next(one for one in documents if preset_name(one) == preset) for preset in presets}
     for name, metric in numbers.perfect.items():
-        made.append((name, "", *(_cell(metric, firsts[preset]) for preset in presets)))
+        made.append((name, "", "", *(_cell(metric, firsts[preset]) for preset in presets)))
     note = "Ordered by the mean place over presets. Overlapping intervals settle no order: use `phibench compare`."
-    return TextTable(numbers.title, ("method", "rig", *presets), tuple(made), "ll" + "r" * len(presets), note)
+    return TextTable(numbers.title, ("method", *BY_WORD, *presets), tuple(made), "lll" + "r" * len(presets), note)
 
 
 def _mean_place(own: Mapping[str, ScoreDocument], documents: Sequence[ScoreDocument], track: Track) -> float:

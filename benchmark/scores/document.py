@@ -12,9 +12,9 @@ import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, Protocol, Self, TypeVar
+from typing import Annotated, Any, Literal, Protocol, Self, TypeVar, get_args
 
 import polars as pl
 from pydantic import AfterValidator, Field, model_validator
@@ -95,6 +95,43 @@ class StratumScore(Document):
     metrics: Mapping[str, Value]
 
 
+Division = Literal["closed", "open"]
+DIVISIONS: tuple[Division, ...] = get_args(Division)
+
+
+@dataclass(frozen=True)
+class Declared:
+    """What the author of a method says of it, and nobody can check.
+
+    Attributes
+    ----------
+    division : "closed", "open" or None
+        Closed: tuned on dev alone. None says nothing: a method of one's own is then open.
+    self_calibrates : bool
+        The method corrects the rig from the pictures that it gets.
+
+    Raises
+    ------
+    DatasetError
+        If there is no such division.
+    """
+
+    division: Division | None = None
+    self_calibrates: bool = False
+
+    def __post_init__(self) -> None:
+        if self.division not in (None, *DIVISIONS):
+            raise DatasetError(f"division {self.division!r}: give {' or '.join(DIVISIONS)} (docs/submission.md)")
+
+    def fields(self, kind: str) -> dict[str, Any]:
+        """Fields of a card; none of a built-in method, of which phibench says it."""
+        division = {} if self.division is None else {"division": self.division}
+        return {} if kind == BUILT_IN else {**division, "self_calibrates": self.self_calibrates}
+
+
+BUILT_IN = "built-in"
+
+
 class MethodCard(Document):
     """Identity of a method: reference, place, hash of its code (null if it cannot be told), and what it ran with."""
 
@@ -118,6 +155,10 @@ class MethodCard(Document):
     sees: Literal["image", "pair", ""] = Field(
         default="", description="each image by itself, or both as one point; empty if that is not known"
     )
+    division: Division = Field(
+        default="open", description="closed: tuned on dev alone, by its author's word; by default of built-in methods"
+    )
+    self_calibrates: bool = Field(default=False, description="corrects the rig from the pictures, by the same word")
 
     @classmethod
     def of(cls, reference: str, **fields: Any) -> MethodCard:
@@ -126,10 +167,15 @@ class MethodCard(Document):
 
     @model_validator(mode="before")
     @classmethod
-    def _name(cls, fields: Any) -> Any:
-        reference = fields.get("reference") if isinstance(fields, dict) else None
-        known = isinstance(reference, str) and reference and not fields.get("name")
-        return {**fields, "name": fields["reference"].rsplit("/", 1)[-1]} if known else fields
+    def _defaults(cls, fields: Any) -> Any:
+        if not isinstance(fields, dict):
+            return fields
+        reference, told = fields.get("reference"), {}
+        if isinstance(reference, str) and reference and not fields.get("name"):
+            told["name"] = reference.rsplit("/", 1)[-1]
+        if fields.get("kind") == BUILT_IN:
+            told["division"] = fields.get("division", "closed")
+        return {**fields, **told}
 
 
 class Flag(Document):

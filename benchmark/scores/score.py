@@ -30,6 +30,8 @@ from phibench.benchmark.pair_sets.wanted_pairs import (
 from phibench.benchmark.scores.answer_errors import Rules
 from phibench.benchmark.scores.causes import with_causes
 from phibench.benchmark.scores.document import (
+    Declared,
+    Division,
     MethodCard,
     ScoreDocument,
     UnfinishedError,
@@ -261,6 +263,8 @@ def score(
     seed: int = 0,
     out: str | Path | None = None,
     console: Console | None = None,
+    division: Division | None = None,
+    self_calibrates: bool = False,
     **choice: Unpack[ChoiceKeywords],
 ) -> Scored:
     """Score one method on the pairs of a data set: `phibench.score`.
@@ -283,6 +287,8 @@ def score(
         JSON file to write, with its Parquet file beside it.
     console : Console, optional
         Where progress goes; by default the standard error.
+    division, self_calibrates : optional
+        What you say of your method, as `Declared`: "closed" if it was tuned on dev alone, "open" by default.
     **choice
         Fields of `PairChoice` but the preset: draws, pairs, hints, boxes_px, calibration, sensor, frames, track.
 
@@ -298,19 +304,20 @@ def score(
     MethodError
         If the method cannot be found or imported.
     """
-    console = console or progress_console()
+    console, declared = console or progress_console(), Declared(division, self_calibrates)
     opened = dataset if isinstance(dataset, Dataset | FramesSet) else open_scored(dataset)
     if out is not None:
         require_writable(Path(out))
     chosen = wanted_pairs(opened, PairChoice(preset, **choice))
     if isinstance(method, str):
         with records_kept([None if out is None else Path(out)]):
-            (scored,) = run_and_score([method], chosen, workers, console, "pairs", seed, limits)
+            (scored,) = run_and_score([method], chosen, workers, console, "pairs", seed, limits, None, declared)
     else:
         if limits is not None or workers != 1:
             raise MethodError("limits and workers are for methods in a process of their own: give FILE.py:FUNCTION")
         with Steps(console, "pairs", len(chosen)) as steps:
-            card = MethodCard.of(function_name(method), kind="function", **code_of_function(method))
+            code = code_of_function(method) | declared.fields("function")
+            card = MethodCard.of(function_name(method), kind="function", **code)
             (scored,) = score_methods([card], chosen, asked_here(method), None, seed, None, steps.reach)
         scored = ran_with(isolated(scored, "not isolated: a function runs in this process"), ran_here())
     return scored if out is None else saved(scored, Path(out))
@@ -350,10 +357,11 @@ def run_and_score(
     seed: int = 0,
     limits: RunLimits | None = None,
     stages: dict[str, float] | None = None,
+    declared: Declared | None = None,
 ) -> list[Scored]:
     """Score methods on the same pairs, built-in ones in one process, others in their own; parameters as for `bench`.
 
-    `stages` gets the CPU-seconds by stage: of all pairs together.
+    `stages` gets the CPU-seconds by stage: of all pairs together. `declared` is of methods that are not built in.
 
     Raises
     ------
@@ -361,7 +369,11 @@ def run_and_score(
         If a method cannot be found or imported.
     """
     resolved, limits = [resolve(reference) for reference in references], limits or RunLimits()
-    cards = [MethodCard.of(name, **method.document()) for name, method in zip(references, resolved, strict=True)]
+    declared = declared or Declared()
+    cards = [
+        MethodCard.of(name, **method.document(), **declared.fields(method.kind))
+        for name, method in zip(references, resolved, strict=True)
+    ]
     if not cards:
         return []
     # the steps first: they tell of time that goes by while methods start

@@ -79,6 +79,27 @@ def rank_words(by: str) -> str:
     return f"ranked by {what}, missed spots and false detections counted"
 
 
+BY_WORD = ("division", "rig")
+"""Columns beside a method's name: what it was tuned on, by its author's word, and what it knows of the rig."""
+
+
+def rig_known(document: ScoreDocument) -> str:
+    """What a method knows of the rig: "nominal", "calibrated" or "self-calibrated".
+
+    A calibration is "calibrated" if it was made from spots whose D was measured. One from outlines and vertical edges
+    is "self-calibrated", and so is a method that corrects the rig from the pictures that it gets.
+    """
+    pair_set = document.pair_set
+    if pair_set.get("calibration") and (pair_set.get("calibrated_from") or {}).get("spots", True):
+        return "calibrated"
+    return "self-calibrated" if pair_set.get("calibration") or document.method.self_calibrates else "nominal"
+
+
+def division_and_rig(document: ScoreDocument) -> tuple[str, str]:
+    """Cells of `BY_WORD`."""
+    return document.method.division, rig_known(document)
+
+
 def refused(records: pl.DataFrame) -> str:
     """Reason for which a built-in method took none of the pairs, such as "takes srgb8, not bayer-raw"; "" if it did.
 
@@ -98,12 +119,14 @@ def leaderboard(documents: Sequence[ScoreDocument], by: str = "phi", wide: bool 
     for document in ranked(documents, by):
         sees = document.method.sees
         cells = (_cell(name, document.metrics[name], wide) if applies(name, sees) else "" for name in names)
-        rows.append((f"{document.method.name}{FLAGGED if document.flags else ''}", *cells))
+        words = division_and_rig(document) if wide else ()
+        rows.append((f"{document.method.name}{FLAGGED if document.flags else ''}", *words, *cells))
     interval = f" {100 * first.rules['confidence']:g} % intervals over samples below the values." if wide else ""
     title = f"{_pairs_in_words(first)}, {rank_words(by)}"
     flagged = _FLAG_NOTE if any(document.flags for document in documents) else ""
     note = " ".join(filter(None, (frames_line(first), light_line(first), interval.strip(), flagged)))
-    return TextTable(title, ("method", *map(head, names)), tuple(rows), "L" + "r" * len(names), note)
+    words, columns = (BY_WORD, "Lll") if wide else ((), "L")
+    return TextTable(title, ("method", *words, *map(head, names)), tuple(rows), columns + "r" * len(names), note)
 
 
 def score_table(document: ScoreDocument, by: str = "phi") -> TextTable:
@@ -388,8 +411,9 @@ def scores_csv(documents: Sequence[ScoreDocument], by: str = "phi") -> str:
             x for estimate, n in values for x in (estimate.value, estimate.low, estimate.high, estimate.share)[:n]
         ]
         flags = ", ".join(flag.quantity for flag in document.flags)
-        rows.append([document.method.name, document.pairs, document.images, document.samples, flags, *numbers])
-    return csv_table(["method", "pairs", "images", "samples", "knows_more", *names], rows)
+        counts = document.pairs, document.images, document.samples
+        rows.append([document.method.name, *division_and_rig(document), *counts, flags, *numbers])
+    return csv_table(["method", *BY_WORD, "pairs", "images", "samples", "knows_more", *names], rows)
 
 
 def scores_json(documents: Sequence[ScoreDocument], by: str = "phi") -> str:

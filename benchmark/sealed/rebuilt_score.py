@@ -21,7 +21,7 @@ from rich.console import Console
 
 from phibench.benchmark.isolation.resolve import MethodError, Reference, RunLimits, resolve
 from phibench.benchmark.scores.answer_errors import Rules
-from phibench.benchmark.scores.document import SCORER, EncodedPicture, MethodCard, ScoreDocument
+from phibench.benchmark.scores.document import BUILT_IN, SCORER, EncodedPicture, MethodCard, ScoreDocument
 from phibench.benchmark.scores.score import Scored, run_and_score, score_outcomes
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import InputFile
@@ -215,6 +215,8 @@ def _of_form(card: MethodCard) -> Iterator[str]:
     for name, found in hashes.items():
         if found and not _HASH.fullmatch(found):
             yield f"method: the hash of {name} is no SHA-256, 64 digits from 0 to f"
+    if card.kind == BUILT_IN and (card.division, card.self_calibrates) != ("closed", False):
+        yield "method.division: built-in methods are closed and take the rig as it is given"
     if not card.packages.get(_ALWAYS):
         yield f"method.packages lacks {_ALWAYS}, which every method loads: nobody can tell which packages ran"
 

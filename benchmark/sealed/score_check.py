@@ -105,7 +105,7 @@ def check_score(
     card = check_card(document, method)
     faults = [*_of_document(document), *_of_release(document, release), *card.faults]
     broken = [*_of_pairs(document, table), *_of_causes(table), *_impossible(table)]
-    unchecked = [*card.unchecked, "seconds, limits and isolation: they are the word of who ran it"]
+    unchecked = [*card.unchecked, "seconds, limits, isolation and division: they are the word of who ran it"]
     if release is None:
         unchecked.append("that the data set is a released one: give --release MANIFEST.json")
     if data is None:

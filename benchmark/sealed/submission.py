@@ -23,7 +23,7 @@ from phibench.benchmark.isolation.resolve import Reference, RunLimits, resolve
 from phibench.benchmark.isolation.runner import Harness, Ran
 from phibench.benchmark.pair_sets.frames_set import pair_of_files
 from phibench.benchmark.pair_sets.truth_file import read_truth_file
-from phibench.benchmark.scores.document import MethodCard
+from phibench.benchmark.scores.document import Declared, MethodCard
 from phibench.benchmark.sealed.sealed_set import SEAL, Seal, read_seal
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import InputFile, Name, Text
@@ -177,7 +177,12 @@ class Submitted:
 
 
 def submit(
-    public: str | Path, method: str, out: str | Path, workers: int = 1, limits: RunLimits | None = None
+    public: str | Path,
+    method: str,
+    out: str | Path,
+    workers: int = 1,
+    limits: RunLimits | None = None,
+    declared: Declared | None = None,
 ) -> Submitted:
     """Run a method on a sealed set and write its answers.
 
@@ -189,6 +194,7 @@ def submit(
     out : JSON file to write
     workers : pairs that are worked on at a time
     limits : limits of the method for one pair
+    declared : what its author says of it: division, and whether it calibrates the rig itself
 
     Raises
     ------
@@ -202,7 +208,7 @@ def submit(
     reference = resolve(method)
     with Harness([reference], limits, workers, truth_folders(pairs)) as harness:
         outcomes = [outcome for (outcome,) in harness.outcomes(pairs, range(len(pairs)))]
-        document = submission(pairs.seal, reference, outcomes, harness.isolations[0], harness.ran[0])
+        document = submission(pairs.seal, reference, outcomes, harness.isolations[0], harness.ran[0], declared)
     check_complete(document, pairs.seal, "the run")
     write_text(out, json.dumps(document.model_dump(mode="json"), indent=1, allow_nan=False) + "\n")
     spots = [spot for o in outcomes if o.answer is not None for spot in (o.answer.down, o.answer.up)]
@@ -215,14 +221,20 @@ def submit(
 
 
 def submission(
-    seal: Seal, method: Reference, outcomes: Sequence[Outcome], isolation: str = "", ran: Ran | None = None
+    seal: Seal,
+    method: Reference,
+    outcomes: Sequence[Outcome],
+    isolation: str = "",
+    ran: Ran | None = None,
+    declared: Declared | None = None,
 ) -> Submission:
     """Document of a method's outcomes on a sealed set, by number."""
+    told = {**(declared or Declared()).fields(method.kind), **({} if ran is None else vars(ran))}
     return Submission(
         format=FORMAT,
         seal=seal.id,
         task_version=seal.task_version,
-        method=MethodCard.of(method.name, **method.document(), **({} if ran is None else vars(ran))),
+        method=MethodCard.of(method.name, **method.document(), **told),
         isolation=isolation,
         provenance=provenance(),
         answers=tuple(_line(outcome) for outcome in sorted(outcomes, key=lambda outcome: outcome.number)),

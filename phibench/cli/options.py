@@ -15,7 +15,7 @@ import tomllib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Group, Parameter, Token
 
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from cyclopts.completion import CompletionContext
 
     from phibench.benchmark.isolation.resolve import RunLimits
+    from phibench.benchmark.scores.document import Declared
 
 START, DATA, METHODS, SENSOR, KEEPERS, INSTALLATION = (
     Group.create_ordered(name)
@@ -228,6 +229,51 @@ class Limits:
 
 
 LIMITS = Limits()
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class OwnWord:
+    """What you say of methods of your own; nobody can check it (docs/submission.md).
+
+    Parameters
+    ----------
+    division
+        closed: tuned on dev alone; open: on anything else. Built-in methods are closed, others open by default.
+    self_calibrates
+        The method corrects the rig from the pictures that it gets.
+    """
+
+    division: Literal["closed", "open"] | None = None
+    self_calibrates: Flag = False
+
+    def declared(self, references: Sequence[str]) -> Declared:
+        """The same for the harness.
+
+        Raises
+        ------
+        DatasetError
+            If something is said and every method is built in.
+        """
+        from phibench.benchmark.scores.document import Declared
+
+        if self.division is not None or self.self_calibrates:
+            _require_own(references)
+        return Declared(self.division, self.self_calibrates)
+
+
+def _require_own(references: Sequence[str]) -> None:
+    from phibench.datasets.common.errors import DatasetError
+    from phibench.estimator.methods.registry import KNOWN
+
+    if all(name in KNOWN for name in references):
+        raise DatasetError(
+            f"--division and --self-calibrates are of methods of your own: {references[0]} is built in, closed, "
+            "and takes the rig as it is given; leave them out"
+        )
+
+
+OWN_WORD = OwnWord()
 
 
 OLD_COMMANDS = {

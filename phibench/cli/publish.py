@@ -14,10 +14,12 @@ from phibench.cli.options import (
     DEFAULT_PRESET,
     KEEPERS,
     LIMITS,
+    OWN_WORD,
     DataFolder,
     Limits,
     OutFolder,
     OwnOrPreset,
+    OwnWord,
     Preset,
     Whole,
     Workers,
@@ -210,6 +212,7 @@ def submit(
     out: Path,
     workers: Whole = 1,
     limits: Limits = LIMITS,
+    own: OwnWord = OWN_WORD,
 ) -> int:
     """Run a method on a sealed set and write its answers for who holds the truth.
 
@@ -226,7 +229,7 @@ def submit(
     """
     from phibench.benchmark.sealed.submission import submit as submit_method
 
-    done = submit_method(public, method, out, workers, limits.of_run)
+    done = submit_method(public, method, out, workers, limits.of_run, own.declared([method]))
     print(
         f"{done.path}: {done.answered} of {done.pairs} pairs answered, {done.positions} of {2 * done.pairs} positions"
     )

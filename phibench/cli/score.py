@@ -11,6 +11,7 @@ from cyclopts import Parameter
 
 from phibench.cli.options import (
     LIMITS,
+    OWN_WORD,
     BootstrapSeed,
     BuiltIn,
     Counts,
@@ -18,6 +19,7 @@ from phibench.cli.options import (
     Limits,
     Methods,
     OwnOrPreset,
+    OwnWord,
     PairsAtOnce,
     Whole,
 )
@@ -131,6 +133,7 @@ def score(
     bootstrap_seed: BootstrapSeed = 0,
     workers: PairsAtOnce = 1,
     limits: Limits = LIMITS,
+    own: OwnWord = OWN_WORD,
     out: Path | None = None,
     output: Output = _TABLES,
 ) -> int:
@@ -154,13 +157,13 @@ def score(
             "`phibench score` scores methods: give --method, such as --method red_centroid. "
             f"The paper's tables are `phibench paper {directory}`"
         )
-    run_limits, form = limits.of_run, output.form
+    run_limits, form, declared = limits.of_run, output.form, own.declared(method)
     files = score_files(out, [MethodCard.of(name, **resolve(name).document()) for name in method])
     for target in filter(None, files):
         require_writable(target)
     pair_set, console, number = choice.of(directory), progress_console(), _seed(bootstrap_seed)
     with records_kept(files):
-        scored = run_and_score(method, pair_set, workers, console, "pairs", number, run_limits)
+        scored = run_and_score(method, pair_set, workers, console, "pairs", number, run_limits, None, declared)
     if targets := [file for file in files if file is not None]:
         scored = saved_each(scored, targets)
     print_scores(scored, form, rank, output.wide, choice.calibration is not None)

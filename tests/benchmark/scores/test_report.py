@@ -26,8 +26,9 @@ from phibench.benchmark.reports.report import Section, report_html, time_section
 from phibench.benchmark.reports.results_page import read_parts
 from phibench.benchmark.scores.answer_errors import Rules
 from phibench.benchmark.scores.causes import CAUSES
-from phibench.benchmark.scores.document import Flag, MethodCard, read_score, write_score
+from phibench.benchmark.scores.document import Declared, Flag, MethodCard, read_score, write_score
 from phibench.benchmark.scores.score import score_outcomes
+from phibench.benchmark.scores.score_tables import division_and_rig, scores_csv
 from phibench.cli import main as cli
 from phibench.datasets.common.errors import DatasetError
 from phibench.estimator.interface import Answer, Spot
@@ -207,6 +208,41 @@ def test_the_leaderboard_has_its_numbers(html, scores):
     assert f"[{100 * rate.low:.3g}, {100 * rate.high:.3g}]" in html
     phi = scores[2][0].metrics["rank_phi_rad"]
     assert f"{1000 * phi.value:.3g}" in text  # mrad, as everywhere on the page
+
+
+CALIBRATED = {"calibration": "0" * 64, "calibrated_from": {"spots": True}}
+
+
+def told(kind="", pair_set=(), **word):
+    """Division and rig of a score, with the word of its author."""
+    document, _ = scored("m", sampler())
+    card = MethodCard.of("m", kind=kind, **Declared(**word).fields(kind))
+    return division_and_rig(document.model_copy(update={"method": card, "pair_set": dict(pair_set)}))
+
+
+def test_division_and_rig_are_the_authors_word_and_what_the_pairs_gave():
+    assert told() == ("open", "nominal")
+    assert told(division="closed", self_calibrates=True) == ("closed", "self-calibrated")
+    assert told("built-in", division="open", self_calibrates=True) == ("closed", "nominal")  # phibench says it
+    assert told(pair_set=CALIBRATED, self_calibrates=True)[1] == "calibrated"  # measured distances are more
+    assert told(pair_set={**CALIBRATED, "calibrated_from": {"spots": False}})[1] == "self-calibrated"
+    assert MethodCard.model_validate_json('{"reference": "chain_fit", "kind": "built-in"}').division == "closed"
+    with pytest.raises(DatasetError, match="division 'half': give closed or open"):
+        Declared("half")
+
+
+def test_division_and_rig_stand_beside_every_method(html, scores, tmp_path, capsys):
+    assert html.count('<td class="word" data-head="division">open</td>') == len(scores)
+    assert html.count('<td class="word" data-head="rig">nominal</td>') == len(scores)
+    (score, table) = scores[0]
+    card = MethodCard.of("own.py:f", division="closed", self_calibrates=True)
+    own = score.model_copy(update={"method": card, "pair_set": {**score.pair_set, "hinted": 0}})
+    write_score(tmp_path / "own.json", own, table)
+    assert cli.main(["results", str(tmp_path / "own.json")]) == 0
+    page = capsys.readouterr().out
+    row = "| own.py:f | closed | self-calibrated |"
+    assert page.count(row) == 3  # the tracks find and depth, and the ranking
+    assert scores_csv([own]).splitlines()[1].startswith("own.py:f,closed,self-calibrated,")
 
 
 def test_pictures_are_pictures(html):

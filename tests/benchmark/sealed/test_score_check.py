@@ -56,7 +56,7 @@ def test_an_honest_score_has_no_fault(honest: Path, bench_dataset: Path, capsys:
     assert checked.faults == ()
     assert [text.split(":")[0] for text in checked.unchecked if not text.startswith("code_sha256")] == [
         "method.sha256, modules, files and packages",
-        "seconds, limits and isolation",
+        "seconds, limits, isolation and division",
         "that the data set is a released one",
     ]
     assert cli.main(["submission", "check", str(honest), "--json"]) == 0
@@ -111,6 +111,16 @@ SENTENCES = (
     "nobody can tell which code was scored",
     "samples is 500, and the records have 3",
 )
+
+
+def test_a_built_in_method_is_closed_and_takes_the_rig_as_it_is(honest: Path, tmp_path: Path) -> None:
+    """Of a method of one's own the word stands; of a built-in one phibench knows."""
+    document = read_score(honest)
+    own = document.method.model_copy(update={"division": "closed", "self_calibrates": True})
+    for card, told in ((own, False), (own.model_copy(update={"kind": "built-in", "division": "open"}), True)):
+        path = tmp_path / "mine.json"
+        write_score(path, document.model_copy(update={"method": card}), read_records(honest, document))
+        assert any("method.division: built-in" in fault for fault in check_score(path).faults) is told
 
 
 def test_each_fault_of_the_document_is_told(honest: Path, tmp_path: Path) -> None:

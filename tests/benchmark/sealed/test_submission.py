@@ -32,6 +32,7 @@ def test_a_submission_comes_back_as_it_was(sealed: Sealed, submitted: Path, meth
 def test_a_submission_names_its_method_by_hash_and_no_path(submitted: Path) -> None:
     document = read_submission(submitted)
     assert (document.method.name, document.method.place) == ("mine:extract", "mine.py")
+    assert document.method.division == "closed"  # its author's word goes with it
     assert document.method.sha256 == hashlib.sha256(METHOD.encode()).hexdigest()
     assert str(submitted.parent) not in submitted.read_text()
     assert len(outcomes_of(document)) == 3
