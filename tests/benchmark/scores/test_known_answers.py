@@ -253,6 +253,7 @@ def test_every_error_within_three_pixels_counts_less_than_a_missed_spot():
 # -- the ideal sampler ---------------------------------------------------------------------------------------------
 
 DRAWS = 20  # 200 samples x 20 = 4000 pairs, 8000 images
+FEW = 5  # for what is off by a fifth or more: deviations are known to 1 %
 
 
 @pytest.fixture(scope="module")
@@ -303,10 +304,10 @@ def test_the_ideal_samplers_phi_and_depth_are_at_their_bounds(ideal):
 
 @pytest.mark.parametrize(("claim", "expected"), [(1.2**2, 1 / 1.2), (1 / 1.2**2, 1.2)])
 def test_a_wrong_covariance_shows_in_the_pull(claim, expected):
-    table, m = score(cases(200, DRAWS), sampler(claim=claim))
+    table, m = score(cases(200, FEW), sampler(claim=claim))
     sigma = expected / np.sqrt(2 * 2 * len(table))
     assert abs(value(m, "pull_deviation") - expected) < 3 * sigma
-    assert abs(value(m, "pull_deviation") - 1.0) > 20 * sigma  # and the test of the ideal sampler would have said so
+    assert abs(value(m, "pull_deviation") - 1.0) > 10 * sigma  # and the test of the ideal sampler would have said so
     low, high = m["pull_deviation"].estimate.low, m["pull_deviation"].estimate.high
     assert low < expected < high
     assert not low < 1.0 < high
@@ -314,7 +315,7 @@ def test_a_wrong_covariance_shows_in_the_pull(claim, expected):
 
 def test_a_noisier_sampler_is_less_efficient():
     """Twice the bound's variance: efficiency 1 / sqrt 2, and the interval excludes 1."""
-    _, m = score(cases(200, DRAWS), sampler(spread=np.sqrt(2.0)))
+    _, m = score(cases(200, FEW), sampler(spread=np.sqrt(2.0)))
     assert m["efficiency_px"].estimate.low < np.sqrt(0.5) < m["efficiency_px"].estimate.high
     assert m["efficiency_px"].estimate.high < 0.8
 

@@ -159,8 +159,15 @@ def test_narrow_pages_name_every_number(html):
     assert len(re.findall("<caption>", html)) == len(re.findall("<caption><span>", html))
 
 
-def test_too_few_samples_for_an_interval_are_a_star(html):
-    few = report_html([scored("ideal", sampler(), cases(3))])
+@pytest.fixture(scope="module")
+def few_samples():
+    """A score of three pairs, and its page."""
+    few = scored("ideal", sampler(), cases(3))
+    return few[0], report_html([few])
+
+
+def test_too_few_samples_for_an_interval_are_a_star(html, few_samples):
+    _, few = few_samples
     assert few.count('title="under 5 samples">*</span>') > 10
     assert "(under 5 samples)" not in few[few.index("<h3") :]
     assert "Every image has a right position." in few
@@ -364,15 +371,15 @@ def test_scores_of_fewer_pairs_are_told_of(score_files, tmp_path, capsys):
     assert "counts" not in capsys.readouterr().out
 
 
-def test_points_without_an_interval_are_open_and_explained(html):
-    """Each stratum of three pairs has fewer than five samples; with forty, those of distance have more."""
-    few = scored("ideal", sampler(), cases(3))
-    assert "Open marks: too few samples for an interval." in report_html([few])
-    assert has_open_marks(few[0])
+def test_points_without_an_interval_are_open_and_explained(few_samples):
+    """Each stratum of three pairs has fewer than five samples; with two hundred, those of distance have more."""
+    few, page = few_samples
+    assert "Open marks: too few samples for an interval." in page
+    assert has_open_marks(few)
     many = scored("ideal", sampler(), cases(200))
     assert not has_open_marks(many[0])
     assert "Open marks" not in report_html([many])
-    for document, is_open in ((few[0], True), (many[0], False)):
+    for document, is_open in ((few, True), (many[0], False)):
         drawn = base64.b64decode(error_panels({"ideal": document})[0].source.split(",")[1]).decode()
         assert ("fill: #ffffff; stroke: #0072b2" in drawn) == is_open
 

@@ -33,7 +33,7 @@ from phibench.estimator.spots.detect import detect
 
 def test_the_benchmark_runs_what_accepts_each_preset(bench_dataset: Path, tmp_path: Path) -> None:
     names = ["red_centroid", "raw_maximum_likelihood"]
-    done = bench(bench_dataset, tmp_path / "out", names, workers=2, pairs=2, console=quiet())
+    done = bench(bench_dataset, tmp_path / "out", names, workers=1, pairs=2, console=quiet())
     raw = [f"bayer-raw-{name}{track}" for track in ("", "-localise") for name in names]
     others = [f"{preset}-red_centroid{track}" for preset in ("srgb8", "mjpeg") for track in ("", "-localise")]
     assert [path.stem for path in done.scores] == [*raw, *others]
