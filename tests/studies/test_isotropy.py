@@ -24,6 +24,7 @@ from phibench.scenes.catalog import default_rig
 from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.random_streams import generator
 from phibench.studies.framework import StudyDatasets, read_settings
+from phibench.studies.isotropy import binocular
 from phibench.studies.isotropy.lines import (
     beside,
     beside_best,
@@ -235,7 +236,9 @@ class _Held:
         return self._held[recipe]
 
 
-def test_tiny_study(tiny_dataset: Path, misaligned_dataset: Path, tmp_path: Path) -> None:
+def test_tiny_study(
+    tiny_dataset: Path, misaligned_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The tests' own small data sets in place of the study's: no more than that all parts fit together."""
     aligned, wrong = open_dataset(tiny_dataset), open_dataset(misaligned_dataset)
     held: Any = _Held({"study-isotropy": aligned, "study-isotropy-sideways": aligned, "study-isotropy-tilted": wrong})
@@ -249,6 +252,7 @@ def test_tiny_study(tiny_dataset: Path, misaligned_dataset: Path, tmp_path: Path
         "panorama_width_px": 360,
         "resamples": 100,
     }
+    monkeypatch.setattr(binocular, "_PLACES_PX", (0.25,))  # one place in the mosaic's cell, for sixteen
     result = STUDY.run(read_settings(STUDY, True).model_copy(update=changes), held)
     assert set(result.tables) == {"table", "bounds", "occlusion", "edges", "lines"}
     assert result.tables["lines"].height == 4

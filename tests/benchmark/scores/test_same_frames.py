@@ -28,13 +28,17 @@ def read_image(file: Path) -> np.ndarray:
         return np.asarray(picture)
 
 
-@pytest.fixture(scope="module", params=["with [frames]", "without"])
+@pytest.fixture(scope="module")
 def folder(request: pytest.FixtureRequest, bench_dataset: Path, tiny_dataset: Path) -> Path:
     """Exposure, levels, quality, cameras and distractors by the recipe, and a recipe that says nothing of them."""
     return bench_dataset if request.param == "with [frames]" else tiny_dataset
 
 
-@pytest.mark.parametrize("preset", ["bayer-raw", "srgb8", "mjpeg"])
+@pytest.mark.parametrize(
+    ("folder", "preset"),
+    [("with [frames]", "bayer-raw"), ("with [frames]", "mjpeg"), ("without", "srgb8")],
+    indirect=["folder"],
+)
 def test_six_ways_give_the_same_bytes(folder: Path, tmp_path: Path, preset: str) -> None:
     """Frames of every visible sample of a set in one draw: the six agree byte by byte, with the numbers they state."""
     dataset = phibench.open_dataset(folder)
@@ -77,6 +81,7 @@ def test_six_ways_give_the_same_bytes(folder: Path, tmp_path: Path, preset: str)
 
 
 @pytest.mark.parametrize("preset", ["bayer-raw", "mjpeg"])
+@pytest.mark.parametrize("folder", ["with [frames]", "without"], indirect=True)
 def test_crops_have_the_camera_of_the_pairs(folder: Path, preset: str) -> None:
     """Crops move spots and draw their own noise; exposure, gain, quality and levels are those of the pair."""
     dataset = phibench.open_dataset(folder)

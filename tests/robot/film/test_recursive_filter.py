@@ -48,9 +48,9 @@ def test_filter_keeps_the_patterns_error_at_rest() -> None:
     for place in uv[1:]:
         state = updated(SCENE.rig, state, place, noise, pattern, 0.0, 0.0)
     variance_px2 = 0.5 * np.trace(np.linalg.solve(per_px2, state.covariance[:2, :2]))
-    # 400 frames leave the pattern's variance and a 400th of the noise's; the map of a and b is that of the first frame,
+    # 200 frames leave the pattern's variance and a 200th of the noise's; the map of a and b is that of the first frame,
     # whose place is off by 0.2 px: to some percent
-    assert variance_px2 == pytest.approx(0.05**2 + 0.2**2 / 400, rel=0.1)
+    assert variance_px2 == pytest.approx(0.05**2 + 0.2**2 / 200, rel=0.1)
 
 
 def test_readings_at_rest_tell_the_filter_nothing_of_the_distance() -> None:
