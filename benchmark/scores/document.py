@@ -101,7 +101,7 @@ DIVISIONS: tuple[Division, ...] = get_args(Division)
 
 @dataclass(frozen=True)
 class Declared:
-    """What the author of a method says of it, and nobody can check.
+    """Statement of a method's author on it, which nobody can check.
 
     Attributes
     ----------

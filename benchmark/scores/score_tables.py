@@ -84,7 +84,7 @@ BY_WORD = ("division", "rig")
 
 
 def rig_known(document: ScoreDocument) -> str:
-    """What a method knows of the rig: "nominal", "calibrated" or "self-calibrated".
+    """Knowledge that a method has of the rig: "nominal", "calibrated" or "self-calibrated".
 
     A calibration is "calibrated" if it was made from spots whose D was measured. One from outlines and vertical edges
     is "self-calibrated", and so is a method that corrects the rig from the pictures that it gets.

@@ -234,7 +234,7 @@ LIMITS = Limits()
 @Parameter(name="*")
 @dataclass(frozen=True)
 class OwnWord:
-    """What you say of methods of your own; nobody can check it (docs/submission.md).
+    """Statement of yours on methods of your own; nobody can check it (docs/submission.md).
 
     Parameters
     ----------
