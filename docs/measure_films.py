@@ -20,7 +20,7 @@ from scipy.stats import chi2
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.film.film_read import Film, open_films
 from phibench.estimator.geometry.status import depth_pull
-from phibench.robot.film.film_estimates import bundle_depth, filtered, seen_film
+from phibench.robot.film.film_estimates import bundle_depth, seen_film
 from phibench.robot.film.film_frames import film_frames
 
 
@@ -32,22 +32,21 @@ class Estimate:
     true_m: float
     depth_m: float = math.nan
     sigma_m: float = math.nan
-    last_m: float = math.nan
-    last_sigma_m: float = math.nan
+    half_m: float = math.nan
+    half_sigma_m: float = math.nan
     why: str = ""
 
 
 def estimate(film: Film, camera: int) -> Estimate:
-    """Bundle and filter of one camera."""
+    """Bundle of all frames of one camera, and of the first half of them."""
     frames = film_frames(film, draw=camera, camera_seed=camera)
     true = film.light_depth_m
     try:
-        seen = seen_film(frames)
-        found = bundle_depth(seen)
-        last_m, last_sigma_m = filtered(seen)[-1].depth(frames.rig)
+        half = bundle_depth(seen_film(frames.until(len(film) // 2)))
+        found = bundle_depth(seen_film(frames))
     except DatasetError as error:
         return Estimate(film.info.film, true, why=str(error))
-    return Estimate(film.info.film, true, found.depth_m, found.sigma_m, float(last_m), float(last_sigma_m))
+    return Estimate(film.info.film, true, found.depth_m, found.sigma_m, half.depth_m, half.sigma_m)
 
 
 def rms(pulls: Sequence[float] | np.ndarray, films: int) -> str:
@@ -73,7 +72,7 @@ def main() -> None:
             every.append(one)
             print(
                 f"{one.film} camera {camera}: D {one.true_m:.4f} m, {one.depth_m:.5f} +- {one.sigma_m:.5f} m; "
-                f"filter {one.last_m:.5f} +- {one.last_sigma_m:.5f} m {one.why}",
+                f"first half {one.half_m:.5f} +- {one.half_sigma_m:.5f} m {one.why}",
                 flush=True,
             )
     good = [one for one in every if math.isfinite(one.depth_m)]
@@ -84,8 +83,9 @@ def main() -> None:
     plain = rms((D - true) / sigma, count)
     print(f"bundle: rms pull {rms(pulls, count)}; largest {np.abs(pulls).max():.2f}; in D {plain}")
     print(f"bundle: beyond 5 sigma {int(np.sum(np.abs(pulls) > 5))}; within 95 % {np.mean(np.abs(pulls) <= 1.96):.1%}")
-    last, spread = (np.array([getattr(one, name) for one in good]) for name in ("last_m", "last_sigma_m"))
-    print(f"filter: rms pull of the last D {rms(depth_pull(last, spread, true), count)}")
+    half, spread = (np.array([getattr(one, name) for one in good]) for name in ("half_m", "half_sigma_m"))
+    early = depth_pull(half, spread, true)
+    print(f"first half: rms pull {rms(early, count)}; beyond 5 sigma {int(np.sum(np.abs(early) > 5))}")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Estimates from a film: depth by joint bundle, bursts at both ends or recursive filter, and its targets.
+"""Estimates from a film: depth by joint bundle of all frames, of the first ones or of both ends, and its targets.
 
 Each takes what a robot has: raw frames with the laser on and off, their times, encoder readings, the rig that it knows,
 and how the carriage was told to go. The true scene is not asked.
@@ -22,7 +22,6 @@ from phibench.robot.film.blink_identity import TargetCode, TargetTracker
 from phibench.robot.film.film_bundle import FilmDepth, deviations2, expected_sigma_m, film_depth, most_agree
 from phibench.robot.film.film_frames import LIT, FilmFrames, Index, room_known, room_weights
 from phibench.robot.film.film_positions import FilmPositions, fit_positions, stepped_positions
-from phibench.robot.film.recursive_filter import FilterState, first_state, updated
 from phibench.scenes.frames import Array, BoolArray
 from phibench.scenes.laser import Beam
 from phibench.scenes.motion.carriage import Carriage
@@ -186,17 +185,6 @@ def _rests(frames: FilmFrames, numbers: Index) -> BoolArray:
     inner = frames.times.frame_s[numbers][:, None] + half * np.linspace(-1.0, 1.0, 9)
     at, stops = frames.carriage.position_m(inner), frames.carriage.stops_m
     return np.any([np.all(np.abs(at - stop) < _REST_M, axis=1) for stop in (min(stops), max(stops))], axis=0)
-
-
-def filtered(seen: SeenFilm) -> list[FilterState]:
-    """Belief after every frame that has a position."""
-    states: list[FilterState] = []
-    rig, sigma = seen.frames.rig, seen.frames.encoder_sigma_m
-    for k in np.flatnonzero(seen.positions.good):
-        uv, noise = seen.positions.uv_px[k], seen.positions.noise_px2[k]
-        new = uv, noise, seen.positions.shared_px2[k, :, k], float(seen.offsets_m[k]), sigma
-        states.append(updated(rig, states[-1], *new) if states else first_state(rig, *new))
-    return states
 
 
 @dataclass(frozen=True)

@@ -104,6 +104,10 @@ class FilmFrames:
             near_px=self.near_px[on],
         )
 
+    def until(self, frame: int) -> FilmFrames:
+        """What a robot has seen after a frame, by its number in the film."""
+        return self.some(np.flatnonzero(self.on <= frame), np.flatnonzero(self.off <= frame))
+
     def offsets_m(self, numbers: Index, rows: Array) -> Array:
         """Carriage when these rows, shape (N,), of these frames were exposed."""
         told = self.carriage.position_m

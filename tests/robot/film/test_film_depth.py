@@ -201,6 +201,11 @@ def test_expected_frames_give_the_exact_point() -> None:
     found = bundle_depth(seen)
     assert found.chi2 / found.frames < 2 * 0.1**2
     assert abs(found.depth_m - DEPTH_M) < 0.3 * found.sigma_m
+    half = seen.frames.until(FRAMES // 2)
+    assert [*half.on, *half.off] == [*range(0, FRAMES // 2 + 1, 2), *range(1, FRAMES // 2 + 1, 2)]
+    early = bundle_depth(seen_film(half))
+    assert abs(early.depth_m - DEPTH_M) < 0.3 * early.sigma_m
+    assert early.sigma_m > found.sigma_m
     still = replace(FILM.times, exposure_s=1e-6)
     assert bundle_depth(seen_film(frames_of(images, told()[0], still))).chi2 > 10.0 * found.chi2
 
