@@ -105,7 +105,7 @@ class FilmFrames:
         )
 
     def until(self, frame: int) -> FilmFrames:
-        """What a robot has seen after a frame, by its number in the film."""
+        """Frames that a robot has seen after one of them, by its number in the film."""
         return self.some(np.flatnonzero(self.on <= frame), np.flatnonzero(self.off <= frame))
 
     def offsets_m(self, numbers: Index, rows: Array) -> Array:
