@@ -1,6 +1,7 @@
 """Pictures of a film: every frame with the exact place of its spot, the way it takes, and the numbers below.
 
-Whole images are shown at half size, with an enlarged square around the spot in the corner; windows are enlarged.
+Whole images are shown some 640 px wide. An enlarged square around the spot stands in the corner that hides least of the
+mirror and of the spot's way. Windows are enlarged.
 """
 
 from __future__ import annotations
@@ -18,7 +19,9 @@ from phibench.render.sensor.light import Region
 
 Picture = NDArray[np.uint8]
 _LINE_PX = 16
-_ZOOM, _INSET_PX = 5, 36  # the spot's surroundings of 36 px, five times as large
+_WIDTH_PX = 640
+_INSET_SHARE = 0.4  # of the height; beside a mirror's image that fills the height, a corner has room for as much
+_INSET_PX = 36  # the spot's surroundings, enlarged
 _GREEN, _YELLOW = (80, 255, 80), (255, 210, 60)
 
 
@@ -37,9 +40,12 @@ def picture(film: Film, frame: FilmFrame) -> Picture:
     """One frame with its overlay."""
     colours = _colours(frame)
     if film.info.window_px is None:
-        whole = Image.fromarray(colours).resize((colours.shape[1] // 2, colours.shape[0] // 2), Image.Resampling.BOX)
-        _marks(whole, film, frame, frame.region, 0.5)
-        whole.paste(_inset(film, frame, colours), (0, 0))
+        scale = _WIDTH_PX / colours.shape[1]
+        size = _WIDTH_PX, round(scale * colours.shape[0])
+        whole = Image.fromarray(colours).resize(size, Image.Resampling.BOX)
+        _marks(whole, film, frame, frame.region, scale)
+        inset = _inset(film, frame, colours, int(_INSET_SHARE * size[1]))
+        whole.paste(inset, _emptiest_corner(film, scale, size, inset.size))
         return _with_numbers(whole, film, frame)
     zoom = max(1, 480 // colours.shape[1])  # a window is shown as large as a small video
     size = colours.shape[1] * zoom, colours.shape[0] * zoom
@@ -61,14 +67,36 @@ def _colours(frame: FilmFrame) -> Picture:
     return np.repeat(np.rint(255.0 * grey).astype(np.uint8)[..., None], 3, axis=2)
 
 
-def _inset(film: Film, frame: FilmFrame, colours: Picture) -> Image.Image:
+def _inset(film: Film, frame: FilmFrame, colours: Picture, side_px: int) -> Image.Image:
+    """Surroundings of the spot, enlarged to at most `side_px`."""
     row = film.table.row(frame.frame, named=True)
     box = Region.around(row["row_u_px"], row["row_v_px"], film.plan.size, min(_INSET_PX, *film.plan.size))
+    zoom = max(1, side_px // max(box.shape))
     cutout = Image.fromarray(colours[box.slices(frame.region)])
-    enlarged = cutout.resize((box.shape[1] * _ZOOM, box.shape[0] * _ZOOM), Image.Resampling.NEAREST)
-    _marks(enlarged, film, frame, box, _ZOOM)
+    enlarged = cutout.resize((box.shape[1] * zoom, box.shape[0] * zoom), Image.Resampling.NEAREST)
+    _marks(enlarged, film, frame, box, zoom)
     ImageDraw.Draw(enlarged).rectangle((0, 0, enlarged.width - 1, enlarged.height - 1), outline=_YELLOW)
     return enlarged
+
+
+def _emptiest_corner(film: Film, scale: float, size: tuple[int, int], inset: tuple[int, int]) -> tuple[int, int]:
+    """Upper left corner of an inset where it hides least of the mirror's image and none of the spot's way, if it can.
+
+    The same in every frame of a film.
+    """
+    way = film.table.select("row_u_px", "row_v_px").to_numpy()
+    outline, track = ((places + 0.5) * scale for places in (film.plan.scene.rig.outline_px(), way))
+    mirror = Image.new("1", size)
+    ImageDraw.Draw(mirror).polygon([tuple(map(float, point)) for point in outline], fill=1)
+    filled, (width, height) = np.asarray(mirror), inset
+    corners = [(u, v) for v in (0, size[1] - height) for u in (0, size[0] - width)]
+
+    def hidden(corner: tuple[int, int]) -> tuple[bool, int]:
+        u, v = corner
+        inside = (track >= (u, v)) & (track <= (u + width, v + height))
+        return bool(inside.all(axis=1).any()), int(filled[v : v + height, u : u + width].sum())
+
+    return min(corners, key=hidden)
 
 
 def _marks(image: Image.Image, film: Film, frame: FilmFrame, region: Region, zoom: float) -> None:

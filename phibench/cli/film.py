@@ -10,7 +10,19 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import App, Parameter
 
-from phibench.cli.options import DATA, SENSOR, FilmFolder, OutFolder, Preset, Variant, Whole, Workers, policies, recipes
+from phibench.cli.options import (
+    DATA,
+    SENSOR,
+    FilmFolder,
+    Flag,
+    OutFolder,
+    Preset,
+    Variant,
+    Whole,
+    Workers,
+    policies,
+    recipes,
+)
 
 if TYPE_CHECKING:
     from phibench.robot.loop.episodes import Episode
@@ -228,7 +240,8 @@ def frames(
     preset: Literal["mjpeg", "yuyv"] = "mjpeg",
     draws: Whole = 1,
     camera_seed: Whole = 0,
-    container: Literal["avi", "mkv"] = "mkv",
+    container: Literal["avi", "mkv", "mp4"] = "mkv",
+    lerobot: Flag = False,
     workers: Workers = None,
 ) -> int:
     """Write the camera's own frames of whole images, one video per film and draw; the frames' bytes are untouched.
@@ -245,8 +258,18 @@ def frames(
         Videos of one seed share the fixed pattern.
     container
         Format of the file.
+    lerobot
+        Lay videos, a Parquet row a frame and info.json out as a LeRobot data set (v3.0): an episode a film and draw.
     """
-    from phibench.datasets.film.film_video import write_videos
+    from phibench.datasets.common.errors import DatasetError
+    from phibench.datasets.film.film_video import write_lerobot, write_videos
+
+    if lerobot:
+        if preset != "mjpeg":
+            raise DatasetError("--lerobot writes the camera's JPEGs: leave --preset out")
+        written = write_lerobot(directory, out, draws, camera_seed, workers)
+        print(f"{written}: read it with LeRobotDataset('phibench/films', root='{out}')")
+        return 0
 
     paths = write_videos(directory, out, preset, draws, camera_seed, f".{container}", workers=workers)
     print(f"{out}: {len(paths)} videos")

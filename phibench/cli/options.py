@@ -56,6 +56,11 @@ def pictures(_: CompletionContext) -> tuple[str, ...]:
     return "layers", "mjpeg", "srgb8"
 
 
+def shipped(_: CompletionContext) -> tuple[str, ...]:
+    """All shipped recipes."""
+    return tuple(file.stem for file in sorted(RECIPES.glob("*.toml")))
+
+
 def recipes(films: bool) -> Callable[[CompletionContext], Iterator[str]]:
     """Completer of shipped recipes, those with films or the others, and of TOML files."""
 

@@ -7,7 +7,7 @@ from typing import Annotated
 
 from cyclopts import App, Parameter
 
-from phibench.cli.options import DEFAULT_PRESET, LIMITS, START, Flag, Limits, Preset, methods, recipes
+from phibench.cli.options import DEFAULT_PRESET, LIMITS, START, Flag, Limits, Preset, methods, shipped
 
 _FIRST = (
     ("phibench demo", "five pairs, three methods, one page: what a score is"),
@@ -63,7 +63,7 @@ def list_recipes() -> int:
 
 
 @recipe.command
-def show(name: Annotated[str, Parameter(completer=recipes(films=True))]) -> int:
+def show(name: Annotated[str, Parameter(completer=shipped)]) -> int:
     """Print a shipped recipe, to be changed and rendered.
 
     Parameters

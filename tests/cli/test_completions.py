@@ -48,6 +48,7 @@ def test_values_that_are_completed_are_those_that_there_are(capsys: pytest.Captu
         ("dataset make de", "deep/other.toml", "mine.toml"),
         ("dataset make deep/", "deep/other.toml", "mine.toml"),
         ("film make ", "bench-films mine.toml", "bench-dev"),
+        ("recipe show ", "bench-dev bench-films", "mine.toml"),
         ("score x --preset ", "mjpeg mono-raw", "ideal"),
         ("dataset frames x --preset ", "mjpeg yuyv", "layers"),
         ("dataset panorama x --preset ", "layers mjpeg", "yuyv"),

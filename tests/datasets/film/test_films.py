@@ -6,8 +6,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import av
 import numpy as np
+import pandas
 import polars
+import polars as pl
 import pytest
 from conftest import ROOT
 from helpers.remembered_spots import SPOTS, RememberedSpots
@@ -20,7 +23,7 @@ from phibench.datasets.film.film_plan import check_drives, film_plans
 from phibench.datasets.film.film_read import Film, open_films
 from phibench.datasets.film.film_show import picture
 from phibench.datasets.film.film_store import verify
-from phibench.datasets.film.film_video import read_frames, write_frames, write_mp4, write_videos
+from phibench.datasets.film.film_video import read_frames, write_frames, write_lerobot, write_mp4, write_videos
 from phibench.datasets.recipe.load import parse_recipe
 from phibench.datasets.store.layers import read_exr, write_exr
 from phibench.render.film.key_views import PoseParts
@@ -243,6 +246,59 @@ def test_videos_and_pictures(film_windows: Path, film_images: Path, tmp_path: Pa
     assert {one.ndim for one in shown} == {3}
     film = write_mp4(tmp_path / "a.mp4", shown[:2], 10.0)
     assert film.stat().st_size > 1000
+
+
+def test_the_enlarged_square_stands_where_the_picture_is_empty(film_images: Path) -> None:
+    """The mirror fills the height: a corner's middle is outside of it. The rest of the picture is the frame's own."""
+    film = film_of(film_images)
+    frame = film.frame(3, "mjpeg")
+    shown = picture(film, frame)[: 4 * 90, : 4 * 160]
+    plain = np.kron(np.asarray(frame.image), np.ones((4, 4, 1), np.uint8))
+    changed = np.abs(shown.astype(int) - plain).max(axis=2) > 0
+    corners = {(v, u): changed[v : v + 40, u : u + 40].mean() for v in (0, 320) for u in (0, 600)}
+    (place,) = [corner for corner, share in corners.items() if share > 0.2]  # the square
+    inset = np.zeros_like(changed)
+    inset[place[0] and 360 - 144 :, place[1] and 640 - 144 :][:144, :144] = True
+    outline = 4.0 * (film.plan.scene.rig.outline_px() + 0.5)
+    assert not inset[tuple(np.clip(outline.T[::-1].astype(int), 0, [[359], [639]]))].any()
+    track = 4.0 * (film.table.select("row_v_px", "row_u_px").to_numpy() + 0.5)
+    assert not inset[tuple(track.T.astype(int))].any()
+
+
+def test_films_are_laid_out_as_lerobot_reads_them(film_images: Path, film_windows: Path, tmp_path: Path) -> None:
+    """Against libraries alone: pandas for the tasks' names, PyAV for the times. LeRobot 0.4.4 reads such a folder."""
+    film, out = film_of(film_images), tmp_path / "set"
+    info = json.loads(write_lerobot(film_images, out, draws=2, workers=1).read_text())
+    assert (info["codebase_version"], info["fps"]) == ("v3.0", 10)
+    assert (info["total_episodes"], info["total_frames"], info["splits"]) == (2, 20, {"train": "0:2"})
+    assert list(pandas.read_parquet(out / "meta/tasks.parquet").index) == [
+        "find the laser spot in the mirror, and its distance"
+    ]
+    episodes = pl.read_parquet(out / "meta/episodes/**/*.parquet").to_dicts()
+    assert [(e["dataset_from_index"], e["dataset_to_index"]) for e in episodes] == [(0, 10), (10, 20)]
+    for number, episode in enumerate(episodes):
+        place = {"chunk_index": episode["data/chunk_index"], "file_index": episode["data/file_index"]}
+        rows = pl.read_parquet(out / info["data_path"].format(**place))
+        names = {name for name, feature in info["features"].items() if feature["dtype"] != "video"}
+        assert set(rows.columns) == names
+        for name in names:
+            (size,) = info["features"][name]["shape"]
+            assert rows[name].to_numpy().reshape(len(rows), -1).shape == (10, size)
+        assert rows["index"].to_list() == list(range(10 * number, 10 * number + 10))
+        truth = film.table.select("row_light_u_px", "row_light_v_px").to_numpy()
+        assert np.array_equal(rows["truth.spot_px"].to_numpy(), truth, equal_nan=True)
+        assert np.allclose(rows["observation.state"].to_numpy()[:, 0], film.table["encoder_m"].to_numpy(), atol=1e-7)
+        video = out / info["video_path"].format(video_key="observation.images.camera", **place)
+        assert list(read_frames(video)) == [film.frame(k, "mjpeg", number).jpeg for k in range(10)]
+        with av.open(str(video)) as container:
+            times = [float(frame.pts * frame.time_base) for frame in container.decode(video=0)]
+        # LeRobot's tolerance
+        assert np.allclose(times, rows["timestamp"].to_numpy(), atol=1e-4)
+    stats = json.loads((out / "meta/stats.json").read_text())
+    assert np.shape(stats["observation.images.camera"]["mean"]) == (3, 1, 1)
+    assert stats["observation.state"]["max"][0] == pytest.approx(film.table["encoder_m"].max(), abs=1e-7)
+    with pytest.raises(DatasetError, match="holds windows"):
+        write_lerobot(film_windows, tmp_path / "other", workers=1)
 
 
 def faulty(change: str, by: str = "") -> str:
