@@ -28,8 +28,10 @@ from phibench.estimator.geometry.reflection import room_rays
 
 OUT = Path(__file__).resolve().parent
 SAMPLE = "table2-d3.180-h0.425"
-_GREY, _COLOURS = ("dense_curves", "dense_sweep"), 64
+_FEW_COLOURS = {"dense_curves": 128, "dense_sweep": 64}  # are enough, and make a file smaller
 _COLUMNS_DEG = (100.0, 20.0, -60.0, -140.0)  # azimuths of the curves
+_AT_M = {1.0: ("v", "#d55e00"), 2.0: ("s", "#e69f00"), 4.0: ("D", "#56b4e9"), 10.0: ("o", "#cc79a7")}
+_SHOWN_DEG = (-36.0, 20.0)  # elevations
 _SWEPT_M = (1.0, 2.0, 4.5)
 _PIXEL_DEG = (-75.0, 7.0)  # azimuth and elevation: the chequered board
 
@@ -37,20 +39,26 @@ _PIXEL_DEG = (-75.0, 7.0)  # azimuth and elevation: the chequered board
 def curves(unrolled: UnrolledPair) -> bytes:
     """Both panoramas, with columns of the down one and where the up one shows their points at all D."""
     grid = unrolled.maps.grid
-    with styled({"axes.grid": False}, (7.5, 4.6), layout="constrained") as figure:
+    low, high = np.degrees(grid.high_rad - grid.height_px * grid.step_rad), np.degrees(grid.high_rad)
+    extent = (180.0, -180.0, float(low), float(high))
+    outlined: dict[str, Any] = {"markeredgecolor": "white", "markeredgewidth": 0.8, "linestyle": "none"}
+    with styled({"axes.grid": False}, (7.5, 6.6), layout="constrained") as figure:
         axes = figure.subplots(2, 1)
         for one, image, name in zip(axes, (unrolled.down, unrolled.up), ("down", "up"), strict=True):
-            one.imshow(codes_8bit(image), cmap="gray", interpolation="nearest")
-            one.set_axis_off()
-            one.set_title(f"{name} image, unrolled")
+            one.imshow(codes_8bit(image), cmap="gray", interpolation="nearest", extent=extent, aspect="auto")
+            one.set(title=f"{name} image, unrolled", xlabel="azimuth, degrees", ylabel="elevation, degrees")
+            one.set(ylim=_SHOWN_DEG, xticks=range(-180, 181, 60))
         for azimuth in _COLUMNS_DEG:
             column = int(np.argmin(np.abs(grid.azimuths_rad - np.radians(azimuth))))
             row = int(np.argmin(np.abs(grid.elevations_rad - np.radians(5.0))))
-            axes[0].plot(column, row, "o", color="#d55e00", markersize=4)
-            axes[1].axvline(column, color="#d55e00", linewidth=1.0)
-            for depth, marker in ((1.0, "v"), (2.0, "s"), (4.0, "D"), (10.0, "o")):
-                place = grid.place(_seen(unrolled, row, column, depth))
-                axes[1].plot(*place, marker=marker, color="#d55e00", markersize=4, linestyle="none")
+            axes[0].plot(azimuth, 5.0, "o", color="black", markersize=8, **outlined)
+            axes[1].axvline(azimuth, color="white", linewidth=1.0)
+            for depth, (marker, colour) in _AT_M.items():
+                x, y, z = _seen(unrolled, row, column, depth)
+                place = np.degrees([np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))])
+                label = f"D = {depth:g} m" if azimuth == _COLUMNS_DEG[0] else None
+                axes[1].plot(*place, marker=marker, color=colour, markersize=7, label=label, **outlined)
+        axes[1].legend(loc="lower center", ncols=len(_AT_M), fontsize=9)
         return encoded(figure, "png")
 
 
@@ -136,8 +144,8 @@ def main() -> None:
     for name, data in pictures.items():
         file = OUT / f"{name}.png"
         picture_file = Image.open(io.BytesIO(data)).convert("RGB")
-        if name in _GREY:  # few colours are enough, and make it smaller; scales of colours would be spoiled
-            picture_file = picture_file.quantize(_COLOURS)
+        if name in _FEW_COLOURS:
+            picture_file = picture_file.quantize(_FEW_COLOURS[name], dither=Image.Dither.NONE)
         picture_file.save(file, optimize=True)
         print(f"{file.name}: {file.stat().st_size / 1e3:.0f} kB")
 

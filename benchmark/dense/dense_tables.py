@@ -55,7 +55,7 @@ def dense_strata_table(score: DenseScore) -> TextTable:
         for part in score.strata
     ]
     heads = ("by", "part", "pixels\n1000", *(f"{_SHOWN[name]}\n%" for name in _OF_STRATA))
-    return TextTable(f"{score.method.name}, by part", heads, tuple(rows), "ll" + "r" * (1 + len(_OF_STRATA)))
+    return TextTable(f"{score.method.name}, by part", heads, tuple(rows), "lL" + "r" * (1 + len(_OF_STRATA)))
 
 
 def dense_metrics_table(score: DenseScore) -> TextTable:
