@@ -41,8 +41,7 @@ from phibench.datasets.store.checksums import (
 from phibench.datasets.store.documents import alike, differences, parse_info, same_number, sensitivity_fault, to_json
 from phibench.datasets.store.layers import (
     SPOT_STACKS,
-    read_ambient,
-    read_ambient_variance,
+    read_ambient_pair,
     read_exr,
     read_spot,
     read_truth,
@@ -347,12 +346,11 @@ def _header_faults(dataset: Dataset, pose: PoseInfo, kind: str) -> Iterator[str]
 
 
 def _ambient_faults(dataset: Dataset, pose: PoseInfo, shape: tuple[int, int]) -> Iterator[str]:
-    planes = read_ambient(dataset.folder / pose.files["ambient"])
+    planes, variance = read_ambient_pair(dataset.folder / pose.files["ambient"])
     if planes.shape[1:] != shape:
         yield f"{pose.files['ambient']} has {planes.shape[1:]} pixels instead of {shape}"
     if not np.all(np.isfinite(planes) & (planes >= 0.0)):
         yield f"{pose.files['ambient']} has negative or non-finite electrons"
-    variance = read_ambient_variance(dataset.folder / pose.files["ambient"])
     if not np.all(np.isfinite(variance) & (variance >= 0.0)):
         yield f"{pose.files['ambient']} has negative or non-finite variances"
 

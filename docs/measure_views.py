@@ -1,9 +1,10 @@
-"""CPU time of light maps, and of views with all that is written of them, one thread, as a worker does them.
+"""CPU time of light maps, of views with all that is written of them, and of a film, one thread, as a worker does them.
 
 python docs/measure_views.py bake lab
 python docs/measure_views.py bake worlds --rooms 20
 python docs/measure_views.py view paper
 python docs/measure_views.py view worlds
+python docs/measure_views.py film bench-drives
 """
 
 from __future__ import annotations
@@ -11,7 +12,9 @@ from __future__ import annotations
 import argparse
 import importlib
 import os
+import re
 import resource
+import shutil
 import sys
 import time
 from collections import Counter
@@ -29,9 +32,12 @@ from phibench.datasets.build.bake_task import bake_room, bake_settings
 from phibench.datasets.build.view_task import render_view
 from phibench.datasets.build.workers import MEMORY
 from phibench.datasets.common.parallel import ONE_THREAD
+from phibench.datasets.film.film_plan import film_plans
+from phibench.datasets.film.film_room import renderer
+from phibench.datasets.film.film_task import make_film
 from phibench.datasets.plan.plan import make_plan
 from phibench.datasets.plan.room_draws import draw_rooms
-from phibench.datasets.recipe.load import load_recipe
+from phibench.datasets.recipe.load import load_recipe, parse_recipe, recipe_text
 from phibench.datasets.store.schema import view_file
 from phibench.render.room.light_map import BakeSettings, bake
 from phibench.render.room.noise_budget import BUDGETS
@@ -41,6 +47,13 @@ from phibench.scenes.catalog import default_rig, lab
 from phibench.scenes.room import Room
 
 COARSE = BakeSettings(texel_m=0.5, lamp_rays=16, bounces=2, bounce_rays=8, final_rays=16)
+SHORT = {  # lines of a recipe of drives
+    'preset = "c310"': 'preset = "default"',
+    r"\[film\]": '[film]\nview = "full"\nframes = 31',
+    "pauses_s =": "pauses_s = [0.1]",
+    "length_m =": "length_m = 0.06\nspeed_m_per_s = 0.08",
+    "turn_deg =": "turn_deg = 3.0",
+}
 TASK = "phibench.datasets.build.view_task"
 PARTS = {
     "light": ("phibench.render.room.ambient", ("view_surfaces", "render_ambient")),
@@ -131,6 +144,31 @@ def _parts(work: Any) -> Counter[str]:
     return spent
 
 
+def measure_film(what: str) -> None:
+    """Make the last film of a recipe of drives as whole images of a short arc; print the CPU time of a frame.
+
+    Light maps are baked before, and are not counted.
+    """
+    text = recipe_text(what)
+    for line, short in SHORT.items():
+        text, count = re.subn(f"(?m)^{line}.*$", short, text)
+        if not count:
+            sys.exit(f"recipe {what} has no line `{line}`: give one of a drive, such as bench-drives")
+    with TemporaryDirectory() as folder:
+        plan, films = film_plans(parse_recipe(text))
+        film = films[-1]
+        renderer(plan, film, plan.room(film.pair.room))
+        out = Path(folder) / "films"
+        for _ in range(2):  # the first compiles kernels
+            spent = _parts(lambda: make_film(out, plan, "key", film))
+            views = len(list(out.rglob("views/*.exr")))
+            shutil.rmtree(out)
+    frames = film.scene.times.frames
+    print(
+        f"{frames} frames, {views} key views: {spent['all'] / frames:.2f} CPU-s a frame, light {spent['light']:.1f} s"
+    )
+
+
 def _memory_mb() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
@@ -141,7 +179,7 @@ def main() -> None:
     if any(os.environ.get(name) != value for name, value in wanted.items()):
         os.execve(sys.executable, [sys.executable, *sys.argv], {**os.environ, **wanted})
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("which", choices=("bake", "view"))
+    parser.add_argument("which", choices=("bake", "view", "film"))
     parser.add_argument("what", help="a recipe; bakes also of `lab` at its own noise")
     parser.add_argument("--rooms", type=int, default=5, help="bakes")
     parser.add_argument("--repeat", type=int, default=5, help="renderings of a view")
@@ -150,6 +188,8 @@ def main() -> None:
     activate()
     if options.which == "bake":
         measure_bakes(options.what, options.rooms)
+    elif options.which == "film":
+        measure_film(options.what)
     else:
         measure_views(options.what, options.quality, options.repeat)
 

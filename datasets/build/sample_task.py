@@ -16,7 +16,7 @@ from phibench.datasets.common.errors import RefusedSampleError
 from phibench.datasets.plan.plan import PairPlan
 from phibench.datasets.rooms.room_sources import RoomSource, room_of
 from phibench.datasets.store import schema
-from phibench.datasets.store.layers import SpotWindow, read_ambient, read_ambient_variance, read_spot
+from phibench.datasets.store.layers import SpotWindow, read_ambient_pair, read_spot
 from phibench.datasets.store.pictures import PositionImages, sample_picture, save_png
 from phibench.datasets.store.schema import NoiseRow
 from phibench.render.optics.room_tracer import room_geometry
@@ -39,8 +39,8 @@ def finish_sample(out: Path, pair: PairPlan, rig: Rig, source: RoomSource, spot:
         view = rig.at(Stroke(pair.stroke_m).offset_m(position))
         truth = spot_truth(view, spot, room_geometry(room, view))
         ambient = out / schema.view_file(pair.pose_id(position), "ambient")
-        planes, window = read_ambient(ambient), _window(out, pair, position)
-        budget = spot_noise(view, truth, window, planes, read_ambient_variance(ambient))
+        (planes, variance), window = read_ambient_pair(ambient), _window(out, pair, position)
+        budget = spot_noise(view, truth, window, planes, variance)
         _check(position, budget, BUDGETS[quality])
         rows[position] = None if budget is None else noise_row(budget).model_dump(mode="json")
         frame = planes.astype(float)

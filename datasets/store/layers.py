@@ -285,12 +285,18 @@ def read_ambient(path: Path, **owner: str) -> NDArray[np.float32]:
 
 def read_ambient_variance(path: Path, **owner: str) -> NDArray[np.float32]:
     """Read the variance of an ambient layer, shape (3, H, W), (electrons per second) squared; `owner` likewise."""
+    return read_ambient_pair(path, **owner)[1]
+
+
+def read_ambient_pair(path: Path, **owner: str) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Read an ambient layer and its variance; `owner` likewise."""
     file = read_layer(path, "ambient", FILTERS, **owner)
+    planes = _scaled(path, file, "")
     if "var.R" in file.planes:  # before version 8
-        return _scaled(path, file, "var.")
+        return planes, _scaled(path, file, "var.")
     if missing := [name for name in AMBIENT_PLANES if name not in file.planes]:
         raise DatasetError(f"{path} lacks the planes {', '.join(missing)}")
-    return np.square(_scaled(path, file, "sd."))
+    return planes, np.square(_scaled(path, file, "sd."))
 
 
 def _scaled(path: Path, file: Exr, prefix: str) -> NDArray[np.float32]:
