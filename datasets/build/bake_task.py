@@ -7,6 +7,7 @@ from pathlib import Path
 from phibench.datasets.build.light_map_cache import light_map
 from phibench.datasets.build.tasks import Made
 from phibench.datasets.common.input_files import InputFile
+from phibench.datasets.common.parallel import return_memory
 from phibench.datasets.recipe.tables import AmbientTable
 from phibench.datasets.rooms.room_sources import RoomSource, room_of
 from phibench.datasets.store import schema
@@ -31,7 +32,9 @@ def bake_room(out: Path, rig: Rig, room_id: str, source: RoomSource, ambient: Am
     if not room.lit:
         (out / file).unlink(missing_ok=True)
         return Made((), info.model_dump(mode="json"))
+    return_memory()  # a bake's arrays do not fit into what views have left, and would come on top of it
     write_bytes(out / file, encoded(light_map(view, room, bake_settings(ambient))))
+    return_memory()
     return Made((file,), info.model_dump(mode="json"))
 
 

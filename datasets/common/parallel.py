@@ -8,6 +8,7 @@ that N workers keep N cores busy. The number of workers changes no result. Data 
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import os
 import reprlib
 import signal
@@ -94,6 +95,12 @@ def environment_of_children(added: dict[str, str]) -> Iterator[None]:
     finally:
         for name in new:
             del os.environ[name]
+
+
+def return_memory() -> None:
+    """Give memory that is free back to the system, where the C library keeps it (glibc); 10 ms for 200 MB."""
+    with contextlib.suppress(AttributeError, OSError, TypeError):  # another library, or another system
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 def end_with_the_parent() -> None:

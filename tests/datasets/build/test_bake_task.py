@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import io
+import platform
+import subprocess
 import warnings
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +15,7 @@ import pytest
 from helpers.valid_files import LIGHT, npy_members, npz, reshaped
 
 from phibench.datasets.build.bake_task import read_light_map
+from phibench.datasets.build.workers import MEMORY
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.store import schema
 from phibench.render.room.light_map import encoded
@@ -71,3 +75,31 @@ def test_what_is_no_light_map_is_refused(tmp_path: Path, data: bytes, words: str
     assert str(caught.value).startswith(f"{path} ")
     assert words in str(caught.value)
     assert str(caught.value).endswith("; run `phibench dataset repair`")
+
+
+KEPT = """
+import os
+from pathlib import Path
+import numpy as np
+from phibench.datasets.common.parallel import return_memory
+
+def resident_mb():
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+before = resident_mb()
+held = [np.ones(250_000) for _ in range(100)]  # 2 MB each
+last = np.ones(1000)  # lies above them: the heap cannot shrink from its end
+del held
+kept = resident_mb() - before
+return_memory()
+print(kept, resident_mb() - before)
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="another C library gives memory back by itself, or not")
+def test_memory_that_is_free_is_given_back(python: Callable[..., subprocess.CompletedProcess[str]]) -> None:
+    child = python(KEPT, **MEMORY)
+    assert child.returncode == 0, child.stderr
+    kept, left = map(float, child.stdout.split())
+    assert kept > 190.0  # what `MEMORY` asks for, or else this test shows nothing
+    assert left < 10.0
