@@ -2,6 +2,7 @@
 
 python docs/measure_views.py bake lab
 python docs/measure_views.py bake worlds --rooms 20
+python docs/measure_views.py bake bench-test --only mesh000005 mesh000015
 python docs/measure_views.py view paper
 python docs/measure_views.py view worlds
 python docs/measure_views.py film bench-drives
@@ -31,7 +32,7 @@ import numpy as np
 from phibench.datasets.build.bake_task import bake_room, bake_settings
 from phibench.datasets.build.view_task import render_view
 from phibench.datasets.build.workers import MEMORY
-from phibench.datasets.common.parallel import ONE_THREAD
+from phibench.datasets.common.parallel import ONE_THREAD, return_memory
 from phibench.datasets.film.film_plan import film_plans
 from phibench.datasets.film.film_room import renderer
 from phibench.datasets.film.film_task import make_film
@@ -63,21 +64,23 @@ PARTS = {
 }
 
 
-def rooms(what: str, count: int) -> Iterator[tuple[str, Room, BakeSettings]]:
-    """Name, room and settings of each bake."""
+def rooms(what: str, count: int, only: list[str]) -> Iterator[tuple[str, Room, BakeSettings]]:
+    """Name, room and settings of each bake; of the first rooms, or of those that are named."""
     if what == "lab":
         yield from (("lab", lab(()), BakeSettings()) for _ in range(count))
         return
     recipe = load_recipe(what)
-    for name, source in islice(draw_rooms(recipe).items(), count):
+    drawn = draw_rooms(recipe)
+    for name, source in ((name, drawn[name]) for name in only) if only else islice(drawn.items(), count):
         yield name, source.build(), bake_settings(recipe.ambient)
 
 
-def measure_bakes(what: str, count: int) -> None:
+def measure_bakes(what: str, count: int, only: list[str]) -> None:
     """Bake and print a line each, then the median."""
     view, times = default_rig().at(0.0), []
     bake(view, lab(()), COARSE)  # compiles the kernels
-    for name, room, settings in rooms(what, count):
+    for name, room, settings in rooms(what, count, only):
+        return_memory()  # as a worker does
         before = time.process_time()
         light = bake(view, room, settings)
         times.append(time.process_time() - before)
@@ -85,7 +88,7 @@ def measure_bakes(what: str, count: int) -> None:
         level, sigma = (np.asarray(a, float)[free] for a in (light.irradiance_w_m2, light.sigma_w_m2))
         noise = np.sqrt(np.mean(sigma**2) / np.mean(level**2))
         print(f"{name}: {len(level)} texels, {times[-1]:.2f} CPU-s, stated noise {100 * noise:.2f} % rms", flush=True)
-    print(f"median {np.median(times):.2f} CPU-s of {len(times)}")
+    print(f"median {np.median(times):.2f} CPU-s of {len(times)}; memory {_memory_mb():.0f} MB")
 
 
 def measure_views(what: str, quality: str | None, repeat: int) -> None:
@@ -182,12 +185,13 @@ def main() -> None:
     parser.add_argument("which", choices=("bake", "view", "film"))
     parser.add_argument("what", help="a recipe; bakes also of `lab` at its own noise")
     parser.add_argument("--rooms", type=int, default=5, help="bakes")
+    parser.add_argument("--only", nargs="+", default=[], metavar="ROOM", help="bakes of these rooms")
     parser.add_argument("--repeat", type=int, default=5, help="renderings of a view")
     parser.add_argument("--quality", choices=tuple(BUDGETS), help="of a view, over the recipe's")
     options = parser.parse_args()
     activate()
     if options.which == "bake":
-        measure_bakes(options.what, options.rooms)
+        measure_bakes(options.what, options.rooms, options.only)
     elif options.which == "film":
         measure_film(options.what)
     else:
