@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from contextlib import nullcontext
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
 import scipy
-from helpers.ball_photographs import ball_photograph
+from helpers.ball_photographs import BallPhotograph, ball_photograph
 
 from phibench.calibration.outline.ball_circle import BallCircle, circles, find_circle, refined
 from phibench.calibration.outline.edge_ring import TURNS, EdgeRing, log_colours
@@ -22,12 +23,18 @@ from phibench.scenes.rig import Rig
 DRAWN = 5
 
 
+@cache
+def photograph(number: int) -> BallPhotograph:
+    """One of the drawn photographs; several tests look at the same one."""
+    return ball_photograph(np.random.default_rng([7, number]))
+
+
 @pytest.fixture(scope="module")
 def found() -> list[tuple[float, BallCircle]]:
     """Distance from the true outline and the circle found, of those photographs that are not refused."""
     result = []
     for number in range(DRAWN):
-        photo = ball_photograph(np.random.default_rng([7, number]))
+        photo = photograph(number)
         try:
             circle = find_circle(photo.light)
         except ImageError:
@@ -36,6 +43,7 @@ def found() -> list[tuple[float, BallCircle]]:
     return result
 
 
+@pytest.mark.slow  # in short: a long, a grey and a narrowly searched photograph below
 def test_accuracy_of_outlines_among_patterns(found) -> None:
     """Asked of photographs: 1.5 px, and none beyond 3 claimed sigma + 1 px. One in five may be refused."""
     assert len(found) >= DRAWN - 1
@@ -58,7 +66,7 @@ def test_the_same_photograph_at_twice_the_size_has_the_same_outline() -> None:
     A last look at twice the size has half the floor of 0.4 px; copies of pixels say nothing new, so that it is the same
     to that floor.
     """
-    photo = ball_photograph(np.random.default_rng([7, 3]))
+    photo = photograph(3)
     small, double = next(circles(photo.light)), np.kron(photo.light, np.ones((2, 2, 1), np.float32))
     expected = 2.0 * np.array(small.circle_px) + [0.5, 0.5, 0.0]
     again = next(circles(double))
@@ -78,7 +86,7 @@ def test_a_long_photograph_is_measured_in_finer_squares() -> None:
 
 
 def test_radii_narrow_the_search() -> None:
-    photo = ball_photograph(np.random.default_rng([7, 3]))
+    photo = photograph(3)
     r = photo.radius_px
     with pytest.raises(ImageError, match="no outline of a ball"):
         find_circle(photo.light, (1.3 * r, 1.4 * r))
@@ -87,7 +95,7 @@ def test_radii_narrow_the_search() -> None:
 
 def test_the_contrast_of_a_curve_beside_the_outline_is_low() -> None:
     """A circle 6 px wider lies in the room's patterns, whose edges are no more frequent on it than beside it."""
-    photo = ball_photograph(np.random.default_rng([7, 3]))
+    photo = photograph(3)
     best = next(circles(photo.light, (0.95 * photo.radius_px, 1.05 * photo.radius_px)))
     u, v, radius = best.circle_px
     there, beside = (EdgeRing(log_colours(photo.light), (u, v, radius + off)) for off in (0.0, 6.0))
@@ -109,7 +117,7 @@ def test_edges_of_a_disc_have_their_place() -> None:
 
 
 def test_a_grey_picture_is_enough() -> None:
-    photo = ball_photograph(np.random.default_rng([7, 1]))
+    photo = photograph(1)
     circle = find_circle(photo.light.mean(axis=-1))
     assert photo.distance_px(circle.points_px) < 1.5
 
