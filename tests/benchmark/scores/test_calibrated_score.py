@@ -223,6 +223,7 @@ def test_methods_are_scored_with_a_calibration(
     assert with_it["pair_set"]["calibration"] == read_calibration(file).sha256
     assert "calibration" not in without["pair_set"]
     assert run("compare", tmp_path / "with.json", tmp_path / "without.json") == 2
+    monkeypatch.setattr(benching, "_presets", lambda _: ["mjpeg"])
     few = ("bench", misaligned.folder, "--method", "detect", "--pairs", "1")
     assert run(*few, "--calibration", file, "--out", tmp_path / "b") == 0
     assert json.loads((tmp_path / "b" / "mjpeg-detect.json").read_text())["pair_set"]["calibration"]

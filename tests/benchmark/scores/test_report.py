@@ -14,6 +14,7 @@ import pytest
 from helpers.bench_cases import Cases, cases, change, constant, outcomes, sampler, shifted, silent, truth_itself
 from PIL import Image
 
+from phibench.benchmark.reports import figures
 from phibench.benchmark.reports.figures import (
     EmbeddedFigure,
     cause_bars,
@@ -114,9 +115,9 @@ def test_pictures_have_words_and_tables_have_heads(html):
     keys = [attributes for attributes in page.of("img") if attributes.get("class") == "key"]
     assert len(keys) == 6  # beside the names, which say it
     assert {attributes["alt"] for attributes in keys} == {""}
-    figures = [attributes for attributes in page.of("img") if attributes.get("class") != "key"]
-    assert len(figures) == 9 + 3 + 2 + 1 + 1  # curves, maps, radius, causes, pulls
-    assert all(len(attributes["alt"]) > 60 for attributes in figures)
+    drawn = [attributes for attributes in page.of("img") if attributes.get("class") != "key"]
+    assert len(drawn) == 9 + 3 + 2 + 1 + 1  # curves, maps, radius, causes, pulls
+    assert all(len(attributes["alt"]) > 60 for attributes in drawn)
     shown = [attributes for attributes in page.of("svg") if "aria-hidden" not in attributes]
     assert all(attributes.get("role") == "img" and attributes.get("aria-label") for attributes in shown)
     assert len(shown) == 60 + 9  # ten crops, each without and with marks, and three frames of each method
@@ -278,6 +279,7 @@ def hidden(n=12):
 
 @pytest.fixture(scope="module")
 def crowded(scores):
+    """Its figures are put together and not drawn: what is compared are words."""
     section = Section(
         "Tilt of the camera",
         ("Predicted and measured.",),
@@ -285,7 +287,9 @@ def crowded(scores):
         ((("tilt", "error"), ("0.5 deg", "0.9 %")),),
     )
     first = [scores[0], scores[0], scored("constant", constant), scored("silent", silent)]
-    return report_html([*first, scored("truth", truth_itself, hidden())], [section])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(figures, "encoded", lambda *_: b"")
+        return report_html([*first, scored("truth", truth_itself, hidden())], [section])
 
 
 def test_other_pairs_make_another_ranking(crowded):
@@ -350,7 +354,7 @@ def test_results_are_one_page_in_each_form(score_files, tmp_path, capsys):
     assert again.read_bytes() == page.read_bytes()
 
 
-def test_scores_of_fewer_pairs_are_told_of(score_files, tmp_path, capsys):
+def test_scores_of_fewer_pairs_are_told_of(score_files, tmp_path, capsys, monkeypatch):
     """One method was scored on 25 of the 40 pairs."""
     few = tmp_path / "few.json"
     write_score(few, *scored("few", shifted(0.3), cases(25)))
@@ -360,6 +364,7 @@ def test_scores_of_fewer_pairs_are_told_of(score_files, tmp_path, capsys):
     assert "25 pairs are counted here, other numbers elsewhere: half (40); such scores do not compare." in text
     assert "40 pairs are counted here, other numbers elsewhere: few (25); such scores do not compare." in text
     assert len(re.findall(r"^## .*, (?:25|40) pairs$", text, re.M)) == 2
+    monkeypatch.setattr(figures, "encoded", lambda *_: b"")  # words are the subject
     assert cli.main(["report", *files, "--out", str(tmp_path / "page.html")]) == 0
     page = (tmp_path / "page.html").read_text()
     assert page.count("pairs are counted here, other numbers elsewhere") == 2
@@ -371,14 +376,16 @@ def test_scores_of_fewer_pairs_are_told_of(score_files, tmp_path, capsys):
     assert "counts" not in capsys.readouterr().out
 
 
-def test_points_without_an_interval_are_open_and_explained(few_samples):
+def test_points_without_an_interval_are_open_and_explained(few_samples, monkeypatch):
     """Each stratum of three pairs has fewer than five samples; with two hundred, those of distance have more."""
     few, page = few_samples
     assert "Open marks: too few samples for an interval." in page
     assert has_open_marks(few)
     many = scored("ideal", sampler(), cases(200))
     assert not has_open_marks(many[0])
-    assert "Open marks" not in report_html([many])
+    with monkeypatch.context() as undrawn:
+        undrawn.setattr(figures, "encoded", lambda *_: b"")
+        assert "Open marks" not in report_html([many])
     for document, is_open in ((few, True), (many[0], False)):
         drawn = base64.b64decode(error_panels({"ideal": document})[0].source.split(",")[1]).decode()
         assert ("fill: #ffffff; stroke: #0072b2" in drawn) == is_open

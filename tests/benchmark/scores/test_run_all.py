@@ -19,6 +19,7 @@ from phibench.benchmark.isolation.resolve import GROUP, MethodError, RunLimits, 
 from phibench.benchmark.isolation.runner import Harness
 from phibench.benchmark.pair_sets.dataset_pairs import TRACKS, dataset_pairs, tracks_of
 from phibench.benchmark.reports import bench as benching
+from phibench.benchmark.reports import figures
 from phibench.benchmark.reports.bench import bench
 from phibench.benchmark.scores.document import read_score
 from phibench.benchmark.scores.score import score
@@ -31,7 +32,10 @@ from phibench.estimator.methods.registry import METHODS
 from phibench.estimator.spots.detect import detect
 
 
-def test_the_benchmark_runs_what_accepts_each_preset(bench_dataset: Path, tmp_path: Path) -> None:
+def test_the_benchmark_runs_what_accepts_each_preset(
+    bench_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(figures, "encoded", lambda *_: b"")  # thirty figures, which test_report.py draws
     names = ["red_centroid", "raw_maximum_likelihood"]
     done = bench(bench_dataset, tmp_path / "out", names, workers=1, pairs=2, console=quiet())
     raw = [f"bayer-raw-{name}{track}" for track in ("", "-localise") for name in names]
@@ -61,7 +65,7 @@ def test_registered_methods_run_beside_built_in_ones(
     """A package's method that is `detect` by another name has its scores, to the last bit."""
     theirs = EntryPoint("theirs", "phibench.estimator.methods.registry:detected_spots", GROUP)
     monkeypatch.setattr(resolving, "entry_points", lambda group: [theirs])
-    # all presets and the report's thirty figures are those of the test above
+    # all presets and the report are those of the test above
     monkeypatch.setattr(benching, "_presets", lambda _: ["bayer-raw", "mjpeg"])
     monkeypatch.setattr(benching, "write_report", lambda *_: tmp_path)
     done = bench(bench_dataset, tmp_path / "out", ["theirs", "detect"], pairs=1, console=quiet(), tracks=["depth"])

@@ -311,7 +311,7 @@ def half(tmp_path_factory):
 def test_score_with_methods_compare_and_report(bench_dataset, half, tmp_path, capsys):
     out = tmp_path / "run.json"
     words = ["score", str(bench_dataset), "--method", "raw_maximum_likelihood", "--method", half]
-    assert cli.main([*words, "--preset", "bayer-raw", "--draws", "2", "--workers", "2", "--out", str(out)]) == 0
+    assert cli.main([*words, "--preset", "bayer-raw", "--draws", "2", "--out", str(out)]) == 0
     shown = capsys.readouterr().out
     assert "raw_maximum_likelihood" in shown
     assert sorted(file.name for file in tmp_path.iterdir()) == [
