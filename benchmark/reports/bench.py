@@ -152,8 +152,8 @@ def _chosen(known: Sequence[str], wanted: Sequence[str] | None) -> list[str]:
 # -- the demo ----------------------------------------------------------------------------------------------------------
 
 SHIPPED = Path(__file__).parent.parent / "pair_sets" / "demo"
-DEMO_METHODS = ("red_centroid", "chain_fit")
-"""A simple method, and the best one on processed images."""
+DEMO_METHODS = ("red_centroid", "detect")
+"""A simple method, and the matched filter that the fits begin with; fits take a second a pair."""
 EXAMPLE, FRAMES = "my_phi.py", "frames"
 
 

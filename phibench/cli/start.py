@@ -45,6 +45,7 @@ def demo(*, out: Path = Path("phibench-demo")) -> int:
     for one in done.scores:
         print(text_of(score_table(one.document)))
     print(f"{done.page}: {'opened' if show(done.page) else 'open it in a browser'}")
+    print(f"the best built-in fit takes a second a pair: phibench score {done.pairs} --method chain_fit")
     print(f"change {done.example} and give the same command again; the pairs and their truth are {done.pairs}")
     return 0
 
