@@ -11,6 +11,7 @@ import tomllib
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from fnmatch import fnmatch
+from functools import cache
 from pathlib import Path
 
 import grimp
@@ -83,6 +84,12 @@ RENDERS = ("render", "datasets", "benchmark/export", "benchmark/release", "studi
 
 def sources(root: Path) -> list[Path]:
     return sorted(file for folder in (*DISTRICTS, PACKAGE) for file in (root / folder).rglob("*.py"))
+
+
+@cache
+def tree(file: Path) -> ast.Module:
+    """Syntax of a file, which several tests look through."""
+    return ast.parse(file.read_text(encoding="utf-8"))
 
 
 def module_name(root: Path, file: Path) -> str:
@@ -179,7 +186,7 @@ def test_nothing_imports_the_top_and_no_folder_is_a_package() -> None:
 
 def imports(file: Path) -> Iterator[tuple[int, str]]:
     """Yield (level, dotted name) of every import, wherever it stands; ``from a import b`` gives ``a.b``."""
-    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+    for node in ast.walk(tree(file)):
         if isinstance(node, ast.Import):
             yield from ((0, alias.name) for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -267,7 +274,7 @@ def test_the_tree_has_few_large_rooms() -> None:
     stems = Counter(file.stem for file in files if file.parts[0] != "studies" and "cli" not in file.parts)
     assert {file.stem for file in files if file.parent == Path(PACKAGE)} == {"__init__", "__main__"}
     assert [stem for stem, n in stems.items() if n > 1] == []
-    bodies = [ast.parse((ROOT / file).read_text(encoding="utf-8")).body for file in files]
+    bodies = [tree(ROOT / file).body for file in files]
     classes = Counter(node.name for body in bodies for node in body if isinstance(node, ast.ClassDef))
     assert len(classes) > 600
     assert [name for name, n in classes.items() if n > 1 and not name.startswith("_")] == []
@@ -279,7 +286,7 @@ def test_docstrings_begin_with_a_noun_or_a_verb() -> None:
     texts = [
         (file.relative_to(ROOT), text)
         for file in sources(ROOT)
-        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8")))
+        for node in ast.walk(tree(file))
         if isinstance(node, documented) and (text := ast.get_docstring(node))
     ]
     assert len(texts) > 1000
