@@ -16,11 +16,10 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from phibench.robot.loop.environment import COST_REFUSED, ApproachTarget
+from phibench.robot.loop.environment import COST_REFUSED, ApproachTarget, numbers_of_action
 from phibench.robot.loop.policies import SearchingPolicy
 from phibench.robot.loop.setups import SETTINGS
 from phibench.robot.loop.simulator import LATE, RUNNING, Action, Known, Setup
-from phibench.scenes.validation import SceneError
 
 FEATURES = ("sin bearing", "cos bearing", "way left", "way left, enlarged", "sigma", "stroke", "missed", "time")
 ACTIONS = ("drive", "turn", "stroke", "state")
@@ -85,11 +84,7 @@ class ApproachTargetBelief(gymnasium.Env[NDArray[Any], NDArray[Any]]):
         SceneError
             If the action has another length or a number outside, or the episode is over.
         """
-        numbers = np.asarray(action, float).reshape(-1)
-        if len(numbers) != len(ACTIONS) or not np.all(np.abs(numbers) <= 1.0):
-            raise SceneError(
-                f"action of {len(numbers)} numbers: give {len(ACTIONS)} from -1 to 1, {', '.join(ACTIONS)}"
-            )
+        numbers = numbers_of_action(action, ACTIONS)
         command, refused = self._command(*numbers.tolist())
         reward, over, late = self._perform(command)
         more = self._identify()

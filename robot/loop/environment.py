@@ -342,6 +342,23 @@ class ApproachTargetFlat(gymnasium.Env[NDArray[Any], NDArray[Any]]):
         return self.inner.render()
 
 
+def numbers_of_action(action: NDArray[Any], names: tuple[str, ...]) -> NDArray[np.float64]:
+    """Numbers of an action of a vector, one for each name.
+
+    Raises
+    ------
+    SceneError
+        If there are more or fewer, or one is not within -1 to 1.
+    """
+    numbers = np.asarray(action, float).reshape(-1)
+    if len(numbers) != len(names):
+        raise SceneError(f"action of {len(numbers)} numbers: give {len(names)} from -1 to 1, {', '.join(names)}")
+    for name, number in zip(names, numbers.tolist(), strict=True):
+        if not abs(number) <= 1.0:
+            raise SceneError(f"action {name} = {number:g}: give a number from -1 to 1")
+    return numbers
+
+
 def unscaled(vector: NDArray[Any], space: spaces.Dict) -> dict[str, Any]:
     """Action of a vector of -1 to 1.
 
@@ -350,9 +367,7 @@ def unscaled(vector: NDArray[Any], space: spaces.Dict) -> dict[str, Any]:
     SceneError
         If it has another length, or a number outside.
     """
-    numbers = np.asarray(vector, float).reshape(-1)
-    if len(numbers) != len(space) or not np.all(np.abs(numbers) <= 1.0):
-        raise SceneError(f"action of {len(numbers)} numbers: give {len(space)} from -1 to 1, {', '.join(space)}")
+    numbers = numbers_of_action(vector, tuple(space))
     values: dict[str, Any] = {}
     for (name, own), number in zip(space.items(), numbers, strict=True):
         if isinstance(own, spaces.Discrete):

@@ -211,8 +211,10 @@ def test_vectors_are_the_dicts_scaled(env, vectors) -> None:
     assert np.array_equal(seen, scaled(other, env.observation_space))
     assert seen.dtype == np.float32
     assert np.abs(seen).max() <= 1.0
-    with pytest.raises(SceneError, match="give 8 from -1 to 1"):
+    with pytest.raises(SceneError, match=r"action \w+ = 1.1: give a number from -1 to 1"):
         unscaled(np.full(8, 1.1), space)
+    with pytest.raises(SceneError, match="action of 3 numbers: give 8 from -1 to 1"):
+        unscaled(np.zeros(3), space)
 
 
 @pytest.mark.slow
