@@ -18,6 +18,7 @@ from phibench.benchmark.dense.dense_easy import EasyDensePairs, EasyTruth, point
 from phibench.benchmark.isolation.check import Check
 from phibench.benchmark.isolation.resolve import DENSE, RunLimits, resolve
 from phibench.benchmark.isolation.runner import Harness
+from phibench.estimator.dense.dense_interface import DensePair
 from phibench.estimator.geometry.mirror_image import image_of
 from phibench.estimator.geometry.status import keep
 from phibench.estimator.geometry.triangulate import meeting
@@ -50,7 +51,10 @@ def check_dense(
             done.append(outcome)
             told(len(done))
         isolation = harness.isolations[0]
-    check = judged_dense(done, [pairs.truth(outcome.number) for outcome in done])
+        check = judged_dense(done, [pairs.truth(outcome.number) for outcome in done])
+        if not check.ok:
+            ((other,),) = harness.outcomes(_Exchanged(pairs), [0])
+            check = replace(check, faults=with_exchanged(check.faults, done[0], other, pairs.truth(0)))
     return check if isolation.startswith("isolated") else replace(check, notes=(*check.notes, isolation))
 
 
@@ -69,6 +73,36 @@ def judged_dense(done: Sequence[Outcome], truths: Sequence[EasyTruth]) -> Check:
         notes += _notes(answered, [outcome.seconds for outcome in done if outcome.dense is not None])
     printed = tuple((outcome.number, outcome.output) for outcome in done if outcome.output)
     return Check(tuple(faults), tuple(notes), printed)
+
+
+@dataclass(frozen=True)
+class _Exchanged:
+    """Pairs whose images are exchanged."""
+
+    pairs: EasyDensePairs
+
+    def pair(self, number: int) -> DensePair:
+        """Images of a pair."""
+        pair = self.pairs.pair(number)
+        return replace(pair, down=pair.up, up=pair.down)
+
+
+def with_exchanged(faults: tuple[str, ...], outcome: Outcome, other: Outcome, truth: EasyTruth) -> tuple[str, ...]:
+    """Faults of a method, or one sentence if its answer is right where both images are exchanged.
+
+    Parameters
+    ----------
+    faults : as of `judged_dense`
+    outcome, other : the method's answers for a pair, and for the pair with down and up exchanged
+    truth : of the pair
+    """
+    asked = judged_dense([outcome], [truth]).faults
+    if not asked or other.dense is None or judged_dense([other], [truth]).faults:
+        return faults
+    return (f"down and up are exchanged inside the method: with both images exchanged {_RIGHT}",)
+
+
+_RIGHT = "its answers are right. pair.down is the lower position's image, and D is asked for its pixels"
 
 
 @dataclass(frozen=True)
@@ -242,7 +276,7 @@ def depth_fault(answers: _Answers) -> str:
             return text
     off = float(np.nanmedian(_off(depth, true)))
     if off <= _FAIR:
-        return _half_pixel(answers)
+        return _grid_offset(answers) or _half_pixel(answers)
     ratio = float(np.nanmedian(depth / true))
     return f"D is {ratio:.2g} times the truth (median), off by {100.0 * np.expm1(off):.0f} %: a plain matcher has 5 %"
 
@@ -278,46 +312,96 @@ def _grids(answers: _Answers) -> dict[str, Array]:
     return texts
 
 
+_TURNS_DEG = (-4.0, -3.0, -2.0, -1.5, -1.0, -0.5, 0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0)
+_ROWS_PX = (-10.0, -7.0, -5.0, -3.5, -2.0, -1.0, 0.0, 1.0, 2.0, 3.5, 5.0, 7.0, 10.0)
+_BESIDE = 3.0  # median errors by which both D differ at pixels that vote
+_VOTES, _NEARER = 60, 0.8  # a fair coin gives 0.8 of 60 votes once in 4e5
+_BETTER = 0.9  # of the mean error may be left
+
+
+def _grid_offset(answers: _Answers) -> str:
+    """Sentence if D is that of a grid which is off by some pixels; "" if not.
+
+    D changes little then, but where surfaces end. So pixels vote at which D of the other grid and of the right one
+    differ by far more than the answers' own error: they are nearer to the one or to the other.
+    """
+    few = answers.some(_FEW // 2)
+    true = few.truth(_true_depth)
+    moved = [(turn, rows) for turn in _TURNS_DEG for rows in _ROWS_PX]
+
+    def expected(move: tuple[float, float]) -> Array:
+        return few.truth(lambda t: _depth_at(t, _moved(t, turn_deg=move[0], outwards_px=move[1])))
+
+    best = min(moved, key=lambda move: _left(few.depth_m, expected(move)))
+    other, off = expected(best), _off(few.depth_m, true)
+    apart = np.isfinite(off) & (_off(true, other) > max(_BESIDE * float(np.nanmedian(off)), _LEAST_APART))
+    nearer = _off(few.depth_m, other)[apart] < off[apart]
+    if (
+        len(nearer) < _VOTES
+        or nearer.mean() < _NEARER
+        or _left(few.depth_m, other) > _BETTER * _left(few.depth_m, true)
+    ):
+        return ""
+    turn, rows = best
+    way = f"{abs(rows):g} px further {'outwards' if rows > 0 else 'inwards'}"
+    both = " and ".join([f"{turn:+g} degrees of azimuth further"] * (turn != 0.0) + [way] * (rows != 0.0))
+    return f"the unrolled grid is off: D is that of pixels about {both}; does a cell's value stand at its centre?"
+
+
 _CENTRE = "the centre of the first pixel is (0, 0), the image begins at -0.5"
-_HYPOTHESES = {
-    "both images": ((0.5, 0.5), (-0.5, -0.5)),
-    "the down image": ((0.5, 0.0), (-0.5, 0.0)),
-    "the up image": ((0.0, 0.5), (0.0, -0.5)),
-}
+_SIDES = ((1.0, 1.0), (1.0, 0.0), (0.0, 1.0), (1.0, -1.0))  # of a shift of (u, v)
+_HYPOTHESES = [
+    (text, (sign * a * side[0], sign * a * side[1], sign * b * side[0], sign * b * side[1]))
+    for text, a, b in (("both images", 0.5, 0.5), ("the down image", 0.5, 0.0), ("the up image", 0.0, 0.5))
+    for side in _SIDES
+    for sign in (1.0, -1.0)
+]
 _SIGMAS, _ALIKE = 8.0, 25.0  # of a shift to be named; pixels whose errors count as one: windows overlap
-_EXPLAINS = 0.75  # of what any shifts explain
+_EXPLAINS = 0.9  # of what any shifts explain: the shift itself differs by less than a third, root 0.1
+_OFFSET_PX, _SHARE = 0.25, 0.25  # from which another offset of the up image is told; of the squared error, explained
 _INLIER = 4.0  # robust deviations
 _STEEP = 0.3  # relative change of D by a pixel from which it is no longer linear
 
 
 def _half_pixel(answers: _Answers) -> str:
-    """Sentence if the errors of D are those of pixel centres at a half; "" if not.
+    """Sentence if the errors of D are those of pixels that are off, as of centres at a half; "" if not.
 
-    Errors are compared with the effects of shifts by half a pixel, by least squares among the inliers.
+    Errors are compared with the effects of shifts of either image along u and v, by least squares among the inliers.
+    A shift of one image is nearly the opposite one of the other: where no half pixel explains them, that of the up
+    image alone is told.
     """
     with np.errstate(invalid="ignore", divide="ignore"):
         error = answers.depth_m / answers.truth(_true_depth) - 1.0
-    shifts = [answers.truth(partial(_shifted, down, up)) for down, up in ((0.5, 0.0), (0.0, 0.5))]
-    A = 2.0 * np.stack(shifts, axis=1)
+    A = 2.0 * np.stack([answers.truth(partial(_shifted, tuple(shift))) for shift in 0.5 * np.eye(4)], axis=1)
     limit = max(_INLIER * 1.4826 * float(np.nanmedian(np.abs(error))), 0.01)
     good = np.isfinite(error) & (np.abs(error) < limit) & (np.abs(A).max(axis=1) < _STEEP)  # False for NaN
     if good.sum() < 1000:
         return ""
     A, y = A[good], error[good]
-    fit, *_ = np.linalg.lstsq(A, y, rcond=None)
-    least, none = (float(np.sum((y - A @ x) ** 2)) for x in (fit, np.zeros(2)))
-    left = {(text, x): float(np.sum((y - A @ np.array(x)) ** 2)) for text, xs in _HYPOTHESES.items() for x in xs}
-    (text, shift), best = min(left.items(), key=lambda item: item[1])
-    gain = (none - best) / (_ALIKE * max(least / len(y), 1e-12))
-    if gain > _SIGMAS**2 and none - best > _EXPLAINS * (none - least):
-        told = f"{shift[0]:+g}, {shift[1]:+g} px, down and up"
-        return f"pixels of {text} are off by half a pixel ({told}): {_CENTRE}"
+
+    def left(shift: Array) -> float:
+        return float(np.sum((y - A @ shift) ** 2))
+
+    none, least = left(np.zeros(4)), left(np.linalg.lstsq(A, y, rcond=None)[0])
+    (text, shift) = min(_HYPOTHESES, key=lambda item: left(np.array(item[1])))
+    gained, one = none - left(np.array(shift)), _ALIKE * max(least / len(y), 1e-12)
+    if gained > _SIGMAS**2 * one and gained > _EXPLAINS * (none - least):
+        return f"pixels of {text} are off by half a pixel ({_told(shift)}): {_CENTRE}"
+    up = np.linalg.lstsq(A[:, 2:], y, rcond=None)[0]
+    gained = none - left(np.array([0.0, 0.0, *up]))
+    if gained > max(_SIGMAS**2 * one, _SHARE * none) and np.abs(up).max() > _OFFSET_PX:
+        return f"pixels of one image are off against the other ({_told((0.0, 0.0, *up))}): {_CENTRE}"
     return ""
 
 
-def _shifted(down_px: float, up_px: float, truth: EasyTruth) -> Array:
-    """Relative change of D by shifts of both coordinates."""
-    return _depth(truth, truth.up_px + up_px, truth.uv_px + down_px) / truth.depth_m - 1.0
+def _told(shift: Sequence[float]) -> str:
+    down, up = (f"({u:+.1f}, {v:+.1f})" if u or v else "" for u, v in (shift[:2], shift[2:]))
+    return ", ".join([f"{down} px in the down image"] * bool(down) + [f"{up} px in the up image"] * bool(up))
+
+
+def _shifted(shift_px: Sequence[float], truth: EasyTruth) -> Array:
+    """Relative change of D by shifts (u, v) of the pixels of the down and of the up image."""
+    return _depth(truth, truth.up_px + shift_px[2:], truth.uv_px + shift_px[:2]) / truth.depth_m - 1.0
 
 
 # Rules for places.

@@ -5,6 +5,8 @@ Processes, limits and isolation are those of spots (`isolation.runner`).
 
 from __future__ import annotations
 
+import hashlib
+import json
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
@@ -20,6 +22,7 @@ from phibench.benchmark.dense.dense_document import (
     COMMAND,
     DENSE_METRICS,
     KIND,
+    SCORER,
     VERSION,
     DenseScore,
     dense_document,
@@ -37,7 +40,10 @@ from phibench.calibration.rig.file import read_calibration
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.progress import Steps, progress_console
 from phibench.datasets.read import Dataset
-from phibench.datasets.store.files import require_writable
+from phibench.datasets.store.documents import parquet_bytes
+from phibench.datasets.store.files import require_writable, write_bytes
+from phibench.datasets.store.provenance import code_behind
+from phibench.datasets.store.schema import RECORDS_SO_FAR
 from phibench.estimator.dense.dense_interface import DenseMethod, DensePair
 from phibench.estimator.interface import Outcome
 
@@ -101,14 +107,15 @@ def score_dense(
     if out is not None:
         require_writable(Path(out))
     if isinstance(method, str):
-        (scored,) = run_dense([method], chosen, console=console, seed=seed, limits=limits)
+        files = [None if out is None else Path(out)]
+        (scored,) = run_dense([method], chosen, console=console, seed=seed, limits=limits, files=files)
     else:
         if limits is not None:
             raise MethodError("limits are for methods in a process of their own: give FILE.py:FUNCTION")
         card = MethodCard.of(function_name(method), kind="function", **code_of_function(method))
         with Steps(console, "dense pairs", len(chosen)) as steps:
             asked = asked_here(method)(_Shown(chosen), range(len(chosen)))
-            (table,) = _records(chosen, asked, 1, steps.reach)
+            (table,) = _records(chosen, asked, [[]], steps.reach)
         alone = "not isolated: a function runs in this process"
         scored = _scored(card, chosen, table, seed, {}, alone, ran_here(), "")
     return scored if out is None else saved_dense(scored, Path(out))
@@ -135,8 +142,15 @@ def run_dense(
     console: Console | None = None,
     seed: int = 0,
     limits: RunLimits | None = None,
+    files: Sequence[Path | None] = (),
 ) -> list[DenseScored]:
     """Score dense methods on the same pairs, each in a process of its own.
+
+    Parameters
+    ----------
+    files : paths of the scores to come, one per method, optional
+        The records so far lie beside them while the run goes on. A run of the same methods, pairs, limits and code goes
+        on from there; `saved_dense` takes them away.
 
     Raises
     ------
@@ -147,11 +161,17 @@ def run_dense(
     cards = [MethodCard.of(name, **method.document()) for name, method in zip(references, resolved, strict=True)]
     if not cards:
         return []
+    console = console or progress_console()
+    so_far = _SoFar.of(files, cards, pairs, limits)
+    rows = so_far.read(len(cards), len(pairs) - 1)  # the last pair is asked for: what a method has loaded is known then
+    done = len(rows[0])
+    if done:
+        console.print(f"{done} of {len(pairs)} pairs are those of a run that was interrupted")
     with ExitStack() as stack:
-        steps = stack.enter_context(Steps(console or progress_console(), "dense pairs", len(pairs)))
+        steps = stack.enter_context(Steps(console, "dense pairs", len(pairs)))
         harness = stack.enter_context(Harness(resolved, limits, workers, pairs.folders))
         shown = _Shown(pairs)
-        tables = _records(shown, _asked(harness, shown, workers), len(cards), steps.reach)
+        tables = _records(shown, _asked(harness, shown, workers, done), rows, steps.reach, so_far)
         told = list(zip(harness.isolations, harness.ran, harness.failed_outputs, strict=True))
     return [
         _scored(card, pairs, table, seed, limits.document(), isolation, ran, output)
@@ -159,9 +179,9 @@ def run_dense(
     ]
 
 
-def _asked(harness: Harness, shown: _Shown, workers: int) -> Iterator[tuple[Outcome, ...]]:
+def _asked(harness: Harness, shown: _Shown, workers: int, done: int) -> Iterator[tuple[Outcome, ...]]:
     """Outcomes pair by pair. No more pairs are asked for than are worked on: an answer takes some megabytes."""
-    for first in range(0, len(shown), workers):
+    for first in range(done, len(shown), workers):
         yield from harness.outcomes(shown, range(first, min(first + workers, len(shown))))
 
 
@@ -185,17 +205,73 @@ class _Shown:
             return self._pairs.truth(number)
 
 
+@dataclass(frozen=True)
+class _SoFar:
+    """Records of the pairs before an interruption, a file per method beside that of its score.
+
+    Attributes
+    ----------
+    files : tuple of Path
+        None without files of scores.
+    keys : tuple of str
+        Hash of all that records depend on; a file with another one is not read.
+    """
+
+    files: tuple[Path, ...] = ()
+    keys: tuple[str, ...] = ()
+
+    @classmethod
+    def of(
+        cls, files: Sequence[Path | None], cards: Sequence[MethodCard], pairs: DensePairs, limits: RunLimits
+    ) -> _SoFar:
+        """Files of methods, in their order."""
+        known = [_so_far(file) for file in files if file is not None]
+        if len(known) != len(cards):
+            return cls()
+        shared = [pairs.document(), limits.document(), code_behind(SCORER)]
+        texts = [json.dumps([card.model_dump(mode="json"), *shared], sort_keys=True, default=str) for card in cards]
+        return cls(tuple(known), tuple(hashlib.sha256(text.encode()).hexdigest() for text in texts))
+
+    def read(self, methods: int, most: int) -> list[list[pl.DataFrame]]:
+        """Tables of the first pairs that every method has, at most so many: a list per method, a table per pair."""
+        found = []
+        for file, key in zip(self.files, self.keys, strict=True):
+            table = pl.read_parquet(file) if file.is_file() else pl.DataFrame({_RUN: []})
+            if table[_RUN].unique().to_list() != [key]:
+                return [[] for _ in range(methods)]
+            found.append(table.drop(_RUN).partition_by(_KEY, maintain_order=True))
+        count = min([most, *map(len, found)])
+        return [tables[: max(count, 0)] for tables in found] or [[] for _ in range(methods)]
+
+    def write(self, rows: Sequence[Sequence[pl.DataFrame]]) -> None:
+        """Tables of the pairs so far."""
+        for file, key, own in zip(self.files, self.keys, rows, strict=False):
+            write_bytes(file, parquet_bytes(pl.concat(own).with_columns(pl.lit(key).alias(_RUN))))
+
+
+_RUN = "run"
+
+
+def _so_far(file: Path) -> Path:
+    return file.with_suffix(RECORDS_SO_FAR)
+
+
 def _records(
-    pairs: DensePairs | _Shown, asked: Iterable[tuple[Outcome, ...]], methods: int, told: Callable[[int], None]
+    pairs: DensePairs | _Shown,
+    asked: Iterable[tuple[Outcome, ...]],
+    rows: list[list[pl.DataFrame]],
+    told: Callable[[int], None],
+    so_far: _SoFar | None = None,
 ) -> list[pl.DataFrame]:
-    """Records of every method; of each pair the truth is made once."""
-    rows: list[list[pl.DataFrame]] = [[] for _ in range(methods)]
-    for done, outcomes in enumerate(asked, 1):
+    """Records of every method, after those of the pairs before; of each pair the truth is made once."""
+    for outcomes in asked:
         errors = TruthErrors(pairs.truth(outcomes[0].number))
         for own, outcome in zip(rows, outcomes, strict=True):
             message = outcome.message + _on_raw(errors.truth.preset) * (outcome.failure in ("error", "invalid"))
             own.append(pair_records(errors, outcome.dense, outcome.seconds, outcome.failure, message))
-        told(done)
+        if so_far is not None:
+            so_far.write(rows)
+        told(len(rows[0]))
     return [pl.concat(own) if own else pl.DataFrame(schema=COLUMN_TYPES) for own in rows]
 
 
@@ -223,7 +299,9 @@ def _scored(
 
 def saved_dense(scored: DenseScored, file: Path) -> DenseScored:
     """The score, written with its records; its document then names their hash."""
-    return replace(scored, document=write_score(file, scored.document, scored.records))
+    saved = replace(scored, document=write_score(file, scored.document, scored.records))
+    _so_far(file).unlink(missing_ok=True)
+    return saved
 
 
 def read_dense(path: Path) -> DenseScore:

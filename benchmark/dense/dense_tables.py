@@ -50,12 +50,14 @@ def dense_board(scores: Sequence[DenseScore], wide: bool = False) -> TextTable:
 
 def dense_strata_table(score: DenseScore) -> TextTable:
     """One row per stratum."""
-    rows = [
-        (part.by, part.label, f"{part.pixels / 1000.0:.0f}", *(_cell(name, part.metrics[name]) for name in _OF_STRATA))
-        for part in score.strata
-    ]
-    heads = ("by", "part", "pixels\n1000", *(f"{_SHOWN[name]}\n%" for name in _OF_STRATA))
-    return TextTable(f"{score.method.name}, by part", heads, tuple(rows), "lL" + "r" * (1 + len(_OF_STRATA)))
+    rows = []
+    for part in score.strata:
+        name = f"{part.by}, {part.label}".removesuffix(" of D").removesuffix(" of the noise")
+        cells = (_cell(name, part.metrics[name]) for name in _OF_STRATA)
+        rows.append((name, f"{part.pixels / 1000.0:.0f}", *cells))
+    names = (_SHOWN[name].replace(" 10", "\n10") for name in _OF_STRATA)
+    heads = ("part", "pixels\n1000", *(f"{name} %" if "\n" in name else f"{name}\n%" for name in names))
+    return TextTable(f"{score.method.name}, by part", heads, tuple(rows), "l" + "r" * (1 + len(_OF_STRATA)))
 
 
 def dense_metrics_table(score: DenseScore) -> TextTable:

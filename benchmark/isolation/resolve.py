@@ -169,7 +169,7 @@ def installed(seat: Seat = SPOTS) -> tuple[EntryPoint, ...]:
 
 def _built_in(method: Any, seat: Seat) -> Reference:
     if not method.installed:
-        raise MethodError(f"method '{method.name}' needs {method.package}: pip install {method.package}")
+        raise MethodError(f"method '{method.name}' {method.needs}")
     sees: Literal["image", "pair"] = "image" if seat is SPOTS and not method.joint else "pair"
     return Reference(method.name, "built-in", seat.registry, sha256=code_behind(seat.registry), sees=sees)
 

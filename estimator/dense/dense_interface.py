@@ -163,10 +163,16 @@ def _require_floats(name: str, plane: Any) -> None:
         raise ValueError(f"{name} is infinite at {number} values: write NaN for 'do not know'")
 
 
+_SIGN = "a negative D comes from a disparity of the wrong sign, or from exchanged images"
+
+
 def _require_positive(name: str, plane: Any) -> None:
+    turned = name == "depth_m" and 2 * np.count_nonzero(plane < 0.0) > np.count_nonzero(np.isfinite(plane))
+    hint = f". Most are negative: {_SIGN}" if turned else ""
     for number, what in ((int((plane <= 0.0).sum()), "0 or below"), (int((plane > _FARTHEST_M).sum()), "above 1e6 m")):
         if number:
-            raise ValueError(f"{name} is {what} at {number} pixels: metres above 0 are needed, NaN for 'do not know'")
+            needed = f"metres above 0 are needed, NaN for 'do not know'{hint}"
+            raise ValueError(f"{name} is {what} at {number} pixels: {needed}")
 
 
 def _require_places(places: Plane) -> None:

@@ -7,7 +7,13 @@ from importlib.util import find_spec
 
 from phibench.datasets.common.errors import DatasetError
 from phibench.estimator.dense.dense_interface import DenseAnswer, DenseMethod, DensePair
-from phibench.estimator.dense.panorama_matchers import dense_flow, dense_sgbm, dense_sgbm_exact, dense_sift
+from phibench.estimator.dense.panorama_matchers import (
+    NEEDS_OPENCV,
+    dense_flow,
+    dense_sgbm,
+    dense_sgbm_exact,
+    dense_sift,
+)
 from phibench.estimator.dense.sweep import dense_sweep
 from phibench.estimator.spots.image_planes import KINDS, kind_of
 
@@ -34,8 +40,8 @@ class DenseBuiltIn:
     source: str
     accepts: tuple[str, ...] = KINDS
 
-    package = "phibench[dense]"
-    """Extra that brings OpenCV."""
+    needs = NEEDS_OPENCV
+    """What to install, where it is not."""
 
     @property
     def installed(self) -> bool:
@@ -45,7 +51,7 @@ class DenseBuiltIn:
     def refusal(self, pair: DensePair) -> str:
         """Reason that this pair cannot be taken; "" if it can."""
         if not self.installed:
-            return "needs OpenCV: pip install 'phibench[dense]'"
+            return self.needs
         kind = kind_of(pair.card)
         return "" if kind in self.accepts else f"takes {', '.join(self.accepts)}, not {kind}"
 

@@ -17,6 +17,7 @@ from phibench.estimator.dense.dense_interface import DenseAnswer, DensePair
 from phibench.estimator.dense.unrolled_pair import NEAREST_M, WIDTH_PX, UnrolledPair, depths
 from phibench.scenes.frames import Array
 
+NEEDS_OPENCV = "needs OpenCV: pip install 'phibench[dense]'"
 _BLOCK_PX = 5
 _UNIQUENESS_PERCENT = 10
 _SPECKLE_PX, _SPECKLE_STEP = 100, 2
@@ -38,7 +39,7 @@ def opencv() -> Any:
     try:
         import cv2
     except ImportError as error:
-        raise DatasetError("this dense method needs OpenCV: pip install 'phibench[dense]'") from error
+        raise DatasetError(f"this dense method {NEEDS_OPENCV}") from error
     return cv2
 
 

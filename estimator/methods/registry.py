@@ -182,6 +182,11 @@ class BuiltIn:
         """Its package can be imported."""
         return not self.package or find_spec(self.package) is not None
 
+    @property
+    def needs(self) -> str:
+        """What to install, where it is not."""
+        return f"needs {self.package}: pip install {self.package}"
+
     def refusal(self, pair: Pair) -> str:
         """Reason that this pair cannot be taken; "" if it can."""
         kind = kind_of(pair.card)

@@ -45,7 +45,7 @@ def list_() -> int:
     from phibench.estimator.dense.dense_methods import KNOWN
 
     for method in KNOWN.values():
-        missing = "" if method.installed else f" (needs {method.package}: pip install {method.package})"
+        missing = "" if method.installed else f" ({method.needs})"
         print(f"{method.name}: {method.description}{missing}")
     for point in installed(DENSE):
         print(f"{point.name}: {point.value}")
@@ -117,12 +117,15 @@ def score(
     out: Path | None = None,
     wide: Flag = False,
 ) -> int:
-    """Score dense methods on the pairs of a data set.
+    """Score dense methods on the pairs of a data set; exit code 1 if one of them failed on every pair.
+
+    With --out an interrupted run goes on where it stopped.
 
     Parameters
     ----------
     preset
-        Preset of the sensor; by default those of the data set's recipe.
+        What the camera delivers: "mjpeg", "yuyv", "srgb8", "bayer-raw" or "mono-raw". By default the presets that the
+        data set's recipe names; if it names none, one must be given.
     draws
         Draws of the noise per sample; by default the recipe's.
     pairs
@@ -150,7 +153,7 @@ def score(
     for target in filter(None, files):
         require_writable(target)
     chosen = chosen_pairs(directory, preset, draws, pairs, frames, calibration)
-    scored = run_dense(method, chosen, workers, None, bootstrap_seed, limits.of_run)
+    scored = run_dense(method, chosen, workers, None, bootstrap_seed, limits.of_run, files)
     for one, file in zip(scored, files, strict=True):
         if file is not None:
             saved_dense(one, file)
@@ -161,7 +164,7 @@ def score(
             print(f"{one.document.method.name}: {line}")
     for file in filter(None, files):
         print(f"written: {file}")
-    return 0
+    return int(any(sum(one.document.failures.values()) == one.document.pairs for one in scored))
 
 
 @dense.command
@@ -183,7 +186,7 @@ def picture(
     sample
         Id or number of the sample; the first by default.
     preset
-        Preset of the sensor.
+        What the camera delivers: "mjpeg", "yuyv", "srgb8", "bayer-raw" or "mono-raw".
     """
     from phibench.benchmark.dense.dense_pictures import picture_of
     from phibench.benchmark.dense.dense_score import chosen_pairs
@@ -211,7 +214,8 @@ def export(
     Parameters
     ----------
     preset
-        Preset of the sensor; by default those of the data set's recipe.
+        What the camera delivers: "mjpeg", "yuyv", "srgb8", "bayer-raw" or "mono-raw". By default the presets that the
+        data set's recipe names; if it names none, one must be given.
     draws
         Draws of the noise per sample; by default the recipe's.
     pairs

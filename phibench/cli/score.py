@@ -77,7 +77,8 @@ class ChoiceOptions:
     Parameters
     ----------
     preset
-        Preset of the sensor; by default those of the data set's recipe.
+        Preset of the sensor, such as "mjpeg"; by default those of the data set's recipe, and one must be given if it
+        names none.
     draws
         Draws of the noise per sample; by default the recipe's.
     pairs

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from phibench.benchmark.dense.dense_check import judged_dense
+from phibench.benchmark.dense.dense_check import judged_dense, with_exchanged
 from phibench.benchmark.dense.dense_easy import EasyDensePairs, EasyTruth, points_of
 from phibench.benchmark.isolation.check import Check
 from phibench.estimator.dense.dense_interface import DenseAnswer
@@ -59,24 +59,28 @@ class Half:
     """A method that takes pixel centres at a half, in one image or in both."""
 
     down_px: float
-    up_px: float
+    up_px: float | tuple[float, float]
 
     def __call__(self, t: EasyTruth) -> np.ndarray:
-        return depth_exact(t.rig, t.stroke_m, t.uv_px + self.down_px, t.up_px + self.up_px).depth_m
+        return depth_exact(t.rig, t.stroke_m, t.uv_px + self.down_px, t.up_px + np.array(self.up_px)).depth_m
 
 
 def turned(t: EasyTruth, degrees: float) -> np.ndarray:
     """D of the panorama's columns that are so many degrees off."""
+    return seen(t, turned_px(t, degrees), 0.0)
+
+
+def turned_px(t: EasyTruth, degrees: float) -> np.ndarray:
     middle, a = np.array([639.5, 359.5]), np.radians(degrees)
     x, y = (t.uv_px - middle).T
-    uv = middle + np.stack([np.cos(a) * x - np.sin(a) * y, np.sin(a) * x + np.cos(a) * y], axis=1)
-    return seen(t, uv, 0.0)
+    return middle + np.stack([np.cos(a) * x - np.sin(a) * y, np.sin(a) * x + np.cos(a) * y], axis=1)
 
 
-def rows_off(t: EasyTruth, pixels: float) -> np.ndarray:
-    away = t.uv_px - np.array([639.5, 359.5])
+def rows_off(t: EasyTruth, pixels: float, uv_px: np.ndarray | None = None) -> np.ndarray:
+    uv_px = t.uv_px if uv_px is None else uv_px
+    away = uv_px - np.array([639.5, 359.5])
     length = np.linalg.norm(away, axis=1, keepdims=True)
-    return seen(t, t.uv_px + pixels * away / np.maximum(length, 1e-9), 0.0)
+    return seen(t, uv_px + pixels * away / np.maximum(length, 1e-9), 0.0)
 
 
 def seen(t: EasyTruth, uv: np.ndarray, offset_m: float) -> np.ndarray:
@@ -112,6 +116,15 @@ DEPTHS: dict[str, tuple[Callable[[EasyTruth], np.ndarray], str]] = {
     ),
     "half a pixel in both": (Half(0.5, 0.5), "pixels of both images are off by half a pixel"),
     "half a pixel in the other": (Half(0.0, -0.5), "pixels of the up image are off by half a pixel"),
+    "half a pixel along v in the other": (
+        Half(0.0, (0.0, 0.5)),
+        "up image are off by half a pixel \\(\\(\\+0.0, \\+0.5",
+    ),
+    "0.8 px in the other": (Half(0.0, (0.8, -0.3)), "one image are off against the other \\(\\(\\+0.8, -0.3\\)"),
+    "half a block of the grid": (
+        lambda t: rows_off(t, 1.7, turned_px(t, 0.75)),
+        "grid is off: D is that of pixels about .*azimuth further and 2 px further outwards",
+    ),
     "a quarter turn of the grid": (lambda t: turned(t, 90.0), "grid is turned by about \\+90 degrees"),
     "five degrees of the grid": (lambda t: turned(t, -5.0), "grid is turned by about -5 degrees"),
     "rows of the grid": (lambda t: rows_off(t, 10.0), "some 10 px further outwards"),
@@ -133,6 +146,18 @@ def test_a_planted_fault_of_d_is_named(fault: str, truths: list[EasyTruth]) -> N
     import re
 
     assert re.search(words, found), found
+
+
+def test_images_that_a_right_method_exchanges_are_named(truths: list[EasyTruth]) -> None:
+    """It is right where both are exchanged once more; a method that is wrong there, too, keeps its own faults."""
+    (truth,) = truths
+    right = Outcome(0, None, 0.1, dense=DenseAnswer(plane(truth, noisy(truth.depth_m))))
+    empty = Outcome(0, None, 0.1, dense=DenseAnswer(np.full(SHAPE, np.nan)))
+    refused = Outcome(0, None, 0.1, "invalid", "depth_m is 0 or below")
+    (found,) = with_exchanged(("some fault",), refused, right, truth)
+    assert "down and up are exchanged" in found
+    assert with_exchanged(("some fault",), refused, empty, truth) == ("some fault",)
+    assert with_exchanged(("pair 1 failed",), right, right, truth) == ("pair 1 failed",)
 
 
 TARGETS: dict[str, tuple[Callable[[EasyTruth], np.ndarray], str]] = {

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import dataclasses
+import io
 import json
 from pathlib import Path
 from typing import Any
@@ -12,19 +13,28 @@ import numpy as np
 import polars as pl
 import pytest
 from helpers.processes import quiet
+from rich.console import Console
 
 from phibench.benchmark.dense.dense_document import DENSE_METRICS
 from phibench.benchmark.dense.dense_pairs import dense_pairs, require_curve
 from phibench.benchmark.dense.dense_records import COLUMN_TYPES
-from phibench.benchmark.dense.dense_score import DenseScored, compare_dense, read_dense, run_dense, score_dense
+from phibench.benchmark.dense.dense_score import (
+    DenseScored,
+    compare_dense,
+    read_dense,
+    run_dense,
+    saved_dense,
+    score_dense,
+)
 from phibench.benchmark.dense.dense_tables import dense_board, dense_metrics_table, dense_strata_table
 from phibench.benchmark.isolation.answers import AnswerError
 from phibench.benchmark.isolation.dense_answers import checked_planes, most_bytes, planes_text
-from phibench.benchmark.isolation.resolve import DENSE, MethodError, resolve
+from phibench.benchmark.isolation.resolve import DENSE, MethodError, RunLimits, resolve
 from phibench.benchmark.scored_dataset import open_dataset
 from phibench.cli.main import main
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.shown_text import text_of
+from phibench.datasets.store.schema import RECORDS_SO_FAR
 from phibench.estimator.dense.dense_interface import DenseAnswer, DensePair
 from phibench.scenes.catalog import default_rig
 from phibench.scenes.frames import Pose
@@ -121,8 +131,6 @@ def test_metrics_are_means_over_pairs(scored: DenseScored) -> None:
 
 
 def test_a_score_comes_back_from_its_file(tiny_dataset: Path, scored: DenseScored, tmp_path: Path) -> None:
-    from phibench.benchmark.dense.dense_score import saved_dense
-
     kept = saved_dense(scored, tmp_path / "a.json")
     assert read_dense(tmp_path / "a.json") == kept.document
     other = saved_dense(score_dense(tiny_dataset, half_right, "mjpeg", console=quiet()), tmp_path / "b.json")
@@ -133,10 +141,57 @@ def test_a_score_comes_back_from_its_file(tiny_dataset: Path, scored: DenseScore
     assert recall.better == "too few samples"
     for table in (dense_board([kept.document]), dense_strata_table(kept.document), dense_metrics_table(kept.document)):
         assert "flat" in text_of(table)
+    heads = text_of(dense_strata_table(kept.document)).splitlines()[1]
+    assert heads.split() == ["pixels", "recall", "answered", "median", "above", "central"]  # whole, in 80 columns
     document = json.loads((tmp_path / "a.json").read_text())
     (tmp_path / "a.json").write_text(json.dumps({**document, "kind": "phibench score"}))
     with pytest.raises(DatasetError, match="is no score"):
         read_dense(tmp_path / "a.json")
+
+
+def test_an_interrupted_run_goes_on(tiny_dataset: Path, methods: Path, tmp_path: Path) -> None:
+    """Only pairs that have no records are asked for; other limits, or a cut file, begin anew."""
+    pairs, reference = dense_pairs(open_dataset(tiny_dataset), "mjpeg"), f"{methods}:flat"
+    target = tmp_path / "a.json"
+    whole = run_dense([reference], pairs, console=quiet())[0]
+
+    class Interrupted:
+        """Pairs whose second one cannot be read."""
+
+        def __getattr__(self, name: str) -> Any:
+            return getattr(pairs, name)
+
+        def __len__(self) -> int:
+            return len(pairs)
+
+        def pair(self, number: int) -> DensePair:
+            if number == 1:
+                raise DatasetError("sample 'b': views/b.exr cannot be read")
+            return pairs.pair(number)
+
+    with pytest.raises(DatasetError, match="cannot be read"):
+        run_dense([reference], Interrupted(), console=quiet(), files=[target])  # type: ignore[arg-type]
+    kept = target.with_suffix(RECORDS_SO_FAR)
+    assert pl.read_parquet(kept)["number"].unique().to_list() == [0]
+    said = Console(file=io.StringIO(), width=200)
+    resumed = run_dense([reference], pairs, console=said, files=[target])[0]
+    assert "1 of 2 pairs are those of a run that was interrupted" in said.file.getvalue()  # type: ignore[attr-defined]
+    assert resumed.document.results_sha256 == whole.document.results_sha256
+    said = Console(file=io.StringIO(), width=200)
+    run_dense([reference], pairs, console=said, files=[target], limits=RunLimits(seconds=50.0))
+    assert "interrupted" not in said.file.getvalue()  # type: ignore[attr-defined]
+    saved_dense(resumed, target)
+    assert target.is_file()
+    assert not kept.exists()
+
+
+def test_the_command_tells_by_its_exit_code_that_every_pair_failed(
+    tiny_dataset: Path, methods: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["dense", "score", str(tiny_dataset), "--preset", "mjpeg", "--pairs", "1"]
+    assert main([*words, "--method", f"{methods}:small"]) == 1
+    assert "1 pairs failed (invalid)" in capsys.readouterr().out
+    assert main([*words, "--method", f"{methods}:flat"]) == 0
 
 
 def half_right(pair: DensePair) -> DenseAnswer:
@@ -144,8 +199,6 @@ def half_right(pair: DensePair) -> DenseAnswer:
 
 
 def test_scores_of_other_pairs_do_not_compare(scored: DenseScored, tiny_dataset: Path, tmp_path: Path) -> None:
-    from phibench.benchmark.dense.dense_score import saved_dense
-
     saved_dense(scored, tmp_path / "a.json")
     saved_dense(score_dense(tiny_dataset, flat, "srgb8", console=quiet()), tmp_path / "b.json")
     with pytest.raises(DatasetError, match="different pair sets \\(presets\\)"):

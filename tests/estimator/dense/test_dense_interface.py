@@ -47,7 +47,7 @@ def test_an_answer_knows_where_it_says_something() -> None:
         ({"target_uv_px": DEPTH}, r"\(H, W, 2\) is needed"),
         ({"depth_m": np.ones((2, 2), int)}, "is of int64"),
         ({"depth_m": np.full((2, 2), np.inf)}, "infinite at 4"),
-        ({"depth_m": -DEPTH}, "0 or below at 3 pixels"),
+        ({"depth_m": -DEPTH}, "0 or below at 3 pixels.*Most are negative: .* disparity of the wrong sign"),
         ({"depth_m": 1e9 * DEPTH}, "above 1e6 m at 3"),
         ({"target_uv_px": np.array([[[1.0, np.nan]]])}, "only one of u and v at 1"),
         ({"target_uv_px": np.full((1, 1, 2), 1e7)}, "beyond 1e\\+06 px"),
