@@ -41,7 +41,7 @@ class DenseBuiltIn:
     accepts: tuple[str, ...] = KINDS
 
     needs = NEEDS_OPENCV
-    """What to install, where it is not."""
+    """Package to install where it is missing, in words."""
 
     @property
     def installed(self) -> bool:

@@ -184,7 +184,7 @@ class BuiltIn:
 
     @property
     def needs(self) -> str:
-        """What to install, where it is not."""
+        """Package to install where it is missing, in words."""
         return f"needs {self.package}: pip install {self.package}"
 
     def refusal(self, pair: Pair) -> str:
