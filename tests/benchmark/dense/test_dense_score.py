@@ -188,10 +188,10 @@ def test_an_interrupted_run_goes_on(tiny_dataset: Path, methods: Path, tmp_path:
 def test_the_command_tells_by_its_exit_code_that_every_pair_failed(
     tiny_dataset: Path, methods: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    """Of a method that answers, `test_the_commands_of_the_seat` has the exit code 0."""
     words = ["dense", "score", str(tiny_dataset), "--preset", "mjpeg", "--pairs", "1"]
     assert main([*words, "--method", f"{methods}:small"]) == 1
-    assert "1 pairs failed (invalid)" in capsys.readouterr().out
-    assert main([*words, "--method", f"{methods}:flat"]) == 0
+    assert "1 pairs failed" in capsys.readouterr().out
 
 
 def half_right(pair: DensePair) -> DenseAnswer:
