@@ -38,6 +38,7 @@ from phibench.benchmark.scores.compare import Difference, compared, rules_of
 from phibench.benchmark.scores.document import MethodCard, read_document, read_records, write_score
 from phibench.calibration.rig.file import read_calibration
 from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.common.input_files import InputFile
 from phibench.datasets.common.progress import Steps, progress_console
 from phibench.datasets.read import Dataset
 from phibench.datasets.store.documents import parquet_bytes
@@ -236,10 +237,10 @@ class _SoFar:
         """Tables of the first pairs that every method has, at most so many: a list per method, a table per pair."""
         found = []
         for file, key in zip(self.files, self.keys, strict=True):
-            table = pl.read_parquet(file) if file.is_file() else pl.DataFrame({_RUN: []})
-            if table[_RUN].unique().to_list() != [key]:
+            table = records_so_far(file, key)
+            if table is None:
                 return [[] for _ in range(methods)]
-            found.append(table.drop(_RUN).partition_by(_KEY, maintain_order=True))
+            found.append(table.partition_by(_KEY, maintain_order=True))
         count = min([most, *map(len, found)])
         return [tables[: max(count, 0)] for tables in found] or [[] for _ in range(methods)]
 
@@ -250,6 +251,15 @@ class _SoFar:
 
 
 _RUN = "run"
+
+
+def records_so_far(file: Path, key: str) -> pl.DataFrame | None:
+    """Records that an interrupted run left, if they are whole and of the same run; else the pairs are asked again."""
+    try:
+        table = InputFile(file, "score again").table({_RUN: pl.String(), **COLUMN_TYPES})
+    except DatasetError:
+        return None
+    return table.select(list(COLUMN_TYPES)) if table[_RUN].unique().to_list() == [key] else None
 
 
 def _so_far(file: Path) -> Path:

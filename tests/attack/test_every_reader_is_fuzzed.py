@@ -21,6 +21,7 @@ NAMES = (
     *("done.json", "spots.npz", "film.parquet", "film.avi", "MANIFEST.json", "set.part/fetch.json", "seed.txt"),
     *("SHA256SUMS", "sensor.toml", "tables.jpg", "limit.txt", "pairs.csv", "rig.toml", "photo.raw", "capture.toml"),
     *("frame.png", "descriptor.txt", "method.py", "network.onnx", "linear.hdr", "room.glb", "dense.jsonl"),
+    "dense.so-far.parquet",
 )
 OF_FOLDERS = (
     *("dataset.json", "recipe.toml", "seal.json", ".phibench-draws", "export.json", "request.json", "rooms.json"),

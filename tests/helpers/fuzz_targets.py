@@ -21,6 +21,8 @@ from helpers.valid_files import ROOT, TEXT, Kind, compact, digest, png
 from PIL import Image
 
 from phibench.benchmark.dense.dense_export import read_dense_index
+from phibench.benchmark.dense.dense_records import COLUMN_TYPES
+from phibench.benchmark.dense.dense_score import records_so_far
 from phibench.benchmark.isolation.resolve import MethodError, resolve
 from phibench.benchmark.release import fetch
 from phibench.benchmark.release.benchmark import read_manifest_file
@@ -39,6 +41,7 @@ from phibench.datasets.frames.sensor_file import SensorFile, read_sensor_file
 from phibench.datasets.rooms.panorama_files import is_linear
 from phibench.datasets.rooms.room_files import RoomFiles
 from phibench.datasets.store.checksums import read_checksums
+from phibench.datasets.store.documents import parquet_bytes
 from phibench.estimator.learned.networks import CROP, Network
 from phibench.render.film.moving_rows import RowsImage
 from phibench.scenes.rig import Rig
@@ -141,6 +144,11 @@ def _network() -> bytes:
     return (ROOT / "estimator" / "learned" / "learned_crop.onnx").read_bytes()
 
 
+def _dense_records() -> bytes:
+    row = pl.DataFrame({name: [None] for name in COLUMN_TYPES}, schema=COLUMN_TYPES)
+    return parquet_bytes(row.with_columns(run=pl.lit("a")))
+
+
 def further_kinds(folder: Path) -> dict[str, Kind]:
     """Targets by the name of their file; `folder` is empty and for the first writing."""
     release = tiny_release(folder / "release")
@@ -173,6 +181,7 @@ def further_kinds(folder: Path) -> dict[str, Kind]:
         Kind("descriptor.txt", DESCRIPTOR.encode(), open_descriptor),
         Kind("method.py", b"def extract(pair):\n    return None\n", _method),
         Kind("dense.jsonl", _DENSE, lambda path: read_dense_index(path.parent)),
+        Kind("dense.so-far.parquet", _dense_records(), lambda path: records_so_far(path, "a")),
         Kind("network.onnx", _network(), lambda path: Network(path, CROP)),
         Kind("linear.hdr", b"#?RADIANCE\n", is_linear),
         Kind("room.glb", b"glTF", lambda path: RoomFiles(path.parent).sha256(path.name)),
@@ -180,7 +189,7 @@ def further_kinds(folder: Path) -> dict[str, Kind]:
     return {kind.name: kind for kind in every}
 
 
-ALWAYS_READ = ("linear.hdr", "room.glb", "limit.txt", "dense.jsonl")
-"""Of any content there is an answer: bytes are hashed or looked at, and a limit that is none is the usual one."""
+ALWAYS_READ = ("linear.hdr", "room.glb", "limit.txt", "dense.jsonl", "dense.so-far.parquet")
+"""Of any content there is an answer: bytes are hashed or looked at, no limit is the usual one, no records are none."""
 
 SIGNED = {"network.onnx": lambda data: data[:-64] + digest(data[:-64]).encode()}
