@@ -79,7 +79,7 @@ def _by_preset(track: Track, documents: Sequence[ScoreDocument]) -> TextTable:
     firsts = {preset: next(one for one in documents if preset_name(one) == preset) for preset in presets}
     for name, metric in numbers.perfect.items():
         made.append((name, "", "", *(_cell(metric, firsts[preset]) for preset in presets)))
-    note = "Ordered by the mean place over presets. Overlapping intervals settle no order: use `phibench compare`."
+    note = "Ordered by the mean place over presets. Overlapping intervals settle no order: use phibench compare."
     return TextTable(numbers.title, ("method", *BY_WORD, *presets), tuple(made), "lll" + "r" * len(presets), note)
 
 
