@@ -26,6 +26,7 @@ from phibench.benchmark.pair_sets.wanted_pairs import PairChoice, open_scored, w
 from phibench.benchmark.reports.report import time_section, write_report
 from phibench.benchmark.scores.document import records_kept
 from phibench.benchmark.scores.score import Scored, run_and_score, saved_each
+from phibench.benchmark.scores.score_tables import failure_line
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.progress import progress_console
 from phibench.datasets.read import Dataset
@@ -45,11 +46,15 @@ _PROBE_BOX = Box(0, 0, 16, 16)  # a method that needs boxes takes the pairs that
 
 @dataclass(frozen=True)
 class Benched:
-    """Files of a run: the report and the scores. `notes` says which methods were left out, and why."""
+    """Files of a run: the report and the scores. `notes` says which methods were left out, and why.
+
+    `failures` are sentences on methods that failed on every pair.
+    """
 
     report: Path
     scores: tuple[Path, ...]
     notes: tuple[str, ...]
+    failures: tuple[str, ...] = ()
 
 
 def bench(
@@ -88,7 +93,7 @@ def bench(
     if out.resolve() == dataset.folder.resolve() or dataset.folder.resolve() in out.resolve().parents:
         raise DatasetError(f"{out} lies inside the data set, whose files are signed; give a folder outside, --out")
     require_writable(out / REPORT)
-    scores, notes, times = [], [], dict[str, dict[str, float]]()
+    scores, notes, failures, times = [], [], [], dict[str, dict[str, float]]()
     for preset, track in product(_presets(dataset), _runs(dataset, tracks)):
         taken = wanted_pairs(dataset, PairChoice(preset, pairs=pairs, calibration=calibration, track=track))
         # what a package's method takes is known to nobody: it is asked, and its answers say so
@@ -103,10 +108,12 @@ def bench(
             done = run_and_score(names, taken, workers, console, run, limits=limits, stages=stages)
         times[run] = {stage: seconds / len(taken) for stage, seconds in stages.items()}
         saved_each(done, paths)
+        failures += [f"{one.document.method.name} {line}" for one in done if (line := failure_line(one.records))]
         scores += paths
     if not scores:
         raise DatasetError(f"none of {', '.join(chosen)} takes a preset of {folder}: give another --method")
-    return Benched(write_report(scores, out / REPORT, [time_section(times)]), tuple(scores), tuple(notes))
+    page = write_report(scores, out / REPORT, [time_section(times)])
+    return Benched(page, tuple(scores), tuple(notes), tuple(failures))
 
 
 def refusal(method: BuiltIn, pairs: PairSet) -> str:

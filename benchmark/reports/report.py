@@ -35,6 +35,7 @@ from phibench.benchmark.scores.score_tables import (
     FULL_OF_FALSE,
     HEADS,
     division_and_rig,
+    failure_line,
     false_line,
     frames_line,
     head,
@@ -93,6 +94,8 @@ def tracks_section(documents: Sequence[ScoreDocument]) -> Section | None:
     words = (
         "localise: spots with a bound below 1 px, in boxes of 64 px. find and depth: whole frames. Division closed: "
         "tuned on dev alone, by its author's word. Rig: what the method was given, or corrects itself.",
+        "find: J is found spots / (visible spots + false answers). A guess pays only where it is right with a chance "
+        "above J / (1 + J). depth: both spots must be found, so that a constant D counts nothing.",
         "Ordered by the mean place over presets. Overlapping intervals settle no order: use phibench compare. A star: "
         "too few samples for an interval. The rows of a perfect method are Gaussian errors at the bound.",
     )
@@ -177,6 +180,11 @@ class Ranking:
         """Metrics of the strata; without places those that have a value."""
         return self._valued(_STRATA) if not self.placed else list(_STRATA)
 
+    @property
+    def claiming(self) -> dict[str, ScoreDocument]:
+        """Scores of methods that claim a covariance."""
+        return {name: one for name, one in self.scores.items() if one.metrics["beyond_5_sigma"].value is not None}
+
     def _valued(self, names: Sequence[str]) -> list[str]:
         return [name for name in names if any(score.metrics[name].value is not None for score in self.scores.values())]
 
@@ -257,6 +265,7 @@ def _ranking(
     refusals = {document.method.name: why for document, table in group if (why := refused(table))}
     left_out = [f"{name} is not compared: it {why}." for name, why in refusals.items()]
     compared = [item for item in group if item[0].method.name not in refusals] or group
+    failed = [f"{document.method.name} {line}." for document, table in compared if (line := failure_line(table))]
     order = sorted(compared, key=lambda item: rank_key(item[0], by))
     names = _distinct([document.method.name for document, _ in order])
     scores = {name: document for name, (document, _) in zip(names, order, strict=True)}
@@ -269,7 +278,7 @@ def _ranking(
     frames, frame_of = _frames(number, scores)
     return Ranking(
         title=title,
-        verdict=" ".join([verdict(scores, by), *left_out]),
+        verdict=" ".join([verdict(scores, by), *left_out, *failed]),
         pair_set=pair_set,
         scores=scores,
         keys=keys(names),

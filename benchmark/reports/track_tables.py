@@ -52,13 +52,13 @@ NUMBERS: dict[Track, TrackNumbers] = {
 }
 
 
-def track_tables(documents: Sequence[ScoreDocument]) -> list[TextTable]:
-    """Tables of all tracks that some score belongs to: method by preset, then the numbers beside it."""
+def track_tables(documents: Sequence[ScoreDocument], beside: bool = True) -> list[TextTable]:
+    """Tables of all tracks that some score belongs to: method by preset, then the numbers beside it if wanted."""
     tables = []
     for track in TRACKS:
         own = [document for document in documents if track in tracks_of(document.pair_set)]
         if own:
-            tables += [_by_preset(track, own), _beside(track, own)]
+            tables += [_by_preset(track, own), *([_beside(track, own)] if beside else [])]
     return tables
 
 
@@ -79,7 +79,8 @@ def _by_preset(track: Track, documents: Sequence[ScoreDocument]) -> TextTable:
     firsts = {preset: next(one for one in documents if preset_name(one) == preset) for preset in presets}
     for name, metric in numbers.perfect.items():
         made.append((name, "", "", *(_cell(metric, firsts[preset]) for preset in presets)))
-    note = "Ordered by the mean place over presets. Overlapping intervals settle no order: use phibench compare."
+    ordered = "Ordered by the mean place over presets. " if len(presets) > 1 else ""
+    note = f"{ordered}Overlapping intervals settle no order: use phibench compare."
     return TextTable(numbers.title, ("method", *BY_WORD, *presets), tuple(made), "lll" + "r" * len(presets), note)
 
 

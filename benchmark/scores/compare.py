@@ -18,6 +18,7 @@ from typing import Any, Literal
 import numpy as np
 import polars as pl
 
+from phibench.benchmark.pair_sets.dataset_pairs import tracks_of
 from phibench.benchmark.scores.answer_errors import Rules
 from phibench.benchmark.scores.document import ScoreDocument, read_records, read_score
 from phibench.benchmark.scores.intervals import (
@@ -172,10 +173,21 @@ def refuse_different(first: ScoreDocument, second: ScoreDocument, first_name: st
     for what, a, b in (("pair sets", same_pairs(first), same_pairs(second)), ("rules", first.rules, second.rules)):
         for key in sorted(set(a) | set(b)):
             if a.get(key) != b.get(key):
+                if key in ("track", "boxes_px"):
+                    raise DatasetError(_other_boxes(first, second, first_name, second_name))
                 raise DatasetError(
                     f"{first_name} and {second_name} have different {what}: {key} is {_short(a.get(key))} and "
                     f"{_short(b.get(key))}; score both methods on the same pairs"
                 )
+
+
+def _other_boxes(first: ScoreDocument, second: ScoreDocument, first_name: str, second_name: str) -> str:
+    """Sentence on two scores whose methods were shown other boxes."""
+    shown = {first_name: same_pairs(first)["track"], second_name: same_pairs(second)["track"]}
+    told = " and ".join(f"{name} ({f'track {track}' if track else 'no track'})" for name, track in shown.items())
+    known = [track for track in shown.values() if track]
+    advice = f"--track {known[0]}" if known else "the same --boxes"
+    return f"{told} were shown other boxes: score both with {advice}"
 
 
 def note_on_size(differences: Sequence[Difference], rules: Mapping[str, float], samples: int) -> str:
@@ -241,8 +253,14 @@ def note_on_others(mine: Sequence[ScoreDocument], every: Sequence[ScoreDocument]
 
 
 def same_pairs(document: ScoreDocument) -> dict[str, Any]:
-    """Entries of a score's pair set that must be equal for two scores to be of the same pairs."""
-    return {key: value for key, value in document.pair_set.items() if key not in _MAY_DIFFER}
+    """Entries of a score's pair set that must be equal for two scores to be of the same pairs.
+
+    Whole frames are the same pairs, whether they were asked for as `find`, as `depth`, or are all that the set has.
+    """
+    pair_set = {"track": "", **document.pair_set}
+    if tracks := tracks_of(pair_set):
+        pair_set["track"] = tracks[0]
+    return {key: value for key, value in pair_set.items() if key not in _MAY_DIFFER}
 
 
 def _short(value: Any) -> str:

@@ -469,7 +469,8 @@ def records_kept(files: Sequence[Path | None]) -> Iterator[None]:
             for file, records in zip(files, error.records, strict=True)
             if file is not None and error.pairs
         ]
-        kept = f"the records of the {error.pairs} pairs before it are in {', '.join(map(str, written))}; "
+        before = "1 pair" if error.pairs == 1 else f"{error.pairs} pairs"
+        kept = f"the records of the {before} before it are in {', '.join(map(str, written))}; "
         advice = "run `phibench dataset repair`, then " if str(error).startswith("sample") else ""
         raise DatasetError(f"{error}; {kept if written else ''}{advice}score again") from error
 

@@ -271,6 +271,11 @@ def failure_line(records: pl.DataFrame) -> str:
     return f"failed on {pairs} with {': '.join(filter(None, (failure, message)))}; {pair_in_words(first)}"
 
 
+def nothing_answered(scored: Sequence[HasScore]) -> bool:
+    """True if some method failed on every pair, or all methods refuse the pairs."""
+    return any(failure_line(one.records) for one in scored) or all(refused(one.records) for one in scored)
+
+
 def pair_in_words(row: Mapping[str, Any]) -> str:
     """Name of a pair: `dataset.pairs(preset).number_of` takes these words."""
     return f"first pair: sample {row['sample_id']}, draw {row['draw']}, {row['preset']}"
@@ -369,9 +374,8 @@ def print_scores(scored: Sequence[HasScore], form: str, by: str, wide: bool, cal
     failed = {id(each): line for each in scored if (line := failure_line(each.records))}
     failed |= refusals
     for each in scored:
-        lines = [failed.get(id(each), ""), *(flag.text for flag in each.document.flags), false_line(each.records)]
-        for line in filter(None, lines):
-            _line(console, f"{each.document.method.name}: {line}")
+        for line in method_lines(each):
+            _line(console, line)
     missing = any(any(kind.values()) for document in documents for kind in document.causes.values())
     if missing and (len(scored) > 1 or not failed):
         show_grid(console, cause_table(documents))
@@ -383,6 +387,14 @@ def print_scores(scored: Sequence[HasScore], form: str, by: str, wide: bool, cal
             _line(console, f"{each.document.method.name}: {line}")
     if len(documents) == 1 and _finds(documents[0]):
         show_grid(console, strata_table(documents[0], wide))
+
+
+def method_lines(one: HasScore) -> list[str]:
+    """Sentences on a method: it failed or refused every pair, it knows too much, what its false answers are."""
+    why = refused(one.records)
+    failure = f"not compared: it {why}" if why else failure_line(one.records)
+    told = filter(None, (failure, *(flag.text for flag in one.document.flags), false_line(one.records)))
+    return [f"{one.document.method.name}: {line}" for line in told]
 
 
 def print_comparison(differences: Sequence[Difference], first: str, second: str, form: str, wide: bool) -> None:

@@ -31,6 +31,7 @@ from phibench.benchmark.scores.document import (
 )
 from phibench.benchmark.scores.record_columns import COLUMN_TYPES
 from phibench.benchmark.scores.records import missed_relative, with_missed
+from phibench.benchmark.scores.score_tables import failure_line
 from phibench.benchmark.sealed.rebuilt_score import (
     ABSOLUTE,
     GIVEN,
@@ -112,6 +113,7 @@ def check_score(
         unchecked.append("truth, bounds, causes and worst images: give --data, the folder of the data set")
     if broken:  # of wrong records every number would differ
         return SealedScoreCheck(path.name, document.method.name, document.pairs, (*faults, *broken), tuple(unchecked))
+    faults += [f"the method {line}"] if (line := failure_line(table)) else []
     if data is None:
         wrong = list(_of_errors(table, document))
         faults += wrong or _of_statistics(document, table)

@@ -214,6 +214,11 @@ def read_info(folder: Path) -> DatasetInfo:
     if not folder.is_dir():
         raise DatasetError(f"there is no folder {folder}")
     if not path.is_file():
+        if (folder / schema.TruthFolder.FRAMES_SET).is_file():
+            raise DatasetError(
+                f"{folder} is a frames set, which `phibench score`, `bench` and PairDataset take; this needs the data "
+                "set with layers that it comes from"
+            )
         if (folder / schema.JOURNAL).is_file():
             raise DatasetError(
                 f"{folder} is not a finished data set: it has no {schema.INFO}; wait until `phibench dataset make` has "

@@ -214,7 +214,7 @@ def submit(
     limits: Limits = LIMITS,
     own: OwnWord = OWN_WORD,
 ) -> int:
-    """Run a method on a sealed set and write its answers for who holds the truth.
+    """Run a method on a sealed set and write its answers for who holds the truth; exit code 1 if it answered no pair.
 
     Parameters
     ----------
@@ -237,7 +237,7 @@ def submit(
         print(f"note: {done.note}", file=sys.stderr)
     if done.silence:
         print(f"most often without a position: {done.silence}")
-    return 0
+    return int(done.answered == 0)
 
 
 @seal.command(name="open")
@@ -257,7 +257,7 @@ def open_(public: Path, *, truth: Path, submission: Path, out: Path | None = Non
     """
     from phibench.benchmark.scores.answer_errors import Rules
     from phibench.benchmark.scores.score import isolated, saved, score_outcomes
-    from phibench.benchmark.scores.score_tables import print_scores
+    from phibench.benchmark.scores.score_tables import nothing_answered, print_scores
     from phibench.benchmark.sealed.submission import unseal as unseal_set
     from phibench.datasets.common.errors import DatasetError
     from phibench.datasets.store.files import require_writable
@@ -275,7 +275,7 @@ def open_(public: Path, *, truth: Path, submission: Path, out: Path | None = Non
     print_scores([scored if out is None else saved(scored, out)], "terminal", "phi", wide=False)
     if out is not None:
         print(f"written: {out}")
-    return 0
+    return int(nothing_answered([scored]))
 
 
 submission = App(name="submission", group=KEEPERS, help="Check a score that is to be added to the results.")

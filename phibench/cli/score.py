@@ -138,7 +138,7 @@ def score(
     out: Path | None = None,
     output: Output = _TABLES,
 ) -> int:
-    """Score methods on the pairs of a data set.
+    """Score methods on the pairs of a data set; exit code 1 if one of them failed on every pair.
 
     Parameters
     ----------
@@ -148,7 +148,7 @@ def score(
     from phibench.benchmark.isolation.resolve import resolve
     from phibench.benchmark.scores.document import MethodCard, records_kept, score_files
     from phibench.benchmark.scores.score import run_and_score, saved_each
-    from phibench.benchmark.scores.score_tables import print_scores
+    from phibench.benchmark.scores.score_tables import nothing_answered, print_scores
     from phibench.datasets.common.errors import DatasetError
     from phibench.datasets.common.progress import progress_console
     from phibench.datasets.store.files import require_writable
@@ -170,7 +170,7 @@ def score(
     print_scores(scored, form, rank, output.wide, choice.calibration is not None)
     for file in filter(None, files):
         print(f"written: {file}", file=sys.stdout if form == "terminal" else sys.stderr)
-    return 0
+    return int(nothing_answered(scored))
 
 
 def compare(first: Path, second: Path, *, bootstrap_seed: BootstrapSeed = 0, output: Output = _TABLES) -> int:
@@ -185,15 +185,20 @@ def compare(first: Path, second: Path, *, bootstrap_seed: BootstrapSeed = 0, out
     """
     from phibench.benchmark.scores.compare import compare as compare_scores
     from phibench.benchmark.scores.compare import note_on_code, note_on_pairs, note_on_size
-    from phibench.benchmark.scores.document import read_score
-    from phibench.benchmark.scores.score_tables import print_comparison
+    from phibench.benchmark.scores.document import read_records, read_score
+    from phibench.benchmark.scores.score_tables import failure_line, print_comparison
 
     form, differences = output.form, compare_scores(first, second, _seed(bootstrap_seed))
     a, b = read_score(first), read_score(second)
     # stdout holds the table alone where a program may read it
     print_comparison(differences, _distinct(first, a), _distinct(second, b), form, output.wide)
     lines = sys.stdout if form == "terminal" else sys.stderr
-    for note in filter(None, (note_on_pairs(a, b, str(first), str(second)), note_on_code(a, b))):
+    failures = [
+        f"{path}: {one.method.name} {line}"
+        for path, one in ((first, a), (second, b))
+        if (line := failure_line(read_records(path, one)))
+    ]
+    for note in filter(None, (*failures, note_on_pairs(a, b, str(first), str(second)), note_on_code(a, b))):
         print(f"note: {note}", file=lines)
     if small := note_on_size(differences, a.rules, min(a.samples, b.samples)):
         print(small, file=lines)
@@ -311,6 +316,8 @@ def bench(
 ) -> int:
     """Run built-in and registered methods on every preset of a data set and write scores and a report.
 
+    The exit code is 1 if a method failed on every pair.
+
     Parameters
     ----------
     directory
@@ -330,8 +337,9 @@ def bench(
     done = run_bench(
         directory, out, method, workers, pairs, calibration=calibration, limits=limits.of_run, tracks=track
     )
-    for note in done.notes:
+    for note in (*done.notes, *done.failures):
         print(f"note: {note}", file=sys.stderr)
-    print(f"{done.report}: the report on {len(done.scores)} scores")
+    count = len(done.scores)
+    print(f"{done.report}: the report on {count} score{'s' * (count != 1)}")
     show(done.report)
-    return 0
+    return int(bool(done.failures))

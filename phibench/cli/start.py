@@ -38,16 +38,22 @@ def demo(*, out: Path = Path("phibench-demo")) -> int:
     """
     from phibench.benchmark.reports.bench import demo as run_demo
     from phibench.benchmark.reports.bench import show
-    from phibench.benchmark.scores.score_tables import score_table
-    from phibench.datasets.common.shown_text import text_of
+    from phibench.benchmark.reports.track_tables import track_tables
+    from phibench.benchmark.scores.score_tables import method_lines, nothing_answered
+    from phibench.datasets.common.shown_text import show_grid, table_console
 
     done = run_demo(out)
-    for one in done.scores:
-        print(text_of(score_table(one.document)))
-    print(f"{done.page}: {'opened' if show(done.page) else 'open it in a browser'}")
-    print(f"the best built-in fit takes a second a pair: phibench score {done.pairs} --method chain_fit")
-    print(f"change {done.example} and give the same command again; the pairs and their truth are {done.pairs}")
-    return 0
+    console = table_console(False)
+    for table in track_tables([one.document for one in done.scores], beside=False):
+        show_grid(console, table)
+    print("Jaccard index: found spots / (visible spots + false answers). In brackets: 95 % interval. A star: too few")
+    print("samples for one. Recall: share of the pairs with D within 0.5, 1, 2, 5, 10, 20 %, averaged over these.")
+    for line in (line for one in done.scores for line in method_lines(one)):
+        print(line)
+    print(f"The page: {done.page}{' is opened' if show(done.page) else '; open it in a browser'}")
+    print(f"Your method: change {done.example} and give the same command again")
+    print(f"The best built-in fit, a second a pair: phibench score {done.pairs} --track find --method chain_fit")
+    return int(nothing_answered(done.scores))
 
 
 recipe = App(name="recipe", group=START, help="List and print the recipes that are shipped.")
@@ -74,10 +80,11 @@ def show(name: Annotated[str, Parameter(completer=shipped)]) -> int:
     """
     from phibench.datasets.common.errors import DatasetError
     from phibench.datasets.recipe.load import RECIPES
+    from phibench.scenes.validation import nearest
 
     known = {path.stem: path for path in RECIPES.glob("*.toml")}
     if name not in known:
-        raise DatasetError(f"no recipe '{name}' is shipped; there are {', '.join(sorted(known))}")
+        raise DatasetError(f"no recipe '{name}' is shipped; {nearest(name, sorted(known))}")
     print(known[name].read_text(encoding="utf-8"), end="")
     return 0
 

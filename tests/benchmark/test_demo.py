@@ -5,8 +5,21 @@ from pathlib import Path
 import pytest
 
 from phibench.benchmark.pair_sets.frames_set import FramesSet
+from phibench.benchmark.reports import figures
 from phibench.benchmark.reports.bench import DEMO_METHODS, EXAMPLE, FRAMES, REPORT, SHIPPED
 from phibench.cli.main import main
+
+METHODS = """
+from phibench import Answer, Spot
+
+
+def failing(pair):
+    raise ValueError("no idea")
+
+
+def silent(pair):
+    return Answer(Spot.missing("dark"), Spot.missing("dark"))
+"""
 
 
 def test_the_pairs_are_of_five_kinds() -> None:
@@ -37,6 +50,29 @@ def test_the_demo_writes_one_page_and_scores_a_changed_example(tmp_path: Path, c
     example.write_text(example.read_text(encoding="utf-8") + "\n# mine\n", encoding="utf-8")
     assert main(["demo", "--out", str(out)]) == 0
     assert example.read_text(encoding="utf-8").endswith("# mine\n")
+
+
+def test_a_method_that_fails_on_every_pair_ends_in_1(
+    tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Score, comparison, report and check of a submission say so."""
+    (tmp_path / "mine.py").write_text(METHODS)
+    command = ["score", str(SHIPPED), "--pairs", "1", "--track", "find", "--out", str(tmp_path / "run.json")]
+    wanted = [f"{tmp_path}/mine.py:{name}" for name in ("failing", "silent")]
+    assert main([*command, "--method", wanted[0], "--method", wanted[1]]) == 1
+    told = "failed on the only pair with error: ValueError: no idea"
+    assert f"mine:failing: {told}" in " ".join(capsys.readouterr().out.split())
+    failed, silent = (tmp_path / f"run-mine-{name}.json" for name in ("failing", "silent"))
+    assert main(["compare", str(failed), str(silent)]) == 0
+    shown = " ".join(capsys.readouterr().out.split())
+    assert f"note: {failed}: mine:failing {told}" in shown
+    assert f"note: {silent}" not in shown
+    monkeypatch.setattr(figures, "encoded", lambda *_: b"")  # the words are the subject
+    page = tmp_path / "page.html"
+    assert main(["report", str(failed), str(silent), "--out", str(page)]) == 0
+    assert f"mine:failing {told}" in page.read_text(encoding="utf-8")
+    assert main(["submission", "check", str(failed)]) == 1
+    assert f"the method {told}" in capsys.readouterr().out
 
 
 def test_a_folder_of_other_files_or_without_access_is_one_sentence(

@@ -35,5 +35,6 @@ def test_recipes_are_listed_and_printed_as_their_files(capsys: pytest.CaptureFix
     for path in files:
         assert main(["recipe", "show", path.stem]) == 0
         assert capsys.readouterr().out == path.read_text(encoding="utf-8")
-    assert main(["recipe", "show", "nope"]) == 2
-    assert "no recipe 'nope' is shipped; there are bench-dev" in capsys.readouterr().err
+    for name, told in (("nope", "known: bench-dev"), ("bench_dev", "did you mean 'bench-dev'? known: bench-dev")):
+        assert main(["recipe", "show", name]) == 2
+        assert f"no recipe '{name}' is shipped; {told}" in capsys.readouterr().err

@@ -14,6 +14,7 @@ from phibench.benchmark.export.export_make import export
 from phibench.benchmark.export.pair_rows import ExportRequest
 from phibench.benchmark.pair_sets.dataset_pairs import tracks_of
 from phibench.benchmark.pair_sets.frames_set import FramesSet
+from phibench.benchmark.reports.bench import SHIPPED
 from phibench.benchmark.scored_dataset import ScoredDataset
 from phibench.benchmark.scores.score import score
 from phibench.cli.main import main
@@ -166,3 +167,11 @@ def test_what_it_does_not_hold_is_refused(
 ) -> None:
     assert main(["score", str(frames.folder), "--method", "red_centroid", *words]) == 2
     assert told in capsys.readouterr().err
+
+
+def test_a_command_that_needs_layers_says_what_the_folder_is(capsys: pytest.CaptureFixture) -> None:
+    for command in (["dataset", "show"], ["paper"], ["calibrate", "--out", "x.json"]):
+        assert main([*command, str(SHIPPED)]) == 2
+        told = capsys.readouterr().err
+        assert f"{SHIPPED} is a frames set" in told
+        assert "layers" in told

@@ -9,7 +9,14 @@ import pytest
 from helpers.bench_cases import Cases, cases, outcomes, sampler, scaled, shifted, silent, truth_itself
 
 from phibench.benchmark.scores.answer_errors import Rules
-from phibench.benchmark.scores.compare import COMPARED, compare, compare_records, note_on_code, note_on_size
+from phibench.benchmark.scores.compare import (
+    COMPARED,
+    compare,
+    compare_records,
+    note_on_code,
+    note_on_size,
+    refuse_different,
+)
 from phibench.benchmark.scores.document import MethodCard, read_score, write_score
 from phibench.benchmark.scores.metrics import METRICS
 from phibench.benchmark.scores.records import records
@@ -193,3 +200,21 @@ def test_what_cannot_be_compared_is_refused(tmp_path, case):
     with pytest.raises(DatasetError, match=words) as error:
         compare(first, second)
     assert "\n" not in str(error.value)
+
+
+def test_whole_frames_are_the_same_pairs_and_boxes_are_not(tmp_path):
+    """`find`, `depth` and a set without boxes show whole frames; `localise` shows boxes."""
+    scored = read_score(write(tmp_path, "a", cases(10), truth_itself))
+
+    def shown(track, boxes_px=None):
+        changes = {"track": track, "hinted": 0, "boxes_px": boxes_px}
+        return scored.model_copy(update={"pair_set": {**scored.pair_set, **changes}})
+
+    for track in ("find", "depth", ""):
+        refuse_different(shown("find"), shown(track), "a.json", "b.json")
+    for other, words in (
+        (shown("localise", 64), r"b.json \(track localise\) were shown other boxes: score both with --track find"),
+        (shown("", 64), r"b.json \(no track\) were shown other boxes: score both with --track find"),
+    ):
+        with pytest.raises(DatasetError, match=words):
+            refuse_different(shown("find"), other, "a.json", "b.json")

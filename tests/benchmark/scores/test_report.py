@@ -307,6 +307,7 @@ def test_methods_of_one_name_are_told_apart(crowded):
 def test_without_a_covariance_there_is_no_histogram(scores, crowded):
     assert pull_histogram({"half": scores[2][1]}) is None
     assert crowded.count("No method claims a covariance.") == 1
+    assert "these included:\n</p>" not in crowded  # no sentence that begins a list of nothing
 
 
 def test_rightly_unanswered_and_wrongly_answered_are_told_apart(crowded):

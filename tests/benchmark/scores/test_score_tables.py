@@ -21,6 +21,7 @@ from phibench.benchmark.scores.score_tables import (
     HEADS,
     cause_table,
     failure_line,
+    nothing_answered,
     number,
     print_comparison,
     print_scores,
@@ -113,6 +114,8 @@ def test_the_most_frequent_failure_is_named(scored, messages, words):
     assert line.startswith(f"failed on {words}; first pair: sample s00")
     assert line.endswith(", draw 0, mjpeg")
     assert failure_line(scored[2].records) == ""
+    assert nothing_answered([scored[2], failed(messages)])
+    assert not nothing_answered(scored)
 
 
 def test_kinds_of_causes_are_named_by_what_they_are(scored):
@@ -197,6 +200,8 @@ def test_a_method_that_takes_none_of_the_pairs_is_not_ranked_and_not_blamed(scor
     other = score_outcomes(MethodCard.of("chain_fit", kind="built-in"), pairs, outcomes(pairs, refuses), RULES)
     assert refused(other.records) == why
     assert [refused(one.records) for one in scored] == ["", "", ""]
+    assert nothing_answered([other])
+    assert not nothing_answered([*scored, other])  # it is told, and the others are scored
     print_scores([*scored, other], "terminal", "phi", wide=False)
     out = " ".join(capsys.readouterr().out.split())
     assert f"chain_fit: not compared: it {why}" in out
