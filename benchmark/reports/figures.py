@@ -89,6 +89,8 @@ def picture(data: bytes, kind: str, alt: str) -> EmbeddedFigure:
 # names of methods are text: a "$" in one is no formula
 _PANEL: Any = {**STYLE, "font.size": 10.0, "svg.fonttype": "none", "text.parse_math": False}
 _SIZE = (4.2, 3.1)  # inches of 96 px
+# left, bottom, width, height; a layout by Matplotlib draws each panel twice
+_PLACE, _MAP_PLACE, _BAR_PLACE = (0.19, 0.16, 0.78, 0.81), (0.15, 0.38, 0.82, 0.58), (0.23, 0.16, 0.66, 0.04)
 _HATCHES = ("", "///", "...", "xx", "\\\\\\", "++", "oo", "--", "**", "||", "//", "O.", "xx..", "+++")
 _BINS = 12  # rings of the image's radius: each has some errors
 _LEAST_IN_BIN = 3  # errors: the rms of fewer is noise
@@ -116,8 +118,8 @@ def error_panels(scores: Named) -> list[EmbeddedFigure]:
         for stratum, below in _COLUMNS:
             if not any(_points(score, stratum, metric) for score in scores.values()):
                 continue  # nothing found, or nothing off
-            with styled(_PANEL, _SIZE, layout="constrained") as figure:
-                axes = figure.subplots()
+            with styled(_PANEL, _SIZE) as figure:
+                axes = figure.add_axes(_PLACE)
                 _curves(axes, scores, stratum, metric, factor)
                 if bound is not None:
                     _bound(axes, scores, stratum, bound, factor)
@@ -142,10 +144,11 @@ def error_maps(tables: Tables) -> dict[str, EmbeddedFigure]:
         return maps
     scale = _scale(tables)
     for name, table in tables.items():
-        with styled(_PANEL, _SIZE, layout="constrained", dpi=150) as figure:
-            axes = figure.subplots()
+        with styled(_PANEL, _SIZE, dpi=150) as figure:
+            axes = figure.add_axes(_MAP_PLACE)
             marks = _map(axes, table, scale)
-            bar = figure.colorbar(marks, ax=axes, label="distance / px", orientation="horizontal", shrink=0.8)
+            place = figure.add_axes(_BAR_PLACE)
+            bar = figure.colorbar(marks, cax=place, label="distance / px", orientation="horizontal")
             plain_ticks(bar.ax, 30.0)
             found = len(table.filter(pl.col("visible") & pl.col("detected")))
             maps[name] = _png(
@@ -161,8 +164,8 @@ def radius_panels(tables: Tables) -> list[EmbeddedFigure]:
     panels: list[EmbeddedFigure] = []
     tables = _placed(tables)
     for column, label in (("radial_px", "radial"), ("tangential_px", "tangential")) if tables else ():
-        with styled(_PANEL, _SIZE, layout="constrained") as figure:
-            axes = figure.subplots()
+        with styled(_PANEL, _SIZE) as figure:
+            axes = figure.add_axes(_PLACE)
             for i, (name, table) in enumerate(tables.items()):
                 radius, rms = _binned(table, column)
                 axes.plot(radius, rms, label=name, **line_style(i))

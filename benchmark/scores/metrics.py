@@ -10,7 +10,7 @@ the error of one coordinate. The bound is the trace of its matrix, so that an ef
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import Literal
@@ -387,14 +387,16 @@ def measure(
         groups.setdefault(clusters.key, {}).update(_statistics(part, chosen, clusters))
     for number, ready in enumerate(groups.values()):
         estimates_by_name |= _resampled(ready, rules, generator(*stream, number))
-    return {name: _with_share(metric, estimates_by_name[name], records) for name, metric in wanted.items()}
+    every = {name: len(records.filter(FAMILIES[name])) for name in ("pair", "visible")}
+    return {name: _with_share(metric, estimates_by_name[name], every) for name, metric in wanted.items()}
 
 
-def _with_share(metric: Metric, measured: MetricEstimate, records: pl.DataFrame) -> MetricEstimate:
+def _with_share(metric: Metric, measured: MetricEstimate, every: Mapping[str, int]) -> MetricEstimate:
+    """The estimate with its share of `every`, the numbers of pairs and of visible spots."""
     if metric.family not in CHOSEN:
         return measured
-    every = len(records.filter(FAMILIES["pair" if metric.family in OF_PAIRS else "visible"]))
-    return replace(measured, share=measured.n / every if every else math.nan)
+    count = every["pair" if metric.family in OF_PAIRS else "visible"]
+    return replace(measured, share=measured.n / count if count else math.nan)
 
 
 def trusted(metric: Metric, estimate: Estimate, samples: int) -> Estimate:

@@ -19,7 +19,8 @@ import polars as pl
 from rich.console import Console
 
 from phibench.benchmark.isolation.resolve import RunLimits
-from phibench.benchmark.pair_sets.dataset_pairs import BOX_PX, TASK_VERSION, TRACKS, DatasetPairs, dataset_pairs
+from phibench.benchmark.pair_sets.dataset_pairs import BOX_PX, TASK_VERSION, TRACKS
+from phibench.benchmark.pair_sets.wanted_pairs import PairChoice, wanted_pairs
 from phibench.benchmark.scores.answer_errors import Rules, usable_covariance, whitened
 from phibench.benchmark.scores.document import (
     ScoreDocument,
@@ -36,6 +37,7 @@ from phibench.benchmark.sealed.rebuilt_score import (
     ABSOLUTE,
     GIVEN,
     RELATIVE,
+    Told,
     alike,
     check_card,
     check_run,
@@ -49,6 +51,7 @@ from phibench.datasets.common.progress import Steps, progress_console
 from phibench.datasets.read import open_finished
 from phibench.datasets.store import schema
 from phibench.datasets.store.files import sha256
+from phibench.estimator.pair_set import PairSet
 from phibench.scenes.frames import Array
 
 _POSITIVE = ("depth_m", "stroke_m", "depth_estimate_m")
@@ -82,6 +85,7 @@ def check_score(
     limits: RunLimits | None = None,
     workers: int = 1,
     console: Console | None = None,
+    calibration: Path | None = None,
 ) -> SealedScoreCheck:
     """Check a score of a set that is not sealed.
 
@@ -93,24 +97,34 @@ def check_score(
     method : the method itself, as `phibench score` takes it: its hashes are compared, and with `data` it is run again
     limits, workers : of that run
     console : where progress goes; by default the standard error
+    calibration : file of `phibench calibrate` that the pairs were scored with, of a score with a calibrated rig
 
     Raises
     ------
     DatasetError
-        If the file is no score, one of another version, or lacks its records; in one sentence.
+        If the file is no score, one of another version, or lacks its records, or if a calibration is given for a score
+        without one; in one sentence.
     MethodError
         If the method cannot be found or started.
     """
     document, console = read_score(path), console or progress_console()
     table = read_records(path, document)
     card = check_card(document, method)
-    faults = [*_of_document(document), *_of_release(document, release), *card.faults]
+    rig = _of_calibration(document, table, calibration)
+    faults = [*_of_document(document), *_of_release(document, release), *card.faults, *rig.faults]
     broken = [*_of_pairs(document, table), *_of_causes(table), *_impossible(table)]
-    unchecked = [*card.unchecked, "seconds, limits, isolation and division: they are the word of who ran it"]
+    unchecked = [
+        *card.unchecked,
+        *rig.unchecked,
+        "seconds, limits, isolation and division: they are the word of who ran it",
+    ]
     if release is None:
         unchecked.append("that the data set is a released one: give --release MANIFEST.json")
+    if document.pair_set.get("calibration") and (calibration is None or rig.faults):
+        data = None  # its pairs cannot be made without the calibrated rig
     if data is None:
-        unchecked.append("truth, bounds, causes and worst images: give --data, the folder of the data set")
+        too = " with --calibration" if document.pair_set.get("calibration") else ""
+        unchecked.append(f"truth, bounds, causes and worst images: give --data, the folder of the data set{too}")
     if broken:  # of wrong records every number would differ
         return SealedScoreCheck(path.name, document.method.name, document.pairs, (*faults, *broken), tuple(unchecked))
     faults += [f"the method {line}"] if (line := failure_line(table)) else []
@@ -118,7 +132,7 @@ def check_score(
         wrong = list(_of_errors(table, document))
         faults += wrong or _of_statistics(document, table)
     else:
-        again = _built_again(document, table, data, console)
+        again = _built_again(document, table, data, console, calibration)
         faults += again.faults
         if method is not None and again.pairs is not None:
             run = check_run(document, table, method, again.pairs, limits or RunLimits(), workers, console)
@@ -141,13 +155,34 @@ def _of_document(document: ScoreDocument) -> Iterator[str]:
     track = pair_set.get("track")
     if track not in ("", None, *TRACKS):
         yield f"pair_set.track is {track!r}: there are {', '.join(TRACKS)}; score again"
-    for name in ("boxes_px", "frames", "sensor_sha256", "calibration"):
+    for name in ("boxes_px", "frames", "sensor_sha256"):
         if pair_set.get(name) is not None and (name, track, pair_set[name]) != ("boxes_px", "localise", BOX_PX):
             yield f"pair_set.{name} is {pair_set[name]}: results are of the data set's own pairs, score without it"
     if document.seed != 0:
         yield f"seed is {document.seed}: intervals of results are of the bootstrap seed 0"
     if document.isolation.startswith("not isolated"):
         yield f"the method was {document.isolation}: score it as FILE.py:FUNCTION on a machine that isolates it"
+
+
+def _of_calibration(document: ScoreDocument, table: pl.DataFrame, calibration: Path | None) -> Told:
+    """Faults of what is said of the rig: the hash of the calibration, and whether D of scored samples went into it."""
+    from phibench.calibration.rig.file import read_calibration  # 25 modules, which most scores do without
+
+    stated, made_from = document.pair_set.get("calibration"), document.pair_set.get("calibrated_from") or {}
+    if stated is None:
+        if calibration is not None:
+            raise DatasetError(f"the score was made without a calibration: leave --calibration {calibration} out")
+        return Told((), ())
+    samples = set(table["sample_id"])
+    shared = len(samples & set(made_from.get("samples", ())))
+    unchecked = []
+    if made_from.get("spots") and shared:
+        unchecked.append(f"independence: D of {shared} of the {len(samples)} scored samples went into the calibration")
+    if calibration is None:
+        unchecked.append("pair_set.calibration: give the file of `phibench calibrate`, --calibration")
+    elif read_calibration(calibration).sha256 != stated:
+        return Told((f"pair_set.calibration is not the hash of {calibration}: give the file that was scored with",), ())
+    return Told((), tuple(unchecked))
 
 
 def _of_release(document: ScoreDocument, release: Path | None) -> Iterator[str]:
@@ -248,18 +283,21 @@ def _matrices(table: pl.DataFrame, name: str) -> Array:
 @dataclass(frozen=True)
 class _Again:
     faults: tuple[str, ...]
-    pairs: DatasetPairs | None = None
+    pairs: PairSet | None = None
 
 
-def _built_again(document: ScoreDocument, table: pl.DataFrame, data: Path, console: Console) -> _Again:
+def _built_again(
+    document: ScoreDocument, table: pl.DataFrame, data: Path, console: Console, calibration: Path | None
+) -> _Again:
     """Faults of what the data set and the answers give, and the pairs of the score."""
     dataset = open_finished(data)
     listed = dataset.folder / schema.CHECKSUMS
     if sha256(listed) != document.pair_set.get("dataset_sha256"):
         return _Again((f"pair_set.dataset_sha256 is not that of {data}: give the data set that was scored",))
     presets = table["preset"].unique().to_list()
-    pairs = dataset_pairs(dataset, presets[0] if len(presets) == 1 else None)
-    pairs = pairs.of_track(track) if (track := document.pair_set.get("track")) in TRACKS else pairs
+    preset, track = presets[0] if len(presets) == 1 else None, document.pair_set.get("track")
+    choice = PairChoice(preset, calibration=calibration, track=track if track in TRACKS else None)
+    pairs = wanted_pairs(dataset, choice)
     if len(pairs) != document.pairs:
         told = f"the data set has {len(pairs)} of {', '.join(presets)}"
         return _Again((f"pairs is {document.pairs}, and {told}: score all of them",))

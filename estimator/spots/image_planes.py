@@ -80,8 +80,10 @@ def linear_planes(image: NDArray[Any], card: SensorCard, origin_px: tuple[int, i
         Image pixel of the first column and row: where the mosaic's red pixels are, and pairs of "yuyv" begin.
     """
     if card.output != "raw":
-        codes = np.asarray(rgb_codes(image, card, origin_px), float)
-        return light_of(np.moveaxis(np.clip(codes / 255.0, 0.0, 1.0), -1, 0), card)
+        codes = rgb_codes(image, card, origin_px)
+        if codes.dtype == np.uint8:  # a power for each code, not for each pixel
+            return np.moveaxis(light_of(np.arange(256) / 255.0, card)[codes], -1, 0)
+        return light_of(np.moveaxis(np.clip(np.asarray(codes, float) / 255.0, 0.0, 1.0), -1, 0), card)
     signal = raw_electrons(image, card) / full_scale_e(card)
     if card.mosaic == "mono":
         return signal[None]

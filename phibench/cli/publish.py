@@ -288,6 +288,7 @@ def check(
     data: Path | None = None,
     release: Path | None = None,
     method: str | None = None,
+    calibration: Path | None = None,
     workers: Whole = 1,
     limits: Limits = LIMITS,
     json: Annotated[bool, Parameter(negative="", help="The outcome as one JSON document.")] = False,
@@ -307,12 +308,14 @@ def check(
         MANIFEST.json of a release: the data set must be one of it.
     method
         The method itself, as for `phibench score`: its hashes are compared, and with --data its answers.
+    calibration
+        File of `phibench calibrate`, of a score that was made with it: --data needs it to make the pairs.
     workers
         Pairs that are worked on at a time when the method is run again.
     """
     from phibench.benchmark.sealed.score_check import check_score
 
-    checked = check_score(file, data, release, method, limits.of_run, workers)
+    checked = check_score(file, data, release, method, limits.of_run, workers, calibration=calibration)
     if json:
         sys.stdout.write(checked.text())
         return int(bool(checked.faults))

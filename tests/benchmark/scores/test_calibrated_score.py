@@ -17,9 +17,11 @@ from phibench.benchmark.reports import bench as benching
 from phibench.benchmark.scores.answer_errors import Rules
 from phibench.benchmark.scores.metrics import measure, prepared
 from phibench.benchmark.scores.records import records
+from phibench.benchmark.sealed.score_check import check_score
 from phibench.calibration.rig.bundle import Bundle
 from phibench.calibration.rig.file import Calibration, CalibrationError, read_calibration, write_calibration
 from phibench.cli.main import main
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.read import Dataset, open_finished
 from phibench.estimator.geometry.rig_parameters import PARAMETERS, RENAMED, changed, prior_sigmas
 from phibench.estimator.interface import Answer, Outcome, Spot
@@ -215,7 +217,8 @@ def test_methods_are_scored_with_a_calibration(
 ) -> None:
     monkeypatch.setattr(benching, "write_report", lambda *_: tmp_path)  # thirty figures
     nominal = misaligned.samples[0].nominal_rig
-    file = written(tmp_path / "c.json", truth_of_rig(misaligned), nominal)
+    made_from = {"dataset": misaligned.info.name, "samples": [misaligned.rows[0].sample_id], "spots": True}
+    file = written(tmp_path / "c.json", truth_of_rig(misaligned), nominal, **made_from)
     common = ("score", misaligned.folder, "--method", "detect", "--preset", "bayer-raw")
     assert run(*common, "--out", tmp_path / "without.json") == 0
     assert run(*common, "--calibration", file, "--out", tmp_path / "with.json") == 0
@@ -223,10 +226,30 @@ def test_methods_are_scored_with_a_calibration(
     assert with_it["pair_set"]["calibration"] == read_calibration(file).sha256
     assert "calibration" not in without["pair_set"]
     assert run("compare", tmp_path / "with.json", tmp_path / "without.json") == 2
+    check_submissions(tmp_path / "with.json", tmp_path / "without.json", file, misaligned)
     monkeypatch.setattr(benching, "_presets", lambda _: ["mjpeg"])
     few = ("bench", misaligned.folder, "--method", "detect", "--pairs", "1")
     assert run(*few, "--calibration", file, "--out", tmp_path / "b") == 0
     assert json.loads((tmp_path / "b" / "mjpeg-detect.json").read_text())["pair_set"]["calibration"]
+
+
+def check_submissions(scored: Path, without: Path, file: Path, dataset: Dataset) -> None:
+    """A calibrated score is handed in like any other; with the calibration's file it is built again whole."""
+    alone = check_score(scored)
+    assert alone.faults == ()
+    assert "independence: D of 1 of the 2 scored samples went into the calibration" in alone.unchecked
+    assert any(text.startswith("pair_set.calibration: give the file") for text in alone.unchecked)
+    half = check_score(scored, dataset.folder)  # its pairs cannot be made without the file
+    assert half.faults == ()
+    assert any(text.endswith("give --data, the folder of the data set with --calibration") for text in half.unchecked)
+    whole = check_score(scored, dataset.folder, calibration=file)
+    assert whole.faults == ()
+    assert not any("--data" in text or "pair_set.calibration" in text for text in whole.unchecked)
+    other = written(file.with_name("other.json"), np.zeros(len(PARAMETERS)), dataset.samples[0].nominal_rig)
+    (fault,) = check_score(scored, dataset.folder, calibration=other).faults
+    assert fault.startswith("pair_set.calibration is not the hash of")
+    with pytest.raises(DatasetError, match="made without a calibration: leave --calibration"):
+        check_score(without, calibration=file)
 
 
 def rewritten(file: Path, change: Callable[[dict], None]) -> None:

@@ -234,3 +234,13 @@ def test_messages() -> None:
     with pytest.raises(ValueError, match="13 x 13 pixels or more are needed"):
         FITS["yuyv"](np.zeros((1, 9, 9, 2), np.uint8), (0, 0), card, SpotBlur(0.7))
     assert FITS["yuyv"](np.zeros((0, 17, 17, 2), np.uint8), (0, 0), card, SpotBlur(0.7)).uv_px.shape == (0, 2)
+
+
+@pytest.mark.parametrize("preset", ["srgb8", "mjpeg"])
+def test_bytes_have_the_light_of_their_codes_to_the_bit(preset: str) -> None:
+    """One power for each of 256 codes is the power of each pixel; planes lie in memory as those of floats do."""
+    card = card_of(sensor(preset))
+    codes = np.arange(3 * 256, dtype=np.uint16).reshape(16, 16, 3) % 256
+    of_bytes, of_floats = linear_planes(codes.astype(np.uint8), card), linear_planes(codes.astype(float), card)
+    assert np.array_equal(of_bytes, of_floats)
+    assert of_bytes.strides == of_floats.strides
