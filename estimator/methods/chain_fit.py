@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -38,7 +39,7 @@ from phibench.estimator.processed.fit_chain import (
 )
 from phibench.estimator.processed.quasi_score import CoefficientWindow
 from phibench.estimator.spots.detect import Detection
-from phibench.estimator.spots.fit_raw import SpotData, SpotFit
+from phibench.estimator.spots.fit_raw import MISFIT_SIGMAS, SpotData, SpotFit
 from phibench.estimator.spots.gaussian_spot import SpotBlur, SpotModel
 from phibench.estimator.spots.image_planes import PROCESSED
 from phibench.estimator.spots.jpeg_coefficients import mcu_px
@@ -189,6 +190,9 @@ def _answer(fit: SpotFit, likelihood: Callable[[Spot], SpotLikelihood | None]) -
     u, v = (float(x) for x in fit.uv_px[0])
     worse = fit.covariance_px2[0] * max(1.0, float(fit.chi2[0]))
     c = claimed_px2(fit.uv_px[0], worse, lambda: likelihood(Spot((u, v))))
+    own = fit.misfit_px2[0]  # of pixels that are fitted one by one; a light of another shape misfits on few of them
+    if c is not None and fit.chi2[0] > 1.0 + MISFIT_SIGMAS * math.sqrt(2.0) / (2 * _HALF_PX + 1):
+        c = max(c, np.where(np.isfinite(own), own, 0.0), key=np.trace)
     return Spot((u, v), None if c is None else ((float(c[0, 0]), float(c[0, 1])), (float(c[1, 0]), float(c[1, 1]))))
 
 

@@ -17,8 +17,8 @@ import scipy
 from phibench.estimator.geometry.joint_posterior import MISFIT_RANGE, LikelihoodMap, single_posterior
 from phibench.estimator.processed.interval_fit import interval_posterior
 from phibench.estimator.processed.quasi_score import CoefficientWindow, fit_window
-from phibench.estimator.spots.fisher import covariance_bound, limited, scoring_step
-from phibench.estimator.spots.fit_raw import SpotData
+from phibench.estimator.spots.fisher import covariance_bound, scoring_step
+from phibench.estimator.spots.fit_raw import SpotData, polished
 from phibench.scenes.frames import Array
 
 FAINT_PX = 0.05
@@ -38,9 +38,10 @@ _MOST_SIDE = 41
 # next to nothing, and when it changes a Gaussian's square is 50 and more, far beyond the logarithm of its chance
 _LIVE = 0.02
 _OUTLIER = 3.0  # of a residual in standard deviations
-_STEPS = 12  # of the scoring from a place that a fit has found
 _WORTH = 1.5 * MISFIT_RANGE  # of a first guess of the misfit, above the least
 _PLACE = 2  # unknowns u, v, the first ones
+_MOST_GAIN = 1.0  # of a step that is not taken, in misfit: half of it in the logarithm of the likelihood
+_MORE_EVALUATIONS = 4  # at most, where steps promise more
 _LEAST_FLUX = 1e-3  # of the fit's flux, below which a hypothesis has no spot
 
 Scores = Callable[[Array, int], tuple[Array, Array, Array]]
@@ -110,10 +111,7 @@ def of_pixels(data: SpotData, uv_px: Array) -> SpotLikelihood:
     levels = [_median(above[used & (level > 0.0)]) for level in data.pixels.levels[0]]
     above = used * (above - np.einsum("c,chw->hw", levels, data.pixels.levels[0])) * data.pixels.response[0]
     start = np.array([*(uv_px - corner), max(float(above.sum()), 100.0), *levels])
-    for _ in range(_STEPS):
-        _, score, fisher = scores(start[None], 0)
-        start = limited(start[None], scoring_step(fisher, score))[0]
-    return SpotLikelihood(scores, start, corner, 1.0)
+    return SpotLikelihood(scores, polished(data, start[None])[0][0], corner, 1.0)
 
 
 def _median(values: Array) -> float:
@@ -247,14 +245,21 @@ def _profiled(one: SpotLikelihood, theta: Array, evaluations: int) -> tuple[Arra
 
 
 def _part_profiled(one: SpotLikelihood, theta: Array, evaluations: int) -> tuple[Array, Array]:
-    rest, theta = slice(_PLACE, None), theta.copy()
-    least = _LEAST_FLUX * one.theta[_PLACE]
-    theta[:, _PLACE] = np.maximum(theta[:, _PLACE], least)
-    misfit = gain = np.zeros(len(theta))
-    for _ in range(evaluations):
-        misfit, score, F = one.scores(theta, _PLACE)
+    """As `_profiled`; where a step promises much it is taken and looked at: beside full codes promises are not kept."""
+    theta, at_least = theta.copy(), _LEAST_FLUX * one.theta[_PLACE]
+    theta[:, _PLACE] = np.maximum(theta[:, _PLACE], at_least)
+    least, gain, steep = np.full(len(theta), np.inf), np.zeros(len(theta)), np.arange(len(theta))
+    value = least.copy()
+    for number in range(1, evaluations + _MORE_EVALUATIONS + 1):
+        misfit, score, F = one.scores(theta[steep], _PLACE)
         step = scoring_step(F, score)
-        gain = np.sum(step * score, axis=1)
-        theta[:, rest] += step
-        theta[:, _PLACE] = np.maximum(theta[:, _PLACE], least)
-    return (misfit - np.maximum(gain, 0.0)) / one.excess, theta
+        least[steep], gain[steep] = np.minimum(least[steep], misfit), np.maximum(np.sum(step * score, axis=1), 0.0)
+        value[steep] = misfit - gain[steep]
+        theta[steep, _PLACE:] += step
+        theta[steep, _PLACE] = np.maximum(theta[steep, _PLACE], at_least)
+        if number >= evaluations:
+            steep = steep[gain[steep] > _MOST_GAIN]
+        if not steep.size:
+            break
+    value[steep] = least[steep]
+    return value / one.excess, theta

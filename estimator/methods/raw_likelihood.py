@@ -49,7 +49,7 @@ from phibench.estimator.methods.locate import (
     seen_depth_m,
 )
 from phibench.estimator.spots.fit_joint import JointFit, fit_joint
-from phibench.estimator.spots.fit_raw import SpotData, SpotFit, fit_law, spot_data
+from phibench.estimator.spots.fit_raw import MISFIT_SIGMAS, SpotData, SpotFit, fit_law, spot_data
 from phibench.estimator.spots.gaussian_spot import SpotModel
 from phibench.estimator.spots.raw_pixels import (
     Background,
@@ -67,7 +67,6 @@ from phibench.scenes.rig import POSITIONS
 
 _FLAT_SIGMAS = 4.0  # by which the chi2 of a fit with flat levels must exceed 1 for the room to have structure
 _SHOT_SIGMAS = 4.0  # of a full pixel in one frame, by which the mean of several must be below it
-_MISFIT_SIGMAS = 3.0  # by which the fit's chi2 must exceed 1 before its covariance is widened
 
 
 def raw_maximum_likelihood(region: SearchRegion) -> Spot:
@@ -147,7 +146,7 @@ def _fitted_spot(fit: SpotFit, data: SpotData) -> Spot:
         covariance = claimed_px2(fit.uv_px[0], covariance, lambda: of_pixels(data, fit.uv_px[0]))
     if covariance is None:
         return Spot((float(fit.uv_px[0, 0]), float(fit.uv_px[0, 1])))
-    if chi2 > 1.0 + _MISFIT_SIGMAS * math.sqrt(2.0 / data.regions.x_e.size):
+    if chi2 > 1.0 + MISFIT_SIGMAS * math.sqrt(2.0 / data.regions.x_e.size):
         # a room that the model does not follow misfits everywhere: the claim is widened by chi2, as for any fit of
         # least squares; a light of another shape, such as a spot on an edge, misfits on the few pixels that place it
         covariance = max(chi2 * covariance, fit.misfit_px2[0], key=np.trace)
@@ -228,8 +227,8 @@ def _raw(pair: Pair, separate: Answer) -> Answer:
     starts = [np.array([spot.uv_px], float) for spot in (separate.down, separate.up)]
     depth_m = seen_depth_m(pair, separate)
     down, up = (raw_spot_data(pair, p, start[0], depth_m) for p, start in zip(POSITIONS, starts, strict=True))
-    likelihoods = [of_pixels(one, start[0]) for one, start in zip((down, up), starts, strict=True)]
-    if any(_of_other_shape(getattr(separate, p), one) for p, one in zip(POSITIONS, likelihoods, strict=True)):
+    likelihoods = [of_pixels(data, start[0]) for data, start in zip((down, up), starts, strict=True)]
+    if _of_other_shape(separate, likelihoods):
         return _combined(pair, separate)
     posterior = _posterior(pair, likelihoods)
     if posterior is not None and posterior.status == Status.OK:
@@ -239,19 +238,26 @@ def _raw(pair: Pair, separate: Answer) -> Answer:
 
 def _processed(pair: Pair, separate: Answer) -> Answer:
     depth_m = seen_depth_m(pair, separate)
-    posterior = _posterior(pair, [spot_likelihood(pair, p, getattr(separate, p), depth_m) for p in POSITIONS])
+    likelihoods = [spot_likelihood(pair, p, getattr(separate, p), depth_m) for p in POSITIONS]
+    if _of_other_shape(separate, likelihoods):
+        return _combined(pair, separate)
+    posterior = _posterior(pair, likelihoods)
     if posterior is not None and posterior.status == Status.OK:
         return separate if not posterior.misfit < _MOST_CHI2 else _posterior_answer(posterior)
     return _combined(pair, separate)
 
 
-def _of_other_shape(spot: Spot, one: SpotLikelihood) -> bool:
-    """True if a fit claims far more than the model's likelihood: its light has another shape, as on an edge.
+def _of_other_shape(separate: Answer, likelihoods: Sequence[SpotLikelihood | None]) -> bool:
+    """True if a fit claims far more than its model's likelihood: its light has another shape, as on an edge.
 
     Not of faint spots: their likelihood has valleys, and the posterior says what they claim.
     """
-    own = float(np.trace(place_covariance(one)))
-    return own < 2.0 * FAINT_PX**2 and bool(np.trace(np.array(spot.covariance_px2)) > _OTHER_SHAPE * own)
+    for position, likelihood in zip(POSITIONS, likelihoods, strict=True):
+        own = math.inf if likelihood is None else float(np.trace(place_covariance(likelihood)))
+        claimed = np.trace(np.array(getattr(separate, position).covariance_px2))
+        if own < 2.0 * FAINT_PX**2 and claimed > _OTHER_SHAPE * own:
+            return True
+    return False
 
 
 def _combined(pair: Pair, separate: Answer) -> Answer:

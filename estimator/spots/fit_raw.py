@@ -27,6 +27,7 @@ LEAST_SNR = 3.0  # flux over its standard deviation below which there is no spot
 DAMPING = (1.0,) * 12 + (0.5,) * 16 + (0.25,) * 24  # of the steps after screening: full ones may go round in circles
 DECREMENT = 1e-8  # squared distance from the minimum in standard deviations: 1e-4 of one
 AT_ONCE = 64  # spots that are fitted together: their arrays stay in the cache
+MISFIT_SIGMAS = 3.0  # by which a fit's chi2 must exceed 1 before its covariance is widened
 _SCREENING_STEPS = 4
 _LEAST_FREEDOM = 0.1  # of a pixel, 1 - leverage: one that a fit follows wholly says nothing of its misfit
 _LEAST_INFORMATION = 1e-12  # per electron squared: of a pixel that is full
@@ -158,7 +159,7 @@ def fit_law(
 def _fit(data: SpotData, near_px: Array | None) -> SpotFit:
     with np.errstate(all="ignore"):
         theta = _screened(data, _first_guess(data, near_px))
-        theta, converged = _polished(data, theta)
+        theta, converged = polished(data, theta)
         return _result(data, theta, converged)
 
 
@@ -242,8 +243,11 @@ def _step(data: SpotData, theta: Array, damping: float = 1.0) -> tuple[Array, Ar
     return limited(theta, step, damping, free_width=data.pixels.free_width), np.sum(step * score, axis=1)
 
 
-def _polished(data: SpotData, theta: Array) -> tuple[Array, BoolArray]:
-    """Go on until the step is small against the standard deviation; only what still moves is computed."""
+def polished(data: SpotData, theta: Array) -> tuple[Array, BoolArray]:
+    """Unknowns, shape (n, k), after scoring from a start until steps are small, and whether they became so.
+
+    Full steps may go round in circles, beside full codes above all: later ones are damped. Only what moves is computed.
+    """
     theta, moving = theta.copy(), np.arange(len(theta))
     for damping in DAMPING:
         theta[moving], decrement = _step(data.rows(moving), theta[moving], damping)
