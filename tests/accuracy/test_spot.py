@@ -93,7 +93,7 @@ def test_accuracy_centroid_and_flux_of_the_paper() -> None:
 
 @pytest.fixture
 def few_rays(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Certificates without their further rounds of up to 2^19 rays, which would only find a fault again."""
+    """Certificates without their further rounds of up to 2^20 rays, which would only find a fault again."""
     monkeypatch.setattr("phibench.render.optics.certificate._LOG2_RAYS", (13, 15))
 
 
