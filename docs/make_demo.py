@@ -1,9 +1,10 @@
 """Make the frames set that `phibench demo` scores, from five samples of bench-dev.
 
-    phibench dataset make bench-dev --samples 24 --out out/dev
-    python docs/make_demo.py out/dev SAMPLE ... --out benchmark/pair_sets/demo
+    phibench dataset make bench-dev --samples 120 --out out/dev
+    python docs/make_demo.py out/dev random-0000{09,12,16,04,05} --out benchmark/pair_sets/demo
 
-Without names of samples it lists what each sample is: found, faint, hidden, beside a lamp or saturated, and its room.
+In turn the spot is saturated, hidden in one image, beside a lamp, found, and faint. Without names of samples the script
+lists what each sample is, and its room.
 """
 
 from __future__ import annotations

@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Any
 
 from phibench.benchmark.pair_sets.dataset_pairs import tracks_of
-from phibench.benchmark.reports.track_tables import NUMBERS, preset_name
+from phibench.benchmark.reports.track_tables import preset_name
 from phibench.benchmark.scores.document import MetricDescription, ScoreDocument, read_score
-from phibench.benchmark.scores.score_tables import rig_known
+from phibench.benchmark.scores.score_tables import RANKS_OF_TRACKS, rig_known
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.store.files import write_text
 
@@ -71,7 +71,7 @@ def every_eval_ever(document: ScoreDocument, dataset_id: str, organization: str,
     method = document.method
     details = {"reference": method.reference, "sha256": method.sha256 or "", "rig": rig_known(document)}
     details["division"] = method.division
-    names = [*(NUMBERS[track].ranks for track in tracks_of(document.pair_set)), *_ALSO]
+    names = [*(RANKS_OF_TRACKS[track] for track in tracks_of(document.pair_set)), *_ALSO]
     return {
         "schema_version": SCHEMA,
         "evaluation_id": f"phibench/{dataset_id}/{method.name}/{int(when.timestamp())}",
@@ -123,7 +123,7 @@ def hub_entries(document: ScoreDocument, dataset_id: str, when: datetime) -> lis
     """Entry of each track of a score that has a number."""
     entries = []
     for track in tracks_of(document.pair_set):
-        name = NUMBERS[track].ranks
+        name = RANKS_OF_TRACKS[track]
         value = document.metrics[name].value
         if value is not None:
             word = f"rig {rig_known(document)}; {document.method.division} division"

@@ -13,19 +13,18 @@ from dataclasses import dataclass
 from phibench.benchmark.pair_sets.dataset_pairs import TRACKS, Track, tracks_of
 from phibench.benchmark.scores.document import ScoreDocument
 from phibench.benchmark.scores.metrics import METRICS
-from phibench.benchmark.scores.score_tables import BY_WORD, FLAGGED, rig_known, shown_parts, starred
+from phibench.benchmark.scores.score_tables import BY_WORD, FLAGGED, RANKS_OF_TRACKS, rig_known, shown_parts, starred
 from phibench.datasets.common.shown_text import TextTable
 
 
 @dataclass(frozen=True)
 class TrackNumbers:
-    """Numbers of a track: `ranks` orders the methods, those `beside` it tell more of them.
+    """Numbers of a track beside the one that ranks it (`RANKS_OF_TRACKS`).
 
     `perfect` are metrics of the pairs alone, by the name of their row.
     """
 
     title: str
-    ranks: str
     beside: tuple[str, ...]
     perfect: Mapping[str, str]
 
@@ -33,19 +32,16 @@ class TrackNumbers:
 NUMBERS: dict[Track, TrackNumbers] = {
     "localise": TrackNumbers(
         "Track localise: error over bound, geometric mean, lower is better",
-        "localise",
         ("median_localise", "p95_localise"),
         {"perfect, one image": "perfect_localise", "perfect, both images": "perfect_localise_pair"},
     ),
     "find": TrackNumbers(
         "Track find: Jaccard index at 3 px, higher is better",
-        "find",
         ("detection_rate", "false_rate", "false_per_empty"),
         {},
     ),
     "depth": TrackNumbers(
         "Track depth: average recall of D within 0.5 to 20 %, higher is better",
-        "average_recall",
         ("depth_rate", "median_depth_relative", "interval_score"),
         {},
     ),
@@ -75,7 +71,7 @@ def _by_preset(track: Track, documents: Sequence[ScoreDocument]) -> TextTable:
         name = f"{document.method.name}{FLAGGED if document.flags else ''}"
         rows.setdefault((name, document.method.division, rig_known(document)), {})[preset_name(document)] = document
     order = sorted(rows.items(), key=lambda row: _mean_place(row[1], documents, track))
-    made = [(*key, *(_cell(numbers.ranks, own.get(preset)) for preset in presets)) for key, own in order]
+    made = [(*key, *(_cell(RANKS_OF_TRACKS[track], own.get(preset)) for preset in presets)) for key, own in order]
     firsts = {preset: next(one for one in documents if preset_name(one) == preset) for preset in presets}
     for name, metric in numbers.perfect.items():
         made.append((name, "", "", *(_cell(metric, firsts[preset]) for preset in presets)))
@@ -95,7 +91,7 @@ def _mean_place(own: Mapping[str, ScoreDocument], documents: Sequence[ScoreDocum
 
 def _key(document: ScoreDocument, track: Track) -> float:
     """Number that is smaller for the better method; infinite where there is none."""
-    name = NUMBERS[track].ranks
+    name = RANKS_OF_TRACKS[track]
     value = document.metrics[name].value
     if value is None:
         return math.inf

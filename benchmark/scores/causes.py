@@ -251,21 +251,21 @@ CAUSES: dict[str, str] = {
 TAKEN_FOR: dict[str, tuple[str, str]] = {
     "lamp": (
         "a lamp or its reflection in the mirror",
-        "subtract a laser-off image, mask lamps (lamp_mask in docs/method.md), or use --boxes 64",
+        "subtract a laser-off image, mask lamps (lamp_mask in docs/method.md), or use --track localise",
     ),
     "lamp_noise": (
         "noise of a lamp or its reflection in on - off",
-        "divide by the noise, mask lamps (lamp_mask in docs/method.md), or use --boxes 64",
+        "divide by the noise, mask lamps (lamp_mask in docs/method.md), or use --track localise",
     ),
-    "light": ("another light of the scene", "tell it by the laser-off image and its size, or use --boxes 64"),
-    "region": ("a region that is brighter than the spot", "subtract a laser-off image, or use --boxes 64"),
+    "light": ("another light of the scene", "tell it by the laser-off image and its size, or use --track localise"),
+    "region": ("a region that is brighter than the spot", "subtract a laser-off image, or use --track localise"),
     "region_noise": (
         "noise of a bright region in on - off",
-        "divide by the noise, mask bright regions (lamp_mask in docs/method.md), or use --boxes 64",
+        "divide by the noise, mask bright regions (lamp_mask in docs/method.md), or use --track localise",
     ),
     "nothing": (
         "false, on nothing brighter than the spot",
-        "phibench method check tells mistakes of convention, --boxes 64 narrows the search",
+        "phibench method check tells mistakes of convention, --track localise narrows the search",
     ),
 }
 """Kinds of places that false detections lie on, in words, with advice."""

@@ -205,7 +205,7 @@ def note_on_size(differences: Sequence[Difference], rules: Mapping[str, float], 
     if samples >= least:
         return (
             f"Too few samples for a verdict: every metric counts fewer than {least} of the {samples} that both have. "
-            "The methods find too few spots together: score them on easier pairs, or with --boxes 64."
+            "The methods find too few spots together: score them on easier pairs, or with --track localise."
         )
     return (
         f"Too few samples for a verdict: both have {samples}, {least} are the least, and more draws of a sample do "

@@ -16,6 +16,7 @@ from typing import Any, Literal, Protocol
 import polars as pl
 from rich.console import Console
 
+from phibench.benchmark.pair_sets.dataset_pairs import Track, tracks_of
 from phibench.benchmark.scores.causes import CAUSES, KINDS, NOISE, TAKEN_FOR
 from phibench.benchmark.scores.compare import Difference
 from phibench.benchmark.scores.document import PairRange, ScoreDocument, Value
@@ -44,6 +45,9 @@ HEADS = {
 }
 """Metrics of a ranking with their heads; a narrow table has the first `NARROW` of them."""
 NARROW = 8  # columns that fit into 80 signs
+RANKS_OF_TRACKS: dict[Track, str] = {"localise": "localise", "find": "find", "depth": "average_recall"}
+"""Metric that ranks a track; those of a score's tracks come first in its narrow tables."""
+_TRACK_HEADS = {"localise": "error\n/ bound", "find": "find\nJ", "average_recall": "recall\nD"}
 DIGITS = 3
 """Significant digits of a value in a table."""
 FULL_OF_FALSE = 0.2
@@ -114,7 +118,8 @@ def refused(records: pl.DataFrame) -> str:
 
 def leaderboard(documents: Sequence[ScoreDocument], by: str = "phi", wide: bool = False) -> TextTable:
     """One row per method, the best first; `wide` adds intervals and the last columns."""
-    first, names = documents[0], tuple(HEADS)[: None if wide else NARROW]
+    first = documents[0]
+    names = tuple(HEADS) if wide else (*_ranking_of_tracks(first), *HEADS)[:NARROW]
     rows = []
     for document in ranked(documents, by):
         sees = document.method.sees
@@ -129,11 +134,16 @@ def leaderboard(documents: Sequence[ScoreDocument], by: str = "phi", wide: bool 
     return TextTable(title, ("method", *words, *map(head, names)), tuple(rows), columns + "r" * len(names), note)
 
 
+def _ranking_of_tracks(document: ScoreDocument) -> list[str]:
+    """Metrics by which the tracks of a score rank; they come first in its tables."""
+    return [RANKS_OF_TRACKS[track] for track in tracks_of(document.pair_set)]
+
+
 def score_table(document: ScoreDocument, by: str = "phi") -> TextTable:
     """One row per metric of one method, with its interval; of a method that finds nothing, rows with values alone."""
     title = f"{document.method.name}: {_pairs_in_words(document)}, {rank_words(by)}"
     there = [name for name in HEADS if applies(name, document.method.sees)]
-    order = sorted(there, key=lambda name: name != RANKS[by])
+    order = [*_ranking_of_tracks(document), *sorted(there, key=lambda name: name != RANKS[by])]
     if not _finds(document):
         order = [name for name in order if document.metrics[name].value is not None]
     rows = ((METRICS[name].text, METRICS[name].shown[1], *_parts(name, document.metrics[name])) for name in order)
@@ -467,6 +477,8 @@ def _difference_fields(d: Difference) -> dict[str, str | float | int | None]:
 
 def head(name: str) -> str:
     """Head of a metric's column, its unit on the second line."""
+    if name in _TRACK_HEADS:
+        return _TRACK_HEADS[name]
     unit = METRICS[name].shown[1]
     text = "pull of D" if name == "pull_depth" else HEADS.get(name, METRICS[name].text)
     return text if unit == "1" else f"{text}\n{unit}"

@@ -21,7 +21,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Literal
 
-from cyclopts import App, CycloptsError
+from cyclopts import App, CycloptsError, Parameter
 
 from phibench.cli.calibration import align, calibrate
 from phibench.cli.captures import import_, measure, sensor
@@ -50,6 +50,7 @@ app = App(
     help="Render an omnidirectional camera-mirror sensor with exact depth, and score depth estimators against it.",
     suppress_keyboard_interrupt=False,
     result_action="return_value",
+    default_parameter=Parameter(negative_iterable=()),  # no --empty-distance-m beside --distance-m
 )
 for _group in (recipe, dataset, film, room, scene, method, dense, seal, submission, sensor, loop, study):
     app.command(_group)

@@ -28,6 +28,13 @@ def start() -> int:
     return 0
 
 
+_MEANINGS = (
+    "Jaccard index: found spots / (visible spots + false answers). Recall: share of the pairs with D within 0.5, 1, 2, "
+    "5, 10, 20 %, averaged over these. In brackets: 95 % interval. A star: too few samples for one.",
+    "",
+)
+
+
 def demo(*, out: Path = Path("phibench-demo")) -> int:
     """Score two built-in methods and an example on five pairs that are shipped; write one page. It needs no Mitsuba.
 
@@ -46,10 +53,8 @@ def demo(*, out: Path = Path("phibench-demo")) -> int:
     console = table_console(False)
     for table in track_tables([one.document for one in done.scores], beside=False):
         show_grid(console, table)
-    print("Jaccard index: found spots / (visible spots + false answers). In brackets: 95 % interval. A star: too few")
-    print("samples for one. Recall: share of the pairs with D within 0.5, 1, 2, 5, 10, 20 %, averaged over these.")
-    for line in (line for one in done.scores for line in method_lines(one)):
-        print(line)
+    for line in (*_MEANINGS, *(line for one in done.scores for line in method_lines(one))):
+        console.print(line, emoji=False, highlight=False, markup=False)
     print(f"The page: {done.page}{' is opened' if show(done.page) else '; open it in a browser'}")
     print(f"Your method: change {done.example} and give the same command again")
     print(f"The best built-in fit, a second a pair: phibench score {done.pairs} --track find --method chain_fit")

@@ -72,6 +72,7 @@ def test_help_fits_80_columns(command: str, capsys: pytest.CaptureFixture[str], 
     assert len(lines) > 2
     assert max(map(len, lines)) <= 80
     assert not any("…" in line for line in lines)  # nothing is cut off
+    assert not any("--empty-" in line for line in lines)
 
 
 @pytest.mark.skipif(not shutil.which("bash"), reason="no bash here")

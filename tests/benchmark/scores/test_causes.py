@@ -242,7 +242,7 @@ def test_a_table_full_of_false_detections_says_what_they_are():
         answers = [Outcome(t.number, (constant if t.number < 20 * share else truth_itself)(t), 0.1) for t in truths]
         table = with_causes(record_table(truths, answers, RULES), Cases(tuple(truths)), RULES)
         assert false_line(table).startswith(expected)
-        assert ("--boxes 64" in false_line(table)) == bool(expected)
+        assert ("--track localise" in false_line(table)) == bool(expected)
 
 
 def test_a_hidden_spot_that_is_not_answered_is_no_fault():

@@ -104,7 +104,7 @@ def test_what_would_give_a_verdict_is_said():
     enough = compare_records(table(shifted(0.1), cases(30)), table(shifted(1.5), cases(30)), RULES, "test")
     assert note_on_size(enough, rules, 30) == ""
     nothing = [replace(item, better="too few samples") for item in enough]
-    assert "--boxes 64" in note_on_size(nothing, rules, 30)
+    assert "--track localise" in note_on_size(nothing, rules, 30)
 
 
 def test_a_constant_depth_without_positions_is_never_better():

@@ -21,11 +21,13 @@ from phibench.benchmark.scores.score_tables import (
     HEADS,
     cause_table,
     failure_line,
+    leaderboard,
     nothing_answered,
     number,
     print_comparison,
     print_scores,
     refused,
+    score_table,
 )
 from phibench.estimator.interface import Answer, Outcome, Spot
 
@@ -212,6 +214,21 @@ def test_a_method_that_takes_none_of_the_pairs_is_not_ranked_and_not_blamed(scor
     assert html.count("chain_fit") == 1
     blamed = next(line for line in html.splitlines() if "Less than half of the spots" in line)
     assert "chain_fit" not in blamed.partition("is not compared")[0].rpartition("Less than half")[2].partition(".")[0]
+
+
+@pytest.mark.parametrize(
+    ("pair_set", "heads", "text"),
+    [
+        ({"hinted": 0, "boxes_px": None, "track": "find"}, ["find\nJ", "recall\nD"], "Jaccard index"),
+        ({"track": "localise", "boxes_px": 64}, ["error\n/ bound"], "error / bound"),
+        ({"hinted": 3}, [], "rms error of phi"),
+    ],
+)
+def test_what_ranks_the_tracks_of_a_score_comes_first(scored, pair_set, heads, text):
+    documents = [one.document.model_copy(update={"pair_set": pair_set}) for one in scored]
+    assert list(leaderboard(documents).heads[1 : 1 + len(heads)]) == heads
+    assert leaderboard(documents).heads[1 + len(heads)] == "rank phi\nmrad"
+    assert score_table(documents[0]).rows[0][0].startswith(text)
 
 
 def test_the_cause_of_the_method_itself_has_words(scored):
