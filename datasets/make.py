@@ -18,6 +18,7 @@ from rich.console import Console
 from phibench.datasets.build.finished_work import (
     OR_REPLACE,
     LostWorkError,
+    draws_bytes,
     finished_without,
     forget_others,
     incomplete_text,
@@ -26,8 +27,11 @@ from phibench.datasets.build.finished_work import (
     left_out_text,
     lost_work,
     possible,
+    read_draws,
     refused_samples,
+    seen_causes,
     settled_samples,
+    write_draws,
 )
 from phibench.datasets.build.forecast import (
     Forecast,
@@ -38,7 +42,6 @@ from phibench.datasets.build.forecast import (
     slowdown,
 )
 from phibench.datasets.build.journal import Journal
-from phibench.datasets.build.kept_draws import draws_bytes, read_draws, seen_causes, write_draws
 from phibench.datasets.build.parts import unfinished
 from phibench.datasets.build.room_export import (
     damaged_exports,
@@ -54,17 +57,16 @@ from phibench.datasets.build.run_tasks import (
     copy_room_files,
     finish,
     missing_room_files,
+    plan_tasks,
     refuse_other,
     remove_files,
     visibility_line,
 )
-from phibench.datasets.build.task_list import plan_tasks
 from phibench.datasets.build.workers import Environment, NoRendererError, WorkerPool
 from phibench.datasets.common.errors import DatasetError, IncompleteError
 from phibench.datasets.common.progress import progress_console
-from phibench.datasets.plan.kept_samples import Causes
+from phibench.datasets.plan.draws import Causes, unexported
 from phibench.datasets.plan.plan import Plan, make_plan
-from phibench.datasets.plan.room_draws import unexported
 from phibench.datasets.recipe.checks import warnings
 from phibench.datasets.recipe.load import find_recipe, parse_recipe, recipe_files, recipe_text, with_numbers
 from phibench.datasets.recipe.tables import Recipe

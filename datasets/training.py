@@ -30,9 +30,8 @@ from phibench.datasets.store.documents import from_json
 from phibench.datasets.store.layers import SpotWindow
 from phibench.datasets.store.pair_files import IMAGES_OFF, FramesRow, PairFiles, is_frames_set
 from phibench.render.sensor.camera_chain import Chain, auto_exposed
-from phibench.render.sensor.light import Light, Region
-from phibench.render.sensor.noise_tiles import NoiseStream
-from phibench.render.sensor.rolling_shutter import layer_spectra
+from phibench.render.sensor.electrons import NoiseStream
+from phibench.render.sensor.light import Light, Region, layer_spectra
 from phibench.scenes.frames import Array
 from phibench.scenes.random_streams import generator
 from phibench.scenes.rig import POSITIONS, Rig

@@ -16,16 +16,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from phibench.datasets.frames.sensor_card import SensorCard, card_of
-from phibench.estimator.geometry.mirror_image import image_of
 from phibench.estimator.geometry.paper_depth import error_eq7, load_published
 from phibench.estimator.geometry.phi import estimate_phi
+from phibench.estimator.geometry.reflection import image_of
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.estimator.limits.best_stroke import spot_bound
 from phibench.estimator.limits.processed_bound import SpotSigma
 from phibench.estimator.spots.spot_prediction import Laser, spot_electrons_per_s
 from phibench.render.sensor.settings import sensor
-from phibench.scenes.catalog import default_rig
 from phibench.scenes.rig import Rig
+from phibench.scenes.room import default_rig
 
 PRESETS = ("mjpeg", "bayer-raw")
 EXPOSURE_S = 0.046  # auto exposure in the lab: docs/experiments.md

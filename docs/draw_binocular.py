@@ -14,18 +14,18 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw
 
-from phibench.datasets.build.light_map_cache import light_map
+from phibench.datasets.build.bake_task import light_map
 from phibench.datasets.store.pictures import display_exposure_s, to_srgb
-from phibench.estimator.geometry.mirror_image import image_of
+from phibench.estimator.geometry.reflection import image_of
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.render.optics.room_tracer import room_geometry
 from phibench.render.optics.spot_layer import spot_layer
 from phibench.render.room.ambient import render_ambient
 from phibench.render.room.light_map import BakeSettings
 from phibench.render.sensor.settings import sensor
-from phibench.scenes.catalog import TargetBoard, lab
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import Rig
+from phibench.scenes.room import TargetBoard, lab
 from phibench.studies.isotropy.binocular import Binocular, Laws, tried
 from phibench.studies.isotropy.noise import sideways
 from phibench.studies.misaligned_rigs import spot_of

@@ -19,7 +19,7 @@ from phibench.calibration.captures.rig_file import MeasuredRig
 from phibench.datasets.frames.frame_files import png_bytes
 from phibench.datasets.read import open_dataset
 from phibench.estimator.methods.draw_pairs import pairs_of
-from phibench.scenes.catalog import default_rig
+from phibench.scenes.room import default_rig
 
 _WIDTH = 1000
 _QUALITY = 80

@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from phibench.datasets.build.light_map_cache import light_map
+from phibench.datasets.build.bake_task import light_map
 from phibench.datasets.store.pictures import display_exposure_s, to_srgb
 from phibench.render.room.ambient import render_ambient
 from phibench.render.room.light_map import BakeSettings
-from phibench.scenes.catalog import default_rig, lab
 from phibench.scenes.frames import Pose
 from phibench.scenes.revolved_mirror import RevolvedMirror
 from phibench.scenes.revolved_profile import cone, hyperboloid, paraboloid
+from phibench.scenes.room import default_rig, lab
 
 _COARSE = BakeSettings(texel_m=0.25, lamp_rays=8, bounces=3, bounce_rays=16, final_rays=32)
 _WIDTH, _HEIGHT, _SQUARE = 640, 480, 470

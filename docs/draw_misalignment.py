@@ -15,15 +15,15 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, FancyArrowPatch
 
-from phibench.estimator.geometry.mirror_image import image_of
+from phibench.estimator.geometry.reflection import image_of
 from phibench.estimator.geometry.sensitivities import PARAMETERS as GEOMETRIC
 from phibench.estimator.geometry.sensitivities import sensitivity
 from phibench.estimator.geometry.triangulate import depth_exact
-from phibench.scenes.catalog import default_rig
 from phibench.scenes.frames import Pose
 from phibench.scenes.mirror import HARMONICS
 from phibench.scenes.misalignment import PARAMETERS, Misalignment
 from phibench.scenes.rig import Rig
+from phibench.scenes.room import default_rig
 
 BLUE, RED, GREY = "#1f5fa8", "#c03028", "0.55"
 DEPTHS_M, STROKE_M, Z_C_M, BELOW_SPHERE_M = (1.0, 2.5, 4.2), 0.5, 0.30, 0.20

@@ -30,12 +30,11 @@ from scipy.optimize import least_squares
 from scipy.special import ndtr
 
 from phibench.calibration.sensor_fit.edge_spread import Edge, edges_of, measure
-from phibench.calibration.sensor_fit.fit import fit_sensor
-from phibench.calibration.sensor_fit.lens_fit import LensFit
+from phibench.calibration.sensor_fit.fit import LensFit, fit_sensor
 from phibench.calibration.sensor_fit.tone_curve import decoded_by
 from phibench.render.sensor.camera_chain import Chain
+from phibench.render.sensor.electrons import NoiseStream
 from phibench.render.sensor.light import Light
-from phibench.render.sensor.noise_tiles import NoiseStream
 from phibench.render.sensor.processing import rgb_from_yuyv
 from phibench.render.sensor.settings import Sensor, sensor
 

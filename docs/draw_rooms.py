@@ -18,8 +18,8 @@ from phibench.datasets.store.pictures import display_exposure_s, to_srgb
 from phibench.render.room.ambient import render_ambient
 from phibench.render.room.light_map import BakeSettings, bake
 from phibench.scenes.camera import Camera
-from phibench.scenes.catalog import default_rig
 from phibench.scenes.rig import Rig
+from phibench.scenes.room import default_rig
 from phibench.scenes.worlds.generated_room import generate_room
 from phibench.scenes.worlds.properties import drawn_properties
 

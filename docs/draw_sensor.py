@@ -24,9 +24,15 @@ from phibench.datasets.read import Sample, open_dataset
 from phibench.datasets.store.files import write_bytes
 from phibench.render.sensor import processing
 from phibench.render.sensor.camera_chain import Chain
-from phibench.render.sensor.electrons import collected, expected_electrons, mean_charge
+from phibench.render.sensor.electrons import (
+    NoiseStream,
+    collected,
+    expected_electrons,
+    frame_stream,
+    mean_charge,
+    whole_tiles,
+)
 from phibench.render.sensor.light import Light, Region
-from phibench.render.sensor.noise_tiles import NoiseStream, frame_stream, whole_tiles
 from phibench.render.sensor.processing import compressed, linear_rgb, linear_signal
 from phibench.render.sensor.settings import Sensor, sensor
 from phibench.render.sensor.srgb import srgb_encoded

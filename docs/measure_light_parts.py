@@ -25,9 +25,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 from helpers.path_windows import RIG, VIEW, windows_of
 
 from phibench.datasets.build.bake_task import bake_settings
-from phibench.datasets.plan.room_draws import draw_rooms
+from phibench.datasets.plan.draws import draw_rooms
 from phibench.datasets.recipe.load import load_recipe
-from phibench.render.optics.faces import FaceTable, IntArray, face_table
+from phibench.render.optics.faces import FaceTable, IntArray, TexelGrid, face_table
 from phibench.render.optics.room_tracer import room_geometry
 from phibench.render.optics.truth import truth_layer
 from phibench.render.room.ambient import view_surfaces
@@ -44,7 +44,6 @@ from phibench.render.room.light_map import (
     smoothed,
 )
 from phibench.render.room.surfaces import Surfaces, aligned
-from phibench.render.room.texel_grid import TexelGrid
 from phibench.render.room.texel_points import Texels, nearest_free
 from phibench.render.setup.variant import activate
 from phibench.scenes.frames import Array, BoolArray

@@ -27,9 +27,9 @@ from helpers.path_ambient import path_runs
 from helpers.path_windows import DEPTH, RIG, VIEW, windows_of
 
 from phibench.datasets.build.bake_task import bake_settings
-from phibench.datasets.plan.room_draws import draw_rooms
+from phibench.datasets.plan.draws import draw_rooms
 from phibench.datasets.recipe.load import load_recipe
-from phibench.datasets.rooms.panorama_settings import PanoramaSettings
+from phibench.datasets.rooms.panorama_room import PanoramaSettings
 from phibench.render.room.ambient import render_ambient
 from phibench.render.room.light_map import BakeSettings, bake
 from phibench.scenes.room import Room

@@ -32,8 +32,8 @@ from phibench.estimator.limits.position_bound import processed_snr, raw_snr
 from phibench.estimator.limits.processed_bound import chain_limit
 from phibench.estimator.spots.gaussian_spot import SpotBlur
 from phibench.render.sensor.camera_chain import Chain
+from phibench.render.sensor.electrons import NoiseStream
 from phibench.render.sensor.light import Light
-from phibench.render.sensor.noise_tiles import NoiseStream
 from phibench.render.sensor.settings import Sensor, sensor
 from phibench.scenes.frames import Array
 

@@ -36,16 +36,15 @@ from phibench.datasets.common.parallel import ONE_THREAD, return_memory
 from phibench.datasets.film.film_plan import film_plans
 from phibench.datasets.film.film_room import renderer
 from phibench.datasets.film.film_task import make_film
+from phibench.datasets.plan.draws import draw_rooms
 from phibench.datasets.plan.plan import make_plan
-from phibench.datasets.plan.room_draws import draw_rooms
 from phibench.datasets.recipe.load import load_recipe, parse_recipe, recipe_text
 from phibench.datasets.store.schema import view_file
 from phibench.render.room.light_map import BakeSettings, bake
 from phibench.render.room.noise_budget import BUDGETS
 from phibench.render.room.subpixel_grid import CellSampler
 from phibench.render.setup.variant import activate
-from phibench.scenes.catalog import default_rig, lab
-from phibench.scenes.room import Room
+from phibench.scenes.room import Room, default_rig, lab
 
 COARSE = BakeSettings(texel_m=0.5, lamp_rays=16, bounces=2, bounce_rays=8, final_rays=16)
 SHORT = {  # lines of a recipe of drives

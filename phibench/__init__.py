@@ -64,7 +64,7 @@ def __getattr__(name: str) -> Any:
     if name in _HOMES:
         value: Any = getattr(import_module(_HOMES[name]), name)
     elif name == "__version__":
-        value = import_module("phibench.datasets.common.version").own_version()
+        value = import_module("phibench.datasets.store.provenance").own_version()
     else:
         raise AttributeError(f"module 'phibench' has no attribute '{name}'; it has {', '.join(__all__)}")
     globals()[name] = value

@@ -20,7 +20,7 @@ import numpy as np
 from phibench.calibration.outline.limb_image import PoseMeasurement
 from phibench.calibration.rig.bundle import Bundle, KnownSpot, apparent_outline, calibrate
 from phibench.datasets.common.errors import DatasetError
-from phibench.estimator.geometry.mirror_image import image_of
+from phibench.estimator.geometry.reflection import image_of
 from phibench.estimator.geometry.rig_parameters import PRIOR_SIGMA, prior_sigmas
 from phibench.estimator.geometry.sensitivities import PARAMETERS as ANALYTIC
 from phibench.estimator.geometry.sensitivities import sensitivity

@@ -219,7 +219,7 @@ def add_rooms(copy: Copy) -> None:
     )
     bare = '[(f"bare{k}", BareRoom(one.name)) for k, one in enumerate(table.bare)]'
     copy.edit(
-        "datasets/plan/room_draws.py",
+        "datasets/plan/draws.py",
         ("    GeneratedRoom,\n", "    BareRoom,\n    GeneratedRoom,\n"),
         ("zip_longest(generated, panoramas, meshes)", f"zip_longest(generated, panoramas, meshes, {bare})"),
     )
@@ -257,7 +257,7 @@ ADDITIONS = {
     "method": Addition(add_method, ("estimator/methods/registry.py",), USE_METHOD, "True\nfaint_blob\n"),
     "source of rooms": Addition(
         add_rooms,
-        ("datasets/plan/room_draws.py", "datasets/recipe/room_tables.py", "datasets/rooms/room_sources.py"),
+        ("datasets/plan/draws.py", "datasets/recipe/room_tables.py", "datasets/rooms/room_sources.py"),
         USE_ROOMS,
         "['bare0'] {'bare0'} True\n",
     ),

@@ -20,11 +20,10 @@ from phibench.estimator.geometry.paper_depth import depth_paper
 from phibench.estimator.geometry.phi import phi_incidence, phi_normal, phi_ray
 from phibench.estimator.geometry.reflection import reflect
 from phibench.render.sensor.electrons import digitised, mosaic
+from phibench.render.sensor.light import row_times_s
 from phibench.render.sensor.processing import tone_encoded, yuyv
-from phibench.render.sensor.rolling_shutter import row_times_s
 from phibench.render.sensor.settings import sensor
 from phibench.scenes.camera import Camera, photons_per_joule
-from phibench.scenes.catalog import default_rig
 from phibench.scenes.frames import Pose, rotation_xyz
 from phibench.scenes.laser import beam_diameter_m
 from phibench.scenes.misalignment import Misalignment
@@ -33,6 +32,7 @@ from phibench.scenes.motion.vehicle import Vehicle
 from phibench.scenes.revolved_mirror import RevolvedMirror
 from phibench.scenes.revolved_profile import FormedProfile, paraboloid
 from phibench.scenes.rig import Rig
+from phibench.scenes.room import default_rig
 
 PAGE = Path(__file__).resolve().parent.parent / "docs/implement.md"
 NUMBER = re.compile(r"[+-]?\d+(?:\.\d+)?")

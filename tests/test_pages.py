@@ -12,7 +12,7 @@ from helpers.districts import DISTRICTS
 
 from phibench.cli.main import app
 from phibench.datasets.read import open_dataset
-from phibench.scenes.catalog import default_rig
+from phibench.scenes.room import default_rig
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = sorted(

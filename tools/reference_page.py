@@ -44,8 +44,8 @@ from phibench.datasets.recipe.tables import (
     RigTable,
     TargetTable,
 )
-from phibench.scenes.catalog import RIGS
 from phibench.scenes.rig import Rig
+from phibench.scenes.room import RIGS
 from phibench.scenes.validation import allowed, schema_node
 from phibench.scenes.worlds.properties import PROPERTIES
 

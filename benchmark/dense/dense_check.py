@@ -19,7 +19,7 @@ from phibench.benchmark.isolation.check import Check
 from phibench.benchmark.isolation.resolve import DENSE, RunLimits, resolve
 from phibench.benchmark.isolation.runner import Harness
 from phibench.estimator.dense.dense_interface import DensePair
-from phibench.estimator.geometry.mirror_image import image_of
+from phibench.estimator.geometry.reflection import image_of
 from phibench.estimator.geometry.status import keep
 from phibench.estimator.geometry.triangulate import meeting
 from phibench.estimator.interface import Outcome

@@ -20,8 +20,7 @@ from phibench.benchmark.scores.document import MethodCard, MetricDescription, Va
 from phibench.benchmark.scores.intervals import Clusters, Statistic, estimates, mean_of, rms_of
 from phibench.benchmark.scores.metrics import MetricEstimate
 from phibench.datasets.common.errors import DatasetError
-from phibench.datasets.common.version import program_version
-from phibench.datasets.store.provenance import code_behind, provenance
+from phibench.datasets.store.provenance import code_behind, program_version, provenance
 from phibench.datasets.store.schema import Document
 from phibench.scenes.random_streams import Name, generator
 

@@ -17,8 +17,7 @@ from phibench.benchmark.isolation.easy_pairs import EasyCamera
 from phibench.benchmark.isolation.resolve import MethodError
 from phibench.datasets.frames.sensor_card import SensorCard, sensor_card
 from phibench.estimator.dense.dense_interface import DensePair
-from phibench.estimator.geometry.mirror_image import image_of
-from phibench.estimator.geometry.reflection import room_rays
+from phibench.estimator.geometry.reflection import image_of, room_rays
 from phibench.estimator.spots.image_planes import KINDS, kind_of
 from phibench.estimator.spots.raw_pixels import bayer_filters
 from phibench.scenes.frames import Array

@@ -18,8 +18,8 @@ from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import InputFile
 from phibench.datasets.exposures.draw import require_outside
 from phibench.datasets.frames.frame_files import suffix, write_frame
+from phibench.datasets.store.checksums import filling, signed, write_documents
 from phibench.datasets.store.files import sha256
-from phibench.datasets.store.filling import filling, signed, write_documents
 from phibench.datasets.store.layers import write_exr
 from phibench.datasets.store.schema import TruthFolder
 from phibench.scenes.frames import Array

@@ -23,7 +23,7 @@ from phibench.datasets.frames.sensor_card import card_of
 from phibench.datasets.frames.source import Frame, FrameSource
 from phibench.datasets.read import Dataset
 from phibench.estimator.dense.dense_interface import DensePair
-from phibench.estimator.geometry.mirror_image import image_of, up_image
+from phibench.estimator.geometry.reflection import image_of, up_image
 from phibench.estimator.geometry.rig_parameters import stroke_of
 from phibench.estimator.interface import Image
 from phibench.estimator.methods.draw_pairs import DrawnPairs

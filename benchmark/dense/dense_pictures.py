@@ -21,10 +21,8 @@ from phibench.benchmark.reports.figures import encoded, styled
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.read import place_of
 from phibench.estimator.dense.dense_interface import DensePair
-from phibench.estimator.dense.smooth_maps import PanoramaMaps, maps_of
-from phibench.estimator.dense.unrolled_pair import luma_codes
-from phibench.estimator.geometry.mirror_image import range_at
-from phibench.estimator.geometry.reflection import room_rays
+from phibench.estimator.dense.unrolled_pair import PanoramaMaps, luma_codes, maps_of
+from phibench.estimator.geometry.reflection import range_at, room_rays
 from phibench.scenes.frames import Array, BoolArray
 
 if TYPE_CHECKING:

@@ -40,11 +40,17 @@ from phibench.datasets.frames.source import FrameSource, has_place
 from phibench.datasets.read import Dataset, open_dataset, open_finished
 from phibench.datasets.recipe.tables import FramesTable
 from phibench.datasets.store import schema
-from phibench.datasets.store.checksums import checksums_text, differing_files, read_checksums
+from phibench.datasets.store.checksums import (
+    checksums_text,
+    differing_files,
+    filling,
+    read_checksums,
+    signed,
+    write_documents,
+)
 from phibench.datasets.store.croissant import LICENSE_TEXT
 from phibench.datasets.store.documents import parquet_bytes
 from phibench.datasets.store.files import sha256, write_text
-from phibench.datasets.store.filling import filling, signed, write_documents
 from phibench.datasets.store.provenance import code_behind
 from phibench.scenes.rig import POSITIONS
 

@@ -22,8 +22,8 @@ from phibench.benchmark.isolation.resolve import MethodError
 from phibench.datasets.common.shown_text import ShortForm
 from phibench.datasets.exposures.expected import ExpectedRegion
 from phibench.datasets.frames.sensor_card import SensorCard, sensor_card
-from phibench.estimator.geometry.mirror_image import image_of
 from phibench.estimator.geometry.phi import phi_incidence, phi_normal, phi_ray
+from phibench.estimator.geometry.reflection import image_of
 from phibench.estimator.interface import Box, Pair
 from phibench.estimator.limits.position_bound import raw_snr, spot_limit
 from phibench.estimator.methods.locate import around, clipped

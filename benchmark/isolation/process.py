@@ -26,8 +26,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import IO, Any
 
-from phibench.benchmark.isolation.answers import AnswerError, checked
-from phibench.benchmark.isolation.dense_answers import checked_planes, most_bytes
+from phibench.benchmark.isolation.answers import AnswerError, checked, checked_planes, most_bytes
 from phibench.benchmark.isolation.isolation import Access, Isolation
 from phibench.benchmark.isolation.method_provenance import MOST_NAMES, OpenedFiles
 from phibench.benchmark.isolation.readable_files import access_of

@@ -30,8 +30,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-from phibench.benchmark.isolation.answers import answer_text, to_bytes
-from phibench.benchmark.isolation.dense_answers import planes_text
+from phibench.benchmark.isolation.answers import answer_text, planes_text, to_bytes
 from phibench.benchmark.isolation.method_provenance import loaded_names
 from phibench.benchmark.isolation.resolve import MethodError, Reference, RunLimits
 from phibench.benchmark.isolation.transport import Connection, ReceivedPair, SharedPages, TransportError, unpack

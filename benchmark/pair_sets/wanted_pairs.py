@@ -12,7 +12,7 @@ from phibench.benchmark.pair_sets.dataset_pairs import TASK_VERSION, DatasetPair
 from phibench.benchmark.pair_sets.frames_set import FramesSet
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.exposures.pair_draws import FrameCounts
-from phibench.datasets.frames.sensor_file import read_sensor_file
+from phibench.datasets.frames.sensor_card import read_sensor_file
 from phibench.datasets.read import Dataset, Sample, open_finished
 from phibench.datasets.store.pair_files import is_frames_set, is_imported
 from phibench.estimator.geometry.rig_parameters import stroke_of

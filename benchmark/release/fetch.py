@@ -29,9 +29,8 @@ from phibench.datasets.common.input_files import FILE_NAME, SETTINGS_BYTES, Inpu
 from phibench.datasets.common.progress import Steps, progress_console
 from phibench.datasets.film.film_store import verify as film_faults
 from phibench.datasets.store import schema
-from phibench.datasets.store.checksums import damaged, differing_files, read_checksums
+from phibench.datasets.store.checksums import damaged, differing_files, read_checksums, writing_to
 from phibench.datasets.store.files import only_run, sha256, write_text
-from phibench.datasets.store.filling import writing_to
 from phibench.datasets.store.leftovers import (
     TEMPORARY_PREFIX,
     OwnedFolder,

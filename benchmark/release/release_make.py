@@ -52,11 +52,10 @@ from phibench.datasets.film.film_store import INFO as FILM_INFO
 from phibench.datasets.make import cost, make
 from phibench.datasets.recipe.load import parse_recipe, recipe_files, with_numbers
 from phibench.datasets.store import schema
-from phibench.datasets.store.checksums import differing_files, read_checksums
+from phibench.datasets.store.checksums import differing_files, filling, read_checksums, signed, write_documents
 from phibench.datasets.store.croissant import LICENSE_TEXT, LICENSE_URL, croissant_text, file_object
 from phibench.datasets.store.documents import read_info
 from phibench.datasets.store.files import sha256, write_atomic, write_text
-from phibench.datasets.store.filling import filling, signed, write_documents
 from phibench.datasets.store.leftovers import folder_for_work
 from phibench.datasets.store.pair_files import FRAMES_SET
 

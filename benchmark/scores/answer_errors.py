@@ -17,8 +17,8 @@ as the best constant answer for the set would (`best_constant`). The ranks also 
 `rank_squares`. No answer counts more than none, so that an error is cut off at what a missed spot costs.
 
 A method that sees both images knows four coordinates of three unknowns. Its bound is smaller than that of the single
-images: `combine.joint_bound`. A smaller error than any method on the images can have shows knowledge from elsewhere,
-such as where the boards of a room stand.
+images: `least_squares_depth.joint_bound`. A smaller error than any method on the images can have shows knowledge from
+elsewhere, such as where the boards of a room stand.
 
 V is the least covariance of a method on the images: the joint bound of `beyond_images.least_px2`. Of every unbiased
 method a squared error is V or more on average. Three numbers are tested by `beyond_images.excesses`:
@@ -44,7 +44,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phibench.datasets.common.errors import DatasetError
-from phibench.estimator.geometry.combine import JointBound, information, joint_bound
+from phibench.estimator.geometry.least_squares_depth import JointBound, information, joint_bound
 from phibench.estimator.geometry.phi import CONVENTIONS, GRADIENTS, estimate_phi, outline_circle
 from phibench.estimator.limits.beyond_images import clipped, least_px2, squares
 from phibench.scenes.frames import Array

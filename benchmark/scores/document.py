@@ -27,9 +27,8 @@ from phibench.benchmark.scores.record_columns import COLUMN_TYPES
 from phibench.benchmark.scores.strata import Stratum, count_pairs, light_shift, measured, strata
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import InputFile, Name
-from phibench.datasets.common.version import program_version
 from phibench.datasets.store.files import sha256, write_bytes, write_text
-from phibench.datasets.store.provenance import code_behind, provenance
+from phibench.datasets.store.provenance import code_behind, program_version, provenance
 from phibench.datasets.store.schema import RECORDS_SO_FAR, Document
 from phibench.estimator.limits.beyond_images import excesses
 from phibench.scenes.validation import printable_line

@@ -25,8 +25,7 @@ from phibench.benchmark.scores.document import BUILT_IN, SCORER, EncodedPicture,
 from phibench.benchmark.scores.score import Scored, run_and_score, score_outcomes
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import InputFile
-from phibench.datasets.common.version import program_version
-from phibench.datasets.store.provenance import code_behind
+from phibench.datasets.store.provenance import code_behind, program_version
 from phibench.estimator.geometry.phi import CONVENTIONS
 from phibench.estimator.interface import FAILURES, Answer, Matrix2, Outcome, Spot
 from phibench.estimator.pair_set import PairSet

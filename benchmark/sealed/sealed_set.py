@@ -5,7 +5,7 @@ pairs.jsonl     per pair what a user knows: rig, stroke, sensor, boxes, files
 frames/         images: PNG of 8 or 16 bits, or the camera's JPEG
 SHA256SUMS      of everything above
 
-The truth stays with the organiser (`truth_file`), and its hash in the seal proves later which it was.
+The truth stays with the organiser (`frames_set`), and its hash in the seal proves later which it was.
 
 Public strokes and rigs confirm a guessed root seed without a judge, 0.7 us a seed and core. So the system draws 128
 bits into a file that nobody else may read: no named stream gives them, no person thinks of them, and no command line
@@ -29,7 +29,7 @@ from pydantic import Field
 from rich.console import Console
 
 from phibench.benchmark.pair_sets.dataset_pairs import TASK_VERSION, DatasetPairs, dataset_pairs
-from phibench.benchmark.pair_sets.truth_file import Digest, truth_text
+from phibench.benchmark.pair_sets.frames_set import Digest, truth_text
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import SETTINGS_BYTES, InputFile, Name
 from phibench.datasets.common.progress import Steps, progress_console
@@ -38,9 +38,8 @@ from phibench.datasets.frames.source import Frames
 from phibench.datasets.read import open_finished
 from phibench.datasets.recipe.load import RECIPES, load_recipe
 from phibench.datasets.recipe.tables import Recipe
-from phibench.datasets.store.checksums import checksums_text, read_checksums
+from phibench.datasets.store.checksums import checksums_text, read_checksums, writing_to
 from phibench.datasets.store.files import sha256, write_bytes, write_secret, write_text
-from phibench.datasets.store.filling import writing_to
 from phibench.datasets.store.leftovers import OwnedFolder, folder_for_work
 from phibench.datasets.store.pair_files import (
     FRAMES,

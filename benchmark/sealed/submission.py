@@ -21,8 +21,7 @@ from pydantic import Field
 from phibench.benchmark.isolation.answers import AnswerError, checked
 from phibench.benchmark.isolation.resolve import Reference, RunLimits, resolve
 from phibench.benchmark.isolation.runner import Harness, Ran
-from phibench.benchmark.pair_sets.frames_set import pair_of_files
-from phibench.benchmark.pair_sets.truth_file import read_truth_file
+from phibench.benchmark.pair_sets.frames_set import pair_of_files, read_truth_file
 from phibench.benchmark.scores.document import Declared, MethodCard
 from phibench.benchmark.sealed.sealed_set import SEAL, Seal, read_seal
 from phibench.datasets.common.errors import DatasetError

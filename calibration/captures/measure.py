@@ -54,8 +54,7 @@ from phibench.calibration.rig.bundle import calibrate
 from phibench.calibration.rig.file import Calibration, read_calibration
 from phibench.calibration.rig.spots import method_for
 from phibench.datasets.common.errors import DatasetError
-from phibench.datasets.frames.sensor_card import SensorCard
-from phibench.datasets.frames.sensor_file import SensorFile, read_sensor_file
+from phibench.datasets.frames.sensor_card import SensorCard, SensorFile, read_sensor_file
 from phibench.estimator.geometry.least_squares_depth import GeneralDepth, depth_general
 from phibench.estimator.geometry.rig_parameters import PARAMETERS, prior_sigmas, stroke_of
 from phibench.estimator.geometry.status import Status, describe

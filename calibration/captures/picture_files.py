@@ -17,12 +17,11 @@ from numpy.typing import NDArray
 
 from phibench.datasets.common.camera_pictures import IN_WORDS, Kind, Subsampling, read_camera_picture
 from phibench.datasets.common.input_files import InputFile
-from phibench.datasets.frames.sensor_card import SensorCard, card_of, sensor_card
-from phibench.datasets.frames.sensor_file import SensorFile
+from phibench.datasets.frames.sensor_card import SensorCard, SensorFile, card_of, sensor_card
 from phibench.datasets.rooms.panorama_files import is_linear, read_light
 from phibench.estimator.interface import Image
+from phibench.estimator.spots.camera_codes import quantisation
 from phibench.estimator.spots.image_planes import ImageError, linear_planes
-from phibench.estimator.spots.jpeg_coefficients import quantisation
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import Rig
 

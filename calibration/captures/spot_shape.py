@@ -30,9 +30,8 @@ from phibench.estimator.methods.chain_fit import spot_outputs
 from phibench.estimator.methods.locate import pair_blur, seen_depth_m
 from phibench.estimator.methods.raw_likelihood import raw_spot_data
 from phibench.estimator.processed.quasi_score import CoefficientWindow, fit_window
-from phibench.estimator.spots.fisher import limited
 from phibench.estimator.spots.fit_raw import SpotData, fit_law
-from phibench.estimator.spots.gaussian_spot import SpotModel, SpotPixels
+from phibench.estimator.spots.gaussian_spot import SpotModel, SpotPixels, limited
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import POSITIONS, Rig
 

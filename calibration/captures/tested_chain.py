@@ -29,11 +29,10 @@ from phibench.estimator.interface import Image, Pair
 from phibench.estimator.methods.chain_fit import spot_outputs
 from phibench.estimator.processed.chain_model import UNIT_MATRIX
 from phibench.estimator.processed.quasi_score import CoefficientWindow, fit_window
-from phibench.estimator.spots.camera_codes import light_of, tone_of
+from phibench.estimator.spots.camera_codes import light_of, quantisation, tone_of
 from phibench.estimator.spots.detect import detect
 from phibench.estimator.spots.fit_raw import SpotData
 from phibench.estimator.spots.image_planes import ImageError, through_jpeg
-from phibench.estimator.spots.jpeg_coefficients import quantisation
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import POSITIONS
 

@@ -3,7 +3,7 @@
 The ball is a sphere of a stated radius before a pinhole camera. Its outline in the photograph gives its direction and,
 with the focal length, its distance; or the focal length, with the distance. A direction of the panorama stands for the
 point at a stated distance from the ball's centre. Ball and camera are symmetric about the line through their centres:
-so one table of angles, from the closed form of `mirror_image`, serves all directions.
+so one table of angles, from the closed form of `reflection.image_of`, serves all directions.
 
 The panorama's middle column looks from the ball back along the camera's axis, its upper edge upwards. Directions behind
 the ball, and those that only the outermost rim shows, take the nearest direction that is seen.
@@ -22,13 +22,13 @@ from PIL import Image, ImageDraw
 
 from phibench.calibration.outline.ball_circle import LONGEST_PX, BallCircle, find_circle, shrunk
 from phibench.calibration.outline.edge_ring import Circle
-from phibench.calibration.outline.outline_start import sphere_from_circle, sphere_from_rays
+from phibench.calibration.outline.outline_fit import sphere_from_circle, sphere_from_rays
 from phibench.datasets.common.errors import DatasetError
-from phibench.datasets.rooms.panorama_settings import PanoramaSettings
+from phibench.datasets.rooms.panorama_room import PanoramaSettings
 from phibench.datasets.store.layers import write_exr
 from phibench.datasets.store.pictures import save_png
-from phibench.estimator.geometry.mirror_image import image_of
 from phibench.estimator.geometry.panorama import PanoramaGrid, unrolled
+from phibench.estimator.geometry.reflection import image_of
 from phibench.estimator.spots.camera_codes import linear_to_srgb
 from phibench.estimator.spots.image_planes import ImageError
 from phibench.scenes.camera import Camera

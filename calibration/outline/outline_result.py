@@ -14,9 +14,8 @@ from phibench.calibration.outline.edge_ring import TURNS
 from phibench.calibration.outline.limb_image import JPEG_LUMA, Plane, PoseMeasurement
 from phibench.calibration.outline.outline_fit import OutlinePixels, Step
 from phibench.datasets.frames.sensor_card import SensorCard
-from phibench.estimator.spots.camera_codes import light_of, tone_of
+from phibench.estimator.spots.camera_codes import light_of, mcu_px, tone_of
 from phibench.estimator.spots.image_planes import ImageError, full_scale_e, through_jpeg
-from phibench.estimator.spots.jpeg_coefficients import mcu_px
 from phibench.scenes.camera import Camera
 from phibench.scenes.frames import Array, BoolArray, as_vector
 from phibench.scenes.random_streams import generator

@@ -26,7 +26,15 @@ from phibench.calibration.outline.contour import Contour, contour_of, place_of_o
 from phibench.calibration.outline.edge_ring import CURVES, TURN_RAD, TURNS
 from phibench.calibration.outline.limb_image import STEP_PX, Plane, blurred, distances_px, line_spread
 from phibench.calibration.outline.limb_sectors import Sectors
-from phibench.calibration.outline.outline_fit import OutlinePixels, Place, Step, pixels_near, solution_of
+from phibench.calibration.outline.outline_fit import (
+    OutlinePixels,
+    Place,
+    Step,
+    circles_by_size,
+    grey,
+    pixels_near,
+    solution_of,
+)
 from phibench.calibration.outline.outline_result import (
     MIN_ARC,
     SECTORS,
@@ -36,7 +44,6 @@ from phibench.calibration.outline.outline_result import (
     edge_shifts_px,
     shared_px2,
 )
-from phibench.calibration.outline.outline_start import circles_by_size, grey
 from phibench.estimator.spots.image_planes import ImageError
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import Rig

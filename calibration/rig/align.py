@@ -24,8 +24,8 @@ from phibench.calibration.outline.contour import aside_by_tilt_m
 from phibench.calibration.outline.edge_ring import Circle
 from phibench.calibration.outline.limb_image import planes_of
 from phibench.calibration.outline.outline import find_outline
+from phibench.calibration.outline.outline_fit import grey, rig_circle
 from phibench.calibration.outline.outline_result import Outline
-from phibench.calibration.outline.outline_start import grey, rig_circle
 from phibench.calibration.rig.edge_meeting import (
     CameraTilt,
     EdgeMeeting,

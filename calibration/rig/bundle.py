@@ -30,11 +30,10 @@ from scipy import optimize
 
 from phibench.calibration.outline.contour import place_of_outline, tilts_of_ellipse
 from phibench.calibration.outline.limb_image import PoseMeasurement
-from phibench.calibration.outline.outline_start import sphere_from_rays
+from phibench.calibration.outline.outline_fit import sphere_from_rays
 from phibench.calibration.rig.vertical_edges import vertical_of
 from phibench.datasets.common.errors import DatasetError
-from phibench.estimator.geometry.mirror_image import image_of
-from phibench.estimator.geometry.reflection import reflect, reflect_jacobian
+from phibench.estimator.geometry.reflection import image_of, reflect, reflect_jacobian
 from phibench.estimator.geometry.rig_parameters import PARAMETERS, changed, has_effect, prior_sigmas, stroke_of
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.scenes.frames import Array, as_vector

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter
 
-from phibench.estimator.spots.jpeg_coefficients import YCC_FROM_RGB
+from phibench.estimator.spots.camera_codes import YCC_FROM_RGB
 from phibench.scenes.frames import Array
 
 Lags = tuple[tuple[int, int], ...]

@@ -27,9 +27,8 @@ from numpy.typing import NDArray
 from phibench.calibration.sensor_fit.noise_levels import BOX_PX, NoiseLevel, PlaneNoise
 from phibench.calibration.sensor_fit.tone_curve import decoded_by
 from phibench.datasets.frames.sensor_card import SensorCard
-from phibench.estimator.spots.camera_codes import noisy_code
+from phibench.estimator.spots.camera_codes import RGB_FROM_YCC, YCC_FROM_RGB, noisy_code
 from phibench.estimator.spots.image_planes import demosaiced
-from phibench.estimator.spots.jpeg_coefficients import RGB_FROM_YCC, YCC_FROM_RGB
 from phibench.scenes.frames import Array
 
 _SIDE = 16  # of the torus: answers reach 4 pixels, lags 3

@@ -19,17 +19,15 @@ from typing import Literal
 
 import numpy as np
 
-from phibench.datasets.build.bake_task import bake_settings
-from phibench.datasets.build.light_map_cache import is_cached
+from phibench.datasets.build.bake_task import bake_settings, is_cached
 from phibench.datasets.build.tasks import BuildTask, Done, Executor, Outcome
 from phibench.datasets.plan.plan import PairPlan, Plan
-from phibench.render.optics.faces import face_table
+from phibench.render.optics.faces import TexelGrid, face_table
 from phibench.render.optics.room_tracer import room_geometry
 from phibench.render.optics.truth import EDGE, NO_REFLECTION, SpotTruth, depth_m, spot_truth
 from phibench.render.room.bounced_light import BOUNCE_TEXEL_M, rays_by_area
 from phibench.render.room.lamp_light import FIRST_RAYS
 from phibench.render.room.light_map import fixed_shapes, texel_count
-from phibench.render.room.texel_grid import TexelGrid
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import POSITIONS, Rig
 from phibench.scenes.room import Room

@@ -16,18 +16,17 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
-from phibench.datasets.build.bake_task import bake_settings
-from phibench.datasets.build.light_map_cache import light_map
+from phibench.datasets.build.bake_task import bake_settings, light_map
 from phibench.datasets.build.parts import schedule
 from phibench.datasets.build.run_tasks import missing_room_files
 from phibench.datasets.build.tasks import BuildTask, Failed, Made
 from phibench.datasets.build.workers import WorkerPool
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.progress import Steps
-from phibench.datasets.plan.room_draws import BOX, room_files
+from phibench.datasets.plan.draws import BOX, room_files
 from phibench.datasets.recipe.tables import AmbientTable, Recipe
 from phibench.datasets.rooms.gltf_export import glb_of
-from phibench.datasets.rooms.panorama_settings import PanoramaSettings
+from phibench.datasets.rooms.panorama_room import PanoramaSettings
 from phibench.datasets.rooms.room_files import RoomError, RoomFiles
 from phibench.datasets.rooms.room_sources import EXPORTED, NamedRoom, UnexportedRoom
 from phibench.datasets.store import schema
@@ -36,9 +35,8 @@ from phibench.datasets.store.files import require_writable, sha256, write_bytes
 from phibench.datasets.store.layers import write_exr
 from phibench.render.optics.faces import face_table
 from phibench.render.room.light_map import BakeSettings
-from phibench.scenes.catalog import default_rig
 from phibench.scenes.frames import Vector
-from phibench.scenes.room import Room
+from phibench.scenes.room import Room, default_rig
 from phibench.scenes.validation import finite_vector, printable_line, within
 from phibench.scenes.worlds.generated_room import generate_room
 from phibench.scenes.worlds.properties import PROPERTIES, drawn_properties

@@ -38,9 +38,8 @@ from phibench.datasets.frames.request import FrameOptions, FrameRequest, whole_n
 from phibench.datasets.frames.source import Frame, FrameSource, has_place
 from phibench.datasets.read import Dataset, Sample, open_dataset, open_finished
 from phibench.datasets.store import schema
-from phibench.datasets.store.checksums import read_checksums
+from phibench.datasets.store.checksums import filling, read_checksums, require_files
 from phibench.datasets.store.files import sha256, working
-from phibench.datasets.store.filling import filling, require_files
 from phibench.datasets.store.provenance import code_behind
 from phibench.datasets.store.schema import ManifestRow, row_line
 from phibench.scenes.rig import POSITIONS

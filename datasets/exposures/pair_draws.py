@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.frames.distractors import Distractor, present
 from phibench.datasets.frames.request import FrameOptions, FrameRequest, sample_stream, whole_number
-from phibench.datasets.frames.sensor_file import SensorFile
+from phibench.datasets.frames.sensor_card import SensorFile
 from phibench.datasets.frames.source import FrameSource, has_place
 from phibench.datasets.read import Dataset, Sample
 from phibench.datasets.recipe.tables import FramesTable

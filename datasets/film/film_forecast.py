@@ -13,9 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from phibench.datasets.build.bake_task import bake_settings
+from phibench.datasets.build.bake_task import bake_settings, is_cached
 from phibench.datasets.build.forecast import START_S, duration, light_map_s, megabytes, slowdown
-from phibench.datasets.build.light_map_cache import is_cached
 from phibench.datasets.film.film_make import unfinished_films
 from phibench.datasets.film.film_plan import FilmPlan, check_drives, film_plans
 from phibench.datasets.film.film_room import light_views

@@ -34,8 +34,8 @@ from phibench.datasets.film.film_store import (
 from phibench.datasets.film.film_task import make_film
 from phibench.datasets.plan.plan import Plan
 from phibench.datasets.recipe.load import find_recipe, parse_recipe, recipe_files, recipe_text
+from phibench.datasets.store.checksums import filling, signed, write_documents
 from phibench.datasets.store.croissant import films_croissant
-from phibench.datasets.store.filling import filling, signed, write_documents
 from phibench.datasets.store.provenance import code_behind, code_sha256
 from phibench.datasets.store.schema import CROISSANT, TruthFolder
 

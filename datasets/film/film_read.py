@@ -52,8 +52,8 @@ from phibench.render.film.moving_rows import RowsImage
 from phibench.render.optics.room_tracer import room_geometry
 from phibench.render.optics.truth import truth_layer
 from phibench.render.sensor.camera_chain import Chain
+from phibench.render.sensor.electrons import NoiseStream
 from phibench.render.sensor.light import Light, OtherSpot, Region
-from phibench.render.sensor.noise_tiles import NoiseStream
 from phibench.render.sensor.processing import decoded
 from phibench.render.sensor.settings import Sensor, sensor
 from phibench.scenes.frames import Array

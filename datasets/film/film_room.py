@@ -81,7 +81,7 @@ def _light_maps(rig: Rig, film: FilmPlan, room: Room, settings: BakeSettings) ->
     Where the robot drives, its ends move by a quarter of a metre at most from one to the next: its soft shadow on the
     floor is some decimetres wide.
     """
-    from phibench.datasets.build.light_map_cache import light_map
+    from phibench.datasets.build.bake_task import light_map
 
     return [(places, [light_map(view, room, settings) for view in views]) for places, views in light_views(rig, film)]
 

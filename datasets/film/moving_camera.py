@@ -24,18 +24,18 @@ from phibench.datasets.common.input_files import FileName, InputFile
 from phibench.datasets.common.progress import progress_console
 from phibench.datasets.frames.request import in_one_sentence
 from phibench.datasets.rooms.room_sources import GeneratedRoom
+from phibench.datasets.store.checksums import filling
 from phibench.datasets.store.documents import from_json, to_json
 from phibench.datasets.store.files import write_bytes, write_text
-from phibench.datasets.store.filling import filling
 from phibench.datasets.store.provenance import code_behind, provenance
 from phibench.datasets.store.schema import Document, TruthFolder, described
 from phibench.render.film.room_image import LitRoom, Placement, quick_spot, room_image
+from phibench.render.optics.faces import TexelGrid
 from phibench.render.optics.room_tracer import blocked_by, own_geometry
 from phibench.render.room.light_map import ARRAYS, BakeSettings, encoded
-from phibench.render.room.texel_grid import TexelGrid
 from phibench.render.sensor.camera_chain import Chain
+from phibench.render.sensor.electrons import NoiseStream
 from phibench.render.sensor.light import Light, OtherSpot, Region
-from phibench.render.sensor.noise_tiles import NoiseStream
 from phibench.render.sensor.settings import Sensor, sensor
 from phibench.scenes.frames import Array
 from phibench.scenes.laser import LaserSpot
@@ -139,7 +139,7 @@ def bake_drawn_room(
     out: Path, settings: BakeSettings, stream: tuple[Name, ...], number: int, fits: Callable[[Room], bool] | None
 ) -> Made:
     """Task: write the light map of a drawn room below `out`; the result is its `BakedRoomInfo`."""
-    from phibench.datasets.build.light_map_cache import light_map
+    from phibench.datasets.build.bake_task import light_map
     from phibench.datasets.build.view_task import start_renderer
 
     try:

@@ -25,12 +25,11 @@ from phibench.render.optics.room_tracer import room_geometry
 from phibench.render.optics.spot_layer import SpotLayer, spot_layer
 from phibench.render.optics.truth import SpotTruth, spot_truth
 from phibench.render.sensor.light import OtherSpot
-from phibench.scenes.catalog import BOARD_SIZE_M
 from phibench.scenes.frames import Vector
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.random_streams import Name, generator
 from phibench.scenes.rig import POSITIONS, View
-from phibench.scenes.room import Room
+from phibench.scenes.room import BOARD_SIZE_M, Room
 
 MIN_APART_PX = 12.0
 """Nearer than this a distractor would lie in the spot's window, and the spot's own place would be in doubt."""

@@ -22,10 +22,9 @@ from phibench.datasets.frames.request import FrameRequest, in_one_sentence, whol
 from phibench.datasets.store.layers import SpotWindow
 from phibench.datasets.store.schema import ManifestRow, SpotRow
 from phibench.render.sensor.camera_chain import Chain, auto_exposed
-from phibench.render.sensor.light import Light, Region
-from phibench.render.sensor.noise_tiles import frame_stream
+from phibench.render.sensor.electrons import frame_stream
+from phibench.render.sensor.light import Light, Region, moved_spot, spot_velocity_px_per_s
 from phibench.render.sensor.processing import decoded
-from phibench.render.sensor.rolling_shutter import moved_spot, spot_velocity_px_per_s
 from phibench.render.sensor.settings import Sensor
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.rig import POSITIONS, Rig, View

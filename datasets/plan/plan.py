@@ -12,9 +12,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from phibench.datasets.common.errors import DatasetError, RecipeError
-from phibench.datasets.plan.kept_samples import Kept, rebuilt
-from phibench.datasets.plan.rig_draws import draw_rigs
-from phibench.datasets.plan.room_draws import draw_rooms, room_files
+from phibench.datasets.plan.draws import Kept, draw_rigs, draw_rooms, rebuilt, room_files
 from phibench.datasets.plan.sampling import RandomSample, draw_samples, have_own_rigs
 from phibench.datasets.recipe.build import build_misalignment, build_rig, build_spot, true_stroke_m
 from phibench.datasets.recipe.tables import DrawnRigsTable, RandomTable, Recipe

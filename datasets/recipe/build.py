@@ -22,7 +22,6 @@ from phibench.datasets.recipe.tables import (
 from phibench.datasets.rooms.room_sources import NamedRoom, room_of
 from phibench.render.optics.faces import face_table
 from phibench.scenes.camera import Camera
-from phibench.scenes.catalog import BOARD_ALBEDO, RIGS, TargetBoard
 from phibench.scenes.frames import Array, Pose, Vector, as_matrix, as_vector, rotation_xyz
 from phibench.scenes.holder import LENGTHS, Holder, fitted
 from phibench.scenes.laser import LaserSpot
@@ -31,7 +30,7 @@ from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.revolved_mirror import RevolvedMirror
 from phibench.scenes.revolved_profile import Profile, cone
 from phibench.scenes.rig import Rig
-from phibench.scenes.room import Room
+from phibench.scenes.room import BOARD_ALBEDO, RIGS, Room, TargetBoard
 from phibench.scenes.validation import Fault, SceneError
 
 CAMERA_KEYS = (

@@ -46,10 +46,9 @@ from phibench.datasets.recipe.tables import (
 )
 from phibench.render.room.subpixel_grid import FilmGrid
 from phibench.render.sensor.settings import SensorError, sensor
-from phibench.scenes.catalog import BOARD_SIZE_M, board
 from phibench.scenes.mirror import OF_REVOLVED
 from phibench.scenes.rig import Rig
-from phibench.scenes.room import Room, chassis
+from phibench.scenes.room import BOARD_SIZE_M, Room, board, chassis
 from phibench.scenes.validation import Fault, SceneError, close_names, nearest
 
 _ON_BOARD, _BY_RAY = ("target", "across_m", "up_m"), ("azimuth_deg", "height_m")

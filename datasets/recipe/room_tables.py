@@ -12,7 +12,7 @@ from pydantic import AfterValidator, Field, create_model
 from phibench.datasets.common.input_files import FILE_NAME, NAME_LENGTH
 from phibench.datasets.recipe.distributions import Distribution, Name, Table, names_of, values_of
 from phibench.datasets.rooms.mesh_placement import MeshLamp, MeshSettings
-from phibench.datasets.rooms.panorama_settings import PanoramaSettings
+from phibench.datasets.rooms.panorama_room import PanoramaSettings
 from phibench.scenes.validation import SHA256, SceneError
 from phibench.scenes.worlds.properties import PROPERTIES, Property
 

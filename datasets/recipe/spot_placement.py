@@ -14,16 +14,14 @@ import numpy as np
 
 from phibench.datasets.recipe.build import build_spot, grown_diameter_m, make_spot
 from phibench.datasets.recipe.tables import OWN_ALBEDO, LaserTable, TargetTable
-from phibench.render.optics.beam_deposit import BEAM_REACH_M
 from phibench.render.optics.faces import FaceTable
-from phibench.render.optics.room_tracer import RoomGeometry, RoomHits, own_geometry, room_geometry
+from phibench.render.optics.room_tracer import BEAM_REACH_M, RoomGeometry, RoomHits, own_geometry, room_geometry
 from phibench.render.optics.spot_layer import spot_layer
 from phibench.render.optics.truth import VISIBLE, spot_truth
-from phibench.scenes.catalog import BOARD_SIZE_M, TargetBoard, board
 from phibench.scenes.frames import Array, as_vector
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.rig import POSITIONS, Rig, Stroke, View
-from phibench.scenes.room import Room, carriage
+from phibench.scenes.room import BOARD_SIZE_M, Room, TargetBoard, board, carriage
 from phibench.scenes.shapes import Cuboid
 
 _HOUSING_REACH_M = 0.1  # housing and mast stay within this of the lens

@@ -33,11 +33,11 @@ from phibench.datasets.recipe.mirror_tables import (
     Unit,
 )
 from phibench.datasets.recipe.room_tables import RoomsTable, RoomTable
-from phibench.scenes.catalog import BOARD_SIZE_M
 from phibench.scenes.metals import MetalName
 from phibench.scenes.mirror import OF_REVOLVED
 from phibench.scenes.misalignment import PARAMETERS
 from phibench.scenes.random_streams import LARGEST_SEED
+from phibench.scenes.room import BOARD_SIZE_M
 
 MIN_STROKE_M, MAX_STROKE_M = 1e-3, 10.0  # below a millimetre there is no parallax to measure
 DatasetName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$", max_length=64)]

@@ -26,6 +26,7 @@ from phibench.datasets.rooms.gltf_file import gltf_parts
 from phibench.datasets.rooms.mesh_parts import (
     REMEDY,
     Companions,
+    CuttingError,
     MeshPart,
     check_count,
     check_part,
@@ -35,7 +36,6 @@ from phibench.datasets.rooms.mesh_parts import (
 )
 from phibench.datasets.rooms.obj_file import obj_parts
 from phibench.datasets.rooms.ply_file import ply_parts
-from phibench.datasets.rooms.polygons import CuttingError
 from phibench.datasets.rooms.room_files import RoomError
 from phibench.scenes.frames import Array, Vector
 from phibench.scenes.room import chassis

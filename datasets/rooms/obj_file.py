@@ -19,6 +19,7 @@ from phibench.datasets.rooms.mesh_parts import (
     MOST_TRIANGLES,
     WHITE,
     Companions,
+    Cutting,
     MeshPart,
     Paint,
     check_count,
@@ -26,8 +27,8 @@ from phibench.datasets.rooms.mesh_parts import (
     damaged,
     leaves_picture,
     three_numbers,
+    triangulated,
 )
-from phibench.datasets.rooms.polygons import Cutting, triangulated
 from phibench.render.sensor.srgb import srgb_decoded
 from phibench.scenes.frames import Array, Vector, as_vector
 from phibench.scenes.validation import printable_line

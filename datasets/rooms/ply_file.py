@@ -21,12 +21,13 @@ from phibench.datasets.common.input_files import InputFile
 from phibench.datasets.rooms.mesh_parts import (
     MOST_TRIANGLES,
     Companions,
+    Cutting,
     MeshPart,
     Paint,
     check_count,
     damaged,
+    triangulated,
 )
-from phibench.datasets.rooms.polygons import Cutting, triangulated
 from phibench.render.sensor.srgb import srgb_decoded
 from phibench.scenes.frames import Array
 from phibench.scenes.validation import printable_line

@@ -16,10 +16,9 @@ from typing import Literal, cast, get_args
 
 from phibench.datasets.common.input_files import FILE_NAME
 from phibench.datasets.rooms.mesh_placement import MeshSettings
-from phibench.datasets.rooms.panorama_settings import PanoramaSettings
+from phibench.datasets.rooms.panorama_room import PanoramaSettings
 from phibench.datasets.rooms.room_files import RoomError, checked_file
-from phibench.scenes.catalog import ROOMS, TargetBoard
-from phibench.scenes.room import Room
+from phibench.scenes.room import ROOMS, Room, TargetBoard
 from phibench.scenes.validation import SceneError, nearest, printable_line
 from phibench.scenes.worlds.properties import RoomProperties
 

@@ -19,8 +19,15 @@ from numpy.typing import NDArray
 
 from phibench.estimator.dense.dense_interface import DenseAnswer, DensePair
 from phibench.estimator.dense.panorama_matchers import opencv
-from phibench.estimator.dense.smooth_maps import PanoramaMaps
-from phibench.estimator.dense.unrolled_pair import FARTHEST_M, NEAREST_M, WIDTH_PX, Float32, UnrolledPair, at_places
+from phibench.estimator.dense.unrolled_pair import (
+    FARTHEST_M,
+    NEAREST_M,
+    WIDTH_PX,
+    Float32,
+    PanoramaMaps,
+    UnrolledPair,
+    at_places,
+)
 from phibench.estimator.geometry.reflection import room_rays
 from phibench.scenes.frames import Array, BoolArray
 

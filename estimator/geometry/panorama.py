@@ -24,8 +24,7 @@ from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.read import Sample
 from phibench.datasets.store.pictures import display_exposure_s, to_srgb
 from phibench.estimator.geometry.mirror_geometry import geometry_of
-from phibench.estimator.geometry.mirror_image import image_of
-from phibench.estimator.geometry.reflection import reflect
+from phibench.estimator.geometry.reflection import image_of, reflect
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import POSITIONS, View
 from phibench.scenes.room import Room

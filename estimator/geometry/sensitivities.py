@@ -15,10 +15,9 @@ from functools import partial
 import numpy as np
 
 from phibench.estimator.geometry.mirror_geometry import geometry_of
-from phibench.estimator.geometry.mirror_image import image_of
 from phibench.estimator.geometry.paper_depth import paper_gradient
 from phibench.estimator.geometry.phi import CONVENTIONS, GRADIENTS
-from phibench.estimator.geometry.reflection import ray_basis, ray_slope, reflect
+from phibench.estimator.geometry.reflection import image_of, ray_basis, ray_slope, reflect
 from phibench.estimator.geometry.triangulate import ESTIMATORS, exact_gradient
 from phibench.scenes.camera import Camera
 from phibench.scenes.frames import Array

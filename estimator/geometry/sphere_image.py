@@ -1,6 +1,6 @@
 """Image of one point in a perfect sphere, and its light, in plain floats: for loops of thousands of steps a second.
 
-`mirror_image.image_of` holds for every mirror and for arrays, and takes milliseconds a call. Here camera, sphere centre
+`reflection.image_of` holds for every mirror and for arrays, and takes milliseconds a call. Here camera, sphere centre
 and point span a plane; the reflection point is one angle in it. With S the centre, e the unit vector from S to the
 lens, l their distance, and the point at w beside and y along e, the mirror point at the angle p has
 

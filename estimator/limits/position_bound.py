@@ -43,7 +43,7 @@ from phibench.estimator.geometry.phi import PhiEstimate, estimate_phi
 from phibench.estimator.geometry.rig_parameters import rig_gradient
 from phibench.estimator.geometry.status import StatusArray
 from phibench.estimator.geometry.triangulate import depth_exact
-from phibench.estimator.spots.fisher import covariance_bound, fisher_matrix
+from phibench.estimator.spots.gaussian_spot import covariance_bound, fisher_matrix
 from phibench.estimator.spots.raw_pixels import PixelNoise, noise_of
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import Rig, View

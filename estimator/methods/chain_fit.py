@@ -25,7 +25,6 @@ from phibench.estimator.methods.locate import (
     seen_depth_m,
     trusted_hints,
 )
-from phibench.estimator.processed.chroma_loss import regained
 from phibench.estimator.processed.fit_chain import (
     code_data,
     first_fit,
@@ -37,12 +36,13 @@ from phibench.estimator.processed.fit_chain import (
     undone_mean,
     unrounded,
 )
+from phibench.estimator.processed.neighbour_filters import regained
 from phibench.estimator.processed.quasi_score import CoefficientWindow
+from phibench.estimator.spots.camera_codes import mcu_px
 from phibench.estimator.spots.detect import Detection
 from phibench.estimator.spots.fit_raw import MISFIT_SIGMAS, SpotData, SpotFit
 from phibench.estimator.spots.gaussian_spot import SpotBlur, SpotModel
 from phibench.estimator.spots.image_planes import PROCESSED
-from phibench.estimator.spots.jpeg_coefficients import mcu_px
 from phibench.estimator.spots.raw_pixels import Background, PatternNoise, around, background_of
 from phibench.scenes.frames import Array
 

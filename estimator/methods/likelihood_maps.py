@@ -17,8 +17,8 @@ import scipy
 from phibench.estimator.geometry.joint_posterior import MISFIT_RANGE, LikelihoodMap, single_posterior
 from phibench.estimator.processed.interval_fit import interval_posterior
 from phibench.estimator.processed.quasi_score import CoefficientWindow, fit_window
-from phibench.estimator.spots.fisher import covariance_bound, scoring_step
 from phibench.estimator.spots.fit_raw import SpotData, polished
+from phibench.estimator.spots.gaussian_spot import covariance_bound, scoring_step
 from phibench.scenes.frames import Array
 
 FAINT_PX = 0.05

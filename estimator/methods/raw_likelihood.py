@@ -10,8 +10,8 @@ per filter, or, where that does not describe it, what surrounds the spot. A misf
 then gives means, covariances and a 95 % interval of the posterior of both images (`joint_posterior`), which knows of
 valleys and of several minima; D is the posterior's mean. Of raw pixels with laser-off frames the likelihood is that of
 on - off, with the noise of both and the pattern of the spot alone. Where the maps do not hold the posterior, raw pixels
-are fitted together (`spots.fit_joint`) and the positions of processed ones combined by their covariances (`combine`).
-Where the two are not one point, the separate answer stands, without a depth of its own.
+are fitted together (`spots.fit_joint`) and the positions of processed ones combined by their covariances
+(`least_squares_depth`). Where the two are not one point, the separate answer stands, without a depth of its own.
 
 Several frames: means are fitted. Photons, read noise and rounding fall with their number; what frames share does not.
 """
@@ -25,8 +25,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from phibench.datasets.frames.sensor_card import SensorCard
-from phibench.estimator.geometry.combine import CombinedEstimate, combine
 from phibench.estimator.geometry.joint_posterior import JointPosterior, joint_posterior, single_posterior
+from phibench.estimator.geometry.least_squares_depth import CombinedEstimate, combine
 from phibench.estimator.geometry.status import Status, describe
 from phibench.estimator.interface import Answer, Image, Matrix2, Pair, Spot
 from phibench.estimator.methods.chain_fit import chain_fit, spot_likelihood

@@ -25,17 +25,18 @@ from scipy import sparse
 
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.estimator.processed.neighbour_filters import EdgeSparing, denoise_margin_px, edge_sparing, neighbours
-from phibench.estimator.spots.camera_codes import noisy_code, ycbcr_transform
-from phibench.estimator.spots.image_planes import full_scale_e
-from phibench.estimator.spots.jpeg_coefficients import (
+from phibench.estimator.spots.camera_codes import (
     CHROMA_STEP,
     YCC_FROM_RGB,
     coefficients,
     mcu_px,
+    noisy_code,
     qtables_of,
     steps,
     transform,
+    ycbcr_transform,
 )
+from phibench.estimator.spots.image_planes import full_scale_e
 from phibench.estimator.spots.pixel_statistics import BESIDE_CURVE, COUNTS, MeanCodes, mean_codes
 from phibench.estimator.spots.raw_pixels import PixelNoise, bayer_filters
 from phibench.scenes.frames import Array

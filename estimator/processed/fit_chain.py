@@ -18,12 +18,10 @@ from phibench.estimator.geometry.status import Status, flag, keep
 from phibench.estimator.processed.chain_model import UNIT_MATRIX, ChainModel, chain_model, window_px
 from phibench.estimator.processed.fit_jpeg import JpegRegion, fit_region, grid_px, region_window
 from phibench.estimator.processed.quasi_score import CoefficientWindow, WindowFit
-from phibench.estimator.spots.camera_codes import light_of, rgb_codes, tone_slope
-from phibench.estimator.spots.fisher import covariance_bound
+from phibench.estimator.spots.camera_codes import RGB_FROM_YCC, light_of, mcu_px, rgb_codes, tone_slope
 from phibench.estimator.spots.fit_raw import LEAST_SNR, SpotData, SpotFit, fit_law, spot_data
-from phibench.estimator.spots.gaussian_spot import SpotBlur, SpotModel
+from phibench.estimator.spots.gaussian_spot import SpotBlur, SpotModel, covariance_bound
 from phibench.estimator.spots.image_planes import full_scale_e
-from phibench.estimator.spots.jpeg_coefficients import RGB_FROM_YCC, mcu_px
 from phibench.estimator.spots.pixel_statistics import code_law, code_table
 from phibench.estimator.spots.raw_pixels import (
     Background,

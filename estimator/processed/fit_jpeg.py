@@ -20,12 +20,10 @@ from phibench.estimator.processed.chain_model import (
     raw_variance_e2,
     window_px,
 )
-from phibench.estimator.processed.interval_fit import fit_intervals
-from phibench.estimator.processed.interval_moments import QuantiserSteps
+from phibench.estimator.processed.interval_fit import QuantiserSteps, fit_intervals
 from phibench.estimator.processed.quasi_score import CoefficientWindow, WindowFit, fit_window
-from phibench.estimator.spots.camera_codes import ycbcr_codes
+from phibench.estimator.spots.camera_codes import hidden_share, mcu_px, qtables_of, room_variance, ycbcr_codes
 from phibench.estimator.spots.gaussian_spot import SpotBlur, SpotModel, SpotPixels
-from phibench.estimator.spots.jpeg_coefficients import hidden_share, mcu_px, qtables_of, room_variance
 from phibench.estimator.spots.jpeg_recovery import recovered
 from phibench.scenes.frames import Array
 

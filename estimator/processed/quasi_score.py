@@ -28,9 +28,8 @@ from phibench.estimator.processed.chain_model import (
     noise_factor,
     raw_variance_e2,
 )
-from phibench.estimator.spots.fisher import limited, scoring_step
-from phibench.estimator.spots.gaussian_spot import SpotPixels
-from phibench.estimator.spots.jpeg_coefficients import quantised, step_correlation
+from phibench.estimator.spots.camera_codes import quantised, step_correlation
+from phibench.estimator.spots.gaussian_spot import SpotPixels, limited, scoring_step
 from phibench.estimator.spots.pixel_statistics import CutPixels, cut_pixels
 from phibench.scenes.frames import Array
 
@@ -158,7 +157,7 @@ class CoefficientWindow:
 
     Attributes
     ----------
-    z : shape (n,), quantised coefficients in the order of `jpeg_coefficients.coefficients`, mean of the frames
+    z : shape (n,), quantised coefficients in the order of `camera_codes.coefficients`, mean of the frames
     model : ChainModel
     pixels : SpotPixels
         Of the one window and the raw pixels around it, r in all.

@@ -16,8 +16,15 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import convolve1d
 
 from phibench.estimator.geometry.status import Status, StatusArray, flag, keep
-from phibench.estimator.spots.fisher import covariance_bound, limited, scoring_step
-from phibench.estimator.spots.gaussian_spot import SpotBlur, SpotModel, SpotPixels, profile
+from phibench.estimator.spots.gaussian_spot import (
+    SpotBlur,
+    SpotModel,
+    SpotPixels,
+    covariance_bound,
+    limited,
+    profile,
+    scoring_step,
+)
 from phibench.estimator.spots.raw_pixels import GaussLaw, PixelLaw, PixelNoise, SpotRegions, spot_regions
 from phibench.scenes.frames import Array, BoolArray
 

@@ -26,8 +26,7 @@ from PIL import Image as Picture
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.estimator.interface import Box, Image
-from phibench.estimator.spots.camera_codes import light_of, rgb_codes, rgb_picture, tone_slope
-from phibench.estimator.spots.jpeg_coefficients import qtables_of
+from phibench.estimator.spots.camera_codes import light_of, qtables_of, rgb_codes, rgb_picture, tone_slope
 from phibench.estimator.spots.raw_pixels import bayer_filters, raw_electrons
 from phibench.scenes.frames import Array, BoolArray
 

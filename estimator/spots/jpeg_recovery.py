@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import idctn
 
-from phibench.estimator.spots.jpeg_coefficients import (
+from phibench.estimator.spots.camera_codes import (
     BLOCK_PX,
     CHROMA_STEP,
     RGB_FROM_YCC,

@@ -27,8 +27,7 @@ import numpy as np
 from numpy.polynomial.legendre import leggauss
 from numpy.typing import ArrayLike
 
-from phibench.estimator.geometry.mirror_image import MirrorImage, image_of
-from phibench.estimator.geometry.reflection import ON_AXIS_SINE, Reflection, reflect
+from phibench.estimator.geometry.reflection import ON_AXIS_SINE, MirrorImage, Reflection, image_of, reflect
 from phibench.estimator.spots.gaussian_spot import SpotBlur, SpotParts
 from phibench.scenes.frames import Array, as_vector
 from phibench.scenes.laser import Beam

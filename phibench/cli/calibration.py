@@ -208,7 +208,7 @@ def align(
     """
     from phibench.calibration.captures.picture_files import read_picture, sensor_choice
     from phibench.calibration.captures.rig_file import read_rig_file, require_camera_size
-    from phibench.calibration.outline.outline_start import rig_circle
+    from phibench.calibration.outline.outline_fit import rig_circle
     from phibench.calibration.rig.align import (
         alignment,
         camera_in_words,
@@ -225,7 +225,7 @@ def align(
         write_circle_picture,
     )
     from phibench.datasets.common.errors import DatasetError
-    from phibench.datasets.frames.sensor_file import read_sensor_file
+    from phibench.datasets.frames.sensor_card import read_sensor_file
 
     stated.require_sound()
     given = stated.given()

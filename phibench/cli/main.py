@@ -39,7 +39,7 @@ from phibench.datasets.common.parallel import ONE_THREAD
 
 def _version_line() -> str:
     """Version as `phibench --version` prints it; in a checkout with the commit and with what differs from it."""
-    from phibench.datasets.common.version import program_version
+    from phibench.datasets.store.provenance import program_version
 
     return program_version()
 
@@ -81,7 +81,7 @@ def show() -> int:
     """List the light maps that are kept for all data sets, with their size and last use."""
     from datetime import datetime
 
-    from phibench.datasets.build.light_map_cache import cache_entries, cache_folder, cache_limit_mb
+    from phibench.datasets.build.bake_task import cache_entries, cache_folder, cache_limit_mb
 
     entries = cache_entries()
     for entry in entries:
@@ -95,7 +95,7 @@ def show() -> int:
 @cache.command
 def clear() -> int:
     """Remove all light maps; a room is baked again when a data set needs it."""
-    from phibench.datasets.build.light_map_cache import cache_folder, clear_cache
+    from phibench.datasets.build.bake_task import cache_folder, clear_cache
 
     print(f"{cache_folder()}: {_maps(clear_cache())} removed")
     return 0
@@ -110,7 +110,7 @@ def limit(megabytes: float) -> int:
     megabytes
         Limit in 1e6 bytes; 0 keeps none.
     """
-    from phibench.datasets.build.light_map_cache import cache_folder, limit_cache
+    from phibench.datasets.build.bake_task import cache_folder, limit_cache
 
     gone = limit_cache(megabytes)
     print(f"{cache_folder()}: at most {megabytes:g} MB from now on, {_maps(gone)} removed")

@@ -4,8 +4,8 @@ In the rig's frame it is the spot that moves, so that the chief rays of all inst
 spot's image is exact for every row and every node of the exposure. Shape and flux are those of the spot's layer at the
 time at which the spot's own row is read. A robot that turns turns that shape as well: by half a degree in an exposure.
 
-The shifted image is `rolling_shutter`'s, by the sampling theorem with derivatives, with a sum over the nodes of an
-exposure instead of a straight smear: w_rj is the laser's level times the weight of node j of row r.
+The shifted image is that of `sensor.light.moved_spot`, by the sampling theorem with derivatives, with a sum over the
+nodes of an exposure instead of a straight smear: w_rj is the laser's level times the weight of node j of row r.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from numpy.polynomial.legendre import leggauss
 from phibench.render.optics.reflection_point import mirror_points
 from phibench.render.optics.room_tracer import room_geometry
 from phibench.render.optics.spot_layer import SpotLayer, spot_layer
-from phibench.render.sensor.rolling_shutter import Spectrum, layer_spectra
+from phibench.render.sensor.light import Spectrum, layer_spectra
 from phibench.render.sensor.settings import SensorError
 from phibench.scenes.frames import Array
 from phibench.scenes.motion.film_scene import FilmScene

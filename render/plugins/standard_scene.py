@@ -22,16 +22,219 @@ from typing import Literal
 
 import numpy as np
 
+from phibench.render.optics.faces import FaceTable, IntArray
+from phibench.render.optics.room_tracer import BEAM_REACH_M, RoomGeometry, deposit, room_geometry, transmittance
+from phibench.render.optics.truth import spot_truth
 from phibench.render.plugins.mirror_plugins import mirror_plugin
-from phibench.render.plugins.plugin_tree import Plugin, SceneSetting, Value
-from phibench.render.plugins.room_plugins import room_plugins
-from phibench.render.plugins.spot_plugins import spot_plugins
+from phibench.render.plugins.plugin_tree import BitmapPlugin, Plugin, Rgb, SceneSetting, Value
+from phibench.render.plugins.room_plugins import diffuse, placed, room_plugins
 from phibench.render.room.camera_plugin import MM_PER_M
 from phibench.scenes.camera import Camera
-from phibench.scenes.frames import Array
+from phibench.scenes.frames import Array, Pose, Vector, as_matrix, as_vector
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.rig import View
 from phibench.scenes.room import MIRROR_NAME, Room
+from phibench.scenes.shapes import Bitmap, Checker
+
+# Laser spot as area emitters of its own size, power and profile.
+#
+# The scattered light of a spot is a radiance on the faces that it lies on. Each of these faces gets a rectangle with a
+# picture of that radiance, a hair above it. A texel's radiance is what the beam leaves at its centre: so edges, corners
+# and textures cut the light as they do in the spot layer. The rectangle takes the albedo of the wall in its middle:
+# lamps light what lies under the spot.
+#
+# The bands of a scene are those of the room's light. Electrons of the laser behind a filter are those of its own
+# wavelength; so is the mirror's reflectance. The radiance of a band is scaled by both ratios, and gives these
+# electrons.
+#
+# What a coat sends out depends on the direction: the radiance is that towards the mirror.
+
+
+_SIGMAS = 5.0  # of a Gaussian: 4e-6 of its power lies beyond
+_TEXELS, _FINER = 96, 3  # along a side of a rectangle, and places along a side of a texel
+_PROBES = 41  # along a side, to find the faces
+_LIFT_M, _BEHIND_M = 1e-4, 1e-3
+
+
+@dataclass(frozen=True)
+class Lit:
+    """Rectangle on a face that a spot lies on.
+
+    Attributes
+    ----------
+    pose : Pose
+        Its z axis is the normal.
+    half_m : 2 floats
+    radiance : array, shape (rows, columns)
+        W/(m^2 sr) at the laser's wavelength, the lowest row first.
+    covered : array, shape (rows, columns)
+        Part of each texel that the face takes up.
+    patch : int
+        Number of the face; -1 for a flat spot.
+    """
+
+    pose: Pose
+    half_m: tuple[float, float]
+    radiance: Array
+    covered: Array
+    patch: int
+
+
+def spot_plugins(view: View, spot: LaserSpot, room: Room, *, alone: bool) -> dict[str, Plugin]:
+    """Emitters of a spot as the mirror shows it, under their keys; none where it has no reflection point.
+
+    Unless they are `alone` they also have the light of the wall below them, where that shines.
+    """
+    geometry = room_geometry(room, view)
+    truth = spot_truth(view, spot, geometry)
+    mirror_m = np.array(truth.reflection_point_world_m)
+    if not np.isfinite(mirror_m).all():
+        return {}
+    bands = _band_ratios(view, spot, math.cos(truth.phi_incidence_rad))
+    faces = [_flat(spot)] if spot.beam_direction_world is None else _on_faces(spot, geometry, mirror_m)
+    found = {}
+    for number, lit in enumerate(face for face in faces if face.radiance.any()):
+        name, (albedo, light) = f"spot_{number}", _wall(geometry, lit)
+        radiance = lit.radiance[..., None] * bands + lit.covered[..., None] * light * (not alone)
+        values: dict[str, Value] = {
+            "to_world": placed(view, _lifted(lit.pose), (*lit.half_m, 1e-3)),
+            "emitter": Plugin("emitter", "area", {"radiance": _picture(name, radiance)}),
+            "bsdf": _ground(name, lit, albedo),
+        }
+        found[name] = Plugin("shape", "rectangle", values, name, "laser spot")
+    return found
+
+
+def _band_ratios(view: View, spot: LaserSpot, cos_incidence: float) -> Array:
+    """Band radiance over the laser's that gives the laser's electrons, shape (3,)."""
+    detector, mirror = view.rig.camera.detector, view.rig.mirror
+    of_laser = np.array(detector.laser_electrons_per_joule(spot.wavelength_nm))
+    of_bands = np.array(detector.band_electrons_per_joule())
+    cos = np.array(cos_incidence)
+    shown = [float(mirror.reflectance(cos, nm)) for nm in detector.band_wavelength_nm]
+    return of_laser / of_bands * float(mirror.reflectance(cos, spot.wavelength_nm)) / np.array(shown)
+
+
+def _flat(spot: LaserSpot) -> Lit:
+    a, b = spot.tangents()
+    axes = np.stack([a, b, np.array(spot.normal_world)], axis=1)
+    half = _reach(spot) * spot.scale_m
+    x, y = _places(half, half)
+    inside = np.ones((_TEXELS, _TEXELS))
+    pose = Pose("world", "shape", spot.position_world_m, as_matrix(axes))
+    return Lit(pose, (half, half), _means(spot.radiance_w_m2_sr(np.hypot(x, y))), inside, -1)
+
+
+def _on_faces(spot: LaserSpot, geometry: RoomGeometry, mirror_m: Array) -> list[Lit]:
+    """Rectangles on every face that a beam meets."""
+    steps = _reach(spot) * np.linspace(-1.0, 1.0, _PROBES)
+    disc = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
+    met = deposit(spot, geometry, disc)
+    planes = _planes(geometry.without_robot.table, np.unique(met.patch[met.lit]))
+    return [_on_plane(spot, geometry, patches, mirror_m) for patches in planes]
+
+
+def _planes(table: FaceTable, patches: IntArray) -> list[list[int]]:
+    """Faces by their planes: triangles of a wall share a rectangle, two at one place would hide each other."""
+    planes: list[list[int]] = []
+    for patch in map(int, patches):
+        normal, centre = table.normal[patch], table.centre_m[patch]
+        for plane in planes:
+            apart = abs((table.centre_m[plane[0]] - centre) @ normal)
+            if normal @ table.normal[plane[0]] > 1.0 - 1e-9 and apart < 1e-5:
+                plane.append(patch)
+                break
+        else:
+            planes.append([patch])
+    return planes
+
+
+def _on_plane(spot: LaserSpot, geometry: RoomGeometry, patches: list[int], mirror_m: Array) -> Lit:
+    beam, table, patch = np.array(spot.beam_direction_world), geometry.without_robot.table, patches[0]
+    normal = table.normal[patch]
+    normal = -normal if normal @ beam > 0.0 else normal
+    cos = float(-normal @ beam)
+    centre = np.array(spot.position_world_m)
+    centre = centre + ((table.centre_m[patch] - centre) @ normal) / (beam @ normal) * beam
+    across = np.cross(normal, beam)
+    across = spot.across_beam()[0] if np.linalg.norm(across) < 1e-9 else across / np.linalg.norm(across)
+    axes = np.stack([across, np.cross(normal, across), normal], axis=1)
+    reach_m = _reach(spot) * spot.scale_m
+    half = (reach_m, min(reach_m / cos, BEAM_REACH_M))
+    x, y = _places(*half)
+    points = centre + x[..., None] * axes[:, 0] + y[..., None] * axes[:, 1]
+    disc = (points - np.array(spot.position_world_m)) @ np.stack(spot.across_beam(), axis=1)
+    light = deposit(spot, geometry, disc.reshape(-1, 2) / spot.scale_m)
+    here = np.isin(light.patch, patches).reshape(x.shape)
+    radius = np.linalg.norm(disc, axis=-1)
+    strength = np.where(here, light.strength.reshape(x.shape), 0.0)
+    coat = float(light.coat[here.ravel()].max(initial=0.0))
+    if coat > 0.0:
+        towards = (mirror_m - points) / np.linalg.norm(mirror_m - points, axis=-1, keepdims=True)
+        strength = strength * transmittance(np.maximum(towards @ normal, 0.0), np.full(x.shape, coat))
+    radiance = strength / np.pi * cos * spot.irradiance_w_m2(radius)
+    pose = Pose("world", "shape", as_vector(centre), as_matrix(axes))
+    return Lit(pose, half, _means(radiance), _means(here.astype(float)), patch)
+
+
+def _reach(spot: LaserSpot) -> float:
+    return _SIGMAS if spot.profile == "gaussian" else 1.0
+
+
+def _places(half_x_m: float, half_y_m: float) -> tuple[Array, Array]:
+    """Places within the texels, shape (fine rows, fine columns) each, metres."""
+    fine = (np.arange(_TEXELS * _FINER) + 0.5) * 2.0 / (_TEXELS * _FINER) - 1.0
+    x, y = np.meshgrid(fine * half_x_m, fine * half_y_m)
+    return x, y
+
+
+def _means(fine: Array) -> Array:
+    """Means over texels."""
+    return np.asarray(fine.reshape(_TEXELS, _FINER, _TEXELS, _FINER).mean(axis=(1, 3)))
+
+
+def _lifted(pose: Pose) -> Pose:
+    return replace(pose, translation_m=as_vector(pose.t + _LIFT_M * pose.R[:, 2]))
+
+
+def _wall(geometry: RoomGeometry, lit: Lit) -> tuple[Vector, Array]:
+    """Albedo of the wall in the bands, and its own light, shape (3,), in the rectangle's middle; black without a wall.
+
+    Of a flat spot it is the face right behind.
+    """
+    table, own = geometry.without_robot.table, geometry.without_robot
+    normal, dark = lit.pose.R[:, 2], (0.0, 0.0, 0.0)
+    patch = lit.patch
+    if patch < 0:
+        start = lit.pose.t + _BEHIND_M * normal
+        patch = int(own.first_hit(start[None], -normal[None], np.array([2.0 * _BEHIND_M])).patch[0])
+    if patch < 0 or table.emits[patch]:
+        return dark, np.zeros(3)
+    place = table.places(np.array([patch]), lit.pose.t[None])[0]
+    texture = table.textures[table.texture[patch]]
+    if isinstance(texture, Bitmap):
+        value = texture.evaluate(place * np.array(texture.texel_m) + np.array(texture.origin_m))
+    elif isinstance(texture, Checker):
+        value = np.array(texture.albedo_odd if np.floor(place).sum() % 2.0 > 0.5 else texture.albedo_even)
+    else:
+        value = np.array(texture.albedo)
+    return (dark, value) if table.is_radiance[patch] else (as_vector(value), np.zeros(3))
+
+
+def _ground(name: str, lit: Lit, albedo: Vector) -> Plugin:
+    """Material of the rectangle: the wall's, and nothing where it reaches beyond the face."""
+    material = diffuse(Rgb(albedo))
+    if lit.covered.min() == 1.0:
+        return material
+    opacity = _picture(f"{name}_opacity", np.repeat(lit.covered[..., None], 3, axis=-1))
+    return Plugin("bsdf", "mask", {"opacity": opacity, "material": material})
+
+
+def _picture(name: str, values: Array) -> Plugin:
+    picture = BitmapPlugin(name, values.astype(np.float32))
+    own: dict[str, Value] = {"filename": picture, "raw": True, "filter_type": "bilinear", "wrap_mode": "clamp"}
+    return Plugin("texture", "bitmap", own)
+
 
 Light = Literal["all", "ambient", "spot"]
 _SPOT_DEPTH = (

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from phibench.render.optics.faces import TexelGrid, texel_sizes_m
 from phibench.render.optics.room_tracer import room_geometry
 from phibench.render.room.light_map import BakeSettings, LightMap, fixed_shapes, light_carriage
 from phibench.render.room.noise_budget import BUDGET
@@ -23,7 +24,6 @@ from phibench.render.room.refinement import render_refined
 from phibench.render.room.shading import LampOutlines, Look
 from phibench.render.room.subpixel_grid import CellSampler, Crop, FilmGrid, Stack
 from phibench.render.room.surfaces import Surfaces
-from phibench.render.room.texel_grid import TexelGrid, texel_sizes_m
 from phibench.render.setup.variant import activate
 from phibench.scenes.camera import Camera
 from phibench.scenes.frames import Array

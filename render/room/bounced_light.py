@@ -18,11 +18,10 @@ from typing import Any
 import numpy as np
 from scipy import ndimage
 
-from phibench.render.optics.faces import IntArray
+from phibench.render.optics.faces import IntArray, TexelGrid
 from phibench.render.room.camera_plugin import MM_PER_M
 from phibench.render.room.subpixel_grid import points, shifts
 from phibench.render.room.surfaces import LookUp, Surfaces, aligned
-from phibench.render.room.texel_grid import TexelGrid
 from phibench.render.room.texel_points import (
     Net,
     Texels,

@@ -11,11 +11,10 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from phibench.render.optics.faces import face_table
+from phibench.render.optics.faces import TexelGrid, face_table
 from phibench.render.room.camera_plugin import MM_PER_M
 from phibench.render.room.light_map import BakeSettings, LightMap, fixed_shapes
 from phibench.render.room.surfaces import Surfaces, aligned
-from phibench.render.room.texel_grid import TexelGrid
 from phibench.render.setup.variant import activate
 from phibench.scenes.frames import Vector
 from phibench.scenes.rig import View

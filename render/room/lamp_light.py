@@ -19,12 +19,11 @@ from typing import Any
 import numpy as np
 from scipy import ndimage
 
-from phibench.render.optics.faces import IntArray
+from phibench.render.optics.faces import IntArray, TexelGrid
 from phibench.render.room.camera_plugin import MM_PER_M
 from phibench.render.room.mirror_intersection import MirrorBody
 from phibench.render.room.subpixel_grid import points, shifts
 from phibench.render.room.surfaces import Surfaces, aligned
-from phibench.render.room.texel_grid import TexelGrid
 from phibench.render.room.texel_points import Net, Texels, by_count, chosen, powers_of_two, transmitted, vector
 from phibench.render.setup.variant import activate
 from phibench.scenes.frames import Array, BoolArray

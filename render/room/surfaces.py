@@ -20,9 +20,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from phibench.render.optics.faces import FaceTable, IntArray
+from phibench.render.optics.faces import FaceTable, IntArray, TexelGrid
 from phibench.render.room.camera_plugin import MM_PER_M
-from phibench.render.room.texel_grid import TexelGrid
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import View
 from phibench.scenes.shapes import Bitmap, Checker, Texture

@@ -17,11 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from phibench.render.optics.faces import IntArray
+from phibench.render.optics.faces import IntArray, TexelGrid
 from phibench.render.room.camera_plugin import MM_PER_M
 from phibench.render.room.subpixel_grid import hashed
 from phibench.render.room.surfaces import Surfaces, aligned
-from phibench.render.room.texel_grid import TexelGrid
 from phibench.scenes.frames import Array, BoolArray
 
 _LIFT_MM = 0.05  # rays start this far in front of their surface

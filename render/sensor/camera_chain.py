@@ -18,7 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phibench.render.sensor.electrons import (
+    TILE_PX,
     FixedPattern,
+    NoiseStream,
     collected,
     digitised,
     expected_electrons,
@@ -28,9 +30,9 @@ from phibench.render.sensor.electrons import (
     read_out,
     speckle_gain,
     stop_factor,
+    whole_tiles,
 )
 from phibench.render.sensor.light import Light, Region
-from phibench.render.sensor.noise_tiles import TILE_PX, NoiseStream, whole_tiles
 from phibench.render.sensor.processing import (
     LUMA,
     MCU_PX,

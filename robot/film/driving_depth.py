@@ -23,8 +23,7 @@ from scipy.linalg import solve_triangular
 
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.film.film_read import Film
-from phibench.estimator.geometry.mirror_image import image_of
-from phibench.estimator.geometry.reflection import room_rays
+from phibench.estimator.geometry.reflection import image_of, room_rays
 from phibench.estimator.geometry.rig_parameters import PARAMETERS, STROKE_PARAMETERS
 from phibench.estimator.spots.spot_prediction import spot_blur
 from phibench.robot.film.film_frames import LENGTH_PX, FilmFrames, Index, RoomWeights, film_frames

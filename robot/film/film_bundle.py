@@ -18,7 +18,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from phibench.datasets.common.errors import DatasetError
-from phibench.estimator.geometry.mirror_image import image_of
+from phibench.estimator.geometry.reflection import image_of
 from phibench.estimator.geometry.rig_parameters import PARAMETERS, STROKE_PARAMETERS
 from phibench.estimator.geometry.status import depth_interval
 from phibench.estimator.geometry.triangulate import depth_exact, depth_of

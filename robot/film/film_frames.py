@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.film.film_read import Film
 from phibench.datasets.frames.sensor_card import SensorCard, card_of
-from phibench.estimator.geometry.mirror_image import image_of
+from phibench.estimator.geometry.reflection import image_of
 from phibench.estimator.geometry.triangulate import depth_of
 from phibench.estimator.spots.gaussian_spot import SpotBlur, SpotParts
 from phibench.estimator.spots.raw_pixels import PixelNoise, raw_electrons

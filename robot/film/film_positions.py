@@ -40,14 +40,20 @@ from scipy.ndimage import gaussian_filter
 
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.estimator.geometry.status import Status
-from phibench.estimator.processed.chroma_loss import regained
 from phibench.estimator.processed.fit_chain import spot_window, undone, unrounded
 from phibench.estimator.processed.interval_fit import interval_posterior
+from phibench.estimator.processed.neighbour_filters import regained
 from phibench.estimator.processed.quasi_score import CoefficientWindow, fit_window
-from phibench.estimator.spots.fisher import covariance_bound, fisher_matrix, scoring_step
+from phibench.estimator.spots.camera_codes import mcu_px
 from phibench.estimator.spots.fit_raw import LEAST_SNR, fit_law
-from phibench.estimator.spots.gaussian_spot import SpotBlur, SpotModel, SpotPixels
-from phibench.estimator.spots.jpeg_coefficients import mcu_px
+from phibench.estimator.spots.gaussian_spot import (
+    SpotBlur,
+    SpotModel,
+    SpotPixels,
+    covariance_bound,
+    fisher_matrix,
+    scoring_step,
+)
 from phibench.estimator.spots.raw_pixels import (
     Background,
     GaussLaw,

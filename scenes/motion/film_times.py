@@ -1,7 +1,7 @@
 """Times of a film: its frames, their rows, and the code by which the laser blinks.
 
 Frame k is centred at t_k = first + k / rate. Row r of H is exposed for T seconds about t_k + (r - (H - 1) / 2) x
-readout / H: the rolling shutter of `render.sensor.rolling_shutter`, whose reference instant is the frame's. Rows may be
+readout / H: the rolling shutter of `render.sensor.light`, whose reference instant is the frame's. Rows may be
 fractions of pixels.
 """
 

@@ -21,9 +21,9 @@ from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.parallel import parallel_map
 from phibench.datasets.exposures.pair_draws import PairDraw, pair_draws
 from phibench.datasets.read import Dataset, open_finished
-from phibench.estimator.geometry.mirror_image import image_of
 from phibench.estimator.geometry.paper_depth import Published, depth_paper, find_published
 from phibench.estimator.geometry.phi import CONVENTIONS, estimate_phi
+from phibench.estimator.geometry.reflection import image_of
 from phibench.estimator.geometry.sensitivities import PARAMETERS
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.estimator.interface import Spot

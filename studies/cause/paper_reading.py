@@ -2,7 +2,7 @@
 
 Everything is closed form and vectorised, so that a sampler can afford a hundred thousand rigs. The mirror image is
 Alhazen's problem in the plane of lens, sphere centre and spot. It takes no Newton step in pixels, unlike
-`geometry.mirror_image`, which the tests hold it against. Coordinates: origin at the true sphere centre, down; z up;
+`geometry.reflection`, which the tests hold it against. Coordinates: origin at the true sphere centre, down; z up;
 D counts from there. The last axis is experiments (n); parameters are scalars, or (m, 1) for m rigs at once.
 """
 

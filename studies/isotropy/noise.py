@@ -19,7 +19,7 @@ from phibench.benchmark.scores.intervals import Clusters, Estimate, deviation_of
 from phibench.datasets.exposures.expected import expected_of_light
 from phibench.datasets.frames.sensor_card import card_of
 from phibench.datasets.read import Dataset, Sample
-from phibench.estimator.geometry.mirror_image import image_of
+from phibench.estimator.geometry.reflection import image_of
 from phibench.estimator.geometry.status import Status
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.estimator.limits.position_bound import spot_limit
@@ -29,8 +29,8 @@ from phibench.estimator.spots.raw_pixels import GaussLaw, noise_of, raw_electron
 from phibench.estimator.spots.spot_prediction import spot_blur
 from phibench.render.optics.spot_layer import spot_layer
 from phibench.render.sensor.camera_chain import Chain
+from phibench.render.sensor.electrons import NoiseStream
 from phibench.render.sensor.light import Light, Region
-from phibench.render.sensor.noise_tiles import NoiseStream
 from phibench.render.sensor.settings import Sensor
 from phibench.scenes.frames import Array, as_vector
 from phibench.scenes.laser import Beam

@@ -19,8 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from phibench.datasets.frames.sensor_card import SensorCard
-from phibench.estimator.geometry.mirror_image import MirrorImage, blocked, image_of
-from phibench.estimator.geometry.reflection import reflect
+from phibench.estimator.geometry.reflection import MirrorImage, blocked, image_of, reflect
 from phibench.estimator.geometry.status import Status
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.estimator.limits.best_stroke import ROOM_E_PER_S

@@ -20,11 +20,11 @@ from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.progress import Steps
 from phibench.estimator.geometry.paper_depth import load_published
 from phibench.estimator.geometry.triangulate import depth_exact
-from phibench.scenes.catalog import default_rig
 from phibench.scenes.frames import Array
 from phibench.scenes.misalignment import PARAMETERS, Misalignment
 from phibench.scenes.random_streams import generator
 from phibench.scenes.rig import Rig
+from phibench.scenes.room import default_rig
 from phibench.scenes.validation import nearest
 from phibench.studies.framework import (
     Drawing,

@@ -16,7 +16,7 @@ import numpy as np
 from phibench.benchmark.scores.answer_errors import Rules
 from phibench.benchmark.scores.intervals import Clusters, Estimate, estimates, rms_of
 from phibench.estimator.geometry.least_squares_depth import depth_general
-from phibench.estimator.geometry.mirror_image import image_of
+from phibench.estimator.geometry.reflection import image_of
 from phibench.estimator.geometry.rig_parameters import (
     PARAMETERS,
     PRIOR_SIGMA,

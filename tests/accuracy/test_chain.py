@@ -18,8 +18,8 @@ from phibench.estimator.limits.position_bound import limit_of
 from phibench.estimator.limits.processed_bound import chain_limit
 from phibench.estimator.spots.gaussian_spot import SpotBlur
 from phibench.render.sensor.camera_chain import Chain
+from phibench.render.sensor.electrons import NoiseStream
 from phibench.render.sensor.light import Region
-from phibench.render.sensor.noise_tiles import NoiseStream
 from phibench.render.sensor.settings import Sensor, sensor
 
 SRGB, YUYV, MJPEG = sensor("srgb8"), sensor("yuyv"), sensor("mjpeg", jpeg_quality=85)

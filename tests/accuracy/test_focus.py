@@ -7,18 +7,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from phibench.calibration.outline.outline_start import rig_circle
+from phibench.calibration.outline.outline_fit import rig_circle
 from phibench.calibration.rig.align import sharpness
-from phibench.datasets.build.light_map_cache import light_map
+from phibench.datasets.build.bake_task import light_map
 from phibench.datasets.frames.sensor_card import sensor_card
 from phibench.render.room.ambient import render_ambient
 from phibench.render.room.light_map import BakeSettings
 from phibench.render.sensor.camera_chain import Chain
+from phibench.render.sensor.electrons import NoiseStream
 from phibench.render.sensor.light import Light
-from phibench.render.sensor.noise_tiles import NoiseStream
 from phibench.render.sensor.settings import sensor
-from phibench.scenes.catalog import lab
 from phibench.scenes.rig import Rig
+from phibench.scenes.room import lab
 
 FOCUS_M = (0.18, 0.235, 0.30, 0.46)
 """The virtual image of far walls lies at z_c - R/2 = 0.23 m on the axis; 0.46 m is the factory's focus."""

@@ -15,12 +15,11 @@ from helpers.misaligned_cases import Case, check, draw_case
 from phibench.render.optics.certificate import certify, trace_spot
 from phibench.render.optics.spot_layer import spot_layer
 from phibench.render.optics.truth import spot_truth
-from phibench.scenes.catalog import default_rig
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.mirror import HARMONICS, Form
 from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.rig import POSITIONS
-from phibench.scenes.room import Room
+from phibench.scenes.room import Room, default_rig
 from phibench.scenes.shapes import Uniform, rectangle
 from phibench.scenes.validation import SceneError
 

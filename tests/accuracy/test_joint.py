@@ -11,7 +11,7 @@ import pytest
 import scipy
 from helpers.joint_pairs import BAYER, MONO, RIG, drawn_pairs
 
-from phibench.estimator.geometry.combine import joint_bound
+from phibench.estimator.geometry.least_squares_depth import joint_bound
 from phibench.estimator.geometry.status import Status
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.render.sensor.settings import Sensor

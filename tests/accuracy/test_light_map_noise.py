@@ -8,7 +8,7 @@ from helpers.oracles import TARGETS
 from helpers.path_windows import independent_bake
 
 from phibench.render.room.light_map import BakeSettings
-from phibench.scenes.catalog import lab
+from phibench.scenes.room import lab
 
 PARTS = (50, 68, 90)
 

@@ -23,11 +23,10 @@ from phibench.render.room.camera_plugin import sensor_dict
 from phibench.render.room.light_map import BakeSettings, bake
 from phibench.render.setup.variant import activate
 from phibench.scenes.camera import Camera, Detector
-from phibench.scenes.catalog import c310_camera, default_rig, lab
 from phibench.scenes.frames import Pose, rotation_xyz
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.rig import Rig, View
-from phibench.scenes.room import Room
+from phibench.scenes.room import Room, c310_camera, default_rig, lab
 from phibench.scenes.shapes import Checker, Uniform, cuboid, rectangle
 
 SHARP = 0.05  # px; the least blur that Camera allows
@@ -232,7 +231,7 @@ BAKE_AND_RENDER = """
 import hashlib, sys
 from phibench.render.room.ambient import render_ambient
 from phibench.render.room.light_map import BakeSettings, bake
-from phibench.scenes.catalog import default_rig, lab
+from phibench.scenes.room import default_rig, lab
 room, rig = lab(), default_rig()
 settings = BakeSettings(texel_m=0.5, lamp_rays=4, bounces=2, bounce_rays=8, final_rays=8)
 light = bake(rig.at(0.0), room, settings)

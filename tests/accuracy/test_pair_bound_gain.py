@@ -12,9 +12,9 @@ import pytest
 from phibench.datasets.frames.sensor_card import SensorCard, sensor_card
 from phibench.datasets.plan.plan import make_plan
 from phibench.datasets.recipe.load import load_recipe
-from phibench.estimator.geometry.combine import joint_bound
-from phibench.estimator.geometry.mirror_image import image_of
+from phibench.estimator.geometry.least_squares_depth import joint_bound
 from phibench.estimator.geometry.phi import estimate_phi
+from phibench.estimator.geometry.reflection import image_of
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.estimator.limits.position_bound import limit_of, raw_information
 from phibench.estimator.limits.processed_bound import chain_limit

@@ -11,12 +11,12 @@ from helpers.oracles import TARGETS, paper_cases
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.render.optics.spot_layer import spot_layer
 from phibench.render.optics.truth import SpotTruth, spot_truth
-from phibench.scenes.catalog import default_rig
 from phibench.scenes.frames import Pose
 from phibench.scenes.laser import LaserSpot, beam_diameter_m
 from phibench.scenes.revolved_mirror import RevolvedMirror
 from phibench.scenes.revolved_profile import sphere_cap
 from phibench.scenes.rig import Rig
+from phibench.scenes.room import default_rig
 
 ANGLES = ("phi_ray_rad", "phi_normal_rad", "phi_incidence_rad", "azimuth_rad")
 LENGTHS = ("path_spot_mirror_m", "path_mirror_camera_m")

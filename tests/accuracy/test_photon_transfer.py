@@ -11,8 +11,8 @@ from helpers import photon_transfer as ptc
 from PIL import Image
 
 from phibench.render.sensor.camera_chain import Chain
+from phibench.render.sensor.electrons import NoiseStream
 from phibench.render.sensor.light import Light
-from phibench.render.sensor.noise_tiles import NoiseStream
 from phibench.render.sensor.settings import Sensor, sensor
 from phibench.scenes.frames import Array
 

@@ -15,7 +15,7 @@ from helpers.revolved_rigs import PROFILES, revolved
 from scipy.special import eval_jacobi
 
 from phibench.datasets.store.documents import from_json, to_json
-from phibench.estimator.geometry.mirror_image import image_of
+from phibench.estimator.geometry.reflection import image_of
 from phibench.estimator.geometry.reflection import reflect as estimated
 from phibench.estimator.geometry.sensitivities import PARAMETERS, pixel_gradient
 from phibench.render.optics.certificate import certify

@@ -10,8 +10,8 @@ from helpers.sensor_moments import QUANTISATION_DN2, drawn_moments, linear_momen
 
 from phibench.render.sensor import processing
 from phibench.render.sensor.camera_chain import Chain
+from phibench.render.sensor.electrons import NoiseStream
 from phibench.render.sensor.light import Light, Region
-from phibench.render.sensor.noise_tiles import NoiseStream
 from phibench.render.sensor.settings import sensor
 
 STREAM = NoiseStream(("moments", 0))

@@ -11,9 +11,8 @@ import pytest
 import scipy
 
 from phibench.render.sensor.camera_chain import Chain
-from phibench.render.sensor.electrons import digitised
+from phibench.render.sensor.electrons import NoiseStream, digitised, poisson
 from phibench.render.sensor.light import Light, Region
-from phibench.render.sensor.noise_tiles import NoiseStream, poisson
 from phibench.render.sensor.settings import Sensor, sensor
 
 FALSE_ALARM = 2e-6  # per assertion; 13 of them in this file: 3e-5 per run

@@ -9,17 +9,15 @@ import numpy as np
 import pytest
 from helpers.oracles import TARGETS, alhazen_quartic, fermat_path, paper_cases, random_rig, random_spot, true_pixel
 
-from phibench.render.optics.beam_deposit import deposit
 from phibench.render.optics.certificate import CENTROID_TOLERANCE_PX, certify, pixel_centroid
 from phibench.render.optics.reflection_point import reflection_points
-from phibench.render.optics.room_tracer import RoomGeometry
+from phibench.render.optics.room_tracer import RoomGeometry, deposit
 from phibench.render.optics.spot_layer import splat, spot_layer
 from phibench.render.optics.spot_samples import FilmCloud, specular_cloud
 from phibench.render.optics.truth import spot_truth
-from phibench.scenes.catalog import default_rig, lab
 from phibench.scenes.laser import LaserSpot, beam_diameter_m
 from phibench.scenes.rig import Rig, View
-from phibench.scenes.room import Room
+from phibench.scenes.room import Room, default_rig, lab
 
 EMPTY = Room("empty", (), (), robot=False)
 

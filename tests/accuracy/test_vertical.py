@@ -9,18 +9,18 @@ import pytest
 from helpers.limb_frames import drawn_rig
 
 from phibench.calibration.rig.vertical_edges import find_vertical
-from phibench.datasets.build.light_map_cache import light_map
+from phibench.datasets.build.bake_task import light_map
 from phibench.datasets.frames.sensor_card import sensor_card
 from phibench.render.room.ambient import render_ambient
 from phibench.render.room.light_map import BakeSettings
 from phibench.render.sensor.camera_chain import Chain
+from phibench.render.sensor.electrons import NoiseStream
 from phibench.render.sensor.light import Light
-from phibench.render.sensor.noise_tiles import NoiseStream
 from phibench.render.sensor.settings import sensor
-from phibench.scenes.catalog import lab
 from phibench.scenes.frames import as_matrix
 from phibench.scenes.random_streams import generator, seed_32
 from phibench.scenes.rig import Rig
+from phibench.scenes.room import lab
 
 RIGS = 6
 

@@ -16,8 +16,8 @@ from helpers.path_windows import independent_bake
 from phibench.render.optics.truth import spot_truth
 from phibench.render.room.ambient import render_ambient
 from phibench.render.room.light_map import BakeSettings, LightMap
-from phibench.scenes.catalog import lab
 from phibench.scenes.laser import LaserSpot
+from phibench.scenes.room import lab
 
 SETTINGS = BakeSettings(texel_m=0.1, indirect_texel_m=0.1, lamp_rays=32, bounces=12, bounce_rays=32, final_rays=192)
 HEIGHT_M = {"cone": 1.5, "polynomial": 0.3}  # of the place on the wall: a cone looks up, a polynomial down; 0.8 m else

@@ -14,7 +14,7 @@ from helpers.path_ambient import traced_scene
 from phibench.render.room.ambient import render_ambient
 from phibench.render.room.light_map import BakeSettings, LightMap, bake
 from phibench.render.setup.variant import activate
-from phibench.scenes.catalog import c310_rig, lab
+from phibench.scenes.room import c310_rig, lab
 
 ROOM, RIG, SETTINGS = lab(TARGETS), c310_rig(), BakeSettings()
 VIEW = RIG.at(0.425)  # lens, blur, distortion, 1280 x 720

@@ -7,12 +7,12 @@ import pytest
 from helpers.sensor_light import spot_at
 
 from phibench.datasets.frames.sensor_card import card_of
-from phibench.estimator.geometry.mirror_image import image_of
+from phibench.estimator.geometry.reflection import image_of
 from phibench.estimator.interface import Pair
 from phibench.estimator.spots.detect import detect
 from phibench.render.sensor.camera_chain import Chain
+from phibench.render.sensor.electrons import NoiseStream
 from phibench.render.sensor.light import Light
-from phibench.render.sensor.noise_tiles import NoiseStream
 from phibench.render.sensor.settings import sensor
 from phibench.scenes.rig import Rig
 

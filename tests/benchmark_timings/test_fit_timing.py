@@ -18,8 +18,8 @@ from phibench.estimator.spots.gaussian_spot import LASER_RESPONSE, SpotBlur, Spo
 from phibench.estimator.spots.raw_pixels import PixelNoise
 from phibench.estimator.spots.simple_spots import SIMPLE_METHODS
 from phibench.render.sensor.camera_chain import Chain
+from phibench.render.sensor.electrons import NoiseStream
 from phibench.render.sensor.light import Light
-from phibench.render.sensor.noise_tiles import NoiseStream
 from phibench.render.sensor.settings import sensor
 from phibench.scenes.random_streams import generator
 

@@ -19,10 +19,10 @@ from phibench.render.optics.spot_layer import spot_layer
 from phibench.render.room.ambient import render_ambient
 from phibench.render.room.light_map import BakeSettings, bake
 from phibench.render.sensor.settings import sensor
-from phibench.scenes.catalog import default_rig, lab
 from phibench.scenes.laser import Beam, LaserSpot, beam_diameter_m
 from phibench.scenes.mirror import Form
 from phibench.scenes.rig import Rig
+from phibench.scenes.room import default_rig, lab
 
 SPOT = LaserSpot((2.0, 0.5, 0.5), (-2.0, -0.5, 0.0), beam_diameter_m(2.06))
 FORMS = {"sphere": None, "form error": Form(form_20_m=2e-5, form_31c_m=-1e-5)}

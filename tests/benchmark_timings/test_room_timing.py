@@ -12,8 +12,7 @@ from PIL import Image
 
 from phibench.datasets.rooms.mesh_placement import MeshSettings
 from phibench.datasets.rooms.mesh_room import mesh_room
-from phibench.datasets.rooms.panorama_room import panorama_room
-from phibench.datasets.rooms.panorama_settings import PanoramaSettings
+from phibench.datasets.rooms.panorama_room import PanoramaSettings, panorama_room
 
 MOST_S = 5.0
 """For 300 000 triangles, on one core of the machine that the figures were taken on."""

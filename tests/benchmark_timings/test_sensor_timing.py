@@ -12,10 +12,8 @@ from phibench.datasets.frames.request import FrameRequest
 from phibench.datasets.frames.source import FrameSource, PositionLight
 from phibench.datasets.store.layers import SpotWindow
 from phibench.render.sensor.camera_chain import Chain
-from phibench.render.sensor.electrons import _pattern
-from phibench.render.sensor.light import Region
-from phibench.render.sensor.noise_tiles import NoiseStream
-from phibench.render.sensor.rolling_shutter import moved_spot
+from phibench.render.sensor.electrons import NoiseStream, _pattern
+from phibench.render.sensor.light import Region, moved_spot
 from phibench.render.sensor.settings import sensor
 
 LIGHT = room((720, 1280))

@@ -18,7 +18,7 @@ from phibench.render.optics.truth import truth_layer
 from phibench.render.room.ambient import render_ambient, view_film, view_surfaces
 from phibench.render.room.light_map import BakeSettings, LightMap, bake
 from phibench.render.room.subpixel_grid import CellSampler
-from phibench.scenes.catalog import default_rig, lab
+from phibench.scenes.room import default_rig, lab
 
 ROOM, RIG = lab(TARGETS), default_rig()
 SETTINGS = BakeSettings(lamp_rays=16, bounces=4, bounce_rays=16, final_rays=64)

@@ -13,8 +13,8 @@ from helpers.processes import quiet
 from phibench.datasets.common.errors import DatasetError, RecipeError
 from phibench.datasets.make import dry_run, make
 from phibench.datasets.merge_repair import merge
+from phibench.datasets.plan.draws import draw_rooms
 from phibench.datasets.plan.plan import make_plan
-from phibench.datasets.plan.room_draws import draw_rooms
 from phibench.datasets.read import open_finished
 from phibench.datasets.recipe.load import load_recipe, parse_recipe
 from phibench.datasets.rooms.room_files import RoomFiles

@@ -23,14 +23,14 @@ from rich.console import Console
 from phibench.datasets import make
 from phibench.datasets.build import run_tasks, spot_task
 from phibench.datasets.build.forecast import forecast
-from phibench.datasets.build.task_list import plan_tasks
+from phibench.datasets.build.run_tasks import plan_tasks
 from phibench.datasets.common import progress
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.progress import Steps
 from phibench.datasets.plan.plan import make_plan
 from phibench.datasets.recipe.load import load_recipe
 from phibench.datasets.rooms.room_sources import room_of
-from phibench.datasets.store import filling, schema
+from phibench.datasets.store import checksums, schema
 from phibench.datasets.store.checksums import damaged, data_files, read_checksums
 from phibench.datasets.store.documents import read_manifest
 from phibench.datasets.store.layers import read_exr
@@ -151,7 +151,7 @@ def test_a_folder_that_cannot_be_written_is_refused(tmp_path: Path, monkeypatch:
     def denied(*_: object) -> None:
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
 
-    monkeypatch.setattr(filling, "write_bytes", denied)
+    monkeypatch.setattr(checksums, "write_bytes", denied)
     text = refusal(tmp_path / "out")
     assert "Permission denied" in text
     assert "\n" not in text

@@ -16,8 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import optimize
 
-from phibench.estimator.geometry.mirror_image import image_of
-from phibench.estimator.geometry.reflection import reflect
+from phibench.estimator.geometry.reflection import image_of, reflect
 from phibench.scenes.frames import Array, rotation_xyz
 from phibench.scenes.revolved_mirror import RevolvedMirror
 from phibench.scenes.rig import Rig

@@ -11,11 +11,10 @@ from phibench.datasets.frames.sensor_card import SensorCard, card_of
 from phibench.estimator.geometry.status import Status
 from phibench.estimator.limits.processed_bound import chain_limit, limit_window
 from phibench.estimator.processed.fit_chain import fit_jpeg, fit_srgb, fit_yuyv
-from phibench.estimator.spots.fisher import covariance_bound
-from phibench.estimator.spots.gaussian_spot import SpotBlur
+from phibench.estimator.spots.gaussian_spot import SpotBlur, covariance_bound
 from phibench.render.sensor.camera_chain import Chain
+from phibench.render.sensor.electrons import NoiseStream
 from phibench.render.sensor.light import Light, Region
-from phibench.render.sensor.noise_tiles import NoiseStream
 from phibench.render.sensor.settings import Sensor
 from phibench.scenes.random_streams import generator
 

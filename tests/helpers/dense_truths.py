@@ -8,8 +8,8 @@ import numpy as np
 
 from phibench.benchmark.dense.dense_pairs import DenseTruth
 from phibench.render.optics.correspondence import correspondence
-from phibench.scenes.catalog import lab
 from phibench.scenes.rig import Rig
+from phibench.scenes.room import lab
 
 
 def smaller(rig: Rig, divisor: float = 4.0) -> Rig:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from phibench.scenes.catalog import default_rig
 from phibench.scenes.mirror import (
     HARMONICS,
     Form,
 )
 from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.rig import Rig
+from phibench.scenes.room import default_rig
 
 
 def formed(form: Form, **more: float) -> Rig:

@@ -36,7 +36,7 @@ from phibench.benchmark.sealed import rebuilt_score, score_check
 from phibench.calibration.captures import imported_set
 from phibench.calibration.sensor_fit import fit
 from phibench.calibration.sensor_fit.capture_folder import read_header
-from phibench.datasets.build import kept_draws, run_tasks
+from phibench.datasets.build import finished_work, run_tasks
 from phibench.datasets.build.journal import Journal
 from phibench.datasets.build.run_tasks import held_head
 from phibench.datasets.common.errors import DatasetError
@@ -98,14 +98,14 @@ def _draws() -> tuple[bytes, Callable[[Path], object], Callable[[random.Random],
     recipe = replace_samples(load_recipe("bench-dev"))
     spot = {"tries": 3, "surface": "wall", "position_world_m": [1.0, 0.0, 0.5], "normal_world": [-1.0, 0.0, 0.0]}
     spot |= {"diameter_m": 0.004, "beam_direction_world": None, "causes": ["none", "none"]}
-    document = [kept_draws._key(recipe, RoomFiles()), {"0": spot, "1": "there is no place"}]
+    document = [finished_work._key(recipe, RoomFiles()), {"0": spot, "1": "there is no place"}]
 
     def signed(content: Any) -> bytes:
         text = compact(content)
         return hashlib.sha256(text).hexdigest().encode() + b"\n" + text
 
     def read(path: Path) -> object:
-        return kept_draws.read_draws(path.parent, recipe, RoomFiles())
+        return finished_work.read_draws(path.parent, recipe, RoomFiles())
 
     return signed(document), read, lambda rng: signed(changed(document, rng))
 

@@ -32,12 +32,12 @@ from phibench.calibration.captures.picture_files import read_photo
 from phibench.calibration.captures.rig_file import read_rig_file
 from phibench.calibration.sensor_fit.capture_folder import CaptureNotes, read_frame, read_notes
 from phibench.calibration.sensor_fit.emva_descriptor import open_descriptor
-from phibench.datasets.build.light_map_cache import cache_limit_mb
+from phibench.datasets.build.bake_task import cache_limit_mb
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.film.film_store import FilmInfo, read_document, read_spots, read_table, write_spots
 from phibench.datasets.film.film_video import read_frames, write_frames
 from phibench.datasets.frames.request import jpeg_tables
-from phibench.datasets.frames.sensor_file import SensorFile, read_sensor_file
+from phibench.datasets.frames.sensor_card import SensorFile, read_sensor_file
 from phibench.datasets.rooms.panorama_files import is_linear
 from phibench.datasets.rooms.room_files import RoomFiles
 from phibench.datasets.store.checksums import read_checksums

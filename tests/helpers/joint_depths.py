@@ -16,7 +16,7 @@ import numpy as np
 
 from phibench.datasets.exposures.pair_draws import FrameCounts
 from phibench.datasets.read import Dataset, Sample, open_dataset
-from phibench.estimator.geometry.combine import combine
+from phibench.estimator.geometry.least_squares_depth import combine
 from phibench.estimator.interface import Answer, Pair
 from phibench.estimator.methods.chain_fit import chain_fit
 from phibench.estimator.methods.draw_pairs import DrawnPairs, pairs_of

@@ -9,15 +9,15 @@ from helpers.sensor_light import FILTERS, spot_at
 
 from phibench.datasets.exposures.expected import expected_of_light
 from phibench.datasets.frames.sensor_card import card_of
-from phibench.estimator.geometry.mirror_image import image_of
+from phibench.estimator.geometry.reflection import image_of
 from phibench.estimator.limits.position_bound import spot_limit
 from phibench.estimator.spots.fit_joint import JointFit, fit_joint
 from phibench.estimator.spots.fit_raw import SpotData, SpotFit, fit_raw, spot_data
 from phibench.estimator.spots.gaussian_spot import LASER_RESPONSE, SpotBlur, SpotModel
 from phibench.estimator.spots.raw_pixels import GaussLaw, noise_of, raw_electrons, spot_regions
 from phibench.render.sensor.camera_chain import Chain
+from phibench.render.sensor.electrons import NoiseStream
 from phibench.render.sensor.light import Light, Region
-from phibench.render.sensor.noise_tiles import NoiseStream
 from phibench.render.sensor.settings import Sensor, sensor
 from phibench.scenes.random_streams import generator
 from phibench.scenes.rig import Rig

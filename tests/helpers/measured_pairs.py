@@ -36,7 +36,7 @@ from phibench.calibration.sensor_fit.fit import fit_sensor
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.exposures.pair_draws import FrameCounts
 from phibench.datasets.frames.frame_files import png_bytes
-from phibench.datasets.frames.sensor_file import write_sensor_file
+from phibench.datasets.frames.sensor_card import write_sensor_file
 from phibench.datasets.read import Dataset, Sample, open_finished
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.estimator.methods.draw_pairs import pairs_of

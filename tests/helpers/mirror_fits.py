@@ -27,8 +27,8 @@ from phibench.estimator.spots.spot_prediction import spot_blur
 from phibench.render.optics.spot_layer import SpotLayer, spot_layer
 from phibench.render.optics.truth import spot_truth
 from phibench.render.sensor.camera_chain import Chain
+from phibench.render.sensor.electrons import NoiseStream
 from phibench.render.sensor.light import Light, Region
-from phibench.render.sensor.noise_tiles import NoiseStream
 from phibench.render.sensor.settings import Sensor
 from phibench.scenes.frames import Array
 from phibench.scenes.laser import Beam, LaserSpot

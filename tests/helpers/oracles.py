@@ -14,8 +14,8 @@ from scipy import optimize
 
 from phibench.estimator.geometry.paper_depth import Published, load_published
 from phibench.scenes.camera import Camera
-from phibench.scenes.catalog import TargetBoard
 from phibench.scenes.rig import Rig
+from phibench.scenes.room import TargetBoard
 
 # depth_m -> azimuth in degrees: one board per depth of the paper
 AZIMUTH_DEG = {1.0: 200, 1.975: 100, 2.18: 150, 2.95: 250, 3.18: 310, 3.97: 20, 4.18: 60}

@@ -16,9 +16,8 @@ from phibench.render.optics.truth import truth_layer
 from phibench.render.room import light_map
 from phibench.render.room.ambient import Crop, render_ambient, view_surfaces
 from phibench.render.room.light_map import BakeSettings, LightMap, bake
-from phibench.scenes.catalog import default_rig
 from phibench.scenes.frames import Array
-from phibench.scenes.room import Room
+from phibench.scenes.room import Room, default_rig
 
 RIG = default_rig()
 VIEW = RIG.at(0.3)

@@ -12,8 +12,7 @@ from PIL import Image
 
 from phibench.datasets.rooms.mesh_placement import MeshLamp, MeshSettings
 from phibench.datasets.rooms.mesh_room import mesh_room
-from phibench.datasets.rooms.panorama_room import panorama_room
-from phibench.datasets.rooms.panorama_settings import PanoramaSettings
+from phibench.datasets.rooms.panorama_room import PanoramaSettings, panorama_room
 from phibench.datasets.rooms.room_sources import GeneratedRoom
 from phibench.scenes.room import Room
 from phibench.scenes.worlds.properties import drawn_properties

@@ -5,11 +5,11 @@ from __future__ import annotations
 import dataclasses
 import math
 
-from phibench.scenes.catalog import default_rig
 from phibench.scenes.frames import Pose, rotation_xyz
 from phibench.scenes.revolved_mirror import RevolvedMirror
 from phibench.scenes.revolved_profile import Profile, cone, hyperboloid, paraboloid, sphere_cap
 from phibench.scenes.rig import Rig
+from phibench.scenes.room import default_rig
 
 VERTEX_M = 0.2
 IMAGE_M = 0.05  # behind the vertex: where paraboloid and hyperboloid show what is level with them

@@ -22,9 +22,8 @@ import numpy as np
 from scipy import sparse
 
 from phibench.render.sensor.camera_chain import Chain
-from phibench.render.sensor.electrons import mean_charge
+from phibench.render.sensor.electrons import NoiseStream, mean_charge, whole_tiles
 from phibench.render.sensor.light import Light, Region
-from phibench.render.sensor.noise_tiles import NoiseStream, whole_tiles
 from phibench.render.sensor.processing import linear_rgb, linear_signal
 from phibench.render.sensor.settings import Sensor
 from phibench.scenes.frames import Array

@@ -35,9 +35,8 @@ from phibench.render.optics.room_tracer import room_geometry
 from phibench.render.optics.spot_layer import spot_layer
 from phibench.render.optics.truth import spot_truth
 from phibench.render.sensor.camera_chain import Chain
-from phibench.render.sensor.electrons import mosaic
+from phibench.render.sensor.electrons import NoiseStream, mosaic
 from phibench.render.sensor.light import Light, Region
-from phibench.render.sensor.noise_tiles import NoiseStream
 from phibench.render.sensor.settings import sensor
 from phibench.robot.film.blink_identity import TargetCode, TargetTracker
 from phibench.scenes.frames import Array

@@ -13,10 +13,10 @@ from helpers.dense_truths import smaller
 from phibench.datasets.frames.sensor_card import sensor_card
 from phibench.estimator.dense.dense_interface import DensePair
 from phibench.estimator.geometry.reflection import room_rays
-from phibench.scenes.catalog import default_rig
 from phibench.scenes.frames import Array
 from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.rig import Rig, View
+from phibench.scenes.room import default_rig
 
 WALL_M, CEILING_M = 2.5, 3.0
 SMALL = 3.0  # times larger pixels than the default rig's, to be quick

@@ -24,7 +24,7 @@ from helpers.bench_cases import cases, outcomes, truth_itself
 from PIL import Image
 
 from phibench.benchmark.isolation.resolve import Reference
-from phibench.benchmark.pair_sets.truth_file import read_truth_file, truth_text
+from phibench.benchmark.pair_sets.frames_set import read_truth_file, truth_text
 from phibench.benchmark.scores.answer_errors import Rules
 from phibench.benchmark.scores.document import MethodCard, read_records, read_score, write_score
 from phibench.benchmark.scores.score import score_outcomes
@@ -39,7 +39,7 @@ from phibench.benchmark.sealed.submission import SealedPairs, outcomes_of, read_
 from phibench.calibration.captures.picture_files import read_picture
 from phibench.calibration.rig.bundle import Bundle
 from phibench.calibration.rig.file import read_calibration, write_calibration
-from phibench.datasets.build import light_map_cache
+from phibench.datasets.build import bake_task
 from phibench.datasets.build.bake_task import read_light_map
 from phibench.datasets.build.journal import Entry, FolderHead, Journal
 from phibench.datasets.common.errors import DatasetError
@@ -242,7 +242,7 @@ def forged_light(rng: random.Random) -> bytes:
 def entry_bytes(payload: bytes) -> bytes:
     """Entry of the cache of light maps, with the hash of its content."""
     body = BAKED + b"\n" + payload
-    return b"\n".join([light_map_cache._FORM, digest(body).encode(), body])
+    return b"\n".join([bake_task._FORM, digest(body).encode(), body])
 
 
 def forged_entry(rng: random.Random) -> bytes:
@@ -250,7 +250,7 @@ def forged_entry(rng: random.Random) -> bytes:
 
 
 def read_entry(path: Path) -> LightMap:
-    light = light_map_cache._read(path, BAKED)
+    light = bake_task._read(path, BAKED)
     if light is None:
         raise DatasetError("baked again")
     return light

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from phibench.scenes.camera import Camera
-from phibench.scenes.catalog import c310_camera
+from phibench.scenes.room import c310_camera
 from phibench.scenes.validation import SceneError
 
 FULL = Camera(fx_px=1430.0, fy_px=1402.0, cx_px=650.3, cy_px=351.7, k1=-0.05, k2=0.31, k3=-0.4, p1=1.3e-3, p2=-0.7e-3)

@@ -12,7 +12,7 @@ from helpers.snell import through
 
 from phibench.datasets.store.documents import from_json, to_json
 from phibench.estimator.geometry.least_squares_depth import depth_general
-from phibench.estimator.geometry.mirror_image import image_of
+from phibench.estimator.geometry.reflection import image_of
 from phibench.estimator.geometry.triangulate import depth_exact, exact_gradient
 from phibench.render.optics import certificate
 from phibench.render.optics.certificate import certify
@@ -22,12 +22,12 @@ from phibench.render.optics.room_tracer import RoomGeometry, into_room, room_geo
 from phibench.render.optics.spot_layer import spot_layer
 from phibench.render.optics.truth import spot_truth, truth_layer
 from phibench.render.setup.variant import activate
-from phibench.scenes.catalog import default_rig, lab
 from phibench.scenes.glass_tube import GlassTube
 from phibench.scenes.holder import OF_TUBES, Holder, fitted
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.rig import Rig, View
+from phibench.scenes.room import default_rig, lab
 
 BALL_M = 0.060
 ALIGNED = Misalignment()

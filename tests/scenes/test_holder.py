@@ -15,11 +15,11 @@ from phibench.render.optics.ray_tracer import trace_pixels
 from phibench.render.optics.room_tracer import first_hit, room_geometry
 from phibench.render.optics.spot_layer import spot_layer
 from phibench.render.optics.truth import spot_truth, truth_layer
-from phibench.scenes.catalog import default_rig, lab
 from phibench.scenes.holder import SIDES, Holder, fitted, prism_radius_m
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.rig import Rig, View
+from phibench.scenes.room import default_rig, lab
 from phibench.scenes.validation import SceneError
 
 BALL_M = 0.060

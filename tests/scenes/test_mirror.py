@@ -18,7 +18,6 @@ from phibench.render.optics.ray_tracer import lens_rays, meet, reflect, trace_pi
 from phibench.render.optics.reflection_point import bundle_spread, fermat_points, mirror_points
 from phibench.render.optics.spot_layer import spot_layer
 from phibench.render.optics.truth import spot_truth, truth_layer
-from phibench.scenes.catalog import default_rig
 from phibench.scenes.frames import Pose, rotation_xyz
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.mirror import (
@@ -33,6 +32,7 @@ from phibench.scenes.mirror import (
 )
 from phibench.scenes.misalignment import PARAMETERS, Misalignment
 from phibench.scenes.rig import Rig, View
+from phibench.scenes.room import default_rig
 from phibench.scenes.validation import SceneError
 
 R = 0.06

@@ -26,14 +26,13 @@ from phibench.datasets.store.documents import from_json, to_json
 from phibench.datasets.store.layers import read_ambient, read_truth
 from phibench.datasets.verify import verify
 from phibench.estimator.geometry.triangulate import depth_exact
-from phibench.render.sensor.rolling_shutter import spot_velocity_px_per_s
-from phibench.scenes.catalog import c310_rig, default_rig
+from phibench.render.sensor.light import spot_velocity_px_per_s
 from phibench.scenes.frames import Pose
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.mirror import HARMONICS, OF_REVOLVED, Form
 from phibench.scenes.misalignment import PARAMETERS, Misalignment, Motion
 from phibench.scenes.rig import Rig
-from phibench.scenes.room import carriage
+from phibench.scenes.room import c310_rig, carriage, default_rig
 from phibench.scenes.validation import SceneError
 from phibench.studies.paper.paper_tables import score
 

@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 from helpers.oracles import TARGETS, paper_cases, true_reflection
 
-from phibench.scenes.catalog import RIGS, ROOMS, TargetBoard, dark, lab
 from phibench.scenes.frames import Pose, rotation_xyz
 from phibench.scenes.rig import Rig
-from phibench.scenes.room import Room, chassis, escalade360
+from phibench.scenes.room import RIGS, ROOMS, Room, TargetBoard, chassis, dark, escalade360, lab
 from phibench.scenes.shapes import Bitmap, Checker, Cuboid, Rectangle, Uniform, cuboid, rectangle
 from phibench.scenes.validation import SceneError
 

@@ -10,12 +10,12 @@ import pytest
 from helpers.oracles import TARGETS
 
 from phibench.scenes.camera import Camera
-from phibench.scenes.catalog import c310_rig, lab
 from phibench.scenes.frames import Pose, rotation_facing, rotation_xyz
 from phibench.scenes.laser import LaserSpot, beam_diameter_m
 from phibench.scenes.metals import METALS, STEEL
 from phibench.scenes.mirror import SphereMirror
 from phibench.scenes.rig import POSITIONS, Rig, Stroke
+from phibench.scenes.room import c310_rig, lab
 from phibench.scenes.shapes import Uniform
 from phibench.scenes.validation import SceneError
 

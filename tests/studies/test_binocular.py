@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from phibench.render.sensor.settings import sensor
-from phibench.scenes.catalog import default_rig
+from phibench.scenes.room import default_rig
 from phibench.studies.isotropy.binocular import Binocular, Gain, binocular_findings, gain, power, standing
 from phibench.studies.isotropy.lines import hidden_share
 from phibench.studies.isotropy.noise import circle

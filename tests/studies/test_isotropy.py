@@ -17,12 +17,12 @@ from scipy.optimize import brentq
 from phibench.benchmark.scores.intervals import Estimate
 from phibench.datasets.read import Dataset, open_dataset
 from phibench.datasets.recipe.load import find_recipe, load_recipe
-from phibench.estimator.geometry.mirror_image import up_image
 from phibench.estimator.geometry.panorama import PanoramaGrid, SeenEdge
+from phibench.estimator.geometry.reflection import up_image
 from phibench.render.sensor.settings import sensor
-from phibench.scenes.catalog import default_rig
 from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.random_streams import generator
+from phibench.scenes.room import default_rig
 from phibench.studies.framework import StudyDatasets, read_settings
 from phibench.studies.isotropy import binocular
 from phibench.studies.isotropy.lines import (
@@ -69,8 +69,7 @@ def test_level_rays_from_afar_give_the_arcsine() -> None:
     """A far spot at the height at which its ray leaves the mirror: the other sphere is seen under asin(r / b)."""
 
     def climb(height_m: float) -> float:
-        from phibench.estimator.geometry.mirror_image import image_of
-        from phibench.estimator.geometry.reflection import reflect
+        from phibench.estimator.geometry.reflection import image_of, reflect
 
         view = RIG.at(0.0)
         return float(reflect(view, image_of(view, np.array([1e4, 0.0, height_m])).uv_px).direction_world[2])

@@ -13,7 +13,7 @@ from rich.console import Console
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.recipe.build import build_rig
 from phibench.datasets.recipe.tables import RigTable
-from phibench.estimator.geometry.mirror_image import image_of
+from phibench.estimator.geometry.reflection import image_of
 from phibench.estimator.geometry.sensitivities import PARAMETERS, sensitivity
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.estimator.limits.processed_bound import SpotSigma

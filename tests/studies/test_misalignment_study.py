@@ -17,11 +17,11 @@ from phibench.datasets.common.errors import DatasetError
 from phibench.estimator.geometry.paper_depth import depth_paper
 from phibench.estimator.geometry.rig_parameters import PARAMETERS as CALIBRATION
 from phibench.render.optics.truth import spot_truth
-from phibench.scenes.catalog import default_rig
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.mirror import OF_REVOLVED
 from phibench.scenes.misalignment import PARAMETERS, Misalignment
 from phibench.scenes.random_streams import generator
+from phibench.scenes.room import default_rig
 from phibench.studies.framework import StudyDatasets, read_settings
 from phibench.studies.misaligned_rigs import (
     NOMINAL,

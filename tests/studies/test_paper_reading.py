@@ -9,9 +9,9 @@ import polars as pl
 import pytest
 import scipy
 
-from phibench.estimator.geometry.mirror_image import image_of
 from phibench.estimator.geometry.paper_depth import depth_approx
 from phibench.estimator.geometry.phi import outline_circle, phi_outline
+from phibench.estimator.geometry.reflection import image_of
 from phibench.estimator.geometry.triangulate import ESTIMATORS
 from phibench.scenes.frames import Array, Pose
 from phibench.scenes.misalignment import PARAMETERS as MISALIGNMENT
@@ -50,7 +50,7 @@ def _world(random: np.random.Generator, scale: float = 1.0) -> dict[str, Array]:
 
 
 def _pixels(world: dict[str, Array], i: int) -> tuple[Rig, Array, Array]:
-    """Nominal rig and the true pixels of experiment i by the Newton iteration in pixels of `mirror_image`."""
+    """Nominal rig and the true pixels of experiment i by the Newton iteration in pixels of `reflection`."""
     nominal = replace(Rig(), T_camera_sphere=Pose("camera", "sphere", (0.0, 0.0, float(world["z_c_m"]))))
     wrong = Misalignment(**{name: float(world[name]) for name in PARAMETERS if name in world})
     true, table = nominal.perturbed(wrong), int(DATA.table[i]) + 1
@@ -63,7 +63,7 @@ def _pixels(world: dict[str, Array], i: int) -> tuple[Rig, Array, Array]:
 
 @pytest.mark.parametrize("convention", ["ray", "normal", "incidence"])
 def test_readings_are_those_of_misaligned_rigs(convention: str) -> None:
-    """Against other mathematics for image, phi and eq. (4); the 1e-10 px of `mirror_image` are below 1e-9 m."""
+    """Against other mathematics for image, phi and eq. (4); the 1e-10 px of `reflection` are below 1e-9 m."""
     checked = 0
     for draw in range(3):
         world = _world(generator("test", "cause", "world", draw))

@@ -12,7 +12,7 @@ from phibench.benchmark.dense.dense_check import judged_dense, with_exchanged
 from phibench.benchmark.dense.dense_easy import EasyDensePairs, EasyTruth, points_of
 from phibench.benchmark.isolation.check import Check
 from phibench.estimator.dense.dense_interface import DenseAnswer
-from phibench.estimator.geometry.mirror_image import image_of
+from phibench.estimator.geometry.reflection import image_of
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.estimator.interface import Outcome
 

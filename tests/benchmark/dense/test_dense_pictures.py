@@ -10,7 +10,7 @@ from PIL import Image
 from phibench.benchmark.dense.dense_pictures import CAUSE_GROUPS, DensePicture, free_space
 from phibench.datasets.frames.sensor_card import sensor_card
 from phibench.estimator.dense.dense_interface import DensePair
-from phibench.scenes.catalog import default_rig
+from phibench.scenes.room import default_rig
 
 
 @pytest.fixture(scope="module")

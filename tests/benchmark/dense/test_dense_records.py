@@ -11,8 +11,8 @@ from helpers.revolved_rigs import revolved
 from phibench.benchmark.dense.dense_pairs import DenseTruth
 from phibench.benchmark.dense.dense_records import COLUMNS, TruthErrors, ause, pair_records
 from phibench.estimator.dense.dense_interface import DenseAnswer
-from phibench.scenes.catalog import default_rig
 from phibench.scenes.misalignment import Misalignment
+from phibench.scenes.room import default_rig
 
 ROUNDING = 1e-9
 

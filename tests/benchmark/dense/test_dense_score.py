@@ -27,8 +27,7 @@ from phibench.benchmark.dense.dense_score import (
     score_dense,
 )
 from phibench.benchmark.dense.dense_tables import dense_board, dense_metrics_table, dense_strata_table
-from phibench.benchmark.isolation.answers import AnswerError
-from phibench.benchmark.isolation.dense_answers import checked_planes, most_bytes, planes_text
+from phibench.benchmark.isolation.answers import AnswerError, checked_planes, most_bytes, planes_text
 from phibench.benchmark.isolation.resolve import DENSE, MethodError, RunLimits, resolve
 from phibench.benchmark.scored_dataset import open_dataset
 from phibench.cli.main import main
@@ -36,8 +35,8 @@ from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.shown_text import text_of
 from phibench.datasets.store.schema import RECORDS_SO_FAR
 from phibench.estimator.dense.dense_interface import DenseAnswer, DensePair
-from phibench.scenes.catalog import default_rig
 from phibench.scenes.frames import Pose
+from phibench.scenes.room import default_rig
 
 METHODS = """
 import numpy as np

@@ -10,11 +10,11 @@ import pytest
 from helpers.oracles import alhazen_quartic
 
 from phibench.benchmark.isolation.easy_pairs import BOX_PX, EasyPairs
-from phibench.estimator.geometry.mirror_image import image_of
+from phibench.estimator.geometry.reflection import image_of
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.estimator.spots.raw_pixels import raw_electrons
-from phibench.scenes.catalog import c310_rig
 from phibench.scenes.rig import Rig
+from phibench.scenes.room import c310_rig
 
 COUNT = 30
 

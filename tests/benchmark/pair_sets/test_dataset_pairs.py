@@ -39,8 +39,8 @@ from phibench.estimator.interface import Pair
 from phibench.estimator.limits.position_bound import spot_limit
 from phibench.estimator.pair_set import PairTruth
 from phibench.estimator.spots.raw_pixels import noise_of
+from phibench.render.sensor.electrons import NoiseStream
 from phibench.render.sensor.light import Region
-from phibench.render.sensor.noise_tiles import NoiseStream
 from phibench.scenes.rig import POSITIONS
 
 SHAPES = {

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from helpers.bench_cases import cases
 
-from phibench.benchmark.pair_sets.truth_file import read_truth_file, truth_document, truth_text
+from phibench.benchmark.pair_sets.frames_set import read_truth_file, truth_document, truth_text
 from phibench.datasets.common.errors import DatasetError
 
 TEXT = "0123456789abcdef" * 4

@@ -14,8 +14,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
+from phibench.datasets.plan.draws import draw_rooms
 from phibench.datasets.plan.plan import Plan, make_plan
-from phibench.datasets.plan.room_draws import draw_rooms
 from phibench.datasets.plan.sampling import HIDDEN
 from phibench.datasets.recipe.load import load_recipe
 from phibench.datasets.recipe.tables import Recipe

@@ -32,7 +32,7 @@ from phibench.benchmark.scores.metrics import METRICS, PAIR_TWINS, applies, meas
 from phibench.benchmark.scores.records import records
 from phibench.benchmark.scores.score import score_outcomes
 from phibench.benchmark.scores.score_tables import leaderboard, scores_csv, scores_json
-from phibench.estimator.geometry.combine import joint_bound
+from phibench.estimator.geometry.least_squares_depth import joint_bound
 from phibench.estimator.geometry.phi import estimate_phi
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.estimator.limits.beyond_images import MODEL_MARGIN, RAW_MARGIN, excesses

@@ -32,7 +32,7 @@ from phibench.benchmark.scores.strata import STRATA
 from phibench.benchmark.scores.worst_images import crop, worst
 from phibench.cli import main as cli
 from phibench.datasets.common.errors import DatasetError
-from phibench.datasets.frames.sensor_file import SensorFile, write_sensor_file
+from phibench.datasets.frames.sensor_card import SensorFile, write_sensor_file
 from phibench.estimator.interface import Outcome
 
 RULES = Rules(resamples=199)

@@ -18,7 +18,7 @@ PICTURE_BLUR_PX = float(np.sqrt(BLUR_PX**2 + (1.0 + 1.0 / FINE**2) / 12.0 + 1.0 
 def ball(inner_edge_px: float = 0.0) -> np.ndarray:
     """Light in which the ball turns rays from a bright wall up to a darker ceiling.
 
-    Asin of the miss, as `mirror_image` has it, gives the turn. With an inner edge, the reflected room is twice as
+    Asin of the miss, as `reflection` has it, gives the turn. With an inner edge, the reflected room is twice as
     bright from that many pixels inside the limb on.
     """
     v, u = (np.mgrid[: FINE * ROWS, : FINE * COLUMNS] + 0.5) / FINE - 0.5

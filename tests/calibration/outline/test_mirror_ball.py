@@ -15,8 +15,7 @@ from phibench.cli.main import main
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.recipe.room_tables import PanoramaTable
 from phibench.datasets.rooms.panorama_files import read_panorama
-from phibench.datasets.rooms.panorama_room import panorama_room
-from phibench.datasets.rooms.panorama_settings import PanoramaSettings
+from phibench.datasets.rooms.panorama_room import PanoramaSettings, panorama_room
 
 RADIUS, SURROUNDINGS, FOCAL, SIZE = 0.05, 0.8, 1100.0, (480, 520)  # rows, columns
 CENTRE = np.array([0.012, -0.008, 0.30])

@@ -13,23 +13,23 @@ from phibench.calibration.outline.limb_image import Plane, Tap, binned, planes_o
 from phibench.calibration.outline.limb_sectors import Sectors, _medians, scatter
 from phibench.calibration.outline.outline import _approach as approach
 from phibench.calibration.outline.outline import find_outline, fit_outline, outline_at
-from phibench.calibration.outline.outline_fit import step_from
-from phibench.calibration.outline.outline_result import binned_rig
-from phibench.calibration.outline.outline_start import (
+from phibench.calibration.outline.outline_fit import (
     circles_by_size,
     grey,
     sphere_from_circle,
     sphere_from_rays,
+    step_from,
 )
+from phibench.calibration.outline.outline_result import binned_rig
 from phibench.datasets.frames.sensor_card import sensor_card
 from phibench.estimator.spots.camera_codes import linear_to_srgb, srgb_to_linear
 from phibench.estimator.spots.image_planes import ImageError
 from phibench.render.sensor.camera_chain import Chain
+from phibench.render.sensor.electrons import NoiseStream
 from phibench.render.sensor.light import Light
-from phibench.render.sensor.noise_tiles import NoiseStream
 from phibench.render.sensor.processing import demosaic, eight_bit
-from phibench.render.sensor.processing import srgb_encoded as srgb_of_the_camera
 from phibench.render.sensor.settings import sensor
+from phibench.render.sensor.srgb import srgb_encoded as srgb_of_the_camera
 from phibench.scenes.camera import Camera
 from phibench.scenes.frames import Pose
 from phibench.scenes.rig import Rig
@@ -155,7 +155,7 @@ def test_a_hopeless_fit_ends_soon(monkeypatch: pytest.MonkeyPatch) -> None:
         steps.append(step_from(*arguments, **options))
         return steps[-1]
 
-    monkeypatch.setattr("phibench.calibration.outline.sphere_outline.step_from", counted)
+    monkeypatch.setattr("phibench.calibration.outline.outline.step_from", counted)
     with pytest.raises(ImageError, match="without a mirror"):
         fit_outline(outline_at(planes_of(np.stack([light] * 3)), rig, rig.sphere_in_camera_m))
     assert len(steps) <= 6 + 6  # to come near, and to see that it leads nowhere

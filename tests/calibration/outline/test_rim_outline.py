@@ -27,8 +27,8 @@ from phibench.calibration.outline.outline_result import Outline, mean_outline
 from phibench.datasets.frames.sensor_card import sensor_card
 from phibench.estimator.spots.image_planes import ImageError
 from phibench.render.sensor.camera_chain import Chain
+from phibench.render.sensor.electrons import NoiseStream
 from phibench.render.sensor.light import Light
-from phibench.render.sensor.noise_tiles import NoiseStream
 from phibench.render.sensor.settings import sensor
 from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.random_streams import generator

@@ -16,15 +16,15 @@ from scipy import ndimage
 from phibench.calibration.captures.picture_files import read_linear, read_picture
 from phibench.calibration.captures.rig_file import read_rig_file
 from phibench.calibration.outline.contour import aside_by_tilt_m
-from phibench.calibration.outline.outline_start import rig_circle
+from phibench.calibration.outline.outline_fit import rig_circle
 from phibench.calibration.rig.align import alignment, circle_of, distance_of, nominal_centre, sharpness
 from phibench.cli import main as cli
 from phibench.datasets.frames.sensor_card import sensor_card
 from phibench.estimator.spots.camera_codes import linear_to_srgb
 from phibench.estimator.spots.image_planes import ImageError
 from phibench.render.sensor.camera_chain import Chain
+from phibench.render.sensor.electrons import NoiseStream
 from phibench.render.sensor.light import Light
-from phibench.render.sensor.noise_tiles import NoiseStream
 from phibench.render.sensor.settings import sensor
 from phibench.scenes.frames import Pose
 from phibench.scenes.rig import Rig

@@ -9,7 +9,7 @@ from helpers.processes import SMALLEST, quiet
 
 from phibench.datasets.build.finished_work import lost_work
 from phibench.datasets.build.journal import Journal
-from phibench.datasets.build.task_list import plan_tasks
+from phibench.datasets.build.run_tasks import plan_tasks
 from phibench.datasets.build.workers import versions
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.make import make

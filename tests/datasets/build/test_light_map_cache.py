@@ -15,11 +15,10 @@ from filelock import FileLock
 from helpers.processes import within
 
 from phibench.cli.main import main
-from phibench.datasets.build import light_map_cache as cache
+from phibench.datasets.build import bake_task as cache
 from phibench.datasets.common.errors import DatasetError
 from phibench.render.room.light_map import BakeSettings, LightMap, texel_count
-from phibench.scenes.catalog import default_rig
-from phibench.scenes.room import Room, Sun
+from phibench.scenes.room import Room, Sun, default_rig
 from phibench.scenes.shapes import Bitmap, rectangle
 
 VIEW = default_rig().at(0.0)

@@ -16,7 +16,7 @@ from phibench.datasets.build.tasks import BuildTask, Made, task_key
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.film.moving_camera import bake_rooms, open_baked_rooms
 from phibench.datasets.store import schema
-from phibench.datasets.store.filling import filling, signed, write_documents
+from phibench.datasets.store.checksums import filling, signed, write_documents
 from phibench.render.room.light_map import BakeSettings, LightMap, texel_count
 
 NAMES = ("a", "b", "c")
@@ -152,7 +152,7 @@ def test_baked_rooms_are_kept_one_by_one(tmp_path: Path, monkeypatch: pytest.Mon
         light = np.full((texels, 3), len(baked), np.float32)
         return LightMap(light, np.zeros_like(light), np.zeros(texels, bool))
 
-    monkeypatch.setattr("phibench.datasets.build.light_map_cache.light_map", light_map)
+    monkeypatch.setattr("phibench.datasets.build.bake_task.light_map", light_map)
     monkeypatch.setattr("phibench.datasets.build.view_task.start_renderer", dict)
     out, settings = tmp_path / "rooms", BakeSettings(texel_m=0.5, indirect_texel_m=1.0)
     with pytest.raises(KeyboardInterrupt):

@@ -23,9 +23,8 @@ from phibench.datasets.recipe.load import load_recipe
 from phibench.datasets.store import schema
 from phibench.datasets.verify import verify
 from phibench.render.optics import certificate, spot_samples
-from phibench.scenes.catalog import default_rig
 from phibench.scenes.laser import LaserSpot
-from phibench.scenes.room import Room
+from phibench.scenes.room import Room, default_rig
 from phibench.scenes.shapes import cuboid
 
 DRAWN = """

@@ -16,7 +16,7 @@ from phibench.datasets.build.journal import FolderHead, Journal
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.plan.plan import make_plan
 from phibench.datasets.recipe.load import load_recipe
-from phibench.datasets.store import files, filling, schema
+from phibench.datasets.store import checksums, files, schema
 from phibench.datasets.store.files import only_run
 
 
@@ -124,7 +124,7 @@ def test_the_last_step_looks_for_every_file(
     out = Path(shutil.copytree(smallest_dataset, tmp_path / "out"))
     (out / schema.TABLE).unlink()
     last = {"before the documents": schema.TABLE, "before the sums": schema.TABLE, "after the sums": schema.CHECKSUMS}
-    write = filling.write_bytes
+    write = checksums.write_bytes
 
     def writing(path: Path, data: bytes) -> Path:
         if path.name != last[moment]:
@@ -136,7 +136,7 @@ def test_the_last_step_looks_for_every_file(
             away(out)
         return path
 
-    monkeypatch.setattr(filling, "write_bytes", writing)
+    monkeypatch.setattr(checksums, "write_bytes", writing)
     text = refusal(out)
     assert " files are gone from " in text
     assert "run the same command again" in text

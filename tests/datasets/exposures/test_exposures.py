@@ -16,11 +16,11 @@ from helpers.processes import quiet
 from helpers.recipes import changed, complaints
 
 from phibench.datasets.build.journal import Journal
-from phibench.datasets.build.task_list import plan_tasks
+from phibench.datasets.build.run_tasks import plan_tasks
 from phibench.datasets.common.errors import DatasetError, RecipeError
 from phibench.datasets.exposures import pair_draws as module
 from phibench.datasets.exposures.pair_draws import BOX_MARGIN_PX, CachedSample, PairDraw, pair_draws
-from phibench.datasets.frames.sensor_file import SensorFile
+from phibench.datasets.frames.sensor_card import SensorFile
 from phibench.datasets.frames.source import noise_draw
 from phibench.datasets.make import make, make_from_plan
 from phibench.datasets.plan.plan import make_plan

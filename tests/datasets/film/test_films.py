@@ -30,7 +30,7 @@ from phibench.render.film.key_views import PoseParts
 from phibench.render.optics.spot_layer import spot_layer
 from phibench.render.optics.truth import spot_truth
 from phibench.render.sensor.camera_chain import Chain
-from phibench.render.sensor.noise_tiles import NoiseStream
+from phibench.render.sensor.electrons import NoiseStream
 from phibench.robot.film.film_frames import film_frames
 
 TEXT = (ROOT / "tests" / "films.toml").read_text(encoding="utf-8")

@@ -17,9 +17,8 @@ from phibench.datasets.exposures.pair_draws import CachedSample, pair_draws
 from phibench.datasets.frames.distractors import MIN_APART_PX, Distractor, distractors, present
 from phibench.datasets.read import Dataset, Sample, open_dataset
 from phibench.render.sensor.camera_chain import Chain
-from phibench.render.sensor.electrons import expected_electrons
+from phibench.render.sensor.electrons import NoiseStream, expected_electrons
 from phibench.render.sensor.light import Light, OtherSpot, Region
-from phibench.render.sensor.noise_tiles import NoiseStream
 from phibench.render.sensor.settings import sensor
 from phibench.scenes.camera import Camera
 

@@ -21,8 +21,8 @@ from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.frames.request import FrameOptions, jpeg_tables
 from phibench.datasets.frames.source import FrameSource
 from phibench.datasets.read import Dataset, Sample, open_dataset
+from phibench.render.sensor.electrons import NoiseStream
 from phibench.render.sensor.light import Region
-from phibench.render.sensor.noise_tiles import NoiseStream
 
 SEEN, HALF = "seen-near-h0.500", "half-hidden-h1.400"
 NAMES = ("down", "up", "down_off", "up_off")

@@ -8,8 +8,8 @@ import pytest
 from helpers.room_files import MESH, PANORAMA, recipe, write_files
 
 from phibench.datasets.common.errors import RecipeError
+from phibench.datasets.plan.draws import draw_rooms
 from phibench.datasets.plan.plan import Plan, make_plan
-from phibench.datasets.plan.room_draws import draw_rooms
 from phibench.datasets.recipe.load import check_recipe
 from phibench.datasets.rooms.room_files import RoomFiles
 from phibench.datasets.rooms.room_sources import MeshRoom, PanoramaRoom

@@ -11,7 +11,7 @@ import scipy
 from helpers.drawn_values import RAY, drawing, shipped
 from helpers.recipes import target
 
-from phibench.datasets.build.task_list import plan_tasks
+from phibench.datasets.build.run_tasks import plan_tasks
 from phibench.datasets.common.errors import RecipeError
 from phibench.datasets.plan.plan import Plan, make_plan
 from phibench.datasets.plan.sampling import PARAMETERS, drawn_parameters, first_points
@@ -21,9 +21,8 @@ from phibench.datasets.recipe.load import check_recipe, load_recipe
 from phibench.datasets.rooms.room_sources import room_of
 from phibench.render.optics.room_tracer import blocked_by
 from phibench.render.optics.truth import spot_truth
-from phibench.scenes.catalog import X_HIGH, X_LOW, Y_HIGH, Y_LOW
 from phibench.scenes.rig import POSITIONS
-from phibench.scenes.room import Room
+from phibench.scenes.room import X_HIGH, X_LOW, Y_HIGH, Y_LOW, Room
 from phibench.scenes.shapes import Cuboid
 
 

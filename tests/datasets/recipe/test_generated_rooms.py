@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from phibench.datasets.common.errors import RecipeError
+from phibench.datasets.plan.draws import draw_rooms
 from phibench.datasets.plan.plan import make_plan
-from phibench.datasets.plan.room_draws import draw_rooms
 from phibench.datasets.recipe.load import check_recipe, load_recipe
 from phibench.datasets.rooms.room_sources import GeneratedRoom
 from phibench.datasets.store.documents import from_json, to_json

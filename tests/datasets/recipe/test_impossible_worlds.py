@@ -18,13 +18,11 @@ from phibench.cli import main as cli
 from phibench.datasets.plan import sampling
 from phibench.datasets.recipe.spot_placement import by_ray
 from phibench.datasets.recipe.tables import LaserTable
-from phibench.datasets.rooms.panorama_room import panorama_room
-from phibench.datasets.rooms.panorama_settings import PanoramaSettings
+from phibench.datasets.rooms.panorama_room import PanoramaSettings, panorama_room
 from phibench.render.optics.truth import spot_truth
-from phibench.scenes.catalog import default_rig
 from phibench.scenes.frames import as_vector
 from phibench.scenes.laser import LaserSpot
-from phibench.scenes.room import Room, carriage
+from phibench.scenes.room import Room, carriage, default_rig
 from phibench.scenes.shapes import Uniform, rectangle
 from phibench.scenes.validation import SceneError
 

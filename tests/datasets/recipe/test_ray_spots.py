@@ -19,10 +19,9 @@ from phibench.datasets.recipe.spot_placement import by_ray
 from phibench.datasets.recipe.tables import LaserTable, Recipe
 from phibench.datasets.rooms.room_sources import room_of
 from phibench.datasets.store.schema import ManifestRow, SpotRow
-from phibench.scenes.catalog import default_rig
 from phibench.scenes.frames import Pose, rotation_xyz
 from phibench.scenes.laser import LaserSpot
-from phibench.scenes.room import Room
+from phibench.scenes.room import Room, default_rig
 from phibench.scenes.shapes import Bitmap, Cuboid, Mesh, Prism, Rectangle, Shape, Uniform, rectangle
 
 OWN, DISC = LaserTable(albedo="surface"), LaserTable()

@@ -10,7 +10,7 @@ from phibench.datasets.common.errors import RecipeError
 from phibench.datasets.recipe.build import build_rig, build_spot
 from phibench.datasets.recipe.checks import warnings
 from phibench.datasets.recipe.load import RECIPES, check_recipe, find_recipe, load_recipe, parse_recipe
-from phibench.scenes.catalog import c310_rig, default_rig
+from phibench.scenes.room import c310_rig, default_rig
 
 
 def experiment(**values: Any) -> dict[str, Any]:

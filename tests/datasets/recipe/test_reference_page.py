@@ -7,7 +7,7 @@ import pytest
 
 from phibench.datasets.recipe.build import build_rig
 from phibench.datasets.recipe.tables import RigTable
-from phibench.scenes.catalog import RIGS
+from phibench.scenes.room import RIGS
 from tools import reference_page
 
 PAGE = (Path(reference_page.__file__).resolve().parents[1] / "datasets" / "RECIPE.md").read_text(encoding="utf-8")

@@ -14,8 +14,7 @@ from PIL import Image
 
 from phibench.datasets.rooms import panorama_room as panorama_room_module
 from phibench.datasets.rooms.mesh_placement import MeshLamp, MeshSettings
-from phibench.datasets.rooms.panorama_room import MEAN_IRRADIANCE_W_M2, panorama_room
-from phibench.datasets.rooms.panorama_settings import PanoramaSettings
+from phibench.datasets.rooms.panorama_room import MEAN_IRRADIANCE_W_M2, PanoramaSettings, panorama_room
 from phibench.render.optics.faces import face_table
 from phibench.scenes.room import Room
 from phibench.scenes.shapes import Bitmap

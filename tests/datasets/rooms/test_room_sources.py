@@ -8,7 +8,7 @@ from helpers.room_files import BOX, write_files
 
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.rooms.mesh_placement import MeshLamp, MeshSettings, read_mesh
-from phibench.datasets.rooms.panorama_settings import PanoramaSettings
+from phibench.datasets.rooms.panorama_room import PanoramaSettings
 from phibench.datasets.rooms.room_files import RoomError, RoomFiles
 from phibench.datasets.rooms.room_sources import SOURCES, MeshRoom, PanoramaRoom, room_of
 from phibench.datasets.store.documents import from_json, to_json

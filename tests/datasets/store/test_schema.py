@@ -19,9 +19,8 @@ from phibench.datasets.plan.plan import make_plan
 from phibench.datasets.recipe.load import load_recipe
 from phibench.datasets.store.documents import differences, from_json, read_manifest, to_json, to_table
 from phibench.datasets.store.schema import ManifestRow, columns, flat, row_line
-from phibench.scenes.catalog import c310_rig, lab
 from phibench.scenes.rig import Rig
-from phibench.scenes.room import Room
+from phibench.scenes.room import Room, c310_rig, lab
 
 TINY = Path(__file__).resolve().parents[2] / "tiny.toml"
 

@@ -14,8 +14,8 @@ from helpers.processes import SMALLEST, quiet
 
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.make import make_from_plan
+from phibench.datasets.plan.draws import draw_rooms
 from phibench.datasets.plan.plan import POSITIONS, Plan, make_plan, pose_of
-from phibench.datasets.plan.room_draws import draw_rooms
 from phibench.datasets.read import open_dataset, open_finished
 from phibench.datasets.recipe.load import load_recipe
 from phibench.datasets.rooms.room_sources import NamedRoom, room_of

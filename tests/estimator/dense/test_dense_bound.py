@@ -14,10 +14,10 @@ import pytest
 
 from phibench.datasets.frames.sensor_card import sensor_card
 from phibench.estimator.dense.dense_bound import EpipolarMotion, dense_bound, matching_information, motion_of
-from phibench.estimator.geometry.mirror_image import up_image
+from phibench.estimator.geometry.reflection import up_image
 from phibench.estimator.spots.image_planes import variance_e2
-from phibench.scenes.catalog import default_rig
 from phibench.scenes.frames import Array
+from phibench.scenes.room import default_rig
 
 HALF, STEP = 10, 4.0  # px: of the window of 21 px, and of the spline's knots
 LEVEL_E, CONTRAST_E = 5000.0, 300.0

@@ -19,10 +19,9 @@ from phibench.estimator.dense.panorama_matchers import (
     dense_sgbm_exact,
     dense_sift,
 )
-from phibench.estimator.dense.smooth_maps import maps_of
 from phibench.estimator.dense.sweep import dense_sweep, hidden
-from phibench.estimator.dense.unrolled_pair import luma_codes
-from phibench.estimator.geometry.mirror_image import image_of, up_image
+from phibench.estimator.dense.unrolled_pair import luma_codes, maps_of
+from phibench.estimator.geometry.reflection import image_of, up_image
 from phibench.scenes.frames import Array
 
 WIDTH_PX = 320  # a third of the default's, as the small rig's pixels

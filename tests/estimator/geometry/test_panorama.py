@@ -28,9 +28,9 @@ from phibench.estimator.geometry.panorama import (
     vertical_edges,
 )
 from phibench.render.optics.truth import spot_truth, truth_layer
-from phibench.scenes.catalog import default_rig, lab
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.misalignment import Misalignment
+from phibench.scenes.room import default_rig, lab
 
 GRID = PanoramaGrid(360, math.radians(-60.0), math.radians(30.0))
 

@@ -14,9 +14,9 @@ from helpers.oracles import TARGETS, alhazen_quartic, paper_cases, true_pixel
 from phibench.estimator.geometry.paper_depth import depth_paper
 from phibench.estimator.geometry.phi import CONVENTIONS, GRADIENTS, estimate_phi, outline_circle
 from phibench.estimator.geometry.status import Status
-from phibench.scenes.catalog import c310_rig
 from phibench.scenes.frames import Pose, rotation_xyz
 from phibench.scenes.rig import Rig
+from phibench.scenes.room import c310_rig
 
 RIG = Rig()
 CENTRE = np.array([639.5, 359.5])

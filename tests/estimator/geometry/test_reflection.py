@@ -18,8 +18,8 @@ from hypothesis import strategies as st
 
 from phibench.estimator.geometry.reflection import GRAZING_COSINE, reflect, reflect_jacobian
 from phibench.estimator.geometry.status import Status
-from phibench.scenes.catalog import c310_rig
 from phibench.scenes.rig import Rig
+from phibench.scenes.room import c310_rig
 
 CENTRE = np.array([639.5, 359.5])
 

@@ -8,19 +8,16 @@ import numpy as np
 import pytest
 from helpers.revolved_rigs import PROFILES, revolved
 
-from phibench.estimator.geometry.combine import combine
-from phibench.estimator.geometry.least_squares_depth import depth_general
-from phibench.estimator.geometry.mirror_image import image_of
+from phibench.estimator.geometry.least_squares_depth import combine, depth_general
 from phibench.estimator.geometry.paper_depth import depth_paper, depth_revolved, paper_gradient, revolved_gradient
 from phibench.estimator.geometry.phi import CONVENTIONS, GRADIENTS
-from phibench.estimator.geometry.reflection import reflect, reflect_jacobian
+from phibench.estimator.geometry.reflection import image_of, reflect, reflect_jacobian
 from phibench.estimator.geometry.rig_parameters import RIG_PARAMETERS, has_effect, moves_rays, rig_gradient
 from phibench.estimator.geometry.sensitivities import PARAMETERS, pixel_gradient, sensitivity
 from phibench.estimator.geometry.status import Status
 from phibench.estimator.geometry.triangulate import ESTIMATORS, depth_exact
 from phibench.render.optics.ray_tracer import trace_pixels
 from phibench.render.optics.reflection_point import mirror_points
-from phibench.scenes.catalog import default_rig
 from phibench.scenes.frames import Array, rotation_xyz
 from phibench.scenes.holder import fitted
 from phibench.scenes.mirror import OF_REVOLVED
@@ -28,6 +25,7 @@ from phibench.scenes.misalignment import PARAMETERS as MISALIGNMENT
 from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.revolved_profile import cone, sphere_cap
 from phibench.scenes.rig import Rig, View
+from phibench.scenes.room import default_rig
 
 STROKE_M = 0.4
 

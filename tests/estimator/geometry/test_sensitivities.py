@@ -15,9 +15,8 @@ from helpers.misaligned_cases import Case, draw_case
 
 from phibench.cli.main import main
 from phibench.datasets.read import open_finished
-from phibench.estimator.geometry.mirror_image import image_of
 from phibench.estimator.geometry.paper_depth import paper_gradient
-from phibench.estimator.geometry.reflection import ray_basis
+from phibench.estimator.geometry.reflection import image_of, ray_basis
 from phibench.estimator.geometry.rig_parameters import RIG_PARAMETERS, rig_gradient
 from phibench.estimator.geometry.sensitivities import (
     PARAMETERS,
@@ -30,12 +29,12 @@ from phibench.estimator.geometry.triangulate import ESTIMATORS, depth_exact, exa
 from phibench.render.optics.certificate import pixel_centroid
 from phibench.render.optics.spot_layer import spot_layer
 from phibench.render.optics.truth import depth_m, spot_truth
-from phibench.scenes.catalog import default_rig
 from phibench.scenes.frames import Pose
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.misalignment import PARAMETERS as MISALIGNMENT
 from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.rig import POSITIONS, Rig, View
+from phibench.scenes.room import default_rig
 from phibench.studies.paper.sensitivity_table import TRUTH, columns
 
 Pixels = tuple[np.ndarray, np.ndarray]

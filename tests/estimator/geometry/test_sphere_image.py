@@ -7,15 +7,15 @@ import dataclasses
 import numpy as np
 import pytest
 
-from phibench.estimator.geometry.mirror_image import image_of
+from phibench.estimator.geometry.reflection import image_of
 from phibench.estimator.geometry.sphere_image import SphereImager
 from phibench.estimator.geometry.status import Status
 from phibench.estimator.spots.spot_prediction import Laser, spot_electrons_per_s
-from phibench.scenes.catalog import c310_rig
 from phibench.scenes.holder import fitted
 from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.random_streams import generator
 from phibench.scenes.rig import Rig
+from phibench.scenes.room import c310_rig
 from phibench.scenes.validation import SceneError
 
 CROOKED = Misalignment(tilt_x_rad=0.01, tilt_y_rad=-0.02, decentre_x_m=2e-3)

@@ -11,17 +11,17 @@ from helpers.sensor_light import spot_at
 
 from phibench.datasets.exposures.expected import ExpectedRegion, expected_of_light
 from phibench.datasets.frames.sensor_card import card_of, sensor_card
-from phibench.estimator.limits.off_frame_bound import (
+from phibench.estimator.limits.position_bound import spot_limit
+from phibench.estimator.limits.processed_bound import (
     FrameCounts,
+    chain_limit,
     on_off_limit,
     processed_on_off_limit,
 )
-from phibench.estimator.limits.position_bound import spot_limit
-from phibench.estimator.limits.processed_bound import chain_limit
 from phibench.estimator.processed.chain_model import chain_model, codes, raw_variance_e2
 from phibench.estimator.processed.fit_chain import unrounded
+from phibench.estimator.spots.camera_codes import quantised, step_correlation
 from phibench.estimator.spots.gaussian_spot import LASER_RESPONSE, SpotBlur, SpotModel, SpotPixels
-from phibench.estimator.spots.jpeg_coefficients import quantised, step_correlation
 from phibench.render.sensor.light import Light
 from phibench.render.sensor.settings import sensor
 

@@ -27,13 +27,12 @@ from phibench.estimator.limits.position_bound import (
     raw_information,
     spot_limit,
 )
-from phibench.estimator.spots.fisher import covariance_bound, fisher_matrix
 from phibench.estimator.spots.fit_raw import fit_raw
-from phibench.estimator.spots.gaussian_spot import SpotBlur, SpotModel
+from phibench.estimator.spots.gaussian_spot import SpotBlur, SpotModel, covariance_bound, fisher_matrix
 from phibench.estimator.spots.raw_pixels import PixelNoise, noise_of, raw_electrons
 from phibench.render.sensor.camera_chain import Chain
+from phibench.render.sensor.electrons import NoiseStream
 from phibench.render.sensor.light import Light, Region
-from phibench.render.sensor.noise_tiles import NoiseStream
 from phibench.render.sensor.settings import Sensor, sensor
 from phibench.scenes.random_streams import generator
 

@@ -13,8 +13,8 @@ from phibench.estimator.methods.chain_fit import chain_fit
 from phibench.estimator.spots.gaussian_spot import SpotBlur
 from phibench.estimator.spots.spot_prediction import spot_blur
 from phibench.render.sensor.camera_chain import Chain
+from phibench.render.sensor.electrons import NoiseStream
 from phibench.render.sensor.light import Light
-from phibench.render.sensor.noise_tiles import NoiseStream
 from phibench.render.sensor.settings import sensor
 from phibench.scenes.rig import Rig
 

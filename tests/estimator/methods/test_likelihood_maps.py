@@ -15,7 +15,7 @@ from phibench.estimator.spots.fit_raw import fit_law
 from phibench.estimator.spots.gaussian_spot import SpotBlur, SpotModel
 from phibench.estimator.spots.raw_pixels import bayer_filters
 from phibench.render.sensor.camera_chain import Chain
-from phibench.render.sensor.noise_tiles import NoiseStream
+from phibench.render.sensor.electrons import NoiseStream
 from phibench.render.sensor.settings import sensor
 from phibench.scenes.random_streams import generator
 

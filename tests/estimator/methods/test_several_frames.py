@@ -20,8 +20,8 @@ from phibench.estimator.spots.detect import detect
 from phibench.estimator.spots.raw_pixels import GaussLaw, PixelNoise
 from phibench.estimator.spots.spot_prediction import spot_blur
 from phibench.render.sensor.camera_chain import Chain
+from phibench.render.sensor.electrons import NoiseStream
 from phibench.render.sensor.light import Light
-from phibench.render.sensor.noise_tiles import NoiseStream
 from phibench.render.sensor.settings import sensor
 from phibench.scenes.random_streams import generator
 from phibench.scenes.rig import Rig

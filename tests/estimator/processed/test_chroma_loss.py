@@ -9,11 +9,11 @@ from helpers.sensor_light import spot_at
 from scipy.ndimage import gaussian_filter
 
 from phibench.datasets.frames.sensor_card import card_of
-from phibench.estimator.processed.chroma_loss import regained
 from phibench.estimator.processed.fit_chain import undone
+from phibench.estimator.processed.neighbour_filters import regained
 from phibench.render.sensor.camera_chain import Chain
+from phibench.render.sensor.electrons import NoiseStream
 from phibench.render.sensor.light import Light, Region
-from phibench.render.sensor.noise_tiles import NoiseStream
 from phibench.render.sensor.settings import Sensor, sensor
 from phibench.scenes.frames import Array
 

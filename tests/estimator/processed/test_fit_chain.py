@@ -16,16 +16,24 @@ from phibench.estimator.geometry.status import Status
 from phibench.estimator.limits.processed_bound import chain_limit
 from phibench.estimator.processed.chain_model import chain_model, codes
 from phibench.estimator.processed.fit_chain import fit_jpeg, fit_srgb, undone, unrounded
-from phibench.estimator.spots.camera_codes import linear_to_srgb, noisy_code, srgb_slope, srgb_to_linear
+from phibench.estimator.spots.camera_codes import (
+    coefficients,
+    linear_to_srgb,
+    noisy_code,
+    quantisation,
+    quantised,
+    srgb_slope,
+    srgb_to_linear,
+    steps,
+)
 from phibench.estimator.spots.fit_raw import fit_law
 from phibench.estimator.spots.gaussian_spot import SpotBlur, SpotModel, SpotPixels
-from phibench.estimator.spots.jpeg_coefficients import coefficients, quantisation, quantised, steps
 from phibench.estimator.spots.jpeg_recovery import recovered
 from phibench.estimator.spots.pixel_statistics import code_law, code_table
 from phibench.estimator.spots.raw_pixels import GaussLaw, PixelNoise, around, background_of, bayer_filters, spot_regions
 from phibench.render.sensor import processing
 from phibench.render.sensor.camera_chain import Chain
-from phibench.render.sensor.noise_tiles import NoiseStream
+from phibench.render.sensor.electrons import NoiseStream
 from phibench.render.sensor.settings import sensor
 from phibench.scenes.random_streams import generator
 

@@ -7,8 +7,7 @@ import pytest
 from helpers.chain_scenes import drawn
 from numpy.polynomial.legendre import leggauss
 
-from phibench.estimator.processed.interval_fit import _Belief, _propagated
-from phibench.estimator.processed.interval_moments import QuantiserSteps, Sites, truncated_moments
+from phibench.estimator.processed.interval_fit import QuantiserSteps, Sites, _Belief, _propagated, truncated_moments
 from phibench.render.sensor.settings import sensor
 from phibench.scenes.frames import Array
 from phibench.scenes.random_streams import generator

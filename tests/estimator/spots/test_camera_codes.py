@@ -19,7 +19,9 @@ from phibench.estimator.processed.chain_model import chain_model, codes
 from phibench.estimator.processed.fit_chain import unrounded
 from phibench.estimator.processed.fit_jpeg import grid_px
 from phibench.estimator.spots.camera_codes import (
+    coefficients,
     light_of,
+    quantised,
     rgb_codes,
     rgb_picture,
     tone_of,
@@ -30,12 +32,11 @@ from phibench.estimator.spots.camera_codes import (
 )
 from phibench.estimator.spots.gaussian_spot import SpotBlur
 from phibench.estimator.spots.image_planes import colour_planes, linear_planes, through_jpeg
-from phibench.estimator.spots.jpeg_coefficients import coefficients, quantised
 from phibench.estimator.spots.jpeg_recovery import recovered
 from phibench.render.sensor import processing
 from phibench.render.sensor.camera_chain import Chain
+from phibench.render.sensor.electrons import NoiseStream
 from phibench.render.sensor.light import Region
-from phibench.render.sensor.noise_tiles import NoiseStream
 from phibench.render.sensor.settings import Sensor, sensor
 
 POINTS = ((0.0, 0.0), (0.02, 0.15), (0.1, 0.38), (0.3, 0.65), (0.6, 0.86), (1.0, 1.0))

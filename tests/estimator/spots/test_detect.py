@@ -19,7 +19,7 @@ from scipy.ndimage import gaussian_filter
 from phibench.datasets.exposures.expected import expected_of_light
 from phibench.datasets.frames.sensor_card import card_of
 from phibench.datasets.read import open_dataset
-from phibench.estimator.geometry.mirror_image import image_of
+from phibench.estimator.geometry.reflection import image_of
 from phibench.estimator.interface import Box, Pair
 from phibench.estimator.limits.position_bound import spot_limit
 from phibench.estimator.methods.locate import box_around, locate
@@ -38,12 +38,12 @@ from phibench.estimator.spots.detect import (
     mirror_box,
     outline_mask,
 )
-from phibench.estimator.spots.fisher import covariance_bound
+from phibench.estimator.spots.gaussian_spot import covariance_bound
 from phibench.estimator.spots.image_planes import colour_planes
 from phibench.render.optics.spot_layer import SpotLayer
 from phibench.render.sensor.camera_chain import Chain
+from phibench.render.sensor.electrons import NoiseStream
 from phibench.render.sensor.light import Light
-from phibench.render.sensor.noise_tiles import NoiseStream
 from phibench.render.sensor.settings import Sensor, sensor
 from phibench.scenes.camera import Camera
 from phibench.scenes.frames import Array

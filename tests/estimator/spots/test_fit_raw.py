@@ -28,8 +28,8 @@ from phibench.estimator.spots.raw_pixels import (
     spot_regions,
 )
 from phibench.render.sensor.camera_chain import Chain
+from phibench.render.sensor.electrons import NoiseStream
 from phibench.render.sensor.light import Light, Region
-from phibench.render.sensor.noise_tiles import NoiseStream
 from phibench.render.sensor.settings import Sensor, sensor
 from phibench.scenes.random_streams import generator
 

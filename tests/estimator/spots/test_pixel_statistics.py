@@ -7,7 +7,7 @@ import pytest
 import scipy
 
 from phibench.datasets.frames.sensor_card import sensor_card
-from phibench.estimator.spots.jpeg_coefficients import room_variance, steps
+from phibench.estimator.spots.camera_codes import room_variance, steps
 from phibench.estimator.spots.pixel_statistics import (
     COUNTS,
     _information_table,

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from phibench.datasets.frames.sensor_card import card_of
-from phibench.estimator.geometry.mirror_image import image_of
+from phibench.estimator.geometry.reflection import image_of
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.estimator.interface import Pair
 from phibench.estimator.methods.registry import METHODS

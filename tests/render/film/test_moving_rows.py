@@ -11,7 +11,6 @@ from phibench.render.film.moving_rows import chief_uv_px, exposure_nodes, parted
 from phibench.render.optics.room_tracer import room_geometry
 from phibench.render.optics.spot_layer import spot_layer
 from phibench.render.optics.truth import spot_truth
-from phibench.scenes.catalog import TargetBoard, lab
 from phibench.scenes.frames import Array, Pose, as_matrix, as_vector
 from phibench.scenes.holder import fitted
 from phibench.scenes.laser import LaserSpot
@@ -22,7 +21,7 @@ from phibench.scenes.motion.film_scene import FilmScene, SpotPath, Waypoint
 from phibench.scenes.motion.film_times import BlinkCode, FilmTimes
 from phibench.scenes.motion.vehicle import PlanarPose, Vehicle, rig_placement, stance
 from phibench.scenes.rig import Rig, View
-from phibench.scenes.room import Room
+from phibench.scenes.room import Room, TargetBoard, lab
 
 TARGET = TargetBoard("t", 1.5, 0.6, 0.5)
 ROOM = lab((TARGET,))

@@ -9,17 +9,16 @@ import numpy as np
 import pytest
 
 from phibench.render.film.room_image import LitRoom, inside_reflectance, quick_spot, reflectance, room_image
+from phibench.render.optics.faces import TexelGrid
 from phibench.render.optics.ray_tracer import trace_pixels
 from phibench.render.optics.room_tracer import RoomGeometry, own_geometry
 from phibench.render.optics.spot_layer import spot_layer
-from phibench.render.room.texel_grid import TexelGrid
 from phibench.render.sensor.light import Region
-from phibench.scenes.catalog import lab
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.motion.vehicle import PlanarPose, Stance, Vehicle, rig_placement
 from phibench.scenes.random_streams import generator
 from phibench.scenes.rig import Rig
-from phibench.scenes.room import Room
+from phibench.scenes.room import Room, lab
 from phibench.scenes.shapes import Cuboid, Rectangle, cuboid
 
 LEVEL = np.eye(3), np.zeros(3)

@@ -8,18 +8,17 @@ import math
 import numpy as np
 import pytest
 
-from phibench.render.optics.beam_deposit import deposit, inside_reflectance, transmittance
 from phibench.render.optics.certificate import CENTROID_TOLERANCE_PX, FLUX_TOLERANCE, _differences, certify
 from phibench.render.optics.faces import face_table
 from phibench.render.optics.ray_tracer import trace_pixels
-from phibench.render.optics.room_tracer import RoomGeometry
+from phibench.render.optics.room_tracer import RoomGeometry, deposit, inside_reflectance, transmittance
 from phibench.render.optics.spot_layer import spot_layer, spot_light
 from phibench.render.optics.spot_samples import disc_nodes
 from phibench.render.optics.truth import spot_truth
-from phibench.scenes.catalog import default_rig
 from phibench.scenes.frames import Pose, rotation_xyz
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.rig import View
+from phibench.scenes.room import default_rig
 from phibench.scenes.shapes import Bitmap, Checker, Cuboid, Mesh, Prism, Rectangle, Shape, Uniform, rectangle
 from phibench.scenes.validation import SceneError
 

@@ -29,11 +29,10 @@ from phibench.render.optics.correspondence import (
     correspondence,
 )
 from phibench.render.optics.truth import truth_layer
-from phibench.scenes.catalog import default_rig, lab
 from phibench.scenes.frames import Pose
 from phibench.scenes.holder import fitted
 from phibench.scenes.rig import Rig, View
-from phibench.scenes.room import Room
+from phibench.scenes.room import Room, default_rig, lab
 
 STROKE_M = 0.42
 TOLERANCE_PX = 1e-6

@@ -9,9 +9,9 @@ import pytest
 from helpers.oracles import TARGETS
 
 from phibench.render.optics.faces import FaceTable, face_table
-from phibench.scenes.catalog import lab
 from phibench.scenes.frames import Pose, rotation_xyz
 from phibench.scenes.rig import Rig
+from phibench.scenes.room import lab
 from phibench.scenes.shapes import Bitmap, Checker, Cuboid, Mesh, Prism, Uniform, faces, rectangle
 from phibench.scenes.validation import SceneError
 

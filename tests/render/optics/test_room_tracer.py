@@ -13,9 +13,8 @@ from helpers.triangles import by_determinants
 from phibench.render.optics.faces import face_table
 from phibench.render.optics.room_tracer import RoomGeometry, blocked_by, first_hit, room_geometry
 from phibench.render.optics.truth import truth_layer
-from phibench.scenes.catalog import default_rig, lab
 from phibench.scenes.frames import Pose, rotation_xyz
-from phibench.scenes.room import Room
+from phibench.scenes.room import Room, default_rig, lab
 from phibench.scenes.shapes import Cuboid, Mesh, Prism, Shape, Uniform, rectangle
 
 VIEW = default_rig().at(0.3)

@@ -8,9 +8,9 @@ import pytest
 from helpers.oracles import alhazen_quartic
 
 from phibench.render.optics.truth import spot_truth, truth_layer
-from phibench.scenes.catalog import default_rig, lab
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.misalignment import Misalignment
+from phibench.scenes.room import default_rig, lab
 from phibench.scenes.shapes import rectangle
 
 

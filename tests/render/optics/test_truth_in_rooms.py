@@ -19,12 +19,11 @@ from phibench.render.optics.faces import FaceTable
 from phibench.render.optics.room_tracer import room_geometry
 from phibench.render.optics.truth import truth_layer
 from phibench.render.room.ambient import view_surfaces
-from phibench.scenes.catalog import default_rig
 from phibench.scenes.frames import Pose, rotation_xyz
 from phibench.scenes.glass_tube import GlassTube
 from phibench.scenes.holder import Holder, fitted
 from phibench.scenes.rig import Rig, View
-from phibench.scenes.room import Room
+from phibench.scenes.room import Room, default_rig
 
 PIXELS = 400
 GUESS_M = 1e-5

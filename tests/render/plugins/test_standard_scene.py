@@ -17,12 +17,11 @@ from phibench.render.plugins.room_plugins import to_scene_mm
 from phibench.render.plugins.standard_scene import carried, etendue, sensor_plugin, standard_scene
 from phibench.render.setup.variant import activate
 from phibench.scenes.camera import Camera
-from phibench.scenes.catalog import c310_camera, default_rig, lab
 from phibench.scenes.frames import Pose, rotation_xyz
 from phibench.scenes.metals import ReflectanceTable
 from phibench.scenes.mirror import SphereMirror
 from phibench.scenes.rig import Rig
-from phibench.scenes.room import Room
+from phibench.scenes.room import Room, c310_camera, default_rig, lab
 from phibench.scenes.shapes import rectangle
 from phibench.scenes.validation import SceneError
 

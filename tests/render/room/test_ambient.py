@@ -10,14 +10,12 @@ import pytest
 from helpers.oracles import TARGETS
 from helpers.path_ambient import path_trace
 
-from phibench.render.optics.faces import face_table
+from phibench.render.optics.faces import TexelGrid, face_table
 from phibench.render.room.ambient import AmbientLayer, render_ambient
 from phibench.render.room.light_map import BakeSettings, LightMap, bake
-from phibench.render.room.texel_grid import TexelGrid
-from phibench.scenes.catalog import default_rig, lab
 from phibench.scenes.frames import Pose, rotation_xyz
 from phibench.scenes.rig import Rig
-from phibench.scenes.room import Room
+from phibench.scenes.room import Room, default_rig, lab
 from phibench.scenes.shapes import Mesh, Prism, Uniform, cuboid, faces, rectangle
 
 ROOM, RIG = lab(TARGETS), default_rig()

@@ -5,14 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from phibench.render.optics.faces import face_table
+from phibench.render.optics.faces import TexelGrid, face_table
 from phibench.render.room.bounced_light import FEWEST, BrightTexels, gathered, rays_by_area, rays_by_noise
 from phibench.render.room.lamp_light import whole_lamp
 from phibench.render.room.surfaces import Surfaces
-from phibench.render.room.texel_grid import TexelGrid
 from phibench.render.room.texel_points import Texels
 from phibench.render.setup.variant import activate
-from phibench.scenes.catalog import default_rig
+from phibench.scenes.room import default_rig
 from phibench.scenes.shapes import Uniform, rectangle
 
 VIEW = default_rig().at(0.0)

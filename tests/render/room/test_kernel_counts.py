@@ -22,9 +22,8 @@ from phibench.render.room.light_map import BakeSettings, LightMap, bake
 from phibench.render.room.subpixel_grid import CellSampler, Samples
 from phibench.render.room.texel_points import Net
 from phibench.render.setup.variant import activate
-from phibench.scenes.catalog import default_rig, lab
 from phibench.scenes.holder import fitted
-from phibench.scenes.room import Room
+from phibench.scenes.room import Room, default_rig, lab
 from phibench.scenes.shapes import Rectangle, rectangle
 
 ROOM, RIG = lab(TARGETS), default_rig()

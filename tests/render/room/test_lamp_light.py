@@ -3,13 +3,12 @@
 import numpy as np
 import pytest
 
-from phibench.render.optics.faces import face_table
+from phibench.render.optics.faces import TexelGrid, face_table
 from phibench.render.room.lamp_light import direct_light, lamps_in_coats, whole_lamp
 from phibench.render.room.surfaces import Surfaces
-from phibench.render.room.texel_grid import TexelGrid
 from phibench.render.room.texel_points import Texels
 from phibench.render.setup.variant import activate
-from phibench.scenes.catalog import default_rig
+from phibench.scenes.room import default_rig
 from phibench.scenes.shapes import rectangle
 
 N = 400  # midpoints along each edge: the sum errs by h^2 / 24 of a second derivative, below 1e-5 at these distances

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from phibench.render.optics.faces import face_table
+from phibench.render.optics.faces import TexelGrid, face_table
 from phibench.render.room.bounced_light import _between, _overlap, coarser, finer
 from phibench.render.room.light_map import line_fit, smoothed
-from phibench.render.room.texel_grid import TexelGrid
 from phibench.render.room.texel_points import nearest_free
 from phibench.scenes.shapes import Rectangle, rectangle
 

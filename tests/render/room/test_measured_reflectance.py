@@ -93,7 +93,7 @@ def test_the_spots_flux_is_that_of_the_table(monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_the_prediction_follows_the_table() -> None:
-    from phibench.estimator.geometry.mirror_image import image_of
+    from phibench.estimator.geometry.reflection import image_of
 
     steel, other = Rig(), Rig(mirror=SphereMirror(reflectance_table=ANGLES))
     image = image_of(steel.at(0.0), np.array([SPOT.position_world_m]))

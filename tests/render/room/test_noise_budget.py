@@ -13,8 +13,8 @@ from phibench.render.optics.spot_layer import spot_layer
 from phibench.render.optics.truth import spot_truth
 from phibench.render.room import noise_budget
 from phibench.render.sensor.settings import PRESETS_FILE
-from phibench.scenes.catalog import default_rig
 from phibench.scenes.laser import LaserSpot, beam_diameter_m
+from phibench.scenes.room import default_rig
 
 VIEW = default_rig().at(0.2)
 SPOT = LaserSpot((2.0, 0.7, 0.5), (-2.0, -0.7, 0.0), beam_diameter_m(2.1))

@@ -39,8 +39,8 @@ from phibench.render.room.subpixel_grid import (
     shifts,
 )
 from phibench.render.setup.variant import activate
-from phibench.scenes.catalog import default_rig, lab
 from phibench.scenes.laser import LaserSpot, beam_diameter_m
+from phibench.scenes.room import default_rig, lab
 from phibench.scenes.shapes import Uniform, rectangle
 
 ROOM, RIG = lab(TARGETS), default_rig()

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from phibench.render.optics.faces import face_table
+from phibench.render.optics.faces import TexelGrid, face_table
 from phibench.render.room.lamp_light import direct_light, whole_lamp
 from phibench.render.room.surfaces import Surfaces
-from phibench.render.room.texel_grid import TexelGrid
 from phibench.render.room.texel_points import Texels, spread_out
 from phibench.render.setup.variant import activate
-from phibench.scenes.catalog import default_rig
+from phibench.scenes.room import default_rig
 from phibench.scenes.shapes import Mesh, Shape, Uniform, cuboid, rectangle
 
 VIEW = default_rig().at(0.0)

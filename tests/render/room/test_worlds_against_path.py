@@ -13,13 +13,12 @@ import pytest
 from helpers.path_ambient import path_trace
 from helpers.revolved_rigs import revolved
 
+from phibench.render.optics.faces import TexelGrid
 from phibench.render.room.ambient import render_ambient, view_surfaces
 from phibench.render.room.light_map import BakeSettings, LightMap, bake, fixed_shapes, light_carriage
-from phibench.render.room.texel_grid import TexelGrid
-from phibench.scenes.catalog import default_rig
 from phibench.scenes.frames import Pose, rotation_xyz
 from phibench.scenes.holder import fitted
-from phibench.scenes.room import Room, Sun
+from phibench.scenes.room import Room, Sun, default_rig
 from phibench.scenes.shapes import Bitmap, Mesh, Prism, Uniform, cuboid, rectangle
 
 RIG = default_rig()

@@ -13,19 +13,17 @@ import numpy as np
 import pytest
 from scipy import optimize
 
-from phibench.render.optics.faces import face_table
+from phibench.render.optics.faces import TexelGrid, face_table
 from phibench.render.optics.spot_layer import spot_layer
 from phibench.render.room.ambient import render_ambient
 from phibench.render.room.light_map import BakeSettings, LightMap, bake
-from phibench.render.room.texel_grid import TexelGrid
 from phibench.render.sensor.camera_chain import Chain
+from phibench.render.sensor.electrons import NoiseStream
 from phibench.render.sensor.light import Light
-from phibench.render.sensor.noise_tiles import NoiseStream
 from phibench.render.sensor.settings import sensor
-from phibench.scenes.catalog import default_rig
 from phibench.scenes.frames import Pose
 from phibench.scenes.laser import LaserSpot, beam_diameter_m
-from phibench.scenes.room import Room
+from phibench.scenes.room import Room, default_rig
 from phibench.scenes.shapes import cuboid, rectangle
 
 STREAM = NoiseStream(("energy", 0))

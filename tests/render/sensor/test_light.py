@@ -11,14 +11,12 @@ from helpers.sensor_light import FILTERS, spot_at
 from phibench.render.optics.spot_layer import splat, spot_layer
 from phibench.render.optics.spot_samples import FilmCloud
 from phibench.render.sensor.camera_chain import Chain
-from phibench.render.sensor.electrons import mono, mosaic, vignetting
-from phibench.render.sensor.light import Light, Region
-from phibench.render.sensor.noise_tiles import NoiseStream
-from phibench.render.sensor.rolling_shutter import layer_spectra, moved_spot, row_times_s, spot_velocity_px_per_s
+from phibench.render.sensor.electrons import NoiseStream, mono, mosaic, vignetting
+from phibench.render.sensor.light import Light, Region, layer_spectra, moved_spot, row_times_s, spot_velocity_px_per_s
 from phibench.render.sensor.settings import SensorError, sensor
 from phibench.scenes.camera import Camera
-from phibench.scenes.catalog import default_rig
 from phibench.scenes.laser import LaserSpot
+from phibench.scenes.room import default_rig
 
 STREAM = NoiseStream(("optics", 0))
 PLANES = np.arange(3 * 5 * 6, dtype=float).reshape(3, 5, 6)

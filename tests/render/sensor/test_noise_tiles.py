@@ -9,9 +9,8 @@ import pytest
 from helpers.sensor_light import room
 
 from phibench.render.sensor.camera_chain import Chain
-from phibench.render.sensor.electrons import speckle_gain
+from phibench.render.sensor.electrons import TILE_PX, NoiseStream, frame_stream, normal, poisson, speckle_gain
 from phibench.render.sensor.light import Light, Region
-from phibench.render.sensor.noise_tiles import TILE_PX, NoiseStream, frame_stream, normal, poisson
 from phibench.render.sensor.settings import sensor
 from phibench.scenes.random_streams import philox_key
 
@@ -69,7 +68,7 @@ import hashlib
 from phibench.render.sensor.camera_chain import Chain
 from phibench.render.sensor.light import Light
 from phibench.render.sensor.settings import sensor
-from phibench.render.sensor.noise_tiles import NoiseStream
+from phibench.render.sensor.electrons import NoiseStream
 light = Light.flat((6e4, 6e4, 6e4), (48, 48))
 frame = Chain(sensor("mjpeg")).frame(light, NoiseStream(("paper", 0, "s", "up", "on", 3)))
 print(hashlib.sha256(frame.tobytes()).hexdigest())

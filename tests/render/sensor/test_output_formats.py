@@ -14,8 +14,8 @@ from scipy.ndimage import convolve
 
 from phibench.render.sensor import processing
 from phibench.render.sensor.camera_chain import Chain
+from phibench.render.sensor.electrons import NoiseStream
 from phibench.render.sensor.light import Light
-from phibench.render.sensor.noise_tiles import NoiseStream
 from phibench.render.sensor.processing import rgb_from_yuyv, tone_decoded, tone_encoded, yuyv
 from phibench.render.sensor.settings import Sensor, SensorError, sensor
 

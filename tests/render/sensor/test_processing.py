@@ -14,9 +14,8 @@ from scipy.ndimage import convolve
 from phibench.datasets.store.files import write_bytes
 from phibench.render.sensor import processing
 from phibench.render.sensor.camera_chain import Chain, auto_exposed, mean_level
-from phibench.render.sensor.electrons import mosaic
+from phibench.render.sensor.electrons import NoiseStream, mosaic
 from phibench.render.sensor.light import Light
-from phibench.render.sensor.noise_tiles import NoiseStream
 from phibench.render.sensor.processing import compressed, decoded, encoded
 from phibench.render.sensor.settings import sensor
 

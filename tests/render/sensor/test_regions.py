@@ -10,8 +10,8 @@ import pytest
 from helpers.sensor_light import room
 
 from phibench.render.sensor.camera_chain import Chain
+from phibench.render.sensor.electrons import NoiseStream
 from phibench.render.sensor.light import Light, Region
-from phibench.render.sensor.noise_tiles import NoiseStream
 from phibench.render.sensor.settings import SensorError, sensor
 from phibench.scenes.camera import Camera
 

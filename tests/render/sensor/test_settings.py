@@ -11,7 +11,7 @@ from helpers.sensor_light import room
 
 from phibench.datasets.recipe.tables import Preset
 from phibench.render.sensor.camera_chain import Chain
-from phibench.render.sensor.noise_tiles import NoiseStream
+from phibench.render.sensor.electrons import NoiseStream
 from phibench.render.sensor.processing import compressed, eight_bit, linear_rgb, linear_signal, rendered
 from phibench.render.sensor.settings import SensorError, sensor
 

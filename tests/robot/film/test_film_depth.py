@@ -13,15 +13,15 @@ from scipy.special import ndtr
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.frames.sensor_card import card_of
 from phibench.datasets.store.layers import SpotWindow
-from phibench.estimator.geometry.mirror_image import image_of
+from phibench.estimator.geometry.reflection import image_of
 from phibench.estimator.geometry.rig_parameters import PARAMETERS
 from phibench.estimator.spots.raw_pixels import PixelNoise, bayer_filters, raw_electrons
 from phibench.estimator.spots.spot_prediction import spot_blur
 from phibench.render.film.moving_rows import chief_uv_px, rows_image, spot_time_s
 from phibench.render.optics.spot_layer import spot_layer
 from phibench.render.sensor.camera_chain import Chain
+from phibench.render.sensor.electrons import NoiseStream
 from phibench.render.sensor.light import Light, Region
-from phibench.render.sensor.noise_tiles import NoiseStream
 from phibench.render.sensor.settings import Sensor, sensor
 from phibench.robot.film.film_bundle import expected_sigma_m, film_depth, most_agree
 from phibench.robot.film.film_estimates import bundle_depth, joint_positions, seen_film

@@ -7,11 +7,11 @@ import math
 import numpy as np
 import pytest
 
-from phibench.estimator.geometry.mirror_image import blocked
+from phibench.estimator.geometry.reflection import blocked
 from phibench.robot.loop.arena import Boxes, arena_of, boxes_of, generated_arena, plain_arena
-from phibench.scenes.catalog import lab
 from phibench.scenes.frames import Array, rotation_xyz
 from phibench.scenes.random_streams import generator
+from phibench.scenes.room import lab
 from phibench.scenes.shapes import cuboid
 from phibench.scenes.validation import SceneError
 

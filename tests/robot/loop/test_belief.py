@@ -21,7 +21,7 @@ from helpers.target_approach import (
 )
 from scipy.optimize import least_squares
 
-from phibench.estimator.geometry.mirror_image import image_of
+from phibench.estimator.geometry.reflection import image_of
 from phibench.estimator.geometry.rig_parameters import PARAMETERS, PRIOR_SIGMA, RigBias, drawn_deviation
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.robot.film.film_positions import FilmPositions

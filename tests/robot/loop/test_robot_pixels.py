@@ -12,8 +12,8 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 from phibench.datasets.film.moving_camera import BakedRoom
+from phibench.render.optics.faces import TexelGrid
 from phibench.render.optics.room_tracer import own_geometry
-from phibench.render.room.texel_grid import TexelGrid
 from phibench.robot.loop.arena import Arena, arena_of, baked_arenas, plain_arena
 from phibench.robot.loop.environment import ENVIRONMENT, ApproachTarget, flat_observation, register
 from phibench.robot.loop.episodes import run_episodes

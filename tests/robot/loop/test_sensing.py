@@ -9,7 +9,7 @@ import numpy as np
 from helpers.target_approach import RIG, VEHICLE, sensing
 
 from phibench.datasets.frames.sensor_card import sensor_card
-from phibench.estimator.geometry.mirror_image import image_of
+from phibench.estimator.geometry.reflection import image_of
 from phibench.estimator.limits.best_stroke import spot_bound
 from phibench.estimator.spots.spot_prediction import Laser, spot_electrons_per_s
 from phibench.robot.loop.arena import Arena, Boxes

@@ -1,25 +1,40 @@
-"""Rooms of a recipe: the one of `[room]`, or those of `[rooms]`, of several kinds in turn.
-
-The first rooms are one of each kind, so that a few samples show all of them. Each property of a generated room has a
-random stream of its own: neither more rooms nor another property changes it.
-"""
+"""Draws of a plan: rooms, rigs of a recipe with `[rigs]`, and samples that were drawn before."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import asdict
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
 from itertools import chain, zip_longest
 from pathlib import Path
 
 import numpy as np
 
-from phibench.datasets.recipe.build import room_source
+from phibench.datasets.common.errors import RecipeError
+from phibench.datasets.plan.sampling import (
+    PREFIX,
+    TRIES,
+    RandomSample,
+    Value,
+    draw_values,
+    drawn_misalignment,
+    drawn_parameters,
+    drawn_rigs,
+    first_points,
+    further_points,
+    points_of,
+    rig_fault,
+    rows_of,
+)
+from phibench.datasets.recipe.build import build_target, by_keys, ceiling_m, make_spot, room_source, true_stroke_m
 from phibench.datasets.recipe.distributions import DistributionTable, quantile
 from phibench.datasets.recipe.room_tables import RoomPropertiesTable, RoomsTable
-from phibench.datasets.recipe.tables import Recipe
+from phibench.datasets.recipe.spot_placement import Boards
+from phibench.datasets.recipe.tables import DrawnRigsTable, RandomTable, Recipe
 from phibench.datasets.rooms.mesh_placement import MeshSettings
-from phibench.datasets.rooms.panorama_settings import PanoramaSettings
+from phibench.datasets.rooms.panorama_room import PanoramaSettings
 from phibench.datasets.rooms.room_files import RoomFiles
 from phibench.datasets.rooms.room_sources import (
     EXPORTED,
@@ -30,9 +45,21 @@ from phibench.datasets.rooms.room_sources import (
     RoomSource,
     UnexportedRoom,
 )
+from phibench.scenes.frames import Array, Vector
+from phibench.scenes.laser import LaserSpot
+from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.random_streams import generator
+from phibench.scenes.rig import Rig
+from phibench.scenes.room import Room
+from phibench.scenes.validation import SceneError
 from phibench.scenes.worlds.floor_plan import floor_plan
 from phibench.scenes.worlds.properties import drawn_properties
+
+# Rooms of a recipe: the one of `[room]`, or those of `[rooms]`, of several kinds in turn.
+#
+# The first rooms are one of each kind, so that a few samples show all of them. Each property of a generated room has a
+# random stream of its own: neither more rooms nor another property changes it.
+
 
 BOX: dict[str, float | str] = {"heading_deg": 0.0, "l_shape": 0.0}
 """Properties of a generated room whose walls are a box along the world's axes: what a panorama is laid on."""
@@ -191,3 +218,156 @@ def _generated(table: RoomPropertiesTable, stream: tuple[str | int, ...], box: b
             value = chosen.choice[int(u[0] * len(chosen.choice))] if named else quantile(chosen, u)[0]
             fixed[name] = value if isinstance(value, str) else float(value)
     return GeneratedRoom(drawn_properties(*stream, **(fixed | (BOX if box else {}))), stream)
+
+
+# Random rigs of a recipe with `[rigs]`: misalignments that are drawn, again where a rig is impossible.
+#
+# Impossible is a rig that cannot exist, or cannot make one of the strokes in its room.
+
+
+@dataclass(frozen=True)
+class DrawnRig:
+    """A drawn rig.
+
+    Attributes
+    ----------
+    rig_id : str
+        Such as ``r000002``, the third one.
+    tries : int
+        Number of the first draw that was possible.
+    drawn : tuple of (parameter, value)
+        Parameters as in `PARAMETERS`.
+    misalignment : Misalignment
+    rig : Rig, the true one
+    """
+
+    rig_id: str
+    tries: int
+    drawn: tuple[tuple[str, Value], ...]
+    misalignment: Misalignment
+    rig: Rig
+
+
+def draw_rigs(recipe: Recipe, table: DrawnRigsTable, nominal: Rig, room: Room) -> tuple[DrawnRig, ...]:
+    """All rigs of a recipe with `[rigs]`.
+
+    Raises
+    ------
+    RecipeError
+        If a rig stays impossible after `TRIES` draws, with the reason of the last one.
+    """
+    chosen = _rig_distributions(table)
+    first = first_points("independent", recipe.dataset.name, recipe.dataset.seed, table.count, chosen)
+    values = {name: quantile(chosen[name], u) for name, u in first.items()}
+    top_m, boards = ceiling_m(room), Boards([build_target(target) for target in recipe.targets])
+    return tuple(_possible(recipe, chosen, _row(values, k), k, nominal, top_m, boards) for k in range(table.count))
+
+
+def _possible(
+    recipe: Recipe,
+    chosen: Mapping[str, DistributionTable],
+    drawn: dict[str, Value],
+    number: int,
+    nominal: Rig,
+    top_m: float,
+    boards: Boards,
+) -> DrawnRig:
+    for attempt in range(TRIES):
+        if attempt:
+            points = further_points(recipe.dataset.name, recipe.dataset.seed, chosen, [number], attempt)
+            drawn = _row({name: quantile(chosen[name], u) for name, u in points.items()}, 0)
+        made = _made(recipe, drawn, number, attempt + 1, nominal, top_m, boards)
+        if isinstance(made, DrawnRig):
+            return made
+    text = f"rig {number} stays impossible in {TRIES} draws; the last: {made}"
+    raise RecipeError(f"rigs: {text}; narrow the distributions, move the boards or shorten the strokes")
+
+
+def _made(
+    recipe: Recipe, drawn: dict[str, Value], number: int, tries: int, nominal: Rig, top_m: float, boards: Boards
+) -> DrawnRig | str:
+    """The rig, or why it is impossible."""
+    try:
+        misalignment = drawn_misalignment(recipe.misalignment, drawn)
+        rig = nominal.perturbed(misalignment)
+        strokes_m = {true_stroke_m(misalignment, h) for experiment in recipe.experiments for h in experiment.strokes_m}
+    except SceneError as error:
+        return by_keys(str(error))
+    faults = (rig_fault(rig, stroke_m, top_m, boards) for stroke_m in sorted(strokes_m))
+    why = next((fault for fault in faults if fault), None)
+    return why or DrawnRig(f"r{number:06d}", tries, tuple(drawn.items()), misalignment, rig)
+
+
+def _rig_distributions(table: DrawnRigsTable) -> dict[str, DistributionTable]:
+    """Distribution by parameter, in the order of `[misalignment]`."""
+    given = ((key, getattr(table.misalignment, key)) for key in type(table.misalignment).model_fields)
+    return {PREFIX + key: distribution for key, distribution in given if isinstance(distribution, DistributionTable)}
+
+
+def _row(values: Mapping[str, Array], k: int) -> dict[str, Value]:
+    return {name: float(np.asarray(column)[k]) for name, column in values.items()}
+
+
+# Samples that were drawn before, made again from what took long to find.
+#
+# To find the draw of a sample that is possible, its room is built and rays are traced in it. The number of that draw
+# and its spot are kept; rig and stroke follow from the draw's numbers in a millisecond, to the same bits, without a
+# room.
+
+
+Causes = tuple[str, str]
+"""Causes of both views, down and up, as in `render.optics.truth`."""
+
+
+@dataclass(frozen=True)
+class KeptSample:
+    """Outcome of a sample's draws; the vectors are those of its spot."""
+
+    tries: int
+    surface: str
+    position_world_m: Vector
+    normal_world: Vector
+    diameter_m: float
+    beam_direction_world: Vector | None
+    causes: Causes
+
+
+Kept = Mapping[int, KeptSample | str]
+"""Outcome by number of a sample; of one that stays impossible its reason."""
+
+
+def rebuilt(
+    recipe: Recipe, table: RandomTable, rooms: Sequence[str], kept: Kept, wanted: range
+) -> dict[int, RandomSample]:
+    """Kept samples of the wanted numbers; `rooms` are the ids of all rooms. One that is no draw of this is left out."""
+    first = first_points(
+        table.sequence, recipe.dataset.name, recipe.dataset.seed, table.samples, drawn_parameters(table)
+    )
+    by_draw: dict[int, list[int]] = defaultdict(list)
+    for number in wanted:
+        if isinstance(sample := kept.get(number), KeptSample):
+            by_draw[sample.tries].append(number)
+    targets, samples = [target.name for target in recipe.targets], dict[int, RandomSample]()
+    for tries, numbers in by_draw.items():
+        points = points_of(recipe, table, first, numbers, tries - 1)
+        rows = rows_of(draw_values(table, targets, points), len(numbers))
+        for number, drawn in zip(numbers, rows, strict=True):
+            sample = kept[number]
+            assert isinstance(sample, KeptSample)
+            try:
+                rigs, spot = drawn_rigs(recipe, dict(drawn)), _spot(recipe, sample)
+            except SceneError:  # of an older draw: it is drawn anew
+                continue
+            place = (rooms[number % len(rooms)], rigs.rig, sample.surface, spot)
+            numbers_of = (rigs.stroke_m, rigs.nominal_rig, rigs.nominal_stroke_m)
+            samples[number] = RandomSample(number, tries, drawn, *place, *numbers_of, sample.causes)
+    return samples
+
+
+def _spot(recipe: Recipe, one: KeptSample) -> LaserSpot:
+    vectors = (one.position_world_m, one.normal_world, one.diameter_m, one.beam_direction_world)
+    spot = make_spot(recipe.laser, *vectors)
+    # both are of unit length already, and dividing by it again would change their last bit
+    object.__setattr__(spot, "normal_world", one.normal_world)
+    object.__setattr__(spot, "beam_direction_world", one.beam_direction_world)
+    return spot
