@@ -19,6 +19,7 @@ Film positions are pixels (u, v), shape (N, 2); points are world coordinates in 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -29,7 +30,7 @@ from phibench.render.optics.faces import FaceTable, IntArray
 from phibench.render.optics.ray_tracer import MirrorRays, lens_rays, reflect, through_glass
 from phibench.render.optics.room_tracer import BEAM_REACH_M, GeometryLike, RoomGeometry, as_geometry, blocked_by
 from phibench.render.optics.spot_layer import SpotLayer
-from phibench.render.optics.spot_samples import image_parts
+from phibench.render.optics.spot_samples import ImagePart, image_parts
 from phibench.render.optics.truth import SpotTruth
 from phibench.scenes.frames import Array, BoolArray
 from phibench.scenes.laser import LaserSpot
@@ -43,6 +44,7 @@ CENTROID_TOLERANCE_PX = 2e-3
 FLUX_TOLERANCE = 3e-3
 PLACE_TOLERANCE = 5e-3
 _LOG2_RAYS = (13, 15, 17, 19, 20)  # 13: centroid within 4e-4 px, flux within 5e-4, for the random rigs of the tests
+_RAYS_AT_ONCE = 2**16  # of a beam: more take a gigabyte
 _STEP_PX = 1e-3
 _NEWTON_STEPS = 8
 _HALVINGS = 6
@@ -405,9 +407,19 @@ def _through_lens(view: View, spot: LaserSpot, uv: Array, rays: _Reflected, radi
 def _trace_beam(view: View, spot: LaserSpot, room: RoomGeometry, truth: SpotTruth, log2_rays: int) -> TracedSpot:
     """Trace the image of what a beam leaves on surfaces."""
     x = np.clip(sobol(7, 2**log2_rays), 1e-12, 1.0 - 1e-12)
+    parts = image_parts(view, spot, room, np.array([truth.u_px, truth.v_px]))
+    pieces = np.array_split(x, max(len(x) // _RAYS_AT_ONCE, 1))
+    traced = zip(*(_beam_rays(view, spot, room, truth, parts, piece) for piece in pieces), strict=True)
+    uv, points, watts = map(np.concatenate, traced)
+    return _moments(view, uv, points, watts / len(x))
+
+
+def _beam_rays(
+    view: View, spot: LaserSpot, room: RoomGeometry, truth: SpotTruth, parts: Sequence[ImagePart], x: Array
+) -> tuple[Array, Array, Array]:
+    """Film positions (n, 2), points on surfaces (n, 3) and watts over density (n,) of numbers `x`, shape (n, 7)."""
     bundle = _Bundle(view.rig.camera.aperture_radius_m * _disc(x[:, :2]), _facets(view, x[:, 4:6]))
     centres = aim(view, spot, bundle, np.zeros((len(x), 2)), _through_chief_point(view, truth, bundle.lens_m))
-    parts = image_parts(view, spot, room, np.array([truth.u_px, truth.v_px]))
     chosen = np.searchsorted(np.cumsum([part.share for part in parts])[:-1], x[:, 6], side="right")
     z = ndtri(x[:, 2:4])
     offset = np.empty_like(z)
@@ -424,7 +436,7 @@ def _trace_beam(view: View, spot: LaserSpot, room: RoomGeometry, truth: SpotTrut
         radiance[lit] *= blocked_by(room, start, end) < 0
     watts = np.zeros(len(uv))
     watts[seen] = _through_lens(view, spot, uv, rays, radiance)[seen]
-    return _moments(view, uv, np.where(watts[:, None] > 0.0, points, 0.0), watts / density / len(x))
+    return uv, np.where(watts[:, None] > 0.0, points, 0.0), watts / density
 
 
 def _beam_radiance(spot: LaserSpot, room: RoomGeometry, origins: Array, directions: Array) -> tuple[Array, Array]:
