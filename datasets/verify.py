@@ -38,7 +38,7 @@ from phibench.datasets.store.checksums import (
     read_checksums,
     strays,
 )
-from phibench.datasets.store.documents import alike, differences, parse_info, same_number, sensitivity_fault, to_json
+from phibench.datasets.store.documents import alike, differences, parse_info, same_number, to_json
 from phibench.datasets.store.layers import (
     SPOT_STACKS,
     read_ambient_pair,
@@ -47,6 +47,7 @@ from phibench.datasets.store.layers import (
     read_truth,
 )
 from phibench.datasets.store.schema import LightRow, ManifestRow, PoseInfo, RoomInfo, SpotRow
+from phibench.datasets.store.sensitivity_file import sensitivity_fault
 from phibench.render.optics.ray_tracer import trace_pixels
 from phibench.render.optics.reflection_point import mirror_points
 from phibench.render.optics.spot_layer import spot_light

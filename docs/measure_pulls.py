@@ -22,8 +22,8 @@ import numpy as np
 import polars as pl
 
 from phibench.benchmark.scores.answer_errors import whitened
-from phibench.benchmark.scores.document import read_records, read_score
 from phibench.benchmark.scores.metrics import FAR_SIGMAS
+from phibench.benchmark.scores.score_files import read_records, read_score
 from phibench.benchmark.scores.strata import light_shift
 
 LEAST = 30

@@ -178,6 +178,7 @@ class Camera:
         r2 = x * x + y * y
         radial = 1.0 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
         slope = 2.0 * (self.k1 + r2 * (2.0 * self.k2 + r2 * 3.0 * self.k3))  # (d radial / d r2) * 2
+        # both mixed derivatives are the same: the distortion is a gradient
         cross = x * y * slope + 2.0 * (self.p1 * x + self.p2 * y)
         xx = radial + x * x * slope + 2.0 * self.p1 * y + 6.0 * self.p2 * x
         yy = radial + y * y * slope + 6.0 * self.p1 * y + 2.0 * self.p2 * x
@@ -202,6 +203,7 @@ class Camera:
         NaN where the iteration does not converge (outside the monotonic range of the distortion polynomial).
         """
         uv = np.asarray(uv_px, float)
+        # distorted coordinates; without distortion they are the answer
         target = (uv - np.array([self.cx_px, self.cy_px])) / np.array([self.fx_px, self.fy_px])
         if not any((self.k1, self.k2, self.k3, self.p1, self.p2)):
             return target
@@ -219,6 +221,7 @@ class Camera:
     def rays(self, uv_px: Array) -> Array:
         """Unit chief-ray directions in the camera frame, shape (..., 3), of pixels (u, v), shape (..., 2)."""
         xy = self.normalised(uv_px)
+        # z = 1 before the norm: the camera looks along +z
         directions = np.concatenate([xy, np.ones((*xy.shape[:-1], 1))], axis=-1)
         return directions / np.linalg.norm(directions, axis=-1, keepdims=True)
 
@@ -240,6 +243,7 @@ class Camera:
     def contains(self, uv_px: Array) -> BoolArray:
         """Mask of the pixels (u, v), shape (..., 2), inside the image [-0.5, W - 0.5] x [-0.5, H - 0.5]."""
         uv = np.asarray(uv_px, float)
+        # integers are pixel centres, so that the image begins at -0.5
         inside_u = (uv[..., 0] >= -0.5) & (uv[..., 0] <= self.width_px - 0.5)
         return inside_u & (uv[..., 1] >= -0.5) & (uv[..., 1] <= self.height_px - 0.5)
 
@@ -247,6 +251,7 @@ class Camera:
 def _solve_2x2(matrix: Array, rhs: Array) -> Array:
     """Solve 2 x 2 systems, matrix (..., 2, 2), rhs (..., 2), by Cramer's rule; no raise when singular."""
     (a, b), (c, d) = (matrix[..., i, :].transpose(-1, *range(matrix.ndim - 2)) for i in (0, 1))
+    # singular: a division by 0 that the caller sees as infinite or NaN
     det = a * d - b * c
     return _pairs((d * rhs[..., 0] - b * rhs[..., 1]) / det, (a * rhs[..., 1] - c * rhs[..., 0]) / det)
 

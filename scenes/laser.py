@@ -76,6 +76,7 @@ class LaserSpot:
     @property
     def sigma_m(self) -> float:
         """Standard deviation of the Gaussian profile per axis, metres."""
+        # D4sigma, as data sheets have it: the diameter is four standard deviations
         return self.diameter_m / 4.0
 
     @property
@@ -87,11 +88,13 @@ class LaserSpot:
         """Exitance at the centre of a flat spot: albedo x peak irradiance, W/m^2."""
         if self.albedo is None:
             raise SceneError("LaserSpot.albedo is that of the surfaces: the spot's exitance is not known without them")
+        # power over peak irradiance: 2 pi sigma^2 of a Gaussian, the area of a disc
         area = 2.0 * math.pi * self.sigma_m**2 if self.profile == "gaussian" else math.pi * self.diameter_m**2 / 4.0
         return self.albedo * self.power_w / area
 
     def radiance_w_m2_sr(self, radius_m: Array) -> Array:
         """Radiance of a flat spot at distance `radius_m` from the centre, W/(m^2 sr), shape of `radius_m`."""
+        # Lambert: radiance is exitance over pi
         return self.peak_exitance_w_m2() / math.pi * self._shape(radius_m)
 
     def irradiance_w_m2(self, radius_m: Array) -> Array:

@@ -133,6 +133,7 @@ def deviation(points_m: Array, form: Form) -> Level:
     Q, T = form.tensors
     rho = np.linalg.norm(points_m, axis=-1)
     n, I3 = points_m / rho[..., None], np.eye(3)
+    # H2 = n Q n and H3 = T n n n; their derivatives are twice and three times one contraction less
     q, t2 = n @ Q, (n @ T.reshape(3, 9)).reshape(*n.shape, 3)  # the cubic form contracted with n once
     t1 = np.einsum("...ij,...j->...i", t2, n)
     parts = (
@@ -163,6 +164,7 @@ def curvatures(surface: Level) -> tuple[Array, Array]:
     N = surface.gradient / length[..., None]
     across = np.eye(3) - N[..., :, None] * N[..., None, :]
     K = across @ surface.hessian_per_m @ across / length[..., None, None]
+    # eigenvalues of a symmetric tensor of rank two: mean -+ sqrt(tr(K^2) / 2 - mean^2)
     mean = 0.5 * np.trace(K, axis1=-2, axis2=-1)
     spread = np.sqrt(np.maximum(0.5 * np.einsum("...ij,...ji", K, K) - mean**2, 0.0))
     return mean - spread, mean + spread
@@ -188,6 +190,7 @@ def _basis() -> tuple[Array, Array]:
 
 def _symmetric(monomial: str, coefficient: float) -> Array:
     """Symmetric tensor of one monomial."""
+    # a monomial's coefficient is shared by all orders of its factors
     places = set(itertools.permutations("xyz".index(letter) for letter in monomial))
     result = np.zeros((3,) * len(monomial))
     for place in places:
@@ -359,6 +362,7 @@ class SphereMirror(MetalSurface):
         if self.form is not None:
             turned = T_camera_mirror.R
             return T_camera_mirror.points(limb_points(-s @ turned, rim @ turned, self.radius_m, self.form))
+        # a cone of half angle asin(R / distance) touches the sphere
         sine = self.radius_m / distance
         return np.asarray(math.sqrt(1.0 - sine * sine) * axis + sine * rim)
 
@@ -426,9 +430,9 @@ def limb_points(eye_m: Array, across: Array, radius_m: float, form: Form) -> Arr
         P = _surface(n, radius_m, form)
         at = level(P, radius_m, form)
         rho = np.linalg.norm(P, axis=-1, keepdims=True)
-        rho1 = -rho * np.sum(
-            at.gradient * n1, axis=-1, keepdims=True
-        )  # d rho / d angle: n is radial, grad g = n - grad f
+        # d rho / d angle: n is radial, grad g = n - grad f
+        rho1 = -rho * np.sum(at.gradient * n1, axis=-1, keepdims=True)
+        # derivative of the surface point by the angle, for Newton's slope
         P1 = rho * n1 + rho1 * n
         facing = np.sum(at.gradient * (P - eye_m), axis=-1)
         slope = np.einsum("ni,nij,nj->n", P1, at.hessian_per_m, P - eye_m)

@@ -154,6 +154,7 @@ class Profile:
     def _check_convex(self) -> None:
         s = np.linspace(1e-3, 1.0, _PLACES) ** 2 * self.rim_radius_m**2
         sag = self.sag(s)
+        # d2z/dr2 with s = r^2: 2 z' + 4 s z''
         curved = (2.0 * sag.slope_per_m + 4.0 * s * sag.bend_per_m3) >= -1e-12 / self.rim_radius_m
         if curved.all() and (sag.slope_per_m > 0.0).all():
             return
@@ -194,6 +195,7 @@ class Profile:
         R, A, s = self.vertex_radius_m, 1.0 + self.conic, np.asarray(s_m2, float)
         with np.errstate(invalid="ignore", divide="ignore"):
             w = np.sqrt(R * R - A * s)
+            # s / (R + w) in place of (R - w) / (1 + k): no cancellation near the vertex, and k = -1 is none of its own
             z, slope, bend = np.where(s > 0.0, s / (R + w), 0.0), 0.5 / w, 0.25 * A / (w * w * w)
         for i, a in enumerate(self.even_terms, start=2):
             z = z + a * s**i
@@ -239,6 +241,7 @@ class Profile:
             return np.full(np.shape(t), np.nan)
         with np.errstate(invalid="ignore"):
             if self.is_quadric:
+                # slope of a quadric, r / sqrt(R^2 - (1 + k) r^2), solved for r
                 r = t * R / np.sqrt(1.0 + A * t * t)
             else:
                 low, high = np.zeros(np.shape(t)), np.full(np.shape(t), self.rim_radius_m)

@@ -117,6 +117,7 @@ class Rig:
     @property
     def extent(self) -> Extent:
         """Reach of the mirror around a holder's axis: the line from the lens to the sphere centre or the vertex."""
+        # camera frame; R^T turns it into the frame of the mirror
         towards = self.sphere_in_camera_m / np.linalg.norm(self.sphere_in_camera_m)
         return self.mirror.extent(self.T_camera_sphere.R.T @ towards)
 
@@ -133,6 +134,7 @@ class Rig:
     def at(self, offset_m: float) -> View:
         """Return the rig with its carriage moved by `offset_m` along the stroke axis."""
         finite("Rig", "offset_m", offset_m)
+        # the down image is the reference: what moves between the images acts on every other offset
         return View(self, float(offset_m), None if offset_m == 0.0 else self.motion)
 
     def perturbed(self, misalignment: Misalignment) -> Rig:
@@ -150,6 +152,7 @@ class Rig:
             return self
         T_world_camera, T_camera_sphere = misalignment.poses(self.T_world_camera, self.T_camera_sphere)
         mirror = misalignment.mirror(self.mirror)
+        # a form error gives a sphere axes: those of the world, turned by the tilt of the mirror
         if mirror.has_axes and not self.mirror.has_axes:
             axes = rotation_xyz(misalignment.mirror_tilt_x_rad, misalignment.mirror_tilt_y_rad)
             T_camera_sphere = replace(T_camera_sphere, rotation=as_matrix(T_world_camera.R.T @ np.array(axes)))
@@ -169,6 +172,7 @@ class Rig:
 
     def in_image(self) -> bool:
         """Return True if the mirror's middle or any of its outline lies inside the image."""
+        # the middle alone does for a mirror whose outline lies all around the image
         places = np.vstack([self.camera.project(self.sphere_in_camera_m), self.outline_px(24)])
         return bool(np.any(self.camera.contains(places)))
 
@@ -208,6 +212,7 @@ class View:
     @cached_property
     def T_world_camera(self) -> Pose:
         """Camera pose in the world."""
+        # in this order: stroke in the frame of the rig, the way of the robot, what moved between the images
         shift = self.offset_m * np.array(self.rig.stroke_axis_world)
         carried = replace(self.rig.T_world_camera, translation_m=as_vector(self.rig.T_world_camera.t + shift))
         if self.robot is not None:

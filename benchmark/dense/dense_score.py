@@ -35,7 +35,8 @@ from phibench.benchmark.isolation.runner import Harness, Ran, asked_here, functi
 from phibench.benchmark.pair_sets.wanted_pairs import open_scored
 from phibench.benchmark.scores.answer_errors import Rules
 from phibench.benchmark.scores.compare import Difference, compared, rules_of
-from phibench.benchmark.scores.document import MethodCard, read_document, read_records, write_score
+from phibench.benchmark.scores.document import MethodCard
+from phibench.benchmark.scores.score_files import read_document, read_records, write_score
 from phibench.calibration.rig.file import read_calibration
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import InputFile

@@ -24,8 +24,8 @@ from phibench.benchmark.pair_sets.dataset_pairs import TRACKS, Track, tracks_of
 from phibench.benchmark.pair_sets.frames_set import FramesSet
 from phibench.benchmark.pair_sets.wanted_pairs import PairChoice, open_scored, wanted_pairs
 from phibench.benchmark.reports.report import time_section, write_report
-from phibench.benchmark.scores.document import records_kept
 from phibench.benchmark.scores.score import Scored, run_and_score, saved_each
+from phibench.benchmark.scores.score_files import records_kept
 from phibench.benchmark.scores.score_tables import failure_line
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.progress import progress_console

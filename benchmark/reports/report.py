@@ -28,8 +28,9 @@ from phibench.benchmark.reports.figures import (
 from phibench.benchmark.reports.track_tables import track_tables
 from phibench.benchmark.scores.causes import CAUSES, KINDS
 from phibench.benchmark.scores.compare import note_on_others, same_pairs
-from phibench.benchmark.scores.document import EncodedPicture, ScoreDocument, read_records, read_score
+from phibench.benchmark.scores.document import EncodedPicture, ScoreDocument
 from phibench.benchmark.scores.metrics import METRICS, RANKS, applies
+from phibench.benchmark.scores.score_files import read_records, read_score
 from phibench.benchmark.scores.score_tables import (
     BY_WORD,
     FULL_OF_FALSE,

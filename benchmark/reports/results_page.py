@@ -26,15 +26,16 @@ from phibench.benchmark.scores.compare import (
     note_on_others,
     same_pairs,
 )
-from phibench.benchmark.scores.document import ScoreDocument, StratumScore, read_records, read_score
+from phibench.benchmark.scores.comparison_tables import differences_json
+from phibench.benchmark.scores.document import ScoreDocument, StratumScore
 from phibench.benchmark.scores.metrics import METRICS, applies
+from phibench.benchmark.scores.score_files import read_records, read_score
 from phibench.benchmark.scores.score_tables import (
     BY_WORD,
     DIGITS,
     FLAGGED,
     cause_table,
     cell_parts,
-    differences_json,
     division_and_rig,
     frames_line,
     head,

@@ -178,6 +178,7 @@ def pixel_errors(true_rig: Rig, true_px: Array, answer_px: Array) -> PixelErrors
     with np.errstate(invalid="ignore"):  # at the centre itself there is no direction
         a = outward / np.linalg.norm(outward, axis=-1, keepdims=True)
     radial = error[:, 0] * a[:, 0] + error[:, 1] * a[:, 1]
+    # cross product with the outward direction: positive turns from u to v
     tangential = error[:, 1] * a[:, 0] - error[:, 0] * a[:, 1]
     return PixelErrors(error[:, 0], error[:, 1], radial, tangential)
 
@@ -255,6 +256,7 @@ def whitened(error_px: Array, covariance_px2: Array) -> Array:
     """
     C = covariance_px2
     with np.errstate(invalid="ignore", divide="ignore"):
+        # Cholesky factor of 2 x 2 covariances, solved by hand for all at once
         l11 = np.sqrt(C[:, 0, 0])
         l21 = C[:, 0, 1] / l11
         l22 = np.sqrt(C[:, 1, 1] - l21**2)
@@ -273,6 +275,7 @@ def in_ray_units(rig: Rig, uv_px: Array, conventions: Sequence[str]) -> Array:
         chosen = named == sense
         with np.errstate(all="ignore"):
             g, ray = (GRADIENTS[name](view, uv_px[chosen]) for name in (sense, "ray"))
+            # along its own gradient a change of this phi is so much of a change of phi_ray
             factor[chosen] = np.sum(g * ray, axis=-1) / np.sum(g * g, axis=-1)
     return factor
 

@@ -119,6 +119,7 @@ def best_constant_of(clusters: Clusters, inverse: Array) -> Statistic:
     def error(weights: Array) -> Array:
         first, second, n = np.moveaxis(weights @ table, -1, 0)
         with np.errstate(invalid="ignore", divide="ignore"):
+            # relative rms of the best constant c = sum(q) / sum(q^2), q = 1 / D
             return np.sqrt(np.maximum(1.0 - first**2 / (n * second), 0.0))
 
     return error
@@ -181,6 +182,7 @@ def exchange_chance(statistic: Statistic, n: int, rules: Rules, rng: np.random.G
         flips = rng.integers(0, 2, (min(rows, rules.resamples - start), n)).astype(float)
         one, other = _exchanged(statistic, flips)
         larger += int(np.count_nonzero(~(np.abs(other - one) < least)))  # one without a value counts as larger
+    # the order as it is counts as one of all: never a chance of 0
     return (1.0 + larger) / (1.0 + rules.resamples)
 
 
@@ -286,6 +288,7 @@ def _quantile(counts: NDArray[np.float32], ordered: Array, share: Fraction) -> A
     below = np.cumsum(counts, axis=0, out=counts)
     goal = below[-1] * np.float32(share.numerator)
     below *= np.float32(share.denominator)
+    # both neighbours where the share falls between two values; whole numbers alone, so that it is exact
     low, high = np.count_nonzero(below < goal, axis=0), np.count_nonzero(below <= goal, axis=0)
     return 0.5 * (ordered[low] + ordered[np.minimum(high, len(ordered) - 1)])
 
@@ -310,6 +313,7 @@ def rate(clusters: Clusters, hits: Array, rules: Rules) -> Estimate:
 def clopper_pearson(hits: float, n: float, confidence: float) -> tuple[float, float]:
     """Exact binomial interval; hits and n need not be whole."""
     tail, misses = (1.0 - confidence) / 2.0, n - hits
+    # ends of the interval are quantiles of beta laws; hits and trials need not be whole
     low = 0.0 if hits <= 0.0 else float(scipy.stats.beta.ppf(tail, hits, misses + 1.0))
     high = 1.0 if misses <= 0.0 else float(scipy.stats.beta.ppf(1.0 - tail, hits + 1.0, misses))
     return low, high
@@ -319,6 +323,7 @@ def _effective_number(found: Array, tried: Array, value: float) -> float:
     m, images = len(found), float(tried.sum())
     if m < 2 or value in (0.0, 1.0):
         return float(m)
+    # variance of a ratio over samples, by its linear part
     variance = m / (m - 1) * float(np.sum((found - value * tried) ** 2)) / images**2
     if variance == 0.0:
         return float(m)

@@ -28,19 +28,10 @@ from phibench.benchmark.pair_sets.wanted_pairs import (
     wanted_pairs,
 )
 from phibench.benchmark.scores.answer_errors import Rules
-from phibench.benchmark.scores.causes import with_causes
-from phibench.benchmark.scores.document import (
-    Declared,
-    Division,
-    MethodCard,
-    ScoreDocument,
-    UnfinishedError,
-    Worst,
-    document_of,
-    records_kept,
-    write_score,
-)
+from phibench.benchmark.scores.causes import KeptFits, with_causes
+from phibench.benchmark.scores.document import Declared, Division, MethodCard, ScoreDocument, Worst, document_of
 from phibench.benchmark.scores.records import in_order, missed_relative, record_table, with_missed
+from phibench.benchmark.scores.score_files import UnfinishedError, records_kept, write_score
 from phibench.benchmark.scores.score_tables import score_table
 from phibench.benchmark.scores.worst_images import worst, worst_of, worst_records
 from phibench.datasets.common.errors import DatasetError
@@ -49,7 +40,6 @@ from phibench.datasets.common.shown_text import ShortForm, text_of
 from phibench.datasets.read import Dataset
 from phibench.datasets.store.files import require_writable
 from phibench.estimator.interface import Method, Outcome
-from phibench.estimator.methods.fit_at_truth import KeptFits
 from phibench.estimator.pair_set import CachedPairs, PairSet, truth_folders
 
 Ask = Callable[[PairSet, Sequence[int]], Iterable[tuple[Outcome, ...]]]

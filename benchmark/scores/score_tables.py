@@ -18,7 +18,6 @@ from rich.console import Console
 
 from phibench.benchmark.pair_sets.dataset_pairs import Track, tracks_of
 from phibench.benchmark.scores.causes import CAUSES, KINDS, NOISE, TAKEN_FOR
-from phibench.benchmark.scores.compare import Difference
 from phibench.benchmark.scores.document import PairRange, ScoreDocument, Value
 from phibench.benchmark.scores.intervals import Estimate
 from phibench.benchmark.scores.metrics import CHOSEN, METRICS, RANKS, applies
@@ -315,28 +314,6 @@ def depth_line(document: ScoreDocument) -> str:
     return f"{document.method.name}: pull of D {one_line(pull, 1.0, 3)}; within 1.96 sigma of D {share} %, 95 is right"
 
 
-# -- comparisons ---------------------------------------------------------------------------------------------------
-
-
-_BETTER = {"no difference shown": "not shown", "too few samples": "not shown"}
-
-
-def comparison(differences: Sequence[Difference], first: str, second: str, wide: bool = False) -> TextTable:
-    """One row per metric: both values, second minus first with its interval, and which is better if that is shown."""
-    rows = []
-    for item in differences:
-        metric = METRICS[item.name]
-        factor, unit = metric.shown
-        values = (number(factor * x, DIGITS, significant=True) for x in (item.first, item.second))
-        change = cell_parts(item.difference, factor, DIGITS, significant=True)
-        counts = (str(item.n), str(item.samples), number(item.chance, 4)) if wide else ()
-        rows.append((metric.text, unit, *values, *change, *counts, _BETTER.get(item.better, item.better)))
-    counted = ("n", "samples", "chance") if wide else ()
-    heads = ("metric", "unit", "first", "second", "second\n- first", "interval", *counted, "better")
-    columns = "LlrrrL" + "r" * len(counted) + "L"
-    return TextTable(f"Over what both have. First: {first}. Second: {second}", heads, tuple(rows), columns)
-
-
 # -- output --------------------------------------------------------------------------------------------------------
 
 
@@ -407,17 +384,6 @@ def method_lines(one: HasScore) -> list[str]:
     return [f"{one.document.method.name}: {line}" for line in told]
 
 
-def print_comparison(differences: Sequence[Difference], first: str, second: str, form: str, wide: bool) -> None:
-    """Print a comparison; parameters as for `print_scores`."""
-    grid = comparison(differences, first, second, wide)
-    if form == "terminal":
-        show_grid(table_console(wide), grid)
-    else:
-        texts = {"csv": lambda: differences_csv(differences), "json": lambda: differences_json(differences)}
-        texts |= {"markdown": lambda: markdown(grid), "latex": lambda: latex(grid)}
-        sys.stdout.write(texts[form]())
-
-
 def _line(console: Console, text: str) -> None:
     console.print(text, emoji=False, highlight=False, markup=False)
 
@@ -442,34 +408,6 @@ def scores_json(documents: Sequence[ScoreDocument], by: str = "phi") -> str:
     """One JSON object a line: a score without its pictures."""
     bare = (d.model_copy(update={"worst": []}) for d in ranked(documents, by))
     return "".join(json.dumps(d.model_dump(mode="json"), allow_nan=False) + "\n" for d in bare)
-
-
-def differences_csv(differences: Sequence[Difference]) -> str:
-    """One row per metric, in the units of the files, in full."""
-    return csv_table(
-        list(_difference_fields(differences[0])), [list(_difference_fields(d).values()) for d in differences]
-    )
-
-
-def differences_json(differences: Sequence[Difference]) -> str:
-    """One JSON object: metric to values and difference."""
-    fields = {d.name: {key: x for key, x in _difference_fields(d).items() if key != "metric"} for d in differences}
-    return json.dumps(fields, indent=1, allow_nan=False) + "\n"
-
-
-def _difference_fields(d: Difference) -> dict[str, str | float | int | None]:
-    numbers = {"first": d.first, "second": d.second, "difference": d.difference.value}
-    numbers |= {"low": d.difference.low, "high": d.difference.high}
-    finite = {name: x if math.isfinite(x) else None for name, x in numbers.items()}
-    return {
-        "metric": d.name,
-        "unit": METRICS[d.name].unit,
-        **finite,
-        "n": d.n,
-        "samples": d.samples,
-        "chance": d.chance if math.isfinite(d.chance) else None,
-        "better": d.better,
-    }
 
 
 # -- numbers -------------------------------------------------------------------------------------------------------

@@ -22,16 +22,10 @@ from phibench.benchmark.isolation.resolve import RunLimits
 from phibench.benchmark.pair_sets.dataset_pairs import BOX_PX, TASK_VERSION, TRACKS
 from phibench.benchmark.pair_sets.wanted_pairs import PairChoice, wanted_pairs
 from phibench.benchmark.scores.answer_errors import Rules, usable_covariance, whitened
-from phibench.benchmark.scores.document import (
-    ScoreDocument,
-    Worst,
-    document_of,
-    read_records,
-    read_score,
-    results_sha256,
-)
+from phibench.benchmark.scores.document import ScoreDocument, Worst, document_of, results_sha256
 from phibench.benchmark.scores.record_columns import COLUMN_TYPES
 from phibench.benchmark.scores.records import missed_relative, with_missed
+from phibench.benchmark.scores.score_files import read_records, read_score
 from phibench.benchmark.scores.score_tables import failure_line
 from phibench.benchmark.sealed.rebuilt_score import (
     ABSOLUTE,

@@ -156,6 +156,7 @@ def calibrate(
     DatasetError
         If a spot is not seen in the nominal rig, or the fit does not come to rest.
     """
+    # what has no effect on this rig keeps its nominal value: a prior sigma of 0
     prior = np.where(has_effect(nominal), prior_sigmas() if sigmas is None else np.asarray(sigmas, float), 0.0)
     free = np.flatnonzero(prior > 0.0)
     turned = np.zeros((2, 2)) if vertical is None else vertical_by_principal_point(nominal)
@@ -198,6 +199,7 @@ class _Problem:
     def values(self, x: Array) -> Array:
         """Values of `PARAMETERS` at the unknowns, of which points are left out, shape (p,)."""
         values = np.zeros(len(PARAMETERS))
+        # unknowns are in prior sigmas: their residuals are themselves
         values[self.free] = x[: self.free.size] * self.prior[self.free]
         return values
 
@@ -209,6 +211,7 @@ class _Problem:
             seen = apparent_outline(self.nominal, rig)[:3]
             parts.append(_whitened(seen - self.outline.value[:3], self.outline.covariance[:3, :3]))
         if self.vertical is not None:
+            # a vertical found with another principal point is off to first order
             up = rig.T_world_camera.R.T[:2, 2] + self.by_principal_point @ (_centre_px(rig) - _centre_px(self.nominal))
             parts.append(_whitened(up - self.vertical.value, self.vertical.covariance))
         points = x[self.free.size :].reshape(-1, 3)
@@ -244,6 +247,7 @@ def _with_ellipse(problem: _Problem, fit: _Fit, vertex_rows: Array) -> _Fit:
     rig = changed(problem.nominal, problem.values(fit.x))
     seen = apparent_outline(problem.nominal, rig)
     off = seen - problem.outline.value
+    # regression of the ellipse on the vertex: what is left is independent of the fit so far
     B = np.linalg.solve(C[:3, :3], C[:3, 3:]).T
     adds = tilts_of_ellipse(rig, _TURN_RAD)
     turned, by_x = _ellipse_slopes(problem, fit.x)
@@ -258,17 +262,20 @@ def _with_ellipse(problem: _Problem, fit: _Fit, vertex_rows: Array) -> _Fit:
     L = np.linalg.cholesky(P[:2, :2])
     unit = _grid(float(np.abs(adds(_REACH * np.sqrt(np.diag(P)[:2]))).max() / np.sqrt(np.diag(W)).min()))
     r = unit @ L.T
+    # misfit of the ellipse for every tilt of the grid
     y = r @ K.T - (adds(r) + off[3:] - B @ off[:3])
     misfit = np.sum(unit**2, axis=1) + np.sum(y * np.linalg.solve(W, y.T).T, axis=1)
     weight = np.exp(-0.5 * (misfit - misfit.min()))
     weight /= weight.sum()
     gain = np.linalg.solve(W, Q).T
+    # mean of (r, l) at each node; then moments over the nodes
     z = np.concatenate([r, r @ K.T - y @ gain.T], axis=1)
     mean = weight @ z
     spread = (z - mean).T @ ((z - mean) * weight[:, None])
     spread[2:, 2:] += Q - gain @ Q
     # tilts may be held, with a variance of 0
     G = fit.covariance @ of_x.T @ np.linalg.pinv(P, rcond=1e-12, hermitian=True)
+    # what the ellipse tells of (r, l) passes on to all parameters by regression
     covariance = fit.covariance - G @ (P - spread) @ G.T
     return _Fit(fit.x + G @ mean, 0.5 * (covariance + covariance.T), fit.chi2 + float(misfit.min()))
 
@@ -319,6 +326,7 @@ def _centre_px(rig: Rig) -> Array:
 def _spot_residuals(rig: Rig, values: Array, spots: Sequence[KnownSpot], points: Array) -> Array:
     """Pixels, and the finite ones of distance, height and azimuth, of all spots; points have the shape (K, 3)."""
     strokes = stroke_of(np.array([spot.stroke_m for spot in spots]), values)
+    # the rig up by h is the point down by h
     up_points = points - strokes[:, None] * np.array(rig.stroke_axis_world)
     view, seen = rig.at(0.0), []
     for where, name in ((points, "down"), (up_points, "up")):
@@ -332,6 +340,7 @@ def _spot_residuals(rig: Rig, values: Array, spots: Sequence[KnownSpot], points:
         [
             np.hypot(flat[:, 0], flat[:, 1]) - [spot.depth_m for spot in spots],
             points[:, 2] - [spot.height_m for spot in spots],
+            # a difference of angles between -pi and pi
             np.arctan2(np.sin(turn), np.cos(turn)),
         ],
         axis=-1,
@@ -364,6 +373,7 @@ def _start(rig: Rig, spot: KnownSpot) -> Array:
             "nominal rig: its rays miss the mirror or do not meet; check the pixels and the rig"
         )
     point, centre = np.array(estimate.point_world_m), rig.at(0.0).sphere_centre_m
+    # same azimuth, at the distance of the tape
     point[:2] = centre[:2] + (point[:2] - centre[:2]) * spot.depth_m / float(estimate.depth_m)
     return point
 
@@ -431,6 +441,7 @@ def vertical_by_principal_point(nominal: Rig) -> Array:
 def _lines(rig: Rig) -> Array:
     """Points on upright lines about the sphere, shape (edges, points, 3), world."""
     azimuth = 2.0 * np.pi * np.arange(_EDGES)[:, None] / _EDGES
+    # 0 times the azimuth: the shape of all edges by all points
     height = _DISTANCE_M * np.tan(np.linspace(*_ELEVATIONS_RAD, _POINTS)) + 0.0 * azimuth
     flat = [_DISTANCE_M * f(azimuth) + 0.0 * height for f in (np.cos, np.sin)]
     return np.asarray(np.stack([*flat, height], axis=-1) + rig.at(0.0).sphere_centre_m)

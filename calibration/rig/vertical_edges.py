@@ -72,10 +72,12 @@ def unwrapped(picture: Array, circle: Circle) -> Unwrapped:
     """Unwrap a picture, shape (H, W), about the circle of an outline."""
     centre, radius_px = np.array(circle[:2]), circle[2]
     low, high = (share * radius_px for share in RADII)
+    # columns as wide as the step at the mean radius
     columns = int(2.0 * np.pi * 0.5 * (low + high) / _STEP_PX)
     r, azimuth = np.arange(low, high), np.arange(columns) * (2.0 * np.pi / columns)
     u, v = centre[0] + np.outer(r, np.cos(azimuth)), centre[1] + np.outer(r, np.sin(azimuth))
     light = ndimage.map_coordinates(picture, [v, u], order=3, mode="nearest")
+    # the azimuth is periodic: it wraps
     level = ndimage.gaussian_filter(light, (_LEVEL_PX, _LEVEL_PX / _STEP_PX), mode=("nearest", "wrap"))
     return Unwrapped(light / np.clip(level, 2e-3, None), centre, low, 2.0 * np.pi / columns)
 
@@ -88,6 +90,7 @@ def edges_of(picture: Array, rig: Rig) -> list[Array]:
 def edges_about(picture: Array, circle: Circle) -> list[Array]:
     """The same about the circle of an outline, for a picture of an unknown camera."""
     polar = unwrapped(picture, circle)
+    # upright edges are radial: the step of light lies along the azimuth
     across = _gradient(polar.light)
     edges, taken = [], np.zeros(across.shape, bool)
     noise = 1.4826 * float(np.median(np.abs(across)))  # that of a normal law: edges are few
@@ -147,6 +150,7 @@ def _track(across: Array, least: float, r0: int, r1: int, c0: float, c1: float) 
     row = np.arange(r0 + 1, r1, dtype=np.int64)
     if row.size < _MIN_POINTS:
         return None
+    # straight line of the segment: column by row
     line = np.polynomial.Polynomial([c0 - r0 * (c1 - c0) / max(r1 - r0, 1), (c1 - c0) / max(r1 - r0, 1)])
     sign = np.sign(np.median(across[row, np.rint(line(row)).astype(int) % across.shape[1]])) or 1.0
     for reach in (_REACH_PX, 0.6 * _REACH_PX):
@@ -170,6 +174,7 @@ def _steepest(across: Array, row: Rows, near: Array, reach_px: float) -> tuple[A
     k = np.arange(row.size)
     a, b, c = values[k, inner - 1], values[k, inner], values[k, inner + 1]
     with np.errstate(all="ignore"):
+        # vertex of the parabola through the steepest place and its neighbours
         shift = 0.5 * (a - c) / (a - 2.0 * b + c)
     column = columns[k, inner] + shift
     column[(best != inner) | (np.abs(shift) > 1.0)] = np.nan
@@ -302,12 +307,14 @@ def _azimuth_and_slope(rays: EdgeRays, up: Array, per_m: float = _PER_M[0]) -> t
     """Azimuth of an edge, its slope along the azimuth, radians, and one over the variance that its points give it."""
     x, y = _horizontal(up)
     a, b = rays.direction @ x, rays.direction @ y
+    # along the ray to the assumed distance; the origin of the ray lies on the mirror
     t = (1.0 / per_m - np.hypot(rays.origin_m @ x, rays.origin_m @ y)) / np.hypot(a, b)
     point = rays.origin_m + t[:, None] * rays.direction
     azimuth = float(np.arctan2((point @ y).mean(), (point @ x).mean()))
     along, height = point @ (np.cos(azimuth) * y - np.sin(azimuth) * x), point @ up
     centred = height - height.mean()
     square = float(centred @ centred)
+    # regression of the sideways place on the height: the lean of the edge
     slope = float(centred @ along / square)
     left = along - along.mean() - slope * centred
     # an exact line leaves nothing
@@ -318,6 +325,7 @@ def _slopes(rays: Sequence[EdgeRays], up: Array) -> tuple[Array, Array, Array]:
     """Azimuths, slopes and one over the slopes' variances of edges, shape (K,) each; their distances are not known."""
     azimuth, slope, weight = np.array([_azimuth_and_slope(r, up) for r in rays]).T
     nearer = np.array([_azimuth_and_slope(r, up, _PER_M[1])[1] for r in rays])
+    # the unknown distance adds what it does to the slope; the room adds its own lean
     return azimuth, slope, 1.0 / (1.0 / weight + (nearer - slope) ** 2 + _LEAST_SLOPE_RAD**2)
 
 
@@ -334,10 +342,12 @@ def agreeing(azimuth: Array, value: Array, weight: Array, most: float) -> list[i
     shift = np.stack(
         [value[i] * across[j, 1] - value[j] * across[i, 1], value[j] * across[i, 0] - value[i] * across[j, 0]]
     )
+    # every two edges give one tilt; tilts beyond the limit are no candidates
     shift = (shift / sine).T[np.linalg.norm(shift / sine, axis=0) < most]
     if not len(shift):
         return []
     off = np.abs(value - shift @ across.T) * np.sqrt(_evened(weight))
+    # edges that agree count, those astray count nothing, whatever their distance
     score = np.sum(np.clip(1.0 - (off / _SLOPE_LIMIT) ** 2, 0.0, None), axis=-1)
     return [int(k) for k in np.flatnonzero(off[np.argmax(score)] < _SLOPE_LIMIT)]
 
@@ -385,6 +395,7 @@ def regression(azimuth: Array, value: Array, weight: Array) -> Regression:
     # a single edge that decides: 1 / 0
     leverage = np.clip(np.einsum("ki,ij,kj->k", across, inverse, across) * w, 0.0, 0.9)
     scores = across * (trust * np.sqrt(weight) * off / np.sqrt(1.0 - leverage))[:, None]
+    # bread and meat of a robust sandwich; the mean of it and of the pooled scale serves few edges
     meat = across.T @ ((w * trust)[:, None] * across)
     degrees = max(float(trust.sum()) - 2.0, 1.0)
     pooled = max(float(np.sum(trust * off**2)) / degrees, _LEAST_SCALE**2) * meat

@@ -197,6 +197,7 @@ class _Fit:
     def _sigma(self, name: str, x: Array, response: Response) -> float:
         """Of the blocks, of what frames and rows have in common, and of the choice of the response."""
         own = self.extra.get(name, 0.0)
+        # numbers in electrons carry the relative error of the gain
         by_gain = abs(float(x[0])) * response.spread / float(response.gain[0]) if name in _BY_GAIN else 0.0
         return float(np.sqrt(jackknife_sigma(x) ** 2 + own**2 + by_gain**2))
 
@@ -216,6 +217,7 @@ class _Fit:
 
     def _reach(self, one: _Level) -> float:
         s = one.sums
+        # brightest pixel that is to be expected: noise and fixed pattern together
         return float(s.mean_dn[0] + _MARGIN_SIGMAS * np.sqrt(s.temporal_dn2[0] + max(s.spatial_dn2[0], 0.0)))
 
     def _plateau(self) -> list[_Level]:
@@ -319,6 +321,7 @@ class _Fit:
         counts = [sums.pixels[0] * sums.frames for _, sums in self.timed] + [self.dark.pixels[0] * self.dark.frames]
         weights = np.array([n / s[0, 1] for n, s in zip(counts, series, strict=False)])[:, None]
         t, means = np.array(times)[:, None], np.stack([s[:, 0] for s in series])
+        # weighted straight line: dark current is its slope, the black level its value at 0 s
         centre = (weights * t).sum() / weights.sum()
         slope = np.sum(weights * (t - centre) * means, axis=0) / np.sum(weights * (t - centre) * t)
         black_share = (1.0 - (t - centre) * (weights * t).sum() / np.sum(weights * (t - centre) * t)) / weights.sum()
@@ -358,6 +361,7 @@ class _Fit:
             self.values["row_noise_e"] = np.sqrt(share) / gain
             self.extra["row_noise_e"] = 0.5 * row_sigma / float(np.sqrt(share)) / float(gain[0])
         seconds = self.notes.exposure_s or 0.0
+        # what rows share and the shot noise of the dark current are not the reading's
         square = (self.dark_dn2 - share) / gain**2 - dark_rate * seconds
         self.values["read_noise_e"] = np.sqrt(np.maximum(square, 0.0))
         pattern = self.offset_dn2 / gain**2
@@ -379,6 +383,7 @@ class _Fit:
         signal = np.stack([response.linear(y) / response.slope(y) for y in shown])  # dy / y' is the change of x
         pattern = np.stack([level.sums.spatial_dn2 for level in used]) - self.dark.spatial_dn2
         temporal = np.array([level.sums.temporal_dn2[0] / level.sums.frames for level in used])
+        # inverse variance of pattern / signal^2: a variance is known to its own size
         weights = (signal[:, 0] ** 2 / (np.maximum(pattern[:, 0], 0.0) + temporal)) ** 2
         square = np.sum(weights[:, None] * pattern / signal**2, axis=0) / weights.sum()
         if self._is_cut and response.is_bent:

@@ -75,6 +75,7 @@ def phi(rig: Rig | View, uv_px: ArrayLike, convention: str = "ray") -> Array:
 
 def phi_ray(view: View, uv_px: Array) -> Array:
     """Half the angle between the ray that leaves the mirror and the downward vertical."""
+    # a ray that came straight up leaves at twice the angle of the normal: half of it is the phi of the paper
     return _from_downward(reflect(view, uv_px).direction_world) / 2.0
 
 
@@ -95,6 +96,7 @@ def phi_outline(view: View, uv_px: Array) -> Array:
     """
     uv = np.asarray(uv_px, float)
     centre, radius_px = outline_circle(view.rig)
+    # rounding puts pixels of the outline beyond it: arcsin takes 1 at most
     ratio = np.minimum(np.linalg.norm(uv - centre, axis=-1) / radius_px, 1.0)
     return keep(geometry_of(view.rig.mirror).normal_angle(ratio), _outline_status(view, uv))
 
@@ -168,6 +170,7 @@ def _outline_status(view: View, uv_px: Array) -> StatusArray:
     return flag(
         (~np.isfinite(ratio), Status.NOT_FINITE),
         (ratio > 1.0, Status.MISSES_MIRROR),
+        # the outline itself: the ray grazes, and phi has no derivative
         (ratio == 1.0, Status.GRAZING),
         (ratio < ON_AXIS_SINE, Status.ON_AXIS),
     )

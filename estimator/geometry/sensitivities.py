@@ -67,6 +67,7 @@ def sensitivity(
     """
     views = [true_rig.at(Stroke(true_stroke_m).offset_m(position)) for position in POSITIONS]
     pixels = [image_of(view, point_world_m).uv_px for view in views]
+    # chain rule: dD/d(pixels) of the nominal rig times d(pixels)/dp of the true one
     by_pixel = PIXEL_GRADIENTS[estimator](nominal_rig, nominal_stroke_m, *pixels)
     moved = [pixel_gradient(view, uv, point_world_m) for view, uv in zip(views, pixels, strict=True)]
     estimate = ESTIMATORS[estimator](nominal_rig, nominal_stroke_m, *pixels)
@@ -80,6 +81,7 @@ def truth_gradient(true_rig: Rig, point_world_m: Array) -> Array:
     with np.errstate(invalid="ignore"):  # D = 0 has no direction: NaN
         away /= np.hypot(*away)
     result = np.zeros(len(PARAMETERS))
+    # the line from which D counts moves with the mirror: D falls by the part along its direction
     result[[PARAMETERS.index("decentre_x_m"), PARAMETERS.index("decentre_y_m")]] = -away
     return result
 
@@ -94,10 +96,12 @@ def pixel_gradient(view: View, uv_px: Array, point_world_m: Array) -> Array:
         dP, dr = _ray_changes(view, uv_px)
         ray = reflect(view, uv_px)
         along = np.sum((point_world_m - ray.origin_world_m) * ray.direction_world)
+        # the ray passes beside the point: its miss across, at the distance of the point
         across = ray_basis(ray.direction_world) @ (dP + along * dr).T
         slope = ray_slope(view, uv_px, point_world_m)
     if not (np.isfinite(slope).all() and np.isfinite(across).all()):
         return np.full((2, len(PARAMETERS)), np.nan)
+    # the pixel moves so that the miss is 0 again (implicit function)
     return np.asarray(-np.linalg.solve(slope, across), float)
 
 
@@ -120,6 +124,7 @@ def _ray_changes(view: View, uv_px: Array) -> tuple[Array, Array]:
     t1 = -(g1 / length + (t * d1 - q1 - carried) @ n) / (d @ n)
     P1 = t1[:, None] * d + t * d1 - q1  # relative to the sphere centre
     across = np.eye(3) - np.outer(n, n)
+    # the normal turns with the mirror, and by its change along the surface
     n1 = np.cross(mirror_turn, n) + ((P1 - carried) @ surface.hessian_per_m + gradient1) @ across / length
     cos1 = -(d1 @ n + n1 @ d)
     return sphere + P1, d1 + 2.0 * (cos1[:, None] * n + cos_i * n1)
@@ -138,6 +143,7 @@ def _surface_changes(view: View, P: Array) -> tuple[Level, Array, Array]:
 def _rigid_changes(view: View) -> tuple[Array, Array, Array, Array]:
     """d(lens centre), d(sphere centre), d(camera's turn), d(mirror's turn), shape (p, 3), world, by p."""
     lens, sphere, turn = (dict.fromkeys(PARAMETERS, np.zeros(3)) for _ in range(3))
+    # misalignments are fixed to the rig: a motion between the images turns their axes
     moved = np.eye(3) if view.motion is None else np.array(view.motion.rotation)
     for name, axis in zip(("decentre_x_m", "decentre_y_m", "axial_m"), moved.T, strict=True):
         sphere[name] = axis
@@ -163,6 +169,7 @@ def _stroke_changes(view: View) -> dict[str, Array]:
     return {
         "stroke_relative": h * axis,
         "stroke_offset_m": axis,
+        # small turn of the axis: the lens moves by h (turn x axis)
         "stroke_tilt_x_rad": h * np.cross(_AXES[0], axis),
         "stroke_tilt_y_rad": h * np.cross(_AXES[1], axis),
         **{f"shift_{name}_m": direction for name, direction in zip("xyz", _AXES, strict=True)},
@@ -187,6 +194,7 @@ def _normalised_changes(camera: Camera, uv_px: Array, xy: Array) -> Array:
     r2 = x * x + y * y
     f = np.array([camera.fx_px, camera.fy_px])
     distorted = (uv_px - np.array([camera.cx_px, camera.cy_px])) / f
+    # derivatives of the distorted point by k1, k2, k3, p1, p2 at fixed (x, y)
     brown = [xy * r2, xy * r2**2, xy * r2**3, (2.0 * x * y, r2 + 2.0 * y * y), (r2 + 2.0 * x * x, 2.0 * x * y)]
     right = np.stack([-distorted, (-1.0 / f[0], 0.0), (0.0, -1.0 / f[1]), *(-np.asarray(b) for b in brown)], axis=-1)
     return np.linalg.solve(camera.distort_jacobian(xy), right)

@@ -134,6 +134,7 @@ class SphereImager:
 
     def reflectance(self, cos_incidence: float) -> float:
         """Part of the light that the mirror keeps."""
+        # table of even steps in the cosine, straight between two nodes
         place = cos_incidence * (_NODES - 1)
         low = min(int(place), _NODES - 2)
         left, right = self._reflectance[low], self._reflectance[low + 1]
@@ -144,6 +145,7 @@ class SphereImager:
         point, ray = np.array([x_m, y_m, z_m]), np.array(image.ray)
         from_centre = point - np.array(self._centre)
         along = from_centre @ ray
+        # first of two crossings, seen from the point; rounding at the limb would give a negative square
         root = math.sqrt(max(along**2 - from_centre @ from_centre + self.radius_m**2, 0.0))
         return np.asarray(point - (along - root) * ray)
 
@@ -163,7 +165,9 @@ class SphereImager:
             b1 = (R * dist * c - R * R) / (dist * dist + R * R - 2.0 * dist * R * c)
             t = 2.0 * p + b
             sin_t, cos_t = math.sin(t), math.cos(t)
+            # miss of the reflected ray at the point, and the way to it
             across, along = (w - R * s) * cos_t - (y - R * c) * sin_t, (w - R * s) * sin_t + (y - R * c) * cos_t
+            # derivative of the miss by p, the place on the mirror
             slope = R * math.cos(t - p) + (2.0 + b1) * along
             step = across / slope
             if abs(step) < _CLOSE_RAD:

@@ -19,7 +19,7 @@ that. sigma_D is a root mean square error: for a rig as built it contains the me
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 
 import numpy as np
@@ -159,6 +159,7 @@ def best_stroke(
         nothing = (math.nan,) * 6  # all of `BestStroke` between D and its limits
         return BestStroke(depth_m, *nothing, tuple(dict.fromkeys(curve.causes)), curve)
     index = int(np.argmin(curve.allowed_sigma_m))
+    # the minimum lies between the two neighbours of the best stroke of the grid
     fine = curve_of(strokes_m=np.linspace(*grid_neighbours(curve.strokes_m.tolist(), index), _FINE))
     at = int(np.argmin(fine.allowed_sigma_m))
     return BestStroke(
@@ -188,15 +189,11 @@ def spot_bound(rig: Rig, card: SensorCard) -> SpotSigma:
     rim = rig.outline_px(4)[0]
     blur = spot_blur(rig, 0.4 * centre + 0.6 * rim)  # one place stands for all: defocus changes little over the mirror
     r, g, b = rig.camera.detector.laser_filter_response
+    # the background costs information by its own shot noise
     room = [rate * card.exposure_s for rate in ROOM_E_PER_S]
     # behind the processing every flux costs a covariance of the codes; the bound is smooth enough for 9 of them
     fluxes = np.geomspace(100.0, 1e6, 25 if card.output == "raw" else 9)
     return spot_sigma(card, blur.round_px, room, (r, g, b), flux_e=tuple(fluxes.tolist()))
-
-
-def without_limits(around: Surroundings) -> Surroundings:
-    """Surroundings in which only geometry bounds the stroke: no ceiling and no robot."""
-    return replace(around, room_height_m=math.inf, robot=False)
 
 
 def _limits(curve: StrokeCurve, index: int) -> tuple[str, ...]:

@@ -97,6 +97,7 @@ def clipped(covariance_px2: Array) -> Array:
     """Covariances, shape (n, 2, 2), with no variance above 0.5 px^2 along any axis; NaN stays."""
     good = np.asarray(np.isfinite(covariance_px2).all(axis=(1, 2)))
     values, axes = np.linalg.eigh(np.where(good[:, None, None], covariance_px2, np.eye(2)))
+    # same axes, smaller variances: V = sum of value x axis axis^T
     cut = (axes * np.minimum(values, _CLIPPED_PX2)[:, None, :]) @ np.swapaxes(axes, 1, 2)
     return np.where(good[:, None, None], cut, np.nan)
 
@@ -145,6 +146,7 @@ def at_least(found: int, chances: Array) -> float:
     """Chance that at least so many of independent events happen."""
     law = np.ones(1)
     for p in chances:
+        # law of a sum of independent events of unlike chances, one event at a time
         law = np.convolve(law, [1.0 - p, p])
     return float(min(1.0, law[found:].sum()))
 
@@ -193,6 +195,7 @@ def _found_images(records: pl.DataFrame, name: str) -> pl.DataFrame:
 
 def _of_errors(quantity: str, part: str, values: Array, freedom: int) -> Excess:
     n, total = len(values), float(values.sum())
+    # too small a sum of squares is the suspicious side
     chance = min(1.0, TIMES * float(scipy.stats.chi2.cdf(total, freedom * n))) if n else 1.0
     return Excess(quantity, part, float(np.sqrt(freedom * n / total)) if total > 0.0 else np.inf, n, chance)
 

@@ -44,7 +44,7 @@ from phibench.estimator.geometry.rig_parameters import rig_gradient
 from phibench.estimator.geometry.status import StatusArray
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.estimator.spots.gaussian_spot import covariance_bound, fisher_matrix
-from phibench.estimator.spots.raw_pixels import PixelNoise, noise_of
+from phibench.estimator.spots.raw_pixels import noise_of
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import Rig, View
 from phibench.scenes.validation import nearest
@@ -96,11 +96,6 @@ def raw_information(
     return uncut * censored_share(mean_e, variance, card.saturation_e)
 
 
-def approximate_information(mean_e: Array, noise: PixelNoise) -> Array:
-    """1 / variance, shape of `mean_e`; electrons and electrons^-2."""
-    return 1.0 / noise.variance_e2(mean_e)
-
-
 def without_room(on: Array, off: Array, spot_e: Array, frames: FrameCounts, prnu: float) -> Array:
     """Information of pixels about the spot's light, electrons^-2, shape of `on`; the room is an unknown of each.
 
@@ -116,6 +111,7 @@ def without_room(on: Array, off: Array, spot_e: Array, frames: FrameCounts, prnu
         Relative, unknown.
     """
     with np.errstate(divide="ignore"):
+        # variances of on and off add, and so does the pattern of the spot, which no mean removes
         return np.asarray(1.0 / (1.0 / (frames.on * on) + 1.0 / (frames.off * off) + (prnu * spot_e) ** 2))
 
 
@@ -142,6 +138,7 @@ def censored_share(mean_e: Array, variance_e2: Array, saturation_e: float) -> Ar
     # a full well may be infinite
     z = np.clip((saturation_e - mean_e) / np.sqrt(variance_e2), -2.0 * _FULL_SIGMAS, 2.0 * _FREE_SIGMAS)
     log_density = -0.5 * (z * z + np.log(2.0 * np.pi))
+    # information of a normal law that is cut off at z: uncut part, edge, and the counted rest
     share = ndtr(z) - z * np.exp(log_density) + np.exp(2.0 * log_density - log_ndtr(-z))
     return np.where(z > _FREE_SIGMAS, 1.0, np.where(z < -_FULL_SIGMAS, 0.0, np.minimum(share, 1.0)))
 
@@ -170,6 +167,7 @@ def _interpolated(mean: Array, r: float) -> Array:
     if flat.size <= _NODES or np.ptp(flat) == 0.0:
         values = {mu: _poisson_gauss(mu, r) * (mu + r * r) for mu in set(flat.tolist())}
         return np.array([values[mu] for mu in flat.tolist()]).reshape(mean.shape)
+    # even nodes in the logarithm of the variance, along which J (mu + r^2) bends evenly
     x = np.log(flat + r * r)
     nodes = np.linspace(x.min(), x.max(), _NODES)
     table = [_poisson_gauss(max(mu, 0.0), r) * (mu + r * r) for mu in np.exp(nodes) - r * r]
@@ -185,6 +183,7 @@ def _poisson_gauss(mu: float, r: float) -> float:
     x = np.arange(n[0] - _SIGMAS * r, n[-1] + _SIGMAS * r, r / 3.0)
     density = scipy.stats.norm.pdf(x[:, None], n, r)
     chance = scipy.stats.poisson.pmf
+    # dP(n; mu)/dmu = P(n - 1; mu) - P(n; mu) of a Poisson law
     p, slope = density @ chance(n, mu), density @ (chance(n - 1, mu) - chance(n, mu))
     seen = p > 0.0
     return float(np.sum(slope[seen] ** 2 / p[seen]) * r / 3.0)

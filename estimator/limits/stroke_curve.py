@@ -149,6 +149,7 @@ def stroke_curve(
     """Predicted error of D for strokes, shape (n,); parameters as for `best_stroke.best_stroke`."""
     h, points = np.asarray(strokes_m, float), around.points_m(rig, depth_m)
     images = [_images(rig, points, offset) for offset in (np.zeros(1), h)]
+    # walls face the axis, so that the cosine is that of an upright wall at this azimuth
     electrons = [spot_electrons_per_s(rig, around.laser, image, around.wall_normals()) * exposure_s for image in images]
     C_down, C_up = (_covariance(image, spot, light) for image, light in zip(images, electrons, strict=True))
     down, up = (image.uv_px for image in images)
@@ -191,12 +192,14 @@ def _fault(rig: Rig, points_m: Array, uv_px: Array, offset_m: float, around: Sur
 
 def _images(rig: Rig, points_m: Array, offsets_m: Array) -> MirrorImage:
     """Images of points, shape (m, 3), from offsets, shape (n,), of the carriage: shape (n, m)."""
+    # the rig up by h sees what the rig down sees of a point lower by h
     lowered = points_m - offsets_m[:, None, None] * np.array(rig.stroke_axis_world)
     return image_of(rig.at(0.0), lowered)
 
 
 def _with_unknown(curve: StrokeCurve, spot: SpotSigma, down_e: Array, up_e: Array) -> tuple[str, ...]:
     """Causes, with those of free strokes whose error is not known; spots' electrons (1, m) and (n, m)."""
+    # a stroke is unknown if either of its images is
     light_e = np.concatenate([np.broadcast_to(down_e, up_e.shape), up_e], axis=-1)
     unknown = np.select(
         [(light_e > spot.flux_e[-1]).any(axis=-1), (light_e < spot.flux_e[0]).any(axis=-1)],
@@ -224,11 +227,13 @@ def outline_distance_px(rig: Rig, uv_px: Array) -> Array:
     if radius_m is None:
         corners = rig.outline_px()
         side, to = np.roll(corners, -1, axis=0) - corners, uv_px[:, None] - corners
+        # nearest place on each side of the polygon of the outline
         share = np.clip(np.sum(to * side, axis=-1) / np.sum(side * side, axis=-1), 0.0, 1.0)
         near = np.linalg.norm(to - share[..., None] * side, axis=-1).min(axis=-1)
         return np.where(reflect(rig.at(0.0), uv_px).status == Status.OK, near, -near)
     centre = rig.sphere_in_camera_m
     away = np.arccos(np.clip(rig.camera.rays(uv_px) @ centre / np.linalg.norm(centre), -1.0, 1.0))
+    # a sphere is seen under the half angle asin(R / distance)
     rim = math.asin(radius_m / float(np.linalg.norm(centre)))
     return np.asarray((rim - away) * rig.camera.fx_px)
 
@@ -248,6 +253,7 @@ def grid_neighbours(grid: Sequence[float], index: int) -> tuple[float, float]:
 
 def covariance_root(covariance: Array) -> Array:
     """Matrix A with A A^T = C, shape (p, p), of a covariance that may be singular and has mixed units."""
+    # metres, radians and pixels: the correlation matrix has no units, and its eigenvalues are comparable
     scale = np.sqrt(np.diag(covariance))
     safe = np.where(scale > 0.0, scale, 1.0)
     value, vector = np.linalg.eigh(covariance / np.outer(safe, safe))
@@ -282,6 +288,7 @@ def beyond_first_order_m(
     chosen = _chosen(strokes_m)
     h, up_px2 = strokes_m[chosen], np.broadcast_to(covariance_up_px2, (len(strokes_m), *covariance_up_px2.shape[1:]))
     root, normals = covariance_root(covariance_rig), _normals(_PAIRS)
+    # rigs at random, then a small step along each column of the root, for the linear part
     deviations = np.concatenate([normals @ root.T, _STEP * root.T])
     seen = [_seen(rig, v, h, points_m) for v in (*deviations, *-deviations)]
     down, up, true = (np.stack(column) for column in zip(*seen, strict=True))
@@ -294,9 +301,11 @@ def beyond_first_order_m(
 def _beyond_m2(errors_m: Array, normals: Array) -> Array:
     """Mean square beyond first order, shape (n,), of errors (2 (k + p), n, m): rigs, steps, and their opposites."""
     plus, minus = np.split(errors_m, 2)
+    # opposite rigs: the odd part holds first and third order, the even one second and fourth
     even, odd = 0.5 * (plus + minus), 0.5 * (plus - minus)
     k = len(normals)
     linear = np.einsum("kp,pnm->knm", normals, odd[k:] / _STEP)
+    # what the first-order formula has already counted is taken off
     return np.asarray(np.mean(even[:k] ** 2 + odd[:k] ** 2 - linear**2, axis=(0, 2)))
 
 
@@ -317,6 +326,7 @@ def _seen(rig: Rig, values: Array, strokes_m: Array, points_m: Array) -> tuple[A
     lowered = points_m - offsets[:, None, None] * axis
     up = image_of(view, lowered).uv_px
     down = np.broadcast_to(image_of(view, points_m).uv_px, up.shape)
+    # the true D counts from the mirror of the rig that deviates
     away = points_m[:, :2] - view.sphere_centre_m[:2]
     return down, up, np.hypot(away[:, 0], away[:, 1])[None]
 

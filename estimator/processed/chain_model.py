@@ -166,14 +166,17 @@ class _Way:
 def _way(card: SensorCard) -> _Way:
     """Way of a camera's make; arrays are read only. Nothing here depends on the numbers in `BESIDE_CURVE`."""
     h, w = window_px(card)
+    # pixels that sharpening and denoising reach beyond their own
     mixed = (card.sharpen_amount > 0.0) + denoise_margin_px(card)
     # R, G, B are whole codes before JPEG; those that sharpening or denoising mix are rounded after it
     whole = card.output == "mjpeg" and not mixed and card.colour_matrix == UNIT_MATRIX
     output = _output((h, w), card, whole)
+    # each filter looks one pixel further; the mosaic needs one more
     grown = output.margin + mixed
     margin, outer = grown + 1, (h + 2 * grown, w + 2 * grown)
     filters = bayer_filters(_corner(margin, card.mosaic_phase), (outer[0] + 2, outer[1] + 2))[0]
     sharp, smooth = neighbours(outer, card)
+    # outputs = transform x smoothing x sharpening of codes; kept transposed, codes by outputs
     T = ((smooth @ sharp).T @ output.transform.T).toarray()
     sparing = edge_sparing(sharp, outer, card)
     if sparing is not None:  # R, G and B change by what Y' does
@@ -192,6 +195,7 @@ def _blocks(transform: Array) -> NDArray[np.int64]:
     """Number of each output's block, shape (n,); one for all where there are many, whose products are not worth it."""
     first: dict[bytes, int] = {}
     block = np.array([first.setdefault(row.tobytes(), len(first)) for row in transform.T != 0.0], np.int64)
+    # codes that different blocks do not share need no product
     return block if len(first) <= _MOST_BLOCKS else np.zeros_like(block)
 
 
@@ -229,6 +233,7 @@ def _codes(model: ChainModel, mean_e: Array) -> Codes:
         # the slope carries (by_mean sigma)^2 through the matrices: only what is left of the variance is added as white
         excess = np.maximum(n.variance - (n.by_mean * sigma) ** 2, 0.0)
         return Codes(255.0 * n.mean, 255.0 * n.by_mean, 255.0 * n.by_mean, 255.0**2 * excess)
+    # back to electrons of one pixel of the colour, in which the tables are
     gain = np.repeat(full_scale_e(model.card) / np.asarray(model.card.white_balance), linear.shape[-1] // 3)
     names = ("mean", "by_mean", "regression", "excess")
     mean, by_mean, regression, excess = model.tables.values(names, linear * gain, model.kinds)
@@ -237,6 +242,7 @@ def _codes(model: ChainModel, mean_e: Array) -> Codes:
 
 def raw_variance_e2(model: ChainModel, mean_e: Array) -> Array:
     """Variance of the raw pixels, shape as `mean_e`, rounding included."""
+    # rounding to DN: uniform over one, 1 / 12 of it squared
     return model.noise.variance_e2(mean_e) + 1.0 / (12.0 * model.card.dn_per_e**2)
 
 
@@ -261,6 +267,7 @@ def noise_factor(model: ChainModel, at: Codes, variance_e2: Array, transform: Ar
     transform : shape (3 p + q, n), of those coefficients
     """
     spread = _spread(model, at.regression, np.sqrt(variance_e2))
+    # F = (slopes x sigma)^T x transform: C = F^T F needs no covariance of the raw pixels
     return np.asarray(sparse.csr_array(spread.T) @ _of_codes(model, at, transform))
 
 
@@ -293,6 +300,7 @@ def _linear(card: SensorCard, outer: tuple[int, int], margin: int) -> sparse.csr
     """Demosaicing by the mean of a colour's pixels among the nearest 3 x 3, or the own one; gains; matrix."""
     h, w = outer
     planes = sparse.vstack([_interpolation(h, w, margin, colour, card.mosaic_phase) for colour in range(3)]).tocsr()
+    # columns of the matrix times the gains: 1 at full scale
     mix = np.asarray(card.colour_matrix) * np.asarray(card.white_balance) / full_scale_e(card)
     return sparse.csr_array(sparse.kron(sparse.csr_array(mix), sparse.eye_array(h * w)) @ planes)
 
@@ -303,6 +311,7 @@ def _kinds(filters: NDArray[np.int64]) -> NDArray[np.int64]:
     rows = []
     for colour in range(3):
         distance = np.abs(inner - colour)  # 0: own pixel
+        # red and blue at a green pixel have two neighbours, all others four
         count = np.where(distance == 0, 1, np.where((inner == 1) & (colour != 1), 2, 4))
         rows.append(3 * colour + np.searchsorted(COUNTS, count))
     return np.concatenate([row.ravel() for row in rows])
@@ -367,6 +376,7 @@ def _shift(shape: tuple[int, int], subsampling: str) -> Array:
     h, w = shape
     down, across = CHROMA_STEP[subsampling]
     ycc = np.zeros((3, h, w))
+    # JPEG codes Y less 128; chroma lies about 0 already
     ycc[0] = -128.0
     # libjpeg adds 0, 1, 0, 1 before it halves (1, 2, 1, 2 before it quarters): -1/4 and +1/4 (-1/8, +1/8) in turns
     if across > 1:

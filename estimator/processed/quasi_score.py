@@ -208,6 +208,7 @@ class CoefficientWindow:
         F = noise_factor(model, at, raw.variance_e2[0] + extra, rows.transform)
         room, offset = (np.broadcast_to(x, len(model.step))[rows.index] for x in (self.room, self.offset))
         rest = excess_variance(model, at, rows.transform) + rows.rounding + room
+        # diagonal of F^T F, and what is white beside it
         sigma = np.sqrt(np.einsum("rn,rn->n", F, F) + rest)
         output = quantised(at.mean @ rows.transform + rows.shift + offset, sigma, rows.step)
         variance = np.maximum(output.variance, _LEAST * rows.step**2)
@@ -216,14 +217,17 @@ class CoefficientWindow:
             index = np.flatnonzero(output.variance > least * rows.step**2)
             F, slope, variance, sigma, rows = F[:, index], slope[index], variance[index], sigma[index], rows.part(index)
             room = room[index]
+        # slope of the quantiser: the part of a change that its output shows
         F *= slope
         C = F.T @ F
+        # the diagonal holds the rounding as well, which neighbours do not share
         np.fill_diagonal(C, variance)
         if self.frames > 1:
             if model.noise.prnu > 0.0:
                 extra = extra + raw.slope[0] ** 2 * (model.noise.prnu * np.maximum(raw.mean_e[0], 0.0)) ** 2
             E = noise_factor(model, at, extra, rows.transform)
             alike = shared_covariance(E, room, sigma, slope, rows.step)
+            # mean of n frames: own errors fall by n, shared ones stay
             C = C / self.frames + (1.0 - 1.0 / self.frames) * alike
         return Noise(rows, sigma, np.asarray(np.linalg.cholesky(C), float))
 
@@ -243,6 +247,7 @@ class CoefficientWindow:
         raw, derivatives = self._raw(theta[None])
         at = codes(model, raw.mean_e)
         shared = raw.slope[0] ** 2 * (self.extra_e2 + self._pattern_e2(theta))
+        # the fixed pattern is the same in every frame; the rest is drawn anew
         pattern = raw.slope[0] ** 2 * (model.noise.prnu * np.maximum(raw.mean_e[0], 0.0)) ** 2
         changing = np.maximum(raw.variance_e2[0] - pattern, 0.0)
         white = excess_variance(model, at.one(0), model.transform) + model.rounding
@@ -270,6 +275,7 @@ class CoefficientWindow:
         slopes *= output.slope[:, None, :]
         m, k, count = slopes.shape
         both = np.concatenate([(self.z[rows.index] - output.mean)[:, None], slopes], axis=1)
+        # residual and slopes by one solution of the triangle
         white = noise.whitened(both.reshape(-1, count).T).T.reshape(m, k + 1, count)
         return white[:, 0], white[:, 1:]
 
@@ -303,6 +309,7 @@ def shared_covariance(factor: Array, room: Array, sigma: Array, slope: Array, st
     slope, step : shape (n,), of the quantiser
     """
     shared = np.einsum("rn,rn->n", factor, factor) + room
+    # what differs from frame to frame: it alone decorrelates the rounding
     own = np.sqrt(np.maximum(sigma**2 - shared, 0.0))
     alike = step_correlation(own / step) - step_correlation(sigma / step)
     E = factor * slope

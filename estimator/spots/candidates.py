@@ -98,6 +98,7 @@ def _above_background(on: ColourPlanes, off: ColourPlanes | None, card: SensorCa
 def _flat(plane: Array, on: ColourPlanes) -> Array:
     """Plane less the mean of its surroundings, the core left out."""
     outer, core = _mean(plane, on, _AROUND_PX), _mean(plane, on, _CORE_PX)
+    # mean of the ring: the mean of the outer square less that of the core, by their areas
     share = (_CORE_PX / _AROUND_PX) ** 2
     return np.where(on.sites[0], plane - (outer - share * core) / (1.0 - share), 0.0)
 
@@ -106,6 +107,7 @@ def _mean(plane: Array, on: ColourPlanes, side: int) -> Array:
     """Mean over the red sites of a square, known at every pixel; of a mosaic as near to the side as whole sites go."""
     if not on.mosaic:
         return uniform_filter(plane, side)
+    # red sites are a plane of half the size; an odd window keeps its middle
     result = np.repeat(np.repeat(uniform_filter(plane[::2, ::2], side // 2 + 1 - side // 2 % 2), 2, 0), 2, 1)
     return result[: plane.shape[0], : plane.shape[1]]
 
@@ -127,6 +129,7 @@ def _highest_phase(
     for i, down in enumerate(kernels):
         rows = _correlated(light, down, 0)
         for j, across in enumerate(kernels):
+            # sqrt(sum of kernel^2) over the sites that hold a value: standard deviation of pure noise becomes 1
             norm = np.sqrt(np.outer(_squares(down, on, 0), _squares(across, on, 1)))
             z = _correlated(rows, across, 1) / (scale * norm.astype(np.float32))
             higher = z > best
@@ -248,15 +251,6 @@ def candidates_at(
     return Candidates(uv_px, z, red.amplitude, np.sqrt(red.variance) * noise.spread, red.chi2, colour)
 
 
-def plane_amplitudes(on: ColourPlanes, card: SensorCard, uv_px: Array, sigma_px: float) -> tuple[Array, Array]:
-    """Amplitudes in every plane, each by itself, and their variances, electrons: shape (c, n) each."""
-    reach = _PATCH_REACH_PX[on.mosaic]
-    corner = np.rint(uv_px).astype(int) - reach
-    template = _template(uv_px - corner, sigma_px, reach)
-    fits = [_fitted(on, None, card, c, corner, template, guided=False) for c in range(len(on.values_e))]
-    return np.stack([f.amplitude for f in fits]), np.stack([f.variance * np.maximum(f.chi2, 1.0) for f in fits])
-
-
 def candidate_noise(
     on: ColourPlanes,
     off: ColourPlanes | None,
@@ -277,6 +271,7 @@ def candidate_noise(
         return CandidateNoise(float(np.sqrt(0.5 / frames[0] + 0.5 / frames[1])))
     tests = candidates_at(on, off, card, places, sigma_px)
     chi2 = float(max(np.quantile(tests.chi2, _CHI2_SHARE), 0.1))  # noise-free and empty JPEG places have none
+    # significances as they will be with this usual misfit in place of 1
     z = tests.z * np.sqrt(np.maximum(tests.chi2, 1.0) / np.maximum(tests.chi2 / chi2, 1.0))
     return CandidateNoise(max(_tail_spread(z), 0.5), chi2)
 
@@ -326,11 +321,13 @@ def _fitted(
     columns = [template]
     if off is not None:
         dark = _patches(off.values_e[c], corner, size)
+        # noise of a difference: twice that of the darker frame
         y, level = y - dark, np.maximum(dark, _middle(dark, used)[:, None, None])
     elif guided and c == 0 and len(on.values_e) > 1:
         guide = _patches(green_at_red(on), corner, size)
         middle = _middle(guide, used)[:, None, None]
         level = np.maximum(level, guide * _middle(y, used)[:, None, None] / np.maximum(middle, 1.0))
+        # structure of the room as green shows it, about 0, so that the level stays in the constant
         columns.append(guide / np.maximum(middle, 1.0) - 1.0)
     variance = (1.0 if off is None else 2.0) * variance_e2(level, card, off is not None)
     return _least_squares(y, used / variance, np.stack(columns, axis=1))
@@ -348,6 +345,7 @@ def _least_squares(y: Array, weight: Array, columns: Array) -> _Fit:
     n, k, size = columns.shape[:3]
     slope = np.linspace(-1.0, 1.0, size)
     ones = np.ones((size, size))
+    # background of a patch: a constant and a slope along both axes
     plane = np.stack([ones, ones * slope, ones * slope[:, None]]).reshape(3, size * size)
     flat_columns = columns.reshape(n, k, size * size)
     X = np.concatenate([flat_columns, np.broadcast_to(plane, (n, *plane.shape))], axis=1)
@@ -384,6 +382,7 @@ def _middle(y: Array, used: Array) -> Array:
 
 def _red(fits: list[_Fit], card: SensorCard) -> BoolArray:
     """Places whose green is below half of what white light of this red would have, within one standard deviation."""
+    # on processed planes white has equal codes; here in electrons, before white balance
     share = _GREEN_SHARE[card.output] * card.white_balance[0] / card.white_balance[1]
     red, green = fits[0], fits[1]
     sigma = np.sqrt(green.variance * np.maximum(green.chi2, 1.0) + share**2 * red.variance * np.maximum(red.chi2, 1.0))

@@ -46,6 +46,7 @@ def lamp_halo(planes: ColourPlanes, inside: BoolArray, card: SensorCard, laser_o
     however strong, is small. Of a laser-off frame (`laser_off`) only full pixels count: what is merely bright, such as
     a sunlit wall, is subtracted, and its noise is known. There a spot of several times the threshold counts.
     """
+    # red pixels alone: every second one of a mosaic
     step = 2 if planes.mosaic else 1
     red = planes.values_e[0][::step, ::step]
     bright = planes.full[0][::step, ::step]
@@ -53,6 +54,7 @@ def lamp_halo(planes: ColourPlanes, inside: BoolArray, card: SensorCard, laser_o
         bright = bright | (red > _BRIGHT * np.median(red[inside[::step, ::step]]))
     areas, count = label(bright)
     large = np.bincount(areas.ravel(), minlength=count + 1) * step**2 >= _LEAST_AREA_PX
+    # area 0 is what is not bright
     large[0] = False
     lamps = np.repeat(np.repeat(large[areas], step, axis=0), step, axis=1)[: planes.shape[0], : planes.shape[1]]
     return np.asarray(maximum_filter(lamps, 2 * (_JPEG_HALO_PX if card.output == "mjpeg" else _HALO_PX) + 1))
@@ -160,6 +162,7 @@ def _single(down: Candidates, up: Candidates, rows: tuple[int | None, int | None
     """One candidate, the more significant of two: both could not be one point."""
     if rows[0] is None or rows[1] is None:
         return Choice(rows[0], rows[1])
+    # two that are not one point: the more significant one is the spot, the other image has none
     in_down = down.z[rows[0]] >= up.z[rows[1]]
     return Choice(rows[0] if in_down else None, None if in_down else rows[1], apart=True)
 
@@ -281,6 +284,7 @@ def outline_mask(rig: Rig, box: Box) -> BoolArray:
 def mirror_box(rig: Rig) -> Box:
     """Smallest part of the image around the mirror that begins at an even row and column."""
     outline, size = rig.outline_px(), np.array([rig.camera.width_px, rig.camera.height_px])
+    # an even corner: the phase of the mosaic stays that of the frame
     low = np.clip(np.floor(outline.min(axis=0)).astype(int) - _MARGIN_PX, 0, size - 2) // 2 * 2
     high = np.clip(np.ceil(outline.max(axis=0)).astype(int) + _MARGIN_PX, low + 2, size)
     return Box(int(low[0]), int(low[1]), int(high[0] - low[0]), int(high[1] - low[1]))
@@ -300,6 +304,7 @@ def _searched(pair: Pair, position: str, hint: Box | None, least: Thresholds) ->
     where = seen if hint is None else seen & _hinted(hint, box)
     places = peaks(on, off, card, sigma, where, _LEAST_PEAK, _MOST_PEAKS).uv_px
     first = candidates_at(on, off, card, places, sigma, noise)
+    # a sum, so that no candidates at all give 0
     first = _rows(first, first.z >= np.sort(first.z)[-_MOST_TESTED:][:1].sum())
     best = _better(first, candidates_at(on, off, card, first.uv_px, _WIDER * sigma, noise))
     near = halo[tuple(np.rint(best.uv_px).astype(int).T[::-1])]
@@ -363,6 +368,7 @@ def parabola_peak(searched: _Searched, card: SensorCard, uv_px: Array) -> Array:
     offsets = _PARABOLA_PX * np.stack(np.meshgrid((-1, 0, 1), (-1, 0, 1)), -1).reshape(-1, 2)
     for _ in range(3):
         test = candidates_at(searched.on, searched.off, card, uv_px + offsets, searched.sigma_px)
+        # log likelihood of the best flux, but for a factor 2: near its peak a parabola
         gain = (np.maximum(test.electrons, 0.0) / test.sigma_e) ** 2
         best = int(np.argmax(gain))
         if best == len(offsets) // 2:
@@ -375,5 +381,6 @@ def parabola_peak(searched: _Searched, card: SensorCard, uv_px: Array) -> Array:
 def _vertex(values: Array) -> float:
     """Place of the maximum of a parabola through values at -1, 0, 1; within half a step."""
     left, middle, right = values
+    # vertex of the parabola through three places at -1, 0 and 1; a peak bends down
     bend = left - 2.0 * middle + right
     return float(np.clip(0.5 * (left - right) / bend, -0.5, 0.5)) if bend < 0.0 else 0.0

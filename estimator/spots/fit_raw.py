@@ -155,6 +155,7 @@ def fit_law(
         SPOT_CUT (the minimum lies outside the region), NOT_CONVERGED.
     """
     data = spot_data(regions, law, blur, model)
+    # whole rows of a table of spots: a fit does not depend on its neighbours
     parts = [np.arange(i, min(i + AT_ONCE, len(data))) for i in range(0, len(data), AT_ONCE)]
     near = None if near_px is None else np.broadcast_to(np.asarray(near_px, float), (len(data), 2))
     fits = [_fit(data.rows(rows), None if near is None else near[rows]) for rows in parts]
@@ -177,6 +178,7 @@ def _first_guess(data: SpotData, near_px: Array | None) -> Array:
     """Background: median of the border per level. Position and flux: peak of the matched filter on whole pixels."""
     regions, pixels = data.regions, data.pixels
     border = regions.used.copy()
+    # two pixels around the region hold next to no light of the spot
     border[:, 2:-2, 2:-2] = False
     levels = [_median(regions.x_e, border & (pixels.levels[:, i] > 0.0)) for i in range(pixels.levels.shape[1])]
     b = np.stack(levels, axis=1) if levels else np.zeros((len(data), 0))
@@ -184,6 +186,7 @@ def _first_guess(data: SpotData, near_px: Array | None) -> Array:
     kernel = profile(np.array([4.0]), np.array([np.median(pixels.blur.sigma_px)]), 9).share[0]
     match = _blurred(np.where(regions.used, above * pixels.response, 0.0), kernel)
     norm = _blurred(np.where(regions.used, pixels.response**2, 0.0), kernel**2) + 1e-12  # no used pixel near: 0 / 0
+    # fall of chi^2 by a spot of the best flux at each pixel; a negative flux is none
     gain = np.maximum(match, 0.0) ** 2 / norm
     if near_px is not None:
         gain = near_alone(gain, near_px - regions.origin_px)
@@ -197,6 +200,7 @@ def _first_guess(data: SpotData, near_px: Array | None) -> Array:
 def near_alone(values: Array, uv_px: Array) -> Array:
     """Values of images, shape (n, h, w), within `NEAR_PX` of places, shape (n, 2), of them; elsewhere -inf."""
     v, u = np.indices(values.shape[1:])
+    # a square, so that whole pixels about a detection count alike
     off = np.maximum(np.abs(u - uv_px[:, 0, None, None]), np.abs(v - uv_px[:, 1, None, None]))
     return np.where(off <= NEAR_PX, values, -np.inf)
 
@@ -218,6 +222,7 @@ def _screened(data: SpotData, guess: Array) -> Array:
     n, c = len(guess), data.pixels.levels.shape[1]
     grid = START_PX * np.stack(np.meshgrid((-1, 0, 1), (-1, 0, 1)), -1).reshape(-1, 2)
     background = data.pixels.background_e + np.einsum("nc,nchw->nhw", guess[:, 3 : 3 + c], data.pixels.levels)
+    # starts differ in place and flux alone: levels and width stay those of the guess
     fixed = replace(data.pixels, background_e=background, levels=data.pixels.levels[:, :0], free_width=False)
     many = replace(data, pixels=fixed).rows(np.repeat(np.arange(n), len(grid)))
     theta = np.repeat(guess[:, :3], len(grid), axis=0)
@@ -285,6 +290,7 @@ def _result(data: SpotData, theta: Array, converged: BoolArray) -> SpotFit:
     )
     mean, _ = pixels.at(theta)
     information = np.maximum(data.law.information(mean), _LEAST_INFORMATION)
+    # score^2 / information is a chi^2 of one pixel, whatever its law
     square = regions.used * data.law.score(regions.x_e, mean) ** 2 / information
     chi2 = np.sum(square, axis=(1, 2)) / np.maximum(used - k, 1)
     c = pixels.levels.shape[1]
@@ -312,6 +318,7 @@ def _sandwich(data: SpotData, theta: Array, fisher: Array) -> Array:
     inverse = covariance_bound(fisher, keep=k)
     own = inverse @ J
     leverage = w * np.einsum("nkp,nkp->np", J, own)
+    # residuals that the fit has not pulled to itself (jackknife): over 1 - leverage
     scaled = own[:, :2] * (s / np.maximum(1.0 - leverage, _LEAST_FREEDOM))[:, None]
     return np.asarray(scaled @ np.swapaxes(scaled, 1, 2))
 

@@ -71,6 +71,7 @@ def code_table(card: SensorCard) -> CodeTable:
     A code that no DN gives has the interval of the next one above that occurs.
     """
     dn = np.arange(card.top_dn + 1)
+    # 1 at the last DN; below black it is negative, as the camera has it
     linear = np.asarray((dn - card.black_level_dn) / (card.top_dn - card.black_level_dn), float)
     rows = [
         _ends(np.rint(255.0 * tone_of(gain * linear, card)).astype(int), card.top_dn) for gain in card.white_balance
@@ -124,6 +125,7 @@ class CodeLaw:
         s, by_mean = _deviation(self.noise, mean)
         a, b = (self.low_e - mean) / s, (self.high_e - mean) / s
         chance, change = _interval(a, b, s, by_mean)
+        # beyond all digits the interval is its nearer end: score of a Gaussian at that place
         near = np.where(a > 0.0, a, b)
         far = (np.minimum(np.abs(a), np.abs(b)) > _FAR) & ((a > 0.0) == (b > 0.0))
         # a chance that underflows is `far`
@@ -195,6 +197,7 @@ def _information(low: Array, high: Array, mean: Array, noise: PixelNoise) -> Arr
 def _deviation(noise: PixelNoise, mean: Array) -> tuple[Array, Array]:
     """Standard deviation and its derivative by the mean; the mean's way to 0 has no corner, within 1 electron."""
     root = np.sqrt(mean * mean + 1.0)
+    # max(mean, 0) without a corner: the variance needs light that is not negative
     smooth, slope = 0.5 * (mean + root), 0.5 * (1.0 + mean / root)
     s = np.sqrt(noise.variance_e2(smooth))
     return s, slope * (1.0 + 2.0 * noise.prnu**2 * smooth) / (2.0 * s)
@@ -205,6 +208,7 @@ def _interval(a: Array, b: Array, s: Array, by_mean: Array) -> tuple[Array, Arra
     # of two upper tails the difference loses its digits, of two lower ones it does not
     flip = a > 0.0
     chance = np.where(flip, ndtr(-a) - ndtr(-b), ndtr(b) - ndtr(a))
+    # the ends move with the mean, and scale with s, which depends on it
     change = (_density(a) * (1.0 + _finite(a) * by_mean) - _density(b) * (1.0 + _finite(b) * by_mean)) / s
     return chance, change
 
@@ -298,6 +302,7 @@ class MeanCodes:
             table = self._tables[name].reshape(-1)
             first = table[place]
             value = first + share * (table[place + 1] - first)
+            # less light than none: straight on from 0, so that a fit has a slope there
             below = self._tables["by_mean"].reshape(9, -1)[which, 0]
             return value + np.minimum(mean_e, 0.0) * below if name == "mean" else value
 
@@ -341,6 +346,7 @@ def _moments(mu: float, card: SensorCard, noise: PixelNoise, curve: Array) -> Ar
             chance = np.convolve(chance, chance) if len(chance) < _SHORT else _by_fourier(chance)
         x = first + np.arange(len(chance)) / count - card.black_level_dn  # DN above black
         p = chance / chance.sum()
+        # a mean of 1, 2 or 4 pixels lies on every fourth, second or each value of the curve
         step, start = _FINEST // count, _FINEST * int(first)
         y = np.ascontiguousarray(curve[:, start : start + step * len(x) : step])
         mean = y @ p
@@ -348,6 +354,7 @@ def _moments(mu: float, card: SensorCard, noise: PixelNoise, curve: Array) -> Ar
         variance = dx**2 @ p
         covariance = dy * dx @ p
         slope = covariance / variance if variance > 0.0 else np.zeros(3)  # 0: full pixels have one DN only
+        # variance of the codes that a straight line in DN does not explain
         left = dy**2 @ p - slope * covariance
         result[0, :, i], result[1, :, i], result[2, :, i] = mean, slope * card.dn_per_e, np.maximum(left, 0.0)
     return result
@@ -400,6 +407,7 @@ def cut_pixels(mean_e: Array, variance_e2: Array, well_e: float) -> CutPixels:
     if not (z < _FAR).any():
         return CutPixels(mean_e, np.ones_like(mean_e), variance_e2)
     below, density = ndtr(z), np.exp(-0.5 * z * z) / np.sqrt(2.0 * np.pi)
+    # partial moments of a Gaussian below the well; what is above reads the well itself
     lost = s * (z * below + density)
     square = variance_e2 * ((z * z + 1.0) * below + z * density)
     free = z >= _FAR

@@ -142,7 +142,8 @@ def score(
     from phibench.benchmark.dense.dense_score import chosen_pairs, run_dense, saved_dense
     from phibench.benchmark.dense.dense_tables import dense_board, dense_failures
     from phibench.benchmark.isolation.resolve import DENSE, resolve
-    from phibench.benchmark.scores.document import MethodCard, score_files
+    from phibench.benchmark.scores.document import MethodCard
+    from phibench.benchmark.scores.score_files import score_files
     from phibench.datasets.common.errors import DatasetError
     from phibench.datasets.common.shown_text import show_grid, table_console
     from phibench.datasets.store.files import require_writable

@@ -146,8 +146,9 @@ def score(
         JSON file for the score, records beside it as Parquet; with several methods their names are added to it.
     """
     from phibench.benchmark.isolation.resolve import resolve
-    from phibench.benchmark.scores.document import MethodCard, records_kept, score_files
+    from phibench.benchmark.scores.document import MethodCard
     from phibench.benchmark.scores.score import run_and_score, saved_each
+    from phibench.benchmark.scores.score_files import records_kept, score_files
     from phibench.benchmark.scores.score_tables import nothing_answered, print_scores
     from phibench.datasets.common.errors import DatasetError
     from phibench.datasets.common.progress import progress_console
@@ -185,8 +186,9 @@ def compare(first: Path, second: Path, *, bootstrap_seed: BootstrapSeed = 0, out
     """
     from phibench.benchmark.scores.compare import compare as compare_scores
     from phibench.benchmark.scores.compare import note_on_code, note_on_pairs, note_on_size
-    from phibench.benchmark.scores.document import read_records, read_score
-    from phibench.benchmark.scores.score_tables import failure_line, print_comparison
+    from phibench.benchmark.scores.comparison_tables import print_comparison
+    from phibench.benchmark.scores.score_files import read_records, read_score
+    from phibench.benchmark.scores.score_tables import failure_line
 
     form, differences = output.form, compare_scores(first, second, _seed(bootstrap_seed))
     a, b = read_score(first), read_score(second)

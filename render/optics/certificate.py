@@ -136,6 +136,7 @@ def _differences(
     if total == 0.0 and traced.watts * gain == 0.0:
         return _Differences(0.0, 0.0, 0.0, 0.0)
     with np.errstate(divide="ignore", invalid="ignore"):
+        # NumPy's division: no light in one and some in the other is infinite, which does not pass
         flux = abs(np.float64(total) / (traced.watts * gain) - 1.0)
     return _Differences(
         float(np.linalg.norm(pixel_centroid(layer) - traced.centroid_px)),
@@ -215,6 +216,7 @@ def _through_chief_point(view: View, truth: SpotTruth, lens_m: Array) -> Array:
     """Film positions, shape (N, 2), of rays from aperture points to the chief ray's mirror point: a start for `aim`."""
     camera, mirror = view.rig.camera, np.array(truth.reflection_point_world_m)
     x, y, z = view.T_world_camera.inverse().points(mirror)
+    # the ray through the lens place and the mirror point, at the plane of focus; z = 1 gives the pixel
     share = camera.focus_distance_m / z
     at_focus = np.array([x, y]) * share + lens_m * (1.0 - share)
     return camera.to_pixel(at_focus / camera.focus_distance_m)
@@ -252,6 +254,7 @@ def trace_spot(view: View, spot: LaserSpot, room: GeometryLike, truth: SpotTruth
         return _trace_beam(view, spot, as_geometry(room), truth, log2_rays)
     room = as_geometry(room)
     x = np.clip(sobol(6, 2**log2_rays), 1e-12, 1.0 - 1e-12)
+    # dimensions 0, 1: the lens; 2, 3: the wall; 4, 5: the slopes of facets
     bundle = _Bundle(view.rig.camera.aperture_radius_m * _disc(x[:, :2]), _facets(view, x[:, 4:]))
     wall, density = _wall_samples(spot, x[:, 2:4])
     if view.rig.mirror.radius_m is None:
@@ -260,6 +263,7 @@ def trace_spot(view: View, spot: LaserSpot, room: GeometryLike, truth: SpotTruth
     else:
         uv, jacobian = _linear_aim(view, spot, bundle, wall, truth)
     with np.errstate(invalid="ignore"):
+        # density of samples per pixel: that on the wall times d(wall) / d(pixel)
         area = density * np.abs(jacobian[:, 0, 0] * jacobian[:, 1, 1] - jacobian[:, 0, 1] * jacobian[:, 1, 0])
         watts, points = _watts(view, spot, room, uv, bundle)
         return _moments(view, uv, points, watts / area / len(x))
@@ -296,6 +300,7 @@ def _facets(view: View, x: Array) -> Array:
 def _wall_samples(spot: LaserSpot, x: Array) -> tuple[Array, Array]:
     """Points in the spot's plane (N, 2) that cover the spot generously, and their density, 1/m^2."""
     if spot.profile == "gaussian":
+        # wider than the spot, so that weights of its tail stay bounded
         z, sigma = ndtri(x), 1.2 * spot.sigma_m
         return sigma * z, np.exp(-0.5 * (z**2).sum(axis=1)) / (2.0 * math.pi * sigma**2)
     radius = 1.05 * spot.diameter_m / 2.0
@@ -303,6 +308,7 @@ def _wall_samples(spot: LaserSpot, x: Array) -> tuple[Array, Array]:
 
 
 def _disc(x: Array) -> Array:
+    # square root: as many samples on every part of the area
     radius, turn = np.sqrt(x[:, 0]), 2.0 * np.pi * x[:, 1]
     return np.stack([radius * np.cos(turn), radius * np.sin(turn)], axis=-1)
 
@@ -342,6 +348,7 @@ def _reflect(view: View, spot: LaserSpot, uv: Array, bundle: _Bundle) -> _Reflec
     facet /= np.linalg.norm(facet, axis=-1, keepdims=True)
     cos_facet = -np.einsum("ni,ni->n", facet, directions)
     out = directions + 2.0 * cos_facet[:, None] * facet
+    # projected area of the facet over that of the smooth mirror, seen along the ray
     weight = cos_facet / (rays.cos_incidence * np.einsum("ni,ni->n", facet, rays.normals))
     cos_lens = directions @ view.T_world_camera.R[:, 2]
     if view.tube is None:
@@ -369,6 +376,7 @@ def _on_wall(view: View, spot: LaserSpot, uv: Array, bundle: _Bundle) -> Array:
 
 def _meet(spot: LaserSpot, origins: Array, directions: Array) -> tuple[Array, Array]:
     normal, centre = np.array(spot.normal_world), np.array(spot.position_world_m)
+    # distance to the plane of the wall; negative where the ray leads away
     distance = (centre - origins) @ normal / (directions @ normal)
     points = origins + distance[:, None] * directions
     return (points - centre) @ np.stack(spot.tangents()).T, points
@@ -398,6 +406,7 @@ def _through_lens(view: View, spot: LaserSpot, uv: Array, rays: _Reflected, radi
     reflectance = rays.facet_weight * view.rig.mirror.reflectance(rays.cos_facet, spot.wavelength_nm)
     reflectance = reflectance * rays.transmittance
     density = camera.solid_angle_density(camera.normalised(uv))
+    # thin lens: cos^4 law, aperture area over the square of the focal length in `density`
     return radiance * reflectance * density * rays.cos_lens**4 * math.pi * camera.aperture_radius_m**2
 
 
@@ -420,12 +429,14 @@ def _beam_rays(
     """Film positions (n, 2), points on surfaces (n, 3) and watts over density (n,) of numbers `x`, shape (n, 7)."""
     bundle = _Bundle(view.rig.camera.aperture_radius_m * _disc(x[:, :2]), _facets(view, x[:, 4:6]))
     centres = aim(view, spot, bundle, np.zeros((len(x), 2)), _through_chief_point(view, truth, bundle.lens_m))
+    # dimension 6 chooses the part of the image, by its share of the light
     chosen = np.searchsorted(np.cumsum([part.share for part in parts])[:-1], x[:, 6], side="right")
     z = ndtri(x[:, 2:4])
     offset = np.empty_like(z)
     for number, part in enumerate(parts):
         own = chosen == number
         offset[own] = part.mean + z[own] @ part.root.T
+    # mixture: the density is that of all parts, whichever drew the sample
     uv, density = centres + offset, sum(part.density(offset) for part in parts)
     rays = _reflect(view, spot, uv, bundle)
     seen = np.flatnonzero(np.isfinite(rays.directions).all(axis=1) & np.isfinite(uv).all(axis=1))
@@ -486,6 +497,7 @@ def _entering(cos: Array, n: float) -> Array:
     """Transmittance of a coat by Fresnel's equations in their form with angles."""
     outside = np.clip(np.arccos(cos), 1e-9, None)
     inside = np.arcsin(np.sin(outside) / n)
+    # Fresnel, unpolarised: mean of sin^2 and tan^2 ratios of difference and sum of both angles
     apart, together = outside - inside, outside + inside
     return 1.0 - 0.5 * (np.sin(apart) ** 2 / np.sin(together) ** 2 + np.tan(apart) ** 2 / np.tan(together) ** 2)
 

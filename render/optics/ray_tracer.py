@@ -96,10 +96,12 @@ def _tracer_of(mirror: Mirror) -> Callable[[View, Array, Array], MirrorRays]:
 def _reflect_at_ball(radius: float, view: View, origins_m: Array, directions: Array) -> MirrorRays:
     centre, d = view.sphere_centre_m[:, None], directions.T
     offset = origins_m.T - centre
+    # along the ray to its nearest point to the centre
     approach = -_inner(offset, d)
     miss = offset + approach * d  # nearest point to the centre: no cancellation
     with np.errstate(invalid="ignore"):
         root = np.sqrt(radius**2 - _inner(miss, miss))
+        # c / (b + root) in place of b - root: no cancellation where the lens is far
         t = (_inner(offset, offset) - radius**2) / (approach + root)
         t = np.where(t > 0.0, t, np.nan)
     normals = (offset + t * d) / radius
@@ -123,7 +125,9 @@ def _reflect_at_form(radius_m: float, form: Form, view: View, origins_m: Array, 
 def _reflected(view: View, points: Array, normals: Array, t: Array, directions: Array) -> MirrorRays:
     """Rays from points and normals in the mirror's frame; what lies behind their start is no hit."""
     axes, centre = view.T_world_sphere.R, view.sphere_centre_m
+    # NaN, where the ray misses, is behind as well
     behind = ~(t > 0.0)
+    # one mask for vectors and numbers alike
     points, normals, t = (np.where(behind.reshape(-1, *[1] * (v.ndim - 1)), np.nan, v) for v in (points, normals, t))
     normals = normals @ axes.T
     cos_i = -_dot(normals, directions)
@@ -213,6 +217,7 @@ def _lowest(q: Radius, radius_m: float, count: int) -> Array:
         for width in _NARROWING:
             h = width * radius_m
             left, middle, right = (q(lowest + shift) for shift in (-h, 0.0, h))
+            # vertex of the parabola through three places
             lowest = lowest - 0.5 * h * (right - left) / (right - 2.0 * middle + left)
     return lowest
 
@@ -239,6 +244,7 @@ def _secants(f: Radius, old: Array, new: Array, most: int, rest: float) -> Array
 def _normals(points_m: Array, radius_m: float, added: Radius) -> Array:
     """Outward unit normals, shape (N, 3), at surface points: the cross product of two tangents."""
     n = points_m / np.linalg.norm(points_m, axis=-1, keepdims=True)
+    # the axis that lies farthest from the normal: no small cross product
     helper = np.eye(3)[np.argmin(np.nan_to_num(np.abs(n)), axis=-1)]
     first = np.cross(n, helper)
     first /= np.linalg.norm(first, axis=-1, keepdims=True)
@@ -251,6 +257,7 @@ def _normals(points_m: Array, radius_m: float, added: Radius) -> Array:
 
 def _slope(added: Radius, n: Array, e: Array) -> Array:
     """Derivative of the radius, metres per radian, from n towards e at right angles to it."""
+    # five points: (8 (f1 - f-1) - (f2 - f-2)) / 12 h
     near, far = (_difference(added, n, e, angle) for angle in (_STENCIL_RAD, 2.0 * _STENCIL_RAD))
     return (8.0 * near - far) / (12.0 * _STENCIL_RAD)
 
@@ -289,10 +296,12 @@ def meet_profile(origins_m: Array, directions: Array, surface: Surface) -> tuple
     foot, A, R = origins_m + approach[:, None] * directions, 1.0 + profile.conic, profile.vertex_radius_m
     start = foot + [0.0, 0.0, before_m]
     flat_f, flat_d = start[:, :2], directions[:, :2]
+    # conic in the ray's parameter, a x^2 + 2 b x + c = 0: x^2 + y^2 - 2 R z + (1 + k) z^2 = 0
     a = _dot(flat_d, flat_d) + A * directions[:, 2] ** 2
     b = _dot(flat_f, flat_d) + (A * start[:, 2] - R) * directions[:, 2]
     c = _dot(flat_f, flat_f) + (A * start[:, 2] - 2.0 * R) * start[:, 2]
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        # both roots q / a and c / q without cancellation; a sign of 0 would lose them
         q = -(b + np.where(b < 0.0, -1.0, 1.0) * np.sqrt(b * b - a * c))
         x = _nearest_on_sheet(start, directions, np.stack([q / a, c / q]), -approach, profile)
         if height is not None:
@@ -302,6 +311,7 @@ def meet_profile(origins_m: Array, directions: Array, surface: Surface) -> tuple
         points = foot + x[:, None] * directions
         s = points[:, 0] ** 2 + points[:, 1] ** 2
         slope = 2.0 * profile.sag(s).slope_per_m
+        # outwards is down, towards the camera: z of the normal is -1
         normals = np.stack([slope * points[:, 0], slope * points[:, 1], np.full(len(points), -1.0)], axis=-1)
         if height is not None:
             normals[:, :2] -= _height_slopes(height, points, _STENCIL * profile.rim_radius_m)
@@ -367,6 +377,7 @@ def _form_height(surface: FormedProfile) -> Height:
         s = x * x + y * y
         half_slope = surface.ideal.sag(s).slope_per_m
         place = x / surface.disc_m, y / surface.disc_m, s / surface.disc_m**2
+        # a form error counts along the normal; along the axis it is longer by 1 / cos of the slope
         along_normal = sum(peak * wave(*place) for peak, wave in terms)
         return np.asarray(along_normal * np.sqrt(1.0 + 4.0 * s * half_slope * half_slope))
 
@@ -446,6 +457,7 @@ def through_glass(tube: GlassTube, points: Array, directions: Array) -> tuple[tu
         with np.errstate(divide="ignore", invalid="ignore"):
             points, outward = _to_cylinder(tube, points, directions, radius)
             cos = np.einsum("ni,ni->n", directions, outward)
+            # Snell: the part along the face is scaled by n / n', the rest follows from length 1
             along = ratio * (directions - cos[:, None] * outward)
             directions = along + np.sqrt(1.0 - np.einsum("ni,ni->n", along, along))[:, None] * outward
             if radius == tube.inner_m:
@@ -460,6 +472,7 @@ def _to_cylinder(tube: GlassTube, points: Array, directions: Array, radius: floa
     offset, way = (points - tube.origin_m) @ flat, directions @ flat
     a, b = np.einsum("ni,ni->n", way, way), np.einsum("ni,ni->n", way, offset)
     c = np.einsum("ni,ni->n", offset, offset) - radius**2
+    # the larger root: the ray comes from within the cylinder
     distance = ((np.sqrt(b * b - a * c) - b) / a)[:, None]
     return points + distance * directions, (offset + distance * way) / radius
 

@@ -82,6 +82,7 @@ def rays_by_area(grid: TexelGrid, rays: int, texel_m: float) -> IntArray:
     for the same area.
     """
     most = powers_of_two(np.array(float(rays)))
+    # a small texel counts little in the room's light: rays by area
     return np.clip(powers_of_two(rays * grid.areas_m2() / texel_m**2), np.minimum(FEWEST, most), most)
 
 
@@ -104,6 +105,7 @@ def bounced_light(
     kept = _Kept.of(mi, _Rays(mi, surfaces, texels, each, seed, bright, False))
     for _ in range(bounces):
         surfaces.set_light(coarse, direct + bounced.mean(axis=0))
+        # the same rays in every bounce: only the light at their ends changes
         bounced[:, kept.rays.texels] = kept.light(mi, surfaces)
         bounced = bounced[:, free]
     return finer(coarse, fine, bounced.mean(axis=0)), coarse, bounced
@@ -115,6 +117,7 @@ def rays_by_noise(rays: IntArray, grid: TexelGrid, halves: Array) -> IntArray:
     Equal noise everywhere would need them as the square; the least sum of squares, in proportion to the noise.
     """
     error, level = np.empty(grid.count), np.empty(grid.count)
+    # difference of two halves: four times the variance of their mean
     square, mean = ((halves[0] - halves[1]) ** 2).sum(axis=-1), halves.sum(axis=(0, -1))
     for texels in grid.alike:
         for values, out in ((square, error), (mean, level)):
@@ -157,6 +160,7 @@ class _Rays:
         self._frame, self._spread = mi.Frame3f(self._normal), texels.spread
         self.counts: list[IntArray] = [count] if bright is None else [count, np.maximum(count // _AIMED, 1)]
         self._all = np.sum(self.counts, axis=0)
+        # opaque: another seed then runs the same kernel
         key = dr.opaque(mi.UInt32, seed)
         self._nets = [Net.of(mi, self._lanes, each, 3, key + 2 * k) for k, each in enumerate(self.counts)]
         self._coherent = bool(count.mean() >= _COHERENT)
@@ -235,6 +239,7 @@ class _Rays:
 
         dr.eval(light)  # its bands together: each would run the loop anew
         values = np.stack([np.array(light[k], dtype=float) for k in range(3)], axis=-1)
+        # rays by the cosine: irradiance is pi times the mean radiance
         return np.asarray(np.pi / self._all[:, None] * values)
 
 
@@ -306,6 +311,7 @@ def _beyond_coats(surfaces: Surfaces, met: _Met, chance: Any) -> _Met:
     onward, coated, reflectance = surfaces.mirrored(met.patch, met.place, met.way, met.valid)
     share = dr.maximum(reflectance, _MIRRORED_SHARE)
     follows = coated & (chance < share)
+    # Russian roulette: each branch is weighted by its true share over its chance
     weight = dr.select(follows, reflectance / share, dr.select(coated, 1.0 / (1.0 - share), 1.0))
     t, patch, found = surfaces.hit(onward, follows, coherent=False)
     patch, place = dr.select(follows, patch, met.patch), dr.select(follows, onward(t), met.place)
@@ -356,6 +362,7 @@ class BrightTexels:
         """Bright texels of a map; None where the brightest of the area send out too little."""
         table, (patch, _), area = grid.table, grid.patch(), grid.areas_m2()
         sent = np.maximum(irradiance, 0.0).sum(axis=1) * surfaces.mean_albedo()[patch] * area
+        # brightest by area first, so that the part that is chosen is small
         order = np.argsort(-sent / area, kind="stable")
         chosen = order[np.cumsum(area[order]) <= _BRIGHT_AREA * area.sum()]
         if not len(chosen) or sent[chosen].sum() <= _BRIGHT_LIGHT * sent.sum():
@@ -363,6 +370,7 @@ class BrightTexels:
         ends = np.round(_PICKS * np.cumsum(sent[chosen]) / sent[chosen].sum()).astype(np.int64)
         times = np.diff(ends, prepend=0)
         density = np.zeros(grid.count + 4)
+        # chance per mm^2 of each texel, as rounding has left it
         density[chosen] = times / (_PICKS * MM_PER_M**2 * area[chosen])
         middles, normals = (values[chosen] for values in grid.points())
         sides = MM_PER_M * table.size_m[patch] / np.stack([grid.columns, grid.rows], axis=1)[patch]
@@ -407,6 +415,7 @@ class BrightTexels:
         density = dr.gather(mi.Float, self.density, found.nearest(), found.active & ~mirrored)
         cos_there = dr.maximum(surfaces.cosine(patch, way), 1e-6)
         by_aim = density * dr.square(t) * dr.pi / (cos_there * dr.maximum(cos, 1e-6))  # over what chance has
+        # balance heuristic of both ways to choose a direction (Veach)
         return 1.0 / (1.0 - share + share * dr.select(mirrored, 0.0, by_aim))
 
 
@@ -444,12 +453,14 @@ def _overlap(old: int, new: int) -> Array:
     """Shares of `old` equal parts of a line in `new` ones, shape (new, old)."""
     low, start = np.arange(new)[:, None] / new, np.arange(old) / old
     shared = np.minimum(low + 1.0 / new, start + 1.0 / old) - np.maximum(low, start)
+    # rows add up to 1: means over what new and old texels share
     return np.asarray(np.maximum(shared, 0.0) * new)
 
 
 @lru_cache(maxsize=512)
 def _between(old: int, new: int) -> Array:
     """Linear interpolation between the middles of `old` parts of a line at those of `new` ones, shape (new, old)."""
+    # middles of new texels among those of old ones; beyond the outermost a constant
     place = np.clip((np.arange(new) + 0.5) / new * old - 0.5, 0.0, old - 1.0)
     low = np.minimum(place.astype(int), old - 2)
     matrix = np.zeros((new, old))

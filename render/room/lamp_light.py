@@ -119,6 +119,7 @@ def _lamplight(
 
     A few rays tell where a lamp is partly hidden. There others follow, as many as what is not known is worth.
     """
+    # a few rays first tell which pairs of texel and lamp need more
     first, number = min(FIRST_RAYS, int(powers_of_two(np.array(float(rays))))), np.arange(len(pairs.texel))
     sums = _lamp_rays(mi, surfaces, texels, pairs, number, np.full(len(number), first), seed, mirror)
     counts = _counts(surfaces, texels, pairs, sums, first, rays)
@@ -134,6 +135,7 @@ def _lamplight(
 
 def _by_texel(pairs: _Pairs, sums: Array, count: int) -> Array:
     """Light by the seen part of lamps, shape (texels, 3)."""
+    # ratio estimate: the share that arrives times the exact light of the whole lamp
     share = np.divide(pairs.whole, sums[3], out=np.zeros_like(pairs.whole), where=sums[3] > 0.0)
     return np.stack([np.bincount(pairs.texel, band * share, count) for band in sums[:3]], axis=-1)
 
@@ -162,7 +164,9 @@ def _counts(surfaces: Surfaces, texels: Texels, pairs: _Pairs, sums: Array, firs
     if whole_grid:
         level = _mean_around(beside, level)
     level += _OTHERS * level.mean() + 1e-30
+    # Jeffreys' estimate of a share: never 0 or 1
     here, there = ((first * np.clip(one, 0.0, 1.0) + 0.5) / (first + 1.0) for one in (seen, near))
+    # geometric mean of two binomial deviations, p (1 - p) here and around
     open_part = (here * (1.0 - here) * there * (1.0 - there)) ** 0.25
     light = _bands(surfaces)[patch].mean(axis=1)[pairs.lamp] * pairs.whole
     worth = np.where(again, light * open_part / level[pairs.texel], 0.0)
@@ -211,6 +215,7 @@ def whole_lamp(way: Array, normals: Array, lamp: Array) -> Array:
     total, setting, rising = mi.Float64(0.0), dr.zeros(mi.Vector3d, len(way)), dr.zeros(mi.Vector3d, len(way))
     for k in range(4):
         (here, there), (low, high) = ((values[k], values[(k + 1) % 4]) for values in (corners, heights))
+        # where the side crosses the horizon of the texel
         cut = here + dr.select(low != high, low / (low - high), 0.0) * (there - here)
         up, goes_up = low > 0.0, high > 0.0
         setting, rising = dr.select(up & ~goes_up, cut, setting), dr.select(~up & goes_up, cut, rising)
@@ -283,6 +288,7 @@ def _lamp_rays(
         free = faces & ~surfaces.scene.ray_test(ray, coherent=True, active=faces)
         if mirror is not None:
             free &= ~mirror.meets(start, way)[0]  # lamps are never nearer than the mirror
+        # form factor of a point of the lamp: both cosines over the squared distance
         weight = dr.select(faces, cos_here * cos_lamp / r2, 0.0)
         arrives = mi.Float(1.0) if coat is None else transmitted(surfaces, coat, cos_here)
         part = dr.select(free, weight * arrives, 0.0)
@@ -337,14 +343,17 @@ def _photons(mi: ModuleType, surfaces: Surfaces, lamps: Array, seed: int) -> tup
     import drjit as dr
 
     power = _bands(surfaces)[lamps[:, 13].astype(int)].sum(axis=1) * lamps[:, 12]
+    # photons by power, so that each carries about as much
     counts = np.maximum(np.round(_PHOTONS * power / max(power.sum(), 1e-30)), 1).astype(np.int64)
     owner = mi.UInt32(aligned(np.repeat(np.arange(len(lamps)), counts), np.uint32))
     centre, across, up, normal = (dr.gather(mi.Vector3f, vector(mi, lamps[:, k : k + 3]), owner) for k in (0, 3, 6, 9))
+    # flux of a Lambertian lamp is pi x area x radiance; lengths are mm here
     each = dr.gather(mi.Float, mi.Float(aligned(np.pi * lamps[:, 12] / MM_PER_M**2 / counts)), owner)
     patch = dr.gather(mi.UInt32, mi.UInt32(aligned(lamps[:, 13], np.uint32)), owner)
     lane = dr.arange(mi.UInt32, int(counts.sum()))
     x = points(mi, shifts(mi, lane // 256, 4, dr.opaque(mi.UInt32, seed)), lane % 256)
     place = mi.Point3f(centre + (x[0] - 0.5) * across + (x[1] - 0.5) * up)
+    # Lambert: by the cosine, and then all photons of a lamp weigh the same
     way = mi.Frame3f(normal).to_world(mi.warp.square_to_cosine_hemisphere(mi.Point2f(x[2], x[3])))
     return mi.Ray3f(place + _LAMP_GAP_MM * normal, way), each * surfaces.emission(patch, place)
 
@@ -370,6 +379,7 @@ def _sunlight(
     dr.eval(shift)
 
     def body(i: Any, total: Any) -> tuple[Any, Any]:
+        # a small disc: its radius in radians is the radius at distance 1
         disc = radius * mi.warp.square_to_uniform_disk_concentric(mi.Point2f(*points(mi, shift, i)))
         way = dr.normalize(frame.to_world(mi.Vector3f(disc.x, disc.y, 1.0)))
         _, patch, valid = surfaces.hit(mi.Ray3f(point, way))

@@ -113,6 +113,7 @@ def mosaic(planes: Array, phase: tuple[int, int] = (0, 0)) -> Array:
     result = np.empty((*planes.shape[:-3], *planes.shape[-2:]), planes.dtype)
     for row in (0, 1):
         for column in (0, 1):
+            # RGGB: R where row and column are even, B where both are odd: their sum is the plane
             site = (..., slice(row, None, 2), slice(column, None, 2))
             result[site] = planes[..., (row + phase[0]) % 2 + (column + phase[1]) % 2, :, :][site]
     return result
@@ -133,6 +134,7 @@ def sampled(planes: Array, sensor: Sensor, phase: tuple[int, int]) -> Array:
 
 def stop_factor(sensor: Sensor, light: Light) -> float:
     """Light at the sensor's stop relative to the layers'; the depth of field stays that of the layers."""
+    # light goes with the area of the aperture: as 1 / N^2
     return 1.0 if sensor.f_number is None else (light.f_number / sensor.f_number) ** 2
 
 
@@ -152,6 +154,7 @@ def vignetting(exponent: float, camera: Camera, region: Region) -> Array | float
 def expected_electrons(light: Light, sensor: Sensor, camera: Camera, region: Region, flicker: float = 1.0) -> Array:
     """Expected photo-electrons in one exposure, shape (h, w) (planes, shape (3, h, w), for the output "electrons")."""
     phase = (region.v0_px, region.u0_px)
+    # layers are rates at their own stop: electrons are rate x time x ratio of apertures
     seconds = sensor.exposure_s * stop_factor(sensor, light)
     part = light.ambient_electrons_per_s[(slice(None), *region.slices())]
     electrons = sampled(part, sensor, phase).astype(float) * (seconds * light.lamp_level)
@@ -264,6 +267,7 @@ def collected(mean_e: Array, sensor: Sensor, stream: NoiseStream, region: Region
                 f"layers: {mean_e.min():g} to {mean_e.max():g} expected electrons in a pixel; a layer must hold finite "
                 "numbers from 0 up, render it again"
             ) from error
+    # the well is full before the reading adds its noise
     return np.minimum(charge, sensor.full_well_e)
 
 
@@ -279,5 +283,6 @@ def read_out(charge_e: Array, sensor: Sensor, pattern: FixedPattern, stream: Noi
 
 def digitised(signal_e: Array, sensor: Sensor) -> NDArray[np.uint16]:
     """DN: gain, black level, rounding to the nearest code, clipping to what the converter has."""
+    # the converter rounds to the nearest code and clips at both ends
     dn = np.rint(sensor.black_level_dn + sensor.dn_per_e * signal_e)
     return np.clip(dn, 0.0, sensor.top_dn).astype(np.uint16)

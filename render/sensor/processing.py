@@ -77,6 +77,7 @@ def sharpened(planes: Array, amount: float) -> Array:
     """Unsharp mask x + amount (x - blur x), blur (1 2 1)/4 along both axes."""
     if amount == 0.0:
         return planes
+    # unsharp mask: what the blur takes away is added again, `amount` times
     return planes + planes.dtype.type(amount) * (planes - _blurred(planes))
 
 
@@ -89,6 +90,7 @@ def denoised(planes: Array, sensor: Sensor) -> Array:
     """
     result, of = planes, planes.dtype.type
     if sensor.denoise_chroma > 0.0:
+        # all planes by their own change, less its luma: Y' stays as it is
         change = _blurred(planes) - planes
         result = result + of(sensor.denoise_chroma) * (change - luma_of(change)[..., None, :, :])
     if sensor.denoise_luma > 0.0:
@@ -117,6 +119,7 @@ def _smoothing(y: Array, sensor: Sensor) -> Array:
     *lead, h, w = y.shape
     reach, of = sensor.denoise_reach_px, y.dtype.type
     taps = np.array(_BINOMIAL[reach])
+    # share v of the blur along columns, the rest of no blur
     down = sensor.denoise_vertical * taps + (1.0 - sensor.denoise_vertical) * (np.arange(-reach, reach + 1) == 0)
     p = np.pad(y, [(0, 0)] * len(lead) + [(reach, reach)] * 2, mode="reflect")
     total = np.zeros_like(y)
@@ -174,6 +177,7 @@ def shrunk(planes: Array, factor: int) -> Array:
 
 def eight_bit(planes: Array) -> NDArray[np.uint8]:
     """Image, shape (..., H, W, 3), of planes in [0, 1], rounded and clipped."""
+    # halves go to the even code, as numpy has it
     scaled = np.clip(np.rint(planes * planes.dtype.type(255.0)), 0.0, 255.0).astype(np.uint8)
     return np.ascontiguousarray(np.moveaxis(scaled, -3, -1))
 
@@ -199,19 +203,6 @@ def rendered(linear: Array, sensor: Sensor, shrink: int = 1) -> Array:
     return denoised(sharpened(encoded, sensor.sharpen_amount), sensor)
 
 
-def electrons_from_srgb(image: NDArray[np.uint8], sensor: Sensor) -> Array:
-    """Electrons behind R, G, B, shape (..., 3, H, W): the inverse for flat, unclipped, unsharpened light."""
-    encoded = np.moveaxis(image, -1, -3) / 255.0
-    balanced = colour_corrected(tone_decoded(encoded, sensor), _inverse(sensor.colour_matrix))
-    gains = sensor.white_balance
-    full_scale_e = (sensor.top_dn - sensor.black_level_dn) / sensor.dn_per_e
-    return white_balanced(balanced, (1.0 / gains[0], 1.0 / gains[1], 1.0 / gains[2])) * full_scale_e
-
-
-def _inverse(matrix: Matrix) -> Matrix:
-    return matrix if matrix == IDENTITY else tuple(map(tuple, np.linalg.inv(matrix)))  # type: ignore[return-value]
-
-
 # Y'CbCr 4:2:2, ITU-R BT.601, 8 bits.
 
 
@@ -231,8 +222,10 @@ def yuyv(planes: Array, sensor: Sensor) -> NDArray[np.uint8]:
     width = y.shape[-1]
     second = np.empty_like(y)
     for first, plane, weight in ((0, planes[..., 2, :, :], LUMA[2]), (1, planes[..., 0, :, :], LUMA[0])):
+        # B - Y' and R - Y', mirrored at the edges
         difference = np.pad(plane - y, [(0, 0)] * (y.ndim - 1) + [(1, 1)], mode="reflect")
         left, middle, right = (of(tap) * difference[..., k : k + width : 2] for k, tap in enumerate(sensor.chroma_taps))
+        # scaled so that pure blue and pure red reach the ends of the axis; 128 is no colour
         samples = (left + middle + right) * of(0.5 * chroma / (1.0 - weight)) + of(128.0)
         second[..., first::2] = samples[..., : second[..., first::2].shape[-1]]
     codes = np.stack([y * of(luma) + of(black), second], axis=-1)
@@ -245,6 +238,7 @@ def rgb_from_yuyv(image: NDArray[np.uint8], sensor: Sensor) -> NDArray[np.uint8]
     y = (image[..., 0] - black) / luma
     cb, cr = (np.repeat(image[..., k::2, 1], 2, axis=-1) for k in (0, 1))
     blue, red = ((c - 128.0) * 2.0 * (1.0 - weight) / chroma + y for c, weight in ((cb, LUMA[2]), (cr, LUMA[0])))
+    # Y' solved for the third colour
     green = (y - LUMA[0] * red - LUMA[2] * blue) / LUMA[1]
     return eight_bit(np.stack([red, green, blue], axis=-3))
 

@@ -103,6 +103,7 @@ def film_depth(
     """
     keep = np.flatnonzero(positions.good)
     readings = np.asarray(encoder_m, float)[keep]
+    # depth comes from the stroke alone: frames of one offset give a direction
     if len(keep) < 2 or np.ptp(readings) < _LEAST_STROKE_M:
         raise DatasetError(
             f"film of {len(keep)} positions over {np.ptp(readings) if len(keep) else 0.0:.4f} m of the stroke: two "
@@ -114,6 +115,7 @@ def film_depth(
     for _ in range(_STEPS):
         at = _predicted(rig, X, readings)
         S = cho_factor(_total(rig, X, readings, C, at.by_offset, sigma_m, covariance_rig))
+        # normal equations with the covariance of positions, encoder and rig together
         information = at.by_point.T @ cho_solve(S, at.by_point)
         step = np.linalg.solve(information, at.by_point.T @ cho_solve(S, y - at.uv))
         # nearly all of a step is along the line of sight: half of the distance at most
@@ -122,6 +124,7 @@ def film_depth(
         if float(np.linalg.norm(step)) < _SETTLED_M:
             break
     places = np.full(positions.uv_px.shape, np.nan)
+    # best estimate of each image place: the measured one, moved by its own share of the misfit
     places[keep] = (y - C @ cho_solve(S, y - _predicted(rig, X, readings).uv)).reshape(-1, 2)
     return _result(rig, X, readings, y, S, sigma_m, covariance_rig is not None, places)
 
@@ -137,6 +140,7 @@ def most_agree(rig: Rig, positions: FilmPositions, encoder_m: Array) -> BoolArra
         return positions.good
     uv, readings = positions.uv_px[good], np.asarray(encoder_m, float)[good]
     order, third = np.argsort(readings), max(1, len(good) // 3)
+    # the lowest and the highest third of the readings: long strokes tell the depth best
     low, high = (some[np.linspace(0, third - 1, _PROPOSE).astype(int)] for some in (order[:third], order[-third:]))
     pairs = np.array([(i, j) for i in low for j in high if readings[j] - readings[i] > _LEAST_STROKE_M], np.int64)
     if not len(pairs):
@@ -146,6 +150,7 @@ def most_agree(rig: Rig, positions: FilmPositions, encoder_m: Array) -> BoolArra
     X = depth_exact(rig, readings[j] - readings[i], uv[i], uv[j]).point_world_m + readings[i, None] * axis
     at = image_of(rig.at(0.0), X[:, None] - readings[None, :, None] * axis).uv_px
     apart = np.nan_to_num(np.linalg.norm(at - uv, axis=2), nan=np.inf)
+    # a cut-off distance: one frame far astray counts no more than one beyond the limit
     best = apart[np.argmin(np.minimum(apart, _AGREE_PX).mean(axis=1))]
     result = np.zeros(len(positions.uv_px), bool)
     result[good[best < _AGREE_PX]] = True
@@ -170,6 +175,7 @@ def deviations2(
     at = _predicted(rig, point_world_m, readings)
     S = _total(rig, point_world_m, readings, few.covariance_px2(), at.by_offset, sigma_m, covariance_rig)
     each, apart = np.arange(len(keep)), few.uv_px - at.uv.reshape(-1, 2)
+    # blocks of 2 x 2 on the diagonal: the covariance of each position by itself
     own = S.reshape(len(keep), 2, len(keep), 2)[each, :, each, :]
     result = np.full(len(positions.uv_px), np.nan)
     result[keep] = np.einsum("ni,nij,nj->n", apart, np.linalg.inv(own), apart)

@@ -18,7 +18,8 @@ from typing import Any, cast
 
 from phibench.benchmark.isolation.answers import plain, to_bytes
 from phibench.benchmark.isolation.isolation import Isolation
-from phibench.benchmark.isolation.process import GuestProcess, advised
+from phibench.benchmark.isolation.printed_output import advised
+from phibench.benchmark.isolation.process import GuestProcess
 from phibench.benchmark.isolation.readable_files import access_of
 from phibench.benchmark.isolation.resolve import MethodError, Reference, RunLimits, parsed, resolve
 from phibench.benchmark.isolation.transport import Connection, TransportError

@@ -102,6 +102,7 @@ class SigmaTable:
 
     def at(self, electrons: float) -> float:
         """Bound, pixels; infinite for spots fainter than the table, NaN for brighter ones."""
+        # the bound falls evenly in logarithms: straight between nodes
         x = math.log(electrons) if electrons > 0.0 else -math.inf
         if x < self.log_flux[0]:
             return math.inf
@@ -140,6 +141,7 @@ class Sensing:
         self._axis = np.array(rig.stroke_axis_world)
         self._robot: Boxes = boxes_of(chassis())
         response = rig.camera.detector.laser_electrons_per_joule(self.laser.wavelength_nm)[0]
+        # Lambert: radiance = albedo x irradiance / pi; the red filter sees the laser
         self._electrons_per_etendue_s = self.laser.power_w * self.laser.albedo / np.pi * response
 
     @cached_property
@@ -207,7 +209,9 @@ class Sensing:
         return room.blocks(start, light.point_m)
 
     def _image(self, light: SpotOnSurface, R: Array, origin: Array, stroke_m: float) -> _Seen | None:
+        # rows times R are R^T times columns: from the world into the frame of the rig
         own = (light.point_m - origin) @ R
+        # the rig is up by the stroke, which is the point being lower by it
         lowered = own - stroke_m * self._axis
         image = self.imager.image(*lowered.tolist())
         return None if image is None else _Seen(image, own, lowered, -float((R @ np.array(image.ray)) @ light.normal))
@@ -223,8 +227,10 @@ class Sensing:
         light = self._electrons_per_etendue_s * self.imager.reflectance(image.cos_incidence)
         electrons = power * light * image.etendue_m2_sr_per_m2 * seen.facing * EXPOSURES_S[exposure]
         sigma = self._tables[exposure].at(electrons)
+        # NaN is a spot brighter than the table, infinity one that is fainter
         if not sigma <= FAINTEST_PX:
             return unseen(BRIGHT if math.isnan(sigma) else FAINT)
+        # the bound is that of one coordinate; both are drawn by themselves
         du, dv = (0.0, 0.0) if rng is None else (sigma * rng.standard_normal(2)).tolist()
         return SpotReading(image.u_px + du, image.v_px + dv, sigma, electrons, SEEN)
 
@@ -310,6 +316,7 @@ def direction_with(rig: Rig, u_px: float, v_px: float, covariance_px2: Array) ->
     across = math.sqrt(across2)
     J = np.array(
         [
+            # azimuth, then rise z / across, by the vector
             [-r[1] / across2, r[0] / across2, 0.0],
             [-r[2] * r[0] / across**3, -r[2] * r[1] / across**3, 1.0 / across],
         ]
@@ -331,6 +338,7 @@ def angles(d: Array) -> Array:
 
 def turned(difference: Array) -> Array:
     """Differences with their azimuth between -pi and pi."""
+    # sine and cosine know no jump at half a turn
     azimuth = np.arctan2(np.sin(difference[:, 0]), np.cos(difference[:, 0]))
     return np.stack([azimuth, difference[:, 1]], axis=-1)
 
@@ -341,5 +349,6 @@ def angle_slopes(d: Array) -> Array:
     across2 = x**2 + y**2
     across = np.sqrt(across2)
     zero = np.zeros_like(x)
+    # azimuth atan2(y, x), rise z / hypot(x, y)
     rows = (-y / across2, x / across2, zero), (-z * x / across**3, -z * y / across**3, 1.0 / across)
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)

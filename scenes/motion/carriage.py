@@ -47,6 +47,7 @@ class Leg:
     def ramp_s(self) -> float:
         """Time of speeding up, and of slowing down."""
         way = abs(self.end_m - self.start_m)
+        # a short way ends before top speed is reached: two ramps alone, way = a t^2
         return min(self.speed_m_per_s / self.acceleration_m_per_s2, math.sqrt(way / self.acceleration_m_per_s2))
 
     @property
@@ -56,6 +57,7 @@ class Leg:
         if ramp == 0.0:
             return 0.0
         top = self.acceleration_m_per_s2 * ramp
+        # both ramps together cover top x ramp; the rest is driven at top speed
         return 2.0 * ramp + max(way - top * ramp, 0.0) / top
 
     def state(self, times_s: Array) -> tuple[Array, Array, Array]:
@@ -193,8 +195,10 @@ class Vibration:
         within("Vibration", "high_hz", high_hz, low_hz, 1e4)
         within("Vibration", "rms_m", rms_m, 0.0, 0.1)
         rng, count = generator("vibration", *names), _LINES if high_hz > low_hz else 1
+        # one frequency in each of as many parts of the band: an even spectrum
         where = (np.arange(count) + rng.random(count)) / count
         frequencies, phases = low_hz + (high_hz - low_hz) * where, 2.0 * np.pi * rng.random(count)
+        # a sine of amplitude A has the mean square A^2 / 2
         amplitude = rms_m * math.sqrt(2.0 / count)
         pairs = zip(frequencies, phases, strict=True)
         return cls(axis, tuple(Sine(amplitude, float(f), float(phase)) for f, phase in pairs))
@@ -249,5 +253,6 @@ class Encoder:
     def readings_m(self, offsets_m: Array, *names: Name) -> Array:
         """Readings of true offsets, shape (N,), from the named stream; reading k is the same whatever N."""
         noise = generator("encoder", *names).standard_normal(len(offsets_m))
+        # noise comes before the rounding, as in an encoder
         read = np.asarray(offsets_m, float) + self.rms_m * noise
         return read if self.step_m == 0.0 else np.rint(read / self.step_m) * self.step_m

@@ -63,6 +63,7 @@ class FilmTimes:
 
     def row_s(self, frame: int | Array, rows: float | Array) -> Array:
         """Middle of the exposure of rows (pixels, fractions allowed) of frames; both broadcast."""
+        # row (H - 1) / 2 is read at the time of the frame, each row readout / H after the one above
         row = (np.asarray(rows, float) - 0.5 * (self.height_px - 1)) * (self.readout_s / self.height_px)
         return self.first_s + np.asarray(frame, float) / self.rate_hz + row
 
@@ -116,6 +117,7 @@ class BlinkCode:
         middle = np.asarray(middle_s, float)
         if exposure_s == 0.0:
             return self.level(middle)
+        # difference of an integral: exact for any number of bits in the exposure
         return (self._on_s(middle + 0.5 * exposure_s) - self._on_s(middle - 0.5 * exposure_s)) / exposure_s
 
     @property
@@ -127,6 +129,7 @@ class BlinkCode:
         passed = np.concatenate([[0.0], np.cumsum(self._values)]) * self.bit_s
         position = (times_s - self.start_s) / self.bit_s
         whole = np.floor(position).astype(int)
+        # whole codes, then whole bits of the one that runs, then the part of its present bit
         rounds, number = np.divmod(whole, len(self.bits))
         fraction = (position - whole) * self.bit_s
         return rounds * passed[-1] + passed[number] + fraction * self._values[number]

@@ -17,8 +17,8 @@ from phibench.datasets import make as rendering
 from phibench.datasets import merge_repair
 from phibench.datasets.read import Dataset, Sample, open_finished
 from phibench.datasets.store import schema
-from phibench.datasets.store.documents import sensitivity_bytes, sensitivity_fault
 from phibench.datasets.store.files import write_bytes
+from phibench.datasets.store.sensitivity_file import sensitivity_bytes, sensitivity_fault
 from phibench.estimator.geometry.sensitivities import PARAMETERS, sensitivity
 from phibench.estimator.geometry.triangulate import ESTIMATORS
 from phibench.scenes.rig import POSITIONS

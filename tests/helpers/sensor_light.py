@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from phibench.render.optics.spot_layer import SpotLayer, splat
 from phibench.render.optics.spot_samples import FilmCloud
 from phibench.render.sensor.light import Light
+from phibench.render.sensor.processing import colour_corrected, tone_decoded, white_balanced
+from phibench.render.sensor.settings import Sensor
+from phibench.scenes.frames import Array
 
 FILTERS = np.array([1.0, 0.10, 0.03])
 
@@ -20,3 +24,12 @@ def room(size: tuple[int, int], seed: int = 7) -> Light:
     """Textured room of (height, width) with a spot right of the middle; some pixels saturate at 1/60 s."""
     rates = np.random.default_rng(seed).uniform(0.0, 8e5, (3, *size)).astype(np.float32)
     return Light(rates, spot_at(0.6 * size[1] + 0.3, 0.5 * size[0] - 0.2))
+
+
+def electrons_from_srgb(image: NDArray[np.uint8], sensor: Sensor) -> Array:
+    """Electrons behind R, G, B, shape (..., 3, H, W): the inverse for flat, unclipped, unsharpened light."""
+    inverse = tuple(map(tuple, np.linalg.inv(sensor.colour_matrix)))
+    balanced = colour_corrected(tone_decoded(np.moveaxis(image, -1, -3) / 255.0, sensor), inverse)
+    gains = sensor.white_balance
+    full_scale_e = (sensor.top_dn - sensor.black_level_dn) / sensor.dn_per_e
+    return white_balanced(balanced, (1.0 / gains[0], 1.0 / gains[1], 1.0 / gains[2])) * full_scale_e

@@ -19,7 +19,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import maximum_filter, uniform_filter
 
-from phibench.estimator.spots.candidates import plane_amplitudes
+from phibench.datasets.frames.sensor_card import SensorCard
+from phibench.estimator.spots.candidates import _PATCH_REACH_PX, _fitted, _template
 from phibench.estimator.spots.image_planes import ColourPlanes, green_at_red
 from phibench.robot.film.spot_tracks import FrameSearch, SpotTrack
 from phibench.scenes.frames import Array
@@ -29,6 +30,15 @@ _BLOB_SITES, _AROUND_SITES = 3, 9  # squares of red sites: a spot of 0.9 px lies
 _LEAST_BLOB = 6.0  # of the image's own spread
 _WITHIN_PX = 12.0  # of a blob from where it was
 _GIVEN_UP = 10  # frames without a blob there, after which the brightest one is taken again
+
+
+def plane_amplitudes(on: ColourPlanes, card: SensorCard, uv_px: Array, sigma_px: float) -> tuple[Array, Array]:
+    """Amplitudes in every plane, each by itself, and their variances, electrons: shape (c, n) each."""
+    reach = _PATCH_REACH_PX[on.mosaic]
+    corner = np.rint(uv_px).astype(int) - reach
+    template = _template(uv_px - corner, sigma_px, reach)
+    fits = [_fitted(on, None, card, c, corner, template, guided=False) for c in range(len(on.values_e))]
+    return np.stack([f.amplitude for f in fits]), np.stack([f.variance * np.maximum(f.chi2, 1.0) for f in fits])
 
 
 def red_blobs(planes: ColourPlanes, search: FrameSearch) -> Array:

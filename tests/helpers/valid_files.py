@@ -26,8 +26,9 @@ from PIL import Image
 from phibench.benchmark.isolation.resolve import Reference
 from phibench.benchmark.pair_sets.frames_set import read_truth_file, truth_text
 from phibench.benchmark.scores.answer_errors import Rules
-from phibench.benchmark.scores.document import MethodCard, read_records, read_score, write_score
+from phibench.benchmark.scores.document import MethodCard
 from phibench.benchmark.scores.score import score_outcomes
+from phibench.benchmark.scores.score_files import read_records, read_score, write_score
 from phibench.benchmark.sealed.sealed_set import (
     FORMAT,
     PAIRS,
@@ -46,10 +47,11 @@ from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.frames.frame_files import read_index
 from phibench.datasets.frames.sensor_card import sensor_card
 from phibench.datasets.recipe.load import load_recipe
-from phibench.datasets.store import documents, schema
+from phibench.datasets.store import schema, sensitivity_file
 from phibench.datasets.store.checksums import checksums_text
-from phibench.datasets.store.documents import read_sensitivities, to_json
+from phibench.datasets.store.documents import to_json
 from phibench.datasets.store.layers import read_layer, write_exr
+from phibench.datasets.store.sensitivity_file import read_sensitivities
 from phibench.estimator.geometry.rig_parameters import PARAMETERS
 from phibench.render.room.light_map import LightMap, encoded
 from phibench.scenes.rig import Rig
@@ -263,13 +265,13 @@ def sensitivity_table() -> pl.DataFrame:
 
 def signed_table(data: bytes) -> bytes:
     """A table with the hash that it must hold, if it still has a place for one."""
-    own = documents._OWN.search(data)
-    return data if own is None else data.replace(own[1], digest(data.replace(own[1], documents._PLACE)).encode())
+    own = sensitivity_file._OWN.search(data)
+    return data if own is None else data.replace(own[1], digest(data.replace(own[1], sensitivity_file._PLACE)).encode())
 
 
 def sensitivity_kind(folder: Path) -> tuple[bytes, Callable[[Path], object], None, Callable[[random.Random], bytes]]:
     (folder / schema.CHECKSUMS).write_bytes(b"")
-    written = documents.sensitivity_bytes(sensitivity_table(), folder)
+    written = sensitivity_file.sensitivity_bytes(sensitivity_table(), folder)
 
     def forge(rng: random.Random) -> bytes:
         table = sensitivity_table()
@@ -284,7 +286,7 @@ def sensitivity_kind(folder: Path) -> tuple[bytes, Callable[[Path], object], Non
         else:
             nasty = [value for value in NASTY if isinstance(value, float | str | None) and value != "\ud800"]
             table = table.with_columns(pl.Series(name, [rng.choice(nasty)] * 2, strict=False))
-        return documents.sensitivity_bytes(table, folder)
+        return sensitivity_file.sensitivity_bytes(table, folder)
 
     return written, lambda path: read_sensitivities(path.parent), None, forge
 

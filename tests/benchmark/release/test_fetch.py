@@ -25,7 +25,7 @@ from phibench.benchmark.release.benchmark import STARTER_PAIRS, Archive
 from phibench.benchmark.release.fetch import Fetched, fetch, unpack
 from phibench.benchmark.release.release_source import SOURCE
 from phibench.benchmark.scored_dataset import open_dataset
-from phibench.benchmark.scores.document import read_score
+from phibench.benchmark.scores.score_files import read_score
 from phibench.benchmark.sealed.sealed_set import read_seal
 from phibench.cli.main import main
 from phibench.datasets.common.errors import DatasetError

@@ -21,8 +21,8 @@ from phibench.benchmark.pair_sets.dataset_pairs import TRACKS, dataset_pairs, tr
 from phibench.benchmark.reports import bench as benching
 from phibench.benchmark.reports import figures
 from phibench.benchmark.reports.bench import bench
-from phibench.benchmark.scores.document import read_score
 from phibench.benchmark.scores.score import score
+from phibench.benchmark.scores.score_files import read_score
 from phibench.cli import main as cli
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.read import open_finished

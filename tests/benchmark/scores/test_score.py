@@ -17,16 +17,10 @@ from PIL import Image
 
 import phibench
 from phibench.benchmark.scores.answer_errors import Rules
-from phibench.benchmark.scores.document import (
-    MethodCard,
-    ScoreDocument,
-    read_records,
-    read_score,
-    results_sha256,
-    write_score,
-)
+from phibench.benchmark.scores.document import MethodCard, ScoreDocument, results_sha256
 from phibench.benchmark.scores.metrics import METRICS
 from phibench.benchmark.scores.score import saved_each, score_methods, score_outcomes
+from phibench.benchmark.scores.score_files import read_records, read_score, write_score
 from phibench.benchmark.scores.score_tables import leaderboard, number, ranked
 from phibench.benchmark.scores.strata import STRATA
 from phibench.benchmark.scores.worst_images import crop, worst

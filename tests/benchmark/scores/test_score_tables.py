@@ -14,6 +14,7 @@ from phibench.benchmark.reports.report import report_html, verdict
 from phibench.benchmark.scores.answer_errors import Rules
 from phibench.benchmark.scores.causes import KINDS
 from phibench.benchmark.scores.compare import compare_records
+from phibench.benchmark.scores.comparison_tables import print_comparison
 from phibench.benchmark.scores.document import MethodCard
 from phibench.benchmark.scores.metrics import METRICS
 from phibench.benchmark.scores.score import isolated, score_outcomes
@@ -24,7 +25,6 @@ from phibench.benchmark.scores.score_tables import (
     leaderboard,
     nothing_answered,
     number,
-    print_comparison,
     print_scores,
     refused,
     score_table,

@@ -15,9 +15,9 @@ import pytest
 from helpers.processes import quiet
 
 from phibench.benchmark.pair_sets.dataset_pairs import dataset_pairs
-from phibench.benchmark.scores.document import read_records, read_score, write_score
 from phibench.benchmark.scores.record_columns import COLUMN_TYPES
 from phibench.benchmark.scores.score import Scored, score
+from phibench.benchmark.scores.score_files import read_records, read_score, write_score
 from phibench.benchmark.sealed import score_check
 from phibench.benchmark.sealed.rebuilt_score import GIVEN, differences, outcomes_of_records, rebuilt
 from phibench.benchmark.sealed.score_check import check_score

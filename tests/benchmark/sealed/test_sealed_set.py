@@ -20,7 +20,7 @@ from PIL import Image
 from phibench.benchmark.pair_sets.dataset_pairs import dataset_pairs
 from phibench.benchmark.pair_sets.frames_set import TruthRow, truth_document, truth_of
 from phibench.benchmark.reports.bench import show
-from phibench.benchmark.scores.document import read_score
+from phibench.benchmark.scores.score_files import read_score
 from phibench.benchmark.sealed.sealed_set import (
     Sealed,
     board_warnings,

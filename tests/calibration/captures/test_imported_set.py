@@ -12,7 +12,7 @@ import pytest
 from helpers.camera_files import write_pictures
 
 from phibench.benchmark.pair_sets.wanted_pairs import PairChoice, wanted_pairs
-from phibench.benchmark.scores.document import read_score
+from phibench.benchmark.scores.score_files import read_score
 from phibench.calibration.captures.imported_set import import_pairs, imported_pairs, open_imported
 from phibench.calibration.captures.pair_list import read_pair_list
 from phibench.calibration.outline.limb_image import PoseMeasurement

@@ -22,7 +22,7 @@ from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.read import open_finished
 from phibench.datasets.store import schema
 from phibench.datasets.store.checksums import strays
-from phibench.datasets.store.documents import read_sensitivities, sensitivity_bytes, sensitivity_fault
+from phibench.datasets.store.sensitivity_file import read_sensitivities, sensitivity_bytes, sensitivity_fault
 from phibench.datasets.verify import verify
 from phibench.estimator.geometry.triangulate import ESTIMATORS
 from phibench.studies.paper.sensitivity_table import columns, keep_sensitivities

@@ -23,7 +23,6 @@ from phibench.estimator.limits.best_stroke import (
     LEAST,
     best_stroke,
     spot_bound,
-    without_limits,
 )
 from phibench.estimator.limits.processed_bound import SpotSigma, _variance_px2, spot_sigma
 from phibench.estimator.limits.stroke_curve import (
@@ -58,7 +57,7 @@ P = len(PARAMETERS)
 EXACT = np.zeros((P, P))
 SAME = SpotSigma((1.0, 1e9), (0.05, 0.05))
 """A spot that is known to 0.05 px whatever its strength."""
-OPEN = without_limits(Surroundings())
+OPEN = replace(Surroundings(), room_height_m=math.inf, robot=False)  # only geometry bounds the stroke
 
 
 # -- flux ---------------------------------------------------------------------------------------------------------

@@ -18,7 +18,6 @@ from phibench.datasets.frames.sensor_card import card_of, sensor_card
 from phibench.estimator.geometry.status import Status
 from phibench.estimator.limits.position_bound import (
     UNKNOWNS,
-    approximate_information,
     censored_share,
     derivative_images,
     exact_information,
@@ -77,7 +76,7 @@ def test_accuracy_mortensen(sigma_px: float, flux_e: float) -> None:
     variances = []
     for phase in range(64):
         region = region_of(24 + phase % 8 / 8, 24 + phase // 8 / 8, sigma_px, flux_e, 10.0, MONO)
-        limit = limit_of(derivative_images(region, "flux"), approximate_information(region.mean_e, PixelNoise(0.0)))
+        limit = limit_of(derivative_images(region, "flux"), 1.0 / PixelNoise(0.0).variance_e2(region.mean_e))
         variances.append(np.trace(limit.covariance_px2) / 2.0)
     ratio = np.sqrt(np.mean(variances) / mortensen_variance(sigma_px, flux_e, 10.0))
     thompson = np.sqrt(np.mean(variances) / thompson_variance(sigma_px, flux_e, 10.0))
@@ -170,7 +169,7 @@ def test_accuracy_information_near_the_full_well_against_the_codes(model: str) -
     for card, tolerance in ((ideal, 0.01), (real, 0.06)):
         assert card.saturation_e == card.full_well_e  # the converter does not end first
         mean = card.full_well_e + np.sqrt(card.full_well_e) * z
-        uncut = approximate_information(mean, noise_of(card))
+        uncut = 1.0 / noise_of(card).variance_e2(mean)
         shares, codes = raw_information(mean, card, model) / uncut, quantised_information(mean, card) / uncut
         print("share of the information left:", np.round(shares, 4), "of the codes:", np.round(codes, 4))
         np.testing.assert_allclose(shares, codes, rtol=0, atol=tolerance)
@@ -223,7 +222,7 @@ def test_accuracy_bound_of_a_saturated_spot_against_fits(s: Sensor, u: float, v:
     assert (fit.status == Status.OK).all()
     rms = np.sqrt(np.mean((fit.uv_px - [u, v]) ** 2))
     bound = spot_limit(region, card).rms_px
-    wrong = limit_of(derivative_images(region), approximate_information(region.mean_e, noise_of(card))).rms_px
+    wrong = limit_of(derivative_images(region), 1.0 / noise_of(card).variance_e2(region.mean_e)).rms_px
     print(
         f"{s.mosaic}: rms {1e3 * rms:.2f} mpx, bound {1e3 * bound:.2f} mpx, ratio {rms / bound:.3f}, {rms / wrong:.3f}"
     )

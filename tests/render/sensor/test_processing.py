@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.sensor_light import room
+from helpers.sensor_light import electrons_from_srgb, room
 from PIL import Image
 from scipy.ndimage import convolve
 
@@ -109,15 +109,15 @@ def test_a_flat_field_is_recovered_within_the_noise(preset: str, matrix) -> None
     electrons, size = np.array([3000.0, 4000.0, 2500.0]), (256, 256)
     s = sensor(preset, colour_matrix=matrix, jpeg_quality=95)
     frame = Chain(s).frame(Light.flat(tuple(electrons / s.exposure_s), size), STREAM)
-    found = processing.electrons_from_srgb(frame, s).mean(axis=(1, 2))
+    found = electrons_from_srgb(frame, s).mean(axis=(1, 2))
     usual = Chain(s.replace(jpeg_quality=85)).frame(Light.flat(tuple(electrons / s.exposure_s), size), STREAM)
-    off = processing.electrons_from_srgb(usual, s).mean(axis=(1, 2)) / electrons - 1.0
+    off = electrons_from_srgb(usual, s).mean(axis=(1, 2)) / electrons - 1.0
     print(f"{preset}: {100 * (found / electrons - 1.0)} %; quality 85: {100 * off} %")
     # noise per pixel below 150 e-, so 0.6 e- of the mean; the curve bends by 4 % of its slope per noise of 4 %: 0.1 %;
     # a rounding of 8 bits is dithered by 2 codes of noise. JPEG rounds the mean of a block's chroma to its table, and
     # colour by colour to 8 bits, undithered: half a code of 255, which is 1/255 of the slope's 0.45: 0.5 %
     np.testing.assert_allclose(found, electrons, rtol=0.002 if preset == "srgb8" else 0.006)
-    wrong = processing.electrons_from_srgb(frame, s.replace(white_balance=(1.0117, 1.03, 1.3416))).mean(axis=(1, 2))
+    wrong = electrons_from_srgb(frame, s.replace(white_balance=(1.0117, 1.03, 1.3416))).mean(axis=(1, 2))
     assert np.abs(wrong / electrons - 1.0).max() > 0.006
 
 
