@@ -1,4 +1,4 @@
-"""Cutout of the sensor around the spot's two images: rig, light, frames and bounds of these pixels alone.
+"""For several studies: a cutout of the sensor around the spot's two images, with its light, frames and bounds.
 
 Frames are drawn as if the camera had no other pixels, which saves the time of a whole frame. The corner lies on whole
 JPEG units, so that mosaic and compression are those of the whole image.

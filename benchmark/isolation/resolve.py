@@ -1,4 +1,4 @@
-"""References to methods, and the limits under which methods run.
+"""Methods by reference (file, built-in, package), looked up and hashed but not run; and limits under which they run.
 
 A reference is ``my_phi.py:extract`` (a file and a function in it), the name of a built-in method, or the name under
 which an installed package registers a method (entry-point group ``phibench.methods``). It is resolved without running

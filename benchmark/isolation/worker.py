@@ -1,4 +1,4 @@
-"""Worker: the process in which a method or a policy runs, started by `sandbox.supervisor`.
+"""Worker: the process in which a method or a policy runs, started by `isolation.supervisor`.
 
 The worker tells how it is isolated, gets a reference, imports the method, gets pairs, and answers with JSON. Every
 reply repeats number and nonce of its pair. Standard output and error are the method's alone.

@@ -1,4 +1,4 @@
-"""Frames set: camera frames with their truth, which scores take like a data set with layers.
+"""Frames set, read and written: camera frames with their truth; and the truth file of sealed sets.
 
 frames_set.json   where the frames come from: data set, preset, draws, task version
 pairs.jsonl       per pair: files, what a user knows, and the truth with its bounds

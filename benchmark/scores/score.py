@@ -43,7 +43,7 @@ from phibench.estimator.interface import Method, Outcome
 from phibench.estimator.pair_set import CachedPairs, PairSet, truth_folders
 
 Ask = Callable[[PairSet, Sequence[int]], Iterable[tuple[Outcome, ...]]]
-"""Pairs and numbers to the outcomes of every method: `sandbox.runner.Harness.outcomes`."""
+"""Pairs and numbers to the outcomes of every method: `isolation.runner.Harness.outcomes`."""
 _LATE = "late"
 AT_ONCE = 16
 """Pairs that are examined together; twice as many are in memory. One of MJPEG frames, on and off, takes 11 MB."""

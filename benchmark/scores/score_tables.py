@@ -296,7 +296,7 @@ def _printed(one: HasScore) -> list[str]:
 
 
 def silences(records: pl.DataFrame, count: int = 3) -> list[str]:
-    """Most frequent messages of a method or of the sandbox for images without a position, one line each."""
+    """Most frequent messages of a method or of its process for images without a position, one line each."""
     words = pl.when(pl.col("message") != "").then(pl.col("failure") + ": " + pl.col("message"))
     said = records.filter(pl.col("u_px").is_null()).with_columns(words=words.otherwise(pl.col("status")))
     most = said.group_by("words").len().sort("len", "words", descending=[True, False]).head(count)

@@ -1,4 +1,4 @@
-"""Sealed sets as users have them: pairs without truth, submissions to them, and unsealing.
+"""Sealed sets read: a method's submission to one (`submit`), and its join with the truth (`unseal`).
 
 A submission says what a method answered on a sealed set and which method it was; it holds no images and no truth.
 Unsealing proves that truth and submission belong to the seal, and gives truths and outcomes for the score.
@@ -189,7 +189,7 @@ def submit(
     ----------
     public : folder of the sealed set
     method : str
-        As for `sandbox.runner.Harness`.
+        As for `isolation.runner.Harness`.
     out : JSON file to write
     workers : pairs that are worked on at a time
     limits : limits of the method for one pair
@@ -331,7 +331,7 @@ def _finite(value: float | None) -> float | None:
 
 
 def _outcome(line: AnswerLine) -> Outcome:
-    """Outcome of a line, by the rules of the sandbox: what is no answer there is none here."""
+    """Outcome of a line, by the rules of the isolation: what is no answer there is none here."""
     has_answer = line.down is not None and line.up is not None
     if line.failure not in ("", *FAILURES) or has_answer == bool(line.failure) or line.seconds < 0.0:
         raise DatasetError(

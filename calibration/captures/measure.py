@@ -177,7 +177,7 @@ def measure(photos: PairPhotos, stroke_m: float, setting: KnownNumbers) -> Measu
     photos : PairPhotos
     stroke_m : float
         As the person read it.
-    setting : Setting
+    setting : KnownNumbers
 
     Raises
     ------

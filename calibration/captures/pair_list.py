@@ -1,4 +1,4 @@
-"""Folder of pairs: `pairs.csv` with the names of the pictures, and a CSV of what was measured in them.
+"""Folder of pairs: reads `pairs.csv`, measures every pair, and writes a CSV of the results.
 
 Columns of `pairs.csv`: `name`, `down`, `up` and `stroke_m`; where they are known `down_off`, `up_off`,
 `stroke_sigma_m`, `depth_m` and `depth_sigma_m`, the D of a tape with its standard deviation. Several frames of a
@@ -192,7 +192,7 @@ def measured_pairs(
     Parameters
     ----------
     folder : Path
-    setting : Setting
+    setting : KnownNumbers
         The stroke's standard deviation of a row goes before its own.
     told : callable
         Given each result.

@@ -1,4 +1,4 @@
-"""Depth from two reflected rays: the midpoint of their common perpendicular.
+"""Depth from two reflected rays, the midpoint of their common perpendicular; and all estimators of D by name.
 
 Ray k (1 down, 2 up) leaves the mirror at P_k with the direction r_k: X = P_k + t_k r_k, world frame, metres. Where a
 glass tube is around the mirror, it leaves the glass at P_k. D is the

@@ -30,7 +30,7 @@ START, DATA, METHODS, SENSOR, KEEPERS, INSTALLATION = (
     for name in ("Start with", "Data sets", "Methods", "Sensor and paper", "Publish and study", "Installation")
 )
 DEFAULT_PRESET = "mjpeg"  # what the C310 delivers; a data set's own presets go before it
-SECONDS = 30.0  # of one pair; the same numbers as in `sandbox.resolve.RunLimits`, whose module is slow to import
+SECONDS = 30.0  # of one pair; the same numbers as in `isolation.resolve.RunLimits`, whose module is slow to import
 MEMORY_MB = 4096.0  # of a method; a network and its arrays fit
 
 

@@ -1,4 +1,4 @@
-"""Commands `phibench room` and `phibench scene`: files of which a room can be made, and samples as scenes."""
+"""Commands `phibench room`, which makes panoramas and meshes for recipes, and `phibench scene`, to export samples."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Shading kernel (Dr.Jit): the camera's look into a room, directly or by the mirror.
+"""Shading kernels (Dr.Jit): the camera's look into a room, the outlines of lamps in it, refraction by a glass tube.
 
 The ray from the film to the mirror and its reflection are float64 (`mirror_intersection`). The mirror is convex and
 stands in no table of faces, so that a reflected ray needs no lift. Only where something may stand between lens and

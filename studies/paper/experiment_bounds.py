@@ -1,4 +1,4 @@
-"""Bounds of D for single frames of experiments, and the error budget: predicted against measured errors.
+"""Error budget of a data set's experiments: errors of D predicted by bounds, against measured ones.
 
 The bound counts PRNU and DSNU as noise. They are a camera's own, the same in all of its frames, so that a mean of n
 frames keeps their part. The rest (photons, read noise, rounding) falls as 1 / n.
