@@ -300,7 +300,10 @@ class CellSampler:
 
     def knows(self, numbers: NDArray[np.uint32], lamp: NDArray[np.int32]) -> NDArray[np.bool_]:
         """True where the part of cells, shape (n,), that a lamp covers can be computed."""
-        return np.asarray(self._shares(numbers, np.zeros(len(numbers), dtype=np.int32), 0, lamp)[0].max(axis=0) > 0.0)
+        starts = range(_CELLS_AT_A_TIME // _PARTS**2, len(numbers), _CELLS_AT_A_TIME // _PARTS**2)
+        parts = zip(np.split(numbers, starts), np.split(lamp, starts), strict=True)
+        lights = (self._shares(cells, np.zeros(len(cells), dtype=np.int32), 0, near)[0] for cells, near in parts)
+        return np.concatenate([light.max(axis=0) > 0.0 for light in lights])
 
     def _hidden(self, numbers: NDArray[np.uint32], stream: int, lamp: NDArray[np.int32]) -> NDArray[np.bool_]:
         import drjit as dr
