@@ -291,8 +291,10 @@ def test_cells_sampled_in_parts_get_the_same_bits(
     def sampled() -> list[Samples]:
         return [film.sample_once(numbers, 0), film.sample(numbers, side, 3, None), film.sample(numbers, side, 3, lamp)]
 
-    whole = sampled()
+    whole, known = sampled(), film.knows(numbers, lamp)
+    assert known.any()
     monkeypatch.setattr("phibench.render.room.subpixel_grid._CELLS_AT_A_TIME", 7)
+    assert np.array_equal(film.knows(numbers, lamp), known)
     for one, other in zip(whole, sampled(), strict=True):
         for field in dataclasses.fields(Samples):
             assert np.array_equal(getattr(one, field.name), getattr(other, field.name)), field.name
