@@ -15,6 +15,7 @@ from typing import Any
 import polars as pl
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
+from phibench.benchmark.pair_sets.dataset_pairs import tracks_of
 from phibench.benchmark.reports.figures import (
     EmbeddedFigure,
     cause_bars,
@@ -35,6 +36,7 @@ from phibench.benchmark.scores.score_tables import (
     BY_WORD,
     FULL_OF_FALSE,
     HEADS,
+    RANKS_OF_TRACKS,
     division_and_rig,
     failure_line,
     false_line,
@@ -317,6 +319,7 @@ def verdict(scores: Mapping[str, ScoreDocument], by: str) -> str:
     why = f", most of the others are missed {_because(cause)}" if missing[cause] and placed else ""
     alone = "is best by" if len(scores) > 1 else "has, by the rank of"
     parts = [f"{best}: {flag.text}." for flag in first.flags]
+    parts += _first_of_tracks(scores)
     parts += [
         f"{best} {alone} {quantity}: {number} {METRICS[metric].shown[1]} {interval}; "
         f"it finds {100 * rate:.3g} % of the spots{why}."
@@ -328,6 +331,22 @@ def verdict(scores: Mapping[str, ScoreDocument], by: str) -> str:
     if wrong:
         parts.append(f"False detections in {100 * FULL_OF_FALSE:g} % of the images or more: {_listed(wrong)}.")
     return " ".join(parts if blind or wrong else [*parts, "No method finds less than half."])
+
+
+def _first_of_tracks(scores: Mapping[str, ScoreDocument]) -> list[str]:
+    """A sentence for each track of some scores: who is first, with the track's number."""
+    told = []
+    for track in tracks_of(next(iter(scores.values())).pair_set):
+        name = RANKS_OF_TRACKS[track]
+        values = {method: score.metrics[name].value for method, score in scores.items()}
+        known = {method: value for method, value in values.items() if value is not None}
+        if known:
+            best = (min if METRICS[name].better == "lower" else max)(known.values())
+            first = [method for method, value in known.items() if value == best]
+            told.append(
+                f"Track {track}: {_listed(first)}, {' '.join(shown_parts(name, scores[first[0]].metrics[name]))}."
+            )
+    return told
 
 
 def _because(cause: str) -> str:

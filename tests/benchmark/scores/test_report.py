@@ -139,6 +139,10 @@ def test_the_page_begins_with_who_is_best_and_what_fails(html, scores):
     assert "Less than half of the spots: guess." in verdict(guesses, "phi")
     assert "False detections in 20 % of the images or more: guess." in verdict(guesses, "depth")
     assert verdict({"guess": guesses["guess"]}, "phi") == "No method finds a spot on these pairs."
+    whole = {name: one.model_copy(update={"pair_set": {"hinted": 0}}) for name, one in guesses.items()}
+    found = whole["ideal"].metrics["find"]
+    first = f"Track find: ideal, {found.value:.3g} [{found.low:.3g}, {found.high:.3g}]. Track depth: ideal, "
+    assert verdict(whole, "phi").startswith(first)
 
 
 def test_a_dark_page_and_a_narrow_one_have_their_rules(html):

@@ -14,10 +14,11 @@ from phibench.datasets.build.journal import NO_HEAD, Entry, Journal
 from phibench.datasets.build.parts import Brought, bring_all
 from phibench.datasets.build.tasks import BuildTask, Made, task_key
 from phibench.datasets.common.errors import DatasetError
-from phibench.datasets.film.moving_camera import bake_rooms, open_baked_rooms
+from phibench.datasets.film.moving_camera import _drawn_room, bake_rooms, open_baked_rooms
 from phibench.datasets.store import schema
 from phibench.datasets.store.checksums import filling, signed, write_documents
 from phibench.render.room.light_map import BakeSettings, LightMap, texel_count
+from phibench.scenes.room import Room
 
 NAMES = ("a", "b", "c")
 
@@ -181,3 +182,19 @@ def test_a_result_of_another_form_is_one_sentence(result: object) -> None:
     with pytest.raises(DatasetError, match=r"^journal\.txt has a damaged result of a part: .*again$") as caught:
         damaged.results(dict[str, int])
     assert "\n" not in str(caught.value)
+
+
+def test_a_room_that_does_not_do_is_drawn_again() -> None:
+    """`loop bake` asks so for rooms with targets that can be driven to; a rule that none keeps is a sentence."""
+    seen: list[str] = []
+
+    def third(room: Room) -> bool:
+        seen.append(room.digest)
+        return len(seen) == 3
+
+    _, room = _drawn_room(third, "drawn again", 0)
+    assert len(set(seen)) == 3
+    assert room.digest == seen[-1]
+    assert _drawn_room(None, "drawn again", 0)[1].digest == seen[0]
+    with pytest.raises(DatasetError, match="does what is asked of it; take another stream"):
+        _drawn_room(lambda _: False, "drawn again", 0)
