@@ -1,14 +1,16 @@
 """Training of `learned_crop` by PyTorch, from crops of a data set.
 
     python -m tools.crop_training out/bench-dev --out learned_crop.onnx --seed 0
+    python -m tools.crop_training out/bench-dev --out my_crop.onnx --crops 8000 --passes 8   # a first try
 
 Needs `pip install 'phibench[learned-training]'`; the CPU wheel is enough. Every random number comes from a named
 stream: first weights, crops, their order and flips, and which rooms are held out. One thread: the same file each time.
 
-Loss: -ln of a Gaussian, q / 2 - ln a - ln c with q = |L^T e|^2, L = ((a, 0), (b, c)) the Cholesky
-factor of the precision and e the error (D. A. Nix, A. S. Weigend, "Estimating the mean and variance of the target
-probability distribution", ICNN 1994). Place: sum of w (cell + offset), w a softmax over cells of 2 x 2 pixels, so that
-a shift of the image by a cell of the mosaic shifts the answer by as much.
+Loss: -ln of a Gaussian, q / 2 - ln a - ln c with q = |L^T e|^2, L = ((a, 0), (b, c)) the Cholesky factor of the
+precision and e the error (D. A. Nix, A. S. Weigend, "Estimating the mean and variance of the target probability
+distribution", ICNN 1994). Errors beyond four claimed deviations count by their distance, not its square (P. J. Huber,
+"Robust estimation of a location parameter", 1964): torn spots are not to lead. Place: sum of w (cell + offset), w a
+softmax over cells of 2 x 2 pixels, so that a shift of the image by a cell of the mosaic shifts the answer by as much.
 """
 
 from __future__ import annotations
@@ -18,7 +20,7 @@ import json
 import math
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -30,16 +32,15 @@ from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.frames.request import FrameOptions
 from phibench.datasets.read import open_finished
 from phibench.datasets.training import Crop, CropSettings, SpotCrops
-from phibench.estimator.learned.network_input import (
-    SIDE_PX,
-    crop_input,
-)
+from phibench.estimator.learned.network_input import PLANES, SCALARS, SIDE_PX, crop_input
 from phibench.estimator.learned.networks import (
     CONVOLUTIONS,
     CORRECTION_PX,
     CROP,
     DENSE,
     INSTALL_TRAINING,
+    PLANES_OUT,
+    REDUCED,
     NetworkError,
     Weights,
     cell_places,
@@ -49,7 +50,8 @@ from phibench.estimator.learned.networks import (
 from phibench.scenes.frames import Array
 from phibench.scenes.random_streams import generator
 
-HELD_OUT = 6  # rooms
+HELD_OUT = 20  # rooms
+POOL_SEED = 5  # of the crops, which networks of all seeds share
 REQUESTS: Mapping[str, Sequence[Mapping[str, Any]]] = {
     "bayer-raw": [{"read_noise_e": 3.0}, {"read_noise_e": 6.0}],
     "srgb8": [{"read_noise_e": 3.0}, {"read_noise_e": 6.0}],
@@ -71,32 +73,29 @@ class TrainingSettings:
     Parameters
     ----------
     seed : int
-        Of all streams. Seed k holds out the k-th six of the rooms, in one drawn order.
+        Of first weights, order and flips. Seed k holds out the k-th twenty of the rooms, in one drawn order.
     presets : tuple of keys of `REQUESTS`
-    epochs : int
-        Each has crops of its own.
     crops : int
-        New crops of an epoch.
+        Crops of all rooms; those of the rooms held out give the covariance's scale.
     passes : int
-        Times that an epoch's crops are used, each time flipped anew.
+        Times that crops are used, each time flipped anew.
+    views : int
+        Places of the window of 32 pixels in each crop.
     batch : int
     rate : float
         Largest step of Adam.
     without_off : float
         Part of the crops without a laser-off image.
-    checked : int
-        Crops of held-out rooms that give the covariance's scale.
     """
 
     seed: int = 0
     presets: tuple[str, ...] = tuple(REQUESTS)
-    epochs: int = 3
-    crops: int = 6_000
-    passes: int = 4
-    batch: int = 32
+    crops: int = 30_000
+    passes: int = 16
+    views: int = 2
+    batch: int = 64
     rate: float = 2e-3
     without_off: float = 0.15
-    checked: int = 1500
 
     @property
     def options(self) -> tuple[FrameOptions, ...]:
@@ -108,7 +107,8 @@ class TrainingSettings:
         )
 
 
-CROP_SETTINGS = CropSettings(side_px=SIDE_PX + 2, spread_px=2.5, laser_levels=(0.15, 2.0))
+_REACH_PX = 2.6  # of the spot, from the middle of a view
+CROP_SETTINGS = CropSettings(side_px=SIDE_PX + 10, spread_px=2.5, laser_levels=(0.15, 3.0))
 
 
 def rooms_of(folder: Path, seed: int) -> tuple[list[str], list[str]]:
@@ -139,25 +139,33 @@ def crops_of(
 
 @dataclass(frozen=True)
 class Items:
-    """Inputs and places of n crops of 33 x 33 pixels, red at their four corners.
+    """Inputs and places of n views of 33 x 33 pixels, red at their four corners.
 
     Attributes
     ----------
-    planes : shape (n, 4, 33, 33)
-    scalars : shape (n, 5)
+    planes : shape (n, 4, 33, 33), float16
+    scalars : shape (n, 7)
     uv_px : shape (n, 2)
     turned : shape (n,), bool
         Whether rows may become columns: not of JPEG with chroma of half the width.
+    samples : shape (n,)
+        Where they come from.
     """
 
-    planes: NDArray[np.float32]
+    planes: NDArray[np.float16]
     scalars: NDArray[np.float32]
     uv_px: NDArray[np.float32]
     turned: NDArray[np.bool_]
+    samples: NDArray[np.str_]
+
+    def of(self, samples: Sequence[str]) -> Items:
+        """Those of some samples."""
+        chosen = np.flatnonzero(np.isin(self.samples, list(samples)))
+        return Items(*(column[chosen] for column in vars(self).values()))
 
     def flipped(self, rows: NDArray[Any], draw: np.random.Generator) -> tuple[Array, Array, Array]:
         """Planes (n, 4, 32, 32), scalars and places of some items, each mirrored and turned by chance."""
-        planes, uv = self.planes[rows].copy(), self.uv_px[rows].copy()
+        planes, uv = self.planes[rows].astype(np.float32), self.uv_px[rows].copy()
         left, top, turn = draw.random((3, len(rows))) < 0.5
         turn &= self.turned[rows]
         planes[left], uv[left, 0] = planes[left][..., ::-1], SIDE_PX - uv[left, 0]
@@ -166,37 +174,55 @@ class Items:
         return np.ascontiguousarray(planes[..., :SIDE_PX, :SIDE_PX]), self.scalars[rows], uv
 
 
-def items_of(crops: SpotCrops, settings: TrainingSettings, side_px: int = SIDE_PX + 1) -> Items:
-    """Inputs of all crops of an epoch; some of them without laser-off image."""
-    draw = generator("learned", "without off", crops.seed, crops.epoch)
-    blind = draw.random(len(crops)) < settings.without_off
-    rows = [_item(crops.crop(k), bool(blind[k]), side_px) for k in range(len(crops))]
-    planes, scalars, uv, turned = (np.array(column) for column in zip(*rows, strict=True))
-    return Items(planes, scalars, uv.astype(np.float32), turned)
+def items_of(crops: SpotCrops, settings: TrainingSettings) -> Items:
+    """Views of all crops; some of them without laser-off image."""
+    views, side = settings.views, SIDE_PX + 1
+    n = len(crops) * views
+    planes, scalars = np.empty((n, PLANES, side, side), np.float16), np.empty((n, SCALARS), np.float32)
+    rest: list[tuple[Array, bool, str]] = []
+    draw = generator("learned", "views", crops.seed)
+    for k in range(len(crops)):
+        crop = crops.crop(k)
+        for _ in range(views):
+            first = _first_px(crop, draw)
+            part = tuple(slice(x, x + side) for x in first[::-1])
+            blind = draw.random() < settings.without_off or crop.image_off is None
+            made = crop_input(crop.image[part], None if blind else crop.image_off[part], crop.card)
+            planes[len(rest)], scalars[len(rest)] = made.planes, made.scalars
+            rest.append((crop.uv_px - first, crop.card.output != "mjpeg", crop.sample_id))
+    uv, turned, samples = (np.array(column) for column in zip(*rest, strict=True))
+    return Items(planes, scalars, uv.astype(np.float32), turned, samples)
 
 
-def _item(crop: Crop, blind: bool, side_px: int) -> tuple[NDArray[Any], NDArray[Any], Array, bool]:
-    u0, v0 = crop.phase_px % 2
-    part = (slice(v0, v0 + side_px), slice(u0, u0 + side_px))
-    off = None if blind or crop.image_off is None else crop.image_off[part]
-    made = crop_input(crop.image[part], off, crop.card)
-    return made.planes, made.scalars, crop.uv_px - [u0, v0], crop.card.output != "mjpeg"
+def _first_px(crop: Crop, draw: np.random.Generator) -> NDArray[np.int64]:
+    """First column and row of a view: red, with the spot near its middle."""
+    first = []
+    for axis in (0, 1):
+        starts = np.arange(crop.phase_px[axis] % 2, crop.image.shape[1 - axis] - SIDE_PX, 2)
+        distance = np.abs(crop.uv_px[axis] - starts - (SIDE_PX - 1) / 2.0)
+        near = starts[distance <= max(_REACH_PX, distance.min())]
+        first.append(int(near[draw.integers(len(near))]))
+    return np.array(first)
 
 
 # -- the network of crops --------------------------------------------------------------------------------------------
 
 _FIRST_LN = math.log(1.0 / 0.3)  # of the precision's factor: 0.3 px
+_FAR = 4.0  # claimed deviations
+_LED = 0.05  # of the steps
 
 
 def first_crop_weights(seed: int) -> Weights:
     """Weights before training (He's law), by name: "<layer>.w" and "<layer>.b"."""
     draw = generator("learned", "crop weights", seed)
     weights: Weights = {}
-    for name, of, to, _ in CONVOLUTIONS:
-        weights |= first_layer(draw, name, (to, of, 3, 3))
-    weights |= first_layer(draw, "cells", (3, 32, 1, 1), 0.3)
+    for name, of, side, _ in CONVOLUTIONS:
+        weights |= first_layer(draw, name, (PLANES_OUT, of, side, side))
+    weights |= first_layer(draw, "cells", (3, PLANES_OUT, 1, 1), 0.3)
+    weights |= first_layer(draw, "less", (REDUCED, PLANES_OUT, 1, 1))
     for name, of, to in DENSE:
-        weights |= first_layer(draw, name, (of, to), 0.1 if name == "d2" else 1.0, axis=0)
+        weights |= first_layer(draw, name, (of, to), 0.1 if name in ("f2", "d2") else 1.0, axis=0)
+    weights["f2.b"][:PLANES_OUT] = 1.0
     weights["d2.b"][[2, 4]] = _FIRST_LN
     return weights
 
@@ -214,13 +240,16 @@ def first_layer(
 def crop_forward(torch: Any, p: Parameters, planes: Any, scalars: Any) -> tuple[Any, Any]:
     """Places (n, 2) and factors (n, 3) of crops, as `networks.covariances` takes them."""
     f, x = torch.nn.functional, planes
+    film = f.relu(scalars @ p["f1.w"] + p["f1.b"]) @ p["f2.w"] + p["f2.b"]
+    gain, shift = film[:, :, None, None].split(PLANES_OUT, dim=1)
     for name, _, _, stride in CONVOLUTIONS:
-        x = f.relu(f.conv2d(x, p[f"{name}.w"], p[f"{name}.b"], stride=stride, padding=1))
+        x = f.conv2d(x, p[f"{name}.w"], p[f"{name}.b"], stride=stride)
+        x = f.relu(x * gain + shift if name == "c1" else x)
     cells = f.conv2d(x, p["cells.w"], p["cells.b"]).flatten(2)
     weight = torch.softmax(cells[:, :1], dim=2)
     uv = (weight * (cells[:, 1:] + torch.from_numpy(cell_places()))).sum(2)
-    x = x.flatten(2)
-    pooled = torch.cat([(weight * x).sum(2), x.mean(2), scalars], dim=1)
+    less = f.relu(f.conv2d(x, p["less.w"], p["less.b"])).flatten(1)
+    pooled = torch.cat([(weight * x.flatten(2)).sum(2), less, scalars], dim=1)
     y = f.relu(pooled @ p["d1.w"] + p["d1.b"]) @ p["d2.w"] + p["d2.b"]
     return uv + CORRECTION_PX * y[:, :2], y[:, 2:]
 
@@ -229,39 +258,47 @@ def gaussian_loss(torch: Any, uv: Any, factor: Any, true: Any) -> Any:
     """Negative log likelihood of places, without its constant; shape (n,)."""
     e, (a, b, c) = uv - true, factor.unbind(1)
     along, across = torch.exp(a) * e[:, 0] + b * e[:, 1], torch.exp(c) * e[:, 1]
-    return 0.5 * (along**2 + across**2) - a - c
+    q = along**2 + across**2
+    far = 2.0 * _FAR * torch.sqrt(q.clamp(min=_FAR**2)) - _FAR**2
+    return 0.5 * torch.where(q < _FAR**2, q, far) - a - c
 
 
-def train_crop(folder: Path, settings: TrainingSettings, samples: Sequence[str] | None = None) -> Weights:
-    """Weights after training on some samples; by default on all but the held-out rooms."""
+def train_crop(items: Items, settings: TrainingSettings, checks: Items | None = None) -> Weights:
+    """Weights after training on some items; errors of other ones are told four times on the way."""
     torch = torch_on_one_thread()
-    chosen = rooms_of(folder, settings.seed)[0] if samples is None else samples
-    crops = crops_of(folder, settings, chosen, settings.crops, settings.seed)
     p = {name: torch.tensor(value, requires_grad=True) for name, value in first_crop_weights(settings.seed).items()}
-    steps = AdamSteps(torch, p, settings.rate, settings.epochs * settings.passes * (settings.crops // settings.batch))
-    for epoch in range(settings.epochs):
-        crops.set_epoch(epoch)
-        items, total = items_of(crops, settings), []
-        for planes, scalars, uv in _batches(items, settings, epoch):
-            given, numbers, true = map(torch.from_numpy, (planes, scalars, np.ascontiguousarray(uv)))
-            total.append(steps.step(_crop_loss(torch, p, given, numbers, true, epoch)))
-        _say(f"epoch {epoch}: loss {np.mean(total[-len(total) // settings.passes :]):.3f}")
+    draw, each, total = generator("learned", "batches", settings.seed), len(items.planes) // settings.batch, []
+    steps = AdamSteps(torch, p, settings.rate, settings.passes * each)
+    for number in range(settings.passes):
+        order = draw.permutation(len(items.planes))
+        for k in range(each):
+            batch = items.flipped(order[k * settings.batch : (k + 1) * settings.batch], draw)
+            given, numbers, true = (torch.from_numpy(np.ascontiguousarray(part)) for part in batch)
+            given = given.contiguous(memory_format=torch.channels_last)
+            uv, factor = crop_forward(torch, p, given, numbers)
+            # a likelihood first widens what it does not know yet: the distance itself leads at the beginning
+            lead = torch.nn.functional.smooth_l1_loss(uv, true, beta=0.1) if steps.share < _LED else 0.0
+            total.append(steps.step(gaussian_loss(torch, uv, factor, true).mean() + 10.0 * lead))
+        _say(f"pass {number + 1}: loss {np.mean(total[-each:]):.3f}, {time.process_time() / 60.0:.1f} CPU-min")
+        if checks is not None and (number + 1) % max(settings.passes // 4, 1) == 0:
+            _say(f"  rooms held out: {_told(answers_of(_plain(p), checks))}")
+    return _plain(p)
+
+
+def _plain(p: Parameters) -> Weights:
     return {name: value.detach().numpy().copy() for name, value in p.items()}
 
 
-def _crop_loss(torch: Any, p: Parameters, planes: Any, scalars: Any, true: Any, epoch: int) -> Any:
-    uv, factor = crop_forward(torch, p, planes, scalars)
-    # a likelihood first widens what it does not know yet: the distance itself leads in the first epoch
-    lead = 10.0 * torch.nn.functional.smooth_l1_loss(uv, true, beta=0.1) if epoch == 0 else 0.0
-    return gaussian_loss(torch, uv, factor, true).mean() + lead
-
-
-def _batches(items: Items, settings: TrainingSettings, epoch: int) -> Iterator[tuple[Array, Array, Array]]:
-    draw = generator("learned", "batches", settings.seed, epoch)
-    for _ in range(settings.passes):
-        order = draw.permutation(len(items.planes))
-        for first in range(0, len(order) - settings.batch + 1, settings.batch):
-            yield items.flipped(order[first : first + settings.batch], draw)
+def _told(answers: Answers) -> str:
+    """Loss and errors in words: the mean of ln of a distance weighs bright spots as faint ones."""
+    distance = np.hypot(*answers.error_px.T)
+    a = -0.5 * np.log(np.linalg.det(answers.covariance_px2))
+    loss = float((np.minimum(answers.squared_pull, _TAIL) - a).mean())
+    sure = distance[answers.sure]
+    return (
+        f"loss {loss:.3f}; claims below a pixel {answers.sure.mean():.3f}: rms {np.sqrt((sure**2).mean()):.4f}, median "
+        f"{np.median(sure):.4f} px; geometric mean of all {np.exp(np.log(distance).mean()):.4f} px"
+    )
 
 
 class AdamSteps:
@@ -271,9 +308,14 @@ class AdamSteps:
         self._torch, self._p, self._rate, self._steps, self._done = torch, list(p.values()), rate, max(steps, 1), 0
         self._adam = torch.optim.Adam(self._p, lr=rate)
 
+    @property
+    def share(self) -> float:
+        """Part of the steps that is done."""
+        return self._done / self._steps
+
     def step(self, loss: Any) -> float:
         """Take one step down."""
-        share = self._done / self._steps
+        share = self.share
         self._adam.param_groups[0]["lr"] = self._rate * min(share / 0.05 + 1e-3, 0.5 + 0.5 * math.cos(math.pi * share))
         self._adam.zero_grad()
         loss.backward()
@@ -317,7 +359,7 @@ def answers_of(weights: Weights, items: Items, scale: float = 1.0) -> Answers:
         parts = [
             crop_forward(torch, p, *map(torch.from_numpy, (planes, items.scalars[k : k + 256])))
             for k in range(0, len(items.planes), 256)
-            for planes in [np.ascontiguousarray(items.planes[k : k + 256, :, :SIDE_PX, :SIDE_PX])]
+            for planes in [items.planes[k : k + 256, :, :SIDE_PX, :SIDE_PX].astype(np.float32)]
         ]
     uv, factor = (np.concatenate([part[k].numpy() for part in parts]).astype(float) for k in (0, 1))
     return Answers(uv - items.uv_px, covariances(factor, scale))
@@ -337,15 +379,20 @@ def scale_of(answers: Answers) -> float:
 
 def train(folder: Path, out: Path, settings: TrainingSettings) -> Path:
     """Train `learned_crop` and write its file."""
-    began = time.process_time()
-    weights = train_crop(folder, settings)
-    held = rooms_of(folder, settings.seed)[1]
-    items = items_of(crops_of(folder, settings, held, settings.checked, settings.seed + 1_000_000), settings)
-    scale = scale_of(answers_of(weights, items))
-    answers = answers_of(weights, items, scale)
-    minutes = (time.process_time() - began) / 60.0
-    _say(f"held-out rooms: rms pull {np.sqrt(answers.squared_pull[answers.sure].mean()):.2f}, scale {scale:.2f}")
-    _say(f"rms error {np.sqrt((answers.error_px[answers.sure] ** 2).mean()):.4f} px, {minutes:.1f} CPU-min")
+    torch_on_one_thread()
+    seen, held = rooms_of(folder, settings.seed)
+    items = items_of(crops_of(folder, settings, seen + held, settings.crops, POOL_SEED), settings)
+    _say(f"{settings.crops} crops: {time.process_time() / 60.0:.1f} CPU-min")
+    return train_on(items, seen, held, out, settings)
+
+
+def train_on(items: Items, seen: Sequence[str], held: Sequence[str], out: Path, settings: TrainingSettings) -> Path:
+    """Train on views of some samples, take the covariance's scale from others, and write the file."""
+    checks = items.of(held)
+    weights = train_crop(items.of(seen), settings, checks)
+    scale = scale_of(answers_of(weights, checks))
+    answers = answers_of(weights, checks, scale)
+    _say(f"rooms held out: rms pull {np.sqrt(answers.squared_pull[answers.sure].mean()):.2f}, scale {scale:.2f}")
     entries = {"covariance_scale": scale, "settings": json.dumps(asdict(settings), sort_keys=True)}
     return write_network(out, CROP, weights, entries)
 
@@ -390,11 +437,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, required=True, help="file to write, .onnx")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--preset", action="append", choices=list(REQUESTS), help="may be given again; all by default")
-    parser.add_argument("--epochs", type=one_or_more, default=TrainingSettings.epochs)
-    parser.add_argument("--crops", type=one_or_more, default=TrainingSettings.crops, help="new ones in each epoch")
-    add_passes(parser, TrainingSettings.passes, "times that an epoch's crops are used")
+    parser.add_argument("--crops", type=one_or_more, default=TrainingSettings.crops, help="of all rooms")
+    add_passes(parser, TrainingSettings.passes, "times that the crops are used")
     given = parser.parse_args(arguments)
-    settings = TrainingSettings(given.seed, tuple(given.preset or REQUESTS), given.epochs, given.crops, given.passes)
+    settings = TrainingSettings(given.seed, tuple(given.preset or REQUESTS), given.crops, given.passes)
     try:
         print(train(given.folder, given.out, settings))
     except DatasetError as error:

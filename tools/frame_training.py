@@ -25,17 +25,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.common.input_files import MIB, InputFile
 from phibench.datasets.exposures.pair_draws import CachedSample, PairDraw, pair_draws
 from phibench.datasets.frames.sensor_card import card_of
 from phibench.datasets.read import Dataset, open_finished
 from phibench.datasets.training import CropSettings, SpotCrops
 from phibench.estimator.interface import Box
+from phibench.estimator.learned.network_file import read_model
 from phibench.estimator.learned.network_input import frame_input
 from phibench.estimator.learned.networks import (
     CROP,
     DETECT,
     DETECTOR,
     Network,
+    NetworkError,
     Weights,
     heat_peaks,
     refined,
@@ -337,12 +340,20 @@ def train(folder: Path, out: Path, settings: FrameSettings) -> Path:
         "settings": json.dumps(asdict(settings), sort_keys=True),
     }
     write_network(out, DETECT, weights, entries)
-    checks = spot_crops(folder, held, settings.checked, settings.seed + 3_000_000, _FOUND)
-    answers = answers_at_found(out, checks, thresholds)
-    entries["covariance_scale"] = scale_of(answers)
-    _say(f"thresholds {thresholds}; found {len(answers.error_px)} of {settings.checked}")
-    _say(f"scale {entries['covariance_scale']:.3f}; {(time.process_time() - began) / 60.0:.1f} CPU-min")
-    return write_network(out, DETECT, weights, entries)
+    _say(f"thresholds {thresholds}; {(time.process_time() - began) / 60.0:.1f} CPU-min")
+    return rescaled(folder, out, out, settings)
+
+
+def rescaled(folder: Path, detector: Path, out: Path, settings: FrameSettings) -> Path:
+    """Write a detector with the covariance's scale for the network of crops that phibench ships now."""
+    model = read_model(InputFile(detector, "train it: docs/learned.md", NetworkError, MIB).read())
+    thresholds = json.loads(Network(detector, DETECT).metadata["thresholds"])
+    checks = spot_crops(folder, rooms_of(folder, settings.seed)[1], settings.checked, settings.seed + 3_000_000, _FOUND)
+    answers = answers_at_found(detector, checks, thresholds)
+    scale = scale_of(answers)
+    _say(f"found {len(answers.error_px)} of {settings.checked}, scale {scale:.3f}")
+    kept = {key: value for key, value in model.metadata.items() if key not in ("name", "version", "sha256")}
+    return write_network(out, DETECT, model.tensors, kept | {"covariance_scale": scale})
 
 
 def _say(text: str) -> None:
@@ -357,9 +368,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--spots", type=int, default=FrameSettings.spots, help="tiles with a spot")
     add_passes(parser, FrameSettings.passes, "times that a round's tiles are used")
+    parser.add_argument("--rescale", type=Path, metavar="FILE", help="a detector that only gets a new covariance scale")
     given = parser.parse_args(arguments)
+    settings = FrameSettings(given.seed, given.spots, passes=given.passes)
     try:
-        print(train(given.folder, given.out, FrameSettings(given.seed, given.spots, passes=given.passes)))
+        if given.rescale is None:
+            print(train(given.folder, given.out, settings))
+        else:
+            print(rescaled(given.folder, given.rescale, given.out, settings))
     except DatasetError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

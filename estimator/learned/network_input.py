@@ -4,7 +4,7 @@ Crops have 32 x 32 pixels and begin at an even column and row, so that red pixel
 are interpolated bilinearly, which loses nothing; 8-bit codes go back through tone curve, colour matrix and white
 balance. What is left of the difference on - off is then free of exposure, gain and the brightness of the room.
 
-Noise is measured in the border of the crop itself. No input says which processing it was: a network sees it.
+Noise is measured in the border of the crop itself.
 
 A whole frame is brought to cells of 2 x 2 pixels: the difference on - off behind R and G in standard deviations.
 """
@@ -25,7 +25,7 @@ from phibench.scenes.frames import Array, BoolArray
 
 SIDE_PX = 32
 PLANES = 4  # R, G, B of the difference, and full pixels
-SCALARS = 5  # see `crop_input`
+SCALARS = 7  # see `crop_input`
 FRAME_PLANES = 3  # significance behind R and G, and full pixels
 ACCEPTED = ("bayer-raw", "srgb8", "mjpeg")
 
@@ -99,7 +99,8 @@ def crop_input(on: Image, off: Image | None, card: SensorCard) -> CropInput:
     -------
     CropInput
         Scalars: ln of amplitude over the card's noise; ln of measured over the card's noise; amplitude over the
-        saturation; the room's level over the saturation; whether there are pixels with the laser off.
+        saturation; the room's level over the saturation; whether there are pixels with the laser off; whether the
+        pixels are raw; whether they are of MJPEG.
     """
     planes, full = filter_planes(on, card)
     border = np.ones(full.shape, bool)
@@ -122,6 +123,8 @@ def crop_input(on: Image, off: Image | None, card: SensorCard) -> CropInput:
         amplitude / card.saturation_e,
         level / card.saturation_e,
         float(off is not None),
+        float(card.output == "raw"),
+        float(card.output == "mjpeg"),
     )
     return CropInput(np.concatenate([relative, full[None]]).astype(np.float32), np.array(scalars, np.float32))
 

@@ -43,9 +43,9 @@ from phibench.estimator.learned.network_input import (
 from phibench.scenes.frames import Array, BoolArray
 from phibench.scenes.validation import printable_line
 
-VERSION = "1"
-"""Version of what a network gets and answers; a change of either raises it."""
 CROP, DETECT = "learned_crop", "learned_detect"
+VERSIONS = {CROP: "2", DETECT: "1"}
+"""Versions of what a network gets, of its layers and of what it answers; a change of any raises it."""
 INSTALL = "pip install 'phibench[learned]'"
 INSTALL_TRAINING = "pip install 'phibench[learned-training]' (the CPU's wheel of PyTorch is enough: docs/learned.md)"
 
@@ -65,8 +65,8 @@ class NetworkError(DatasetError):
 
 
 SHIPPED = {
-    CROP: "c4aa88dae1ff24d866a5287c31af3a213a9731eea1a87cd92f73d112c187e652",
-    DETECT: "98a94db274d407ee1a51efb3ab6209a0da18f038dbc2889d1a4aba3d76c2846f",
+    CROP: "cca79ae848c0d329c343f023fbfaee370b95ea4fbfe8f83cff45e5ba70280f83",
+    DETECT: "22409949de63642024a8147dca4ed10d52ae427a8ee50b8c8c0781e0f36abc76",
 }
 """SHA-256 that the files of this release state; part of the code, so that a method's hash changes with its weights."""
 
@@ -203,9 +203,9 @@ def _checked(model: bytes, name: str) -> dict[str, str]:
     network = read_model(model)
     if network.metadata.get("name") != name:
         raise NetworkFileError(f"holds '{printable_line(str(network.metadata.get('name')), 40)}', not '{name}'")
-    if network.metadata.get("version") != VERSION:
+    if network.metadata.get("version") != VERSIONS[name]:
         stated = printable_line(str(network.metadata.get("version")), 20)
-        raise NetworkFileError(f"is of version {stated}, this phibench needs version {VERSION}")
+        raise NetworkFileError(f"is of version {stated}, this phibench needs version {VERSIONS[name]}")
     graph = _GRAPHS[name](_Recorder())
     for kind, given, right in (("inputs", network.inputs, graph.inputs), ("outputs", network.outputs, graph.outputs)):
         if given != list(right):
@@ -257,33 +257,40 @@ def _session(model: bytes, file: InputFile) -> Any:
 
 # -- layers ----------------------------------------------------------------------------------------------------------
 
-CONVOLUTIONS = (("c1", PLANES, 12, 1), ("c2", 12, 24, 2), ("c3", 24, 32, 1), ("c4", 32, 32, 1))
-"""Of the network of crops: name, planes in, planes out, step; 3 x 3 pixels each, cut at 0."""
-DENSE = (("d1", 2 * 32 + SCALARS, 48), ("d2", 48, 5))
-"""Of what is pooled, and their widths."""
+PLANES_OUT = 32
+CONVOLUTIONS = (("c1", PLANES, 6, 2), *((name, PLANES_OUT, 3, 1) for name in ("c2", "c3", "c4")))
+"""Of the network of crops: name, planes in, side of the kernel, step. No border: 8 x 8 cells in the middle are left."""
+CELLS, FIRST_CELL_PX = 8, 8
+REDUCED = 8
+"""Planes of the cells that the dense layers get one by one."""
+DENSE = (
+    ("f1", SCALARS, 32),
+    ("f2", 32, 2 * PLANES_OUT),
+    ("d1", CELLS**2 * REDUCED + PLANES_OUT + SCALARS, 96),
+    ("d2", 96, 5),
+)
+"""Matrices and their widths: gains and offsets of the first planes by the scalars, then the answer."""
 CORRECTION_PX = 0.1
 """Of the place, per unit of the last layer."""
-CELLS = SIDE_PX // 2
 DETECTOR = (("e1", FRAME_PLANES, 12), ("e2", 12, 16), ("e3", 16, 16), ("e4", 16, 16))
 """Of the network of frames: name, planes in, planes out; 3 x 3 cells each, cut at 0; then one plane of 1 x 1."""
 
 
 def weight_shapes(name: str) -> dict[str, tuple[int, ...]]:
     """Shapes of a network's weights by name."""
-    of_cells = (
-        [("cells", (3, CONVOLUTIONS[-1][2], 1, 1), 3)] if name == CROP else [("heat", (1, DETECTOR[-1][2], 1, 1), 1)]
-    )
-    layers = CONVOLUTIONS if name == CROP else DETECTOR
-    sizes: list[tuple[str, tuple[int, ...], int]] = [
-        (layer[0], (layer[2], layer[1], 3, 3), layer[2]) for layer in layers
-    ]
-    sizes += [*of_cells, *((key, (of, to), to) for key, of, to in DENSE if name == CROP)]
+    if name == DETECT:
+        sizes: list[tuple[str, tuple[int, ...], int]] = [(key, (to, of, 3, 3), to) for key, of, to in DETECTOR]
+        sizes.append(("heat", (1, DETECTOR[-1][2], 1, 1), 1))
+    else:
+        sizes = [(key, (PLANES_OUT, of, side, side), PLANES_OUT) for key, of, side, _ in CONVOLUTIONS]
+        sizes += [(key, (to, PLANES_OUT, 1, 1), to) for key, to in (("cells", 3), ("less", REDUCED))]
+        sizes += [(key, (of, to), to) for key, of, to in DENSE]
     return {f"{key}{end}": shape for key, w, b in sizes for end, shape in ((".w", w), (".b", (b,)))}
 
 
 def cell_places() -> NDArray[np.float32]:
-    """Places (u, v) of the middles of all cells, shape (1, 2, cells): of the pixel that the stride begins at."""
-    v, u = np.mgrid[:CELLS, :CELLS] * 2.0
+    """Places (u, v) of the first pixels of all cells, shape (1, 2, cells)."""
+    v, u = np.mgrid[:CELLS, :CELLS] * 2.0 + FIRST_CELL_PX
     return np.stack([u.ravel(), v.ravel()])[None].astype(np.float32)
 
 
@@ -324,7 +331,7 @@ def write_network(path: Path, name: str, weights: Weights, metadata: Mapping[str
     made = onnx.helper.make_graph(graph.nodes, name, *ends, initializer=tensors)
     opset = [onnx.helper.make_operatorsetid("", _OPSET)]
     model = onnx.helper.make_model(made, opset_imports=opset, ir_version=_IR, producer_name="phibench")
-    entries = {"name": name, "version": VERSION, **{key: str(value) for key, value in metadata.items()}}
+    entries = {"name": name, "version": VERSIONS[name], **{key: str(value) for key, value in metadata.items()}}
     onnx.helper.set_model_props(model, entries)
     onnx.checker.check_model(model)
     write_bytes(path, sealed(model.SerializeToString(deterministic=True)))
@@ -344,13 +351,26 @@ class Graph:
 
 def _crop_graph(helper: Any) -> Graph:
     """`crop_forward` in ONNX's operators."""
-    node, nodes, x = helper.make_node, [], "planes"
-    for name, _, _, stride in CONVOLUTIONS:
-        nodes += convolution(helper, x, name, stride)
+    node = helper.make_node
+    nodes = [
+        node("Gemm", ["scalars", "f1.w", "f1.b"], ["f1.x"]),
+        node("Relu", ["f1.x"], ["f1.y"]),
+        node("Gemm", ["f1.y", "f2.w", "f2.b"], ["f2.x"]),
+        node("Reshape", ["f2.x", "film"], ["f2.y"]),
+        node("Split", ["f2.y", "halves"], ["gain", "shift"], axis=1),
+    ]
+    x = "planes"
+    for name, _, side, stride in CONVOLUTIONS:
+        nodes.append(_convolved(helper, x, name, side, stride))
+        x = f"{name}.x"
+        if name == "c1":
+            nodes += [node("Mul", [x, "gain"], ["gained"]), node("Add", ["gained", "shift"], ["moved_planes"])]
+            x = "moved_planes"
+        nodes.append(node("Relu", [x], [f"{name}.y"]))
         x = f"{name}.y"
     nodes += [
-        node("Conv", [x, "cells.w", "cells.b"], ["cells"], kernel_shape=[1, 1]),
-        node("Reshape", ["cells", "three"], ["flat"]),
+        _convolved(helper, x, "cells", 1),
+        node("Reshape", ["cells.x", "three"], ["flat"]),
         node("Split", ["flat", "parts"], ["logit", "offset"], axis=1),
         node("Softmax", ["logit"], ["weight"], axis=2),
         node("Add", ["offset", "places"], ["placed"]),
@@ -359,7 +379,9 @@ def _crop_graph(helper: Any) -> Graph:
         node("Reshape", [x, "many"], ["features"]),
         node("Mul", ["weight", "features"], ["attended"]),
         node("ReduceSum", ["attended", "last"], ["at_spot"], keepdims=0),
-        node("ReduceMean", ["features"], ["everywhere"], axes=[2], keepdims=0),
+        _convolved(helper, x, "less", 1),
+        node("Relu", ["less.x"], ["less.y"]),
+        node("Flatten", ["less.y"], ["everywhere"], axis=1),
         node("Concat", ["at_spot", "everywhere", "scalars"], ["pooled"], axis=1),
         node("Gemm", ["pooled", "d1.w", "d1.b"], ["h"]),
         node("Relu", ["h"], ["h.y"]),
@@ -368,7 +390,9 @@ def _crop_graph(helper: Any) -> Graph:
         node("Mul", ["moved", "share"], ["correction"]),
         node("Add", ["middle", "correction"], ["uv_px"]),
     ]
-    whole = {"three": [0, 3, -1], "many": [0, 32, -1], "parts": [1, 2], "last": [2], "ends": [2, 3]}
+    n = PLANES_OUT
+    whole = {"three": [0, 3, -1], "many": [0, n, -1], "parts": [1, 2], "last": [2], "ends": [2, 3]}
+    whole |= {"film": [0, 2 * n, 1, 1], "halves": [n, n]}
     constants: Weights = {key: np.array(value, np.int64) for key, value in whole.items()}
     constants |= {"places": cell_places(), "share": np.array(CORRECTION_PX, np.float32)}
     inputs: dict[str, list[str | int]] = {"planes": ["n", PLANES, SIDE_PX, SIDE_PX], "scalars": ["n", SCALARS]}
@@ -379,19 +403,21 @@ def _detect_graph(helper: Any) -> Graph:
     """`detector_forward` in ONNX's operators."""
     nodes, x = [], "planes"
     for name, _, _ in DETECTOR:
-        nodes += convolution(helper, x, name)
+        nodes += [
+            helper.make_node(
+                "Conv", [x, f"{name}.w", f"{name}.b"], [f"{name}.x"], kernel_shape=[3, 3], pads=[1] * 4, strides=[1] * 2
+            ),
+            helper.make_node("Relu", [f"{name}.x"], [f"{name}.y"]),
+        ]
         x = f"{name}.y"
     nodes.append(helper.make_node("Conv", [x, "heat.w", "heat.b"], ["heat"], kernel_shape=[1, 1]))
     return Graph(nodes, {}, {"planes": ["n", FRAME_PLANES, "h", "w"]}, {"heat": ["n", 1, "h", "w"]})
 
 
-def convolution(helper: Any, x: str, name: str, stride: int = 1) -> list[Any]:
-    """Nodes of a layer of 3 x 3 that is cut at 0; its result is "<name>.y"."""
-    numbers = {"kernel_shape": [3, 3], "pads": [1] * 4, "strides": [stride] * 2}
-    return [
-        helper.make_node("Conv", [x, f"{name}.w", f"{name}.b"], [f"{name}.x"], **numbers),
-        helper.make_node("Relu", [f"{name}.x"], [f"{name}.y"]),
-    ]
+def _convolved(helper: Any, x: str, name: str, side: int, stride: int = 1) -> Any:
+    """Node of a layer without a border; its result is "<name>.x"."""
+    numbers = {"kernel_shape": [side] * 2, "strides": [stride] * 2}
+    return helper.make_node("Conv", [x, f"{name}.w", f"{name}.b"], [f"{name}.x"], **numbers)
 
 
 _GRAPHS: Mapping[str, Callable[[Any], Graph]] = {CROP: _crop_graph, DETECT: _detect_graph}
@@ -400,7 +426,7 @@ _GRAPHS: Mapping[str, Callable[[Any], Graph]] = {CROP: _crop_graph, DETECT: _det
 # -- spots of a pair -------------------------------------------------------------------------------------------------
 
 _LOOKS = 3  # a crop about the place that the last one gave; the second is nearly always the same
-_REACH_PX = 9.0  # of the crop's middle: farther away nothing was trained
+_REACH_PX = 7.0  # of the crop's middle: farther away there are no cells
 
 
 def refined(
