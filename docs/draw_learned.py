@@ -133,7 +133,9 @@ def _part(sample: CachedSample, pair_draw: PairDraw, position: str, uv_px: tuple
     )
     region = Region(u0, v0, u0 + _PART_PX, v0 + _PART_PX)
     images = [
-        side.chain.frame(light, frame_stream(*source.names, position, laser, noise_draw(pair_draw.preset, pair_draw.draw)), region)
+        side.chain.frame(
+            light, frame_stream(*source.names, position, laser, noise_draw(pair_draw.preset, pair_draw.draw)), region
+        )
         for light, laser in ((side.light, True), (side.light.laser_off(), False))
     ]
     return (*images, card_of(side.chain.sensor), np.array([u0, v0]))
