@@ -24,7 +24,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 
 from phibench.benchmark.scores.intervals import clopper_pearson
-from phibench.robot.loop.setups import SETTINGS
+from phibench.robot.loop.episodes import SETTINGS
 
 ENVIRONMENT = "phibench.robot.loop.belief_environment:phibench/ApproachTargetBelief-v0"
 

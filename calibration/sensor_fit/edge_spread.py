@@ -22,7 +22,7 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.optimize import least_squares
 from scipy.special import ndtr
 
-from phibench.calibration.sensor_fit.tone_curve import Curve, decoded_by, encoded_by
+from phibench.calibration.sensor_fit.noise_levels import Curve, decoded_by, encoded_by
 from phibench.scenes.frames import Array
 
 _WINDOW = 24  # pixels: an edge with both its plateaus

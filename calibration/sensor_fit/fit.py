@@ -26,10 +26,9 @@ from phibench.calibration.sensor_fit.capture_folder import (
 )
 from phibench.calibration.sensor_fit.edge_spread import Edge, EdgeFit, EdgeModel, edges_of, fit_edges
 from phibench.calibration.sensor_fit.emva_descriptor import open_descriptor
-from phibench.calibration.sensor_fit.noise_levels import stack_level
+from phibench.calibration.sensor_fit.noise_levels import ToneFit, fit_tone, stack_level
 from phibench.calibration.sensor_fit.photon_transfer import TransferFit, fit_transfer
 from phibench.calibration.sensor_fit.processed_noise import ProcessedNoise, fit_noise
-from phibench.calibration.sensor_fit.tone_curve import ToneFit, fit_tone
 from phibench.datasets.common.input_files import InputFile
 from phibench.datasets.frames.sensor_card import (
     FitTables,

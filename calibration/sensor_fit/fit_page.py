@@ -11,7 +11,7 @@ import numpy as np
 
 from phibench.calibration.sensor_fit.capture_folder import CaptureError
 from phibench.calibration.sensor_fit.fit import SensorFit
-from phibench.calibration.sensor_fit.tone_curve import encoded_by
+from phibench.calibration.sensor_fit.noise_levels import encoded_by
 from phibench.datasets.common.shown_text import html_text, markdown_cell, markdown_text, table_lines
 from phibench.datasets.store.files import write_bytes, write_text
 

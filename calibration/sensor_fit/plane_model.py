@@ -24,8 +24,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from phibench.calibration.sensor_fit.noise_levels import BOX_PX, NoiseLevel, PlaneNoise
-from phibench.calibration.sensor_fit.tone_curve import decoded_by
+from phibench.calibration.sensor_fit.noise_levels import BOX_PX, NoiseLevel, PlaneNoise, decoded_by
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.estimator.spots.camera_codes import RGB_FROM_YCC, YCC_FROM_RGB, noisy_code
 from phibench.estimator.spots.image_planes import demosaiced

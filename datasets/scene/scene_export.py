@@ -30,8 +30,8 @@ from phibench.datasets.read import Sample
 from phibench.datasets.rooms.gltf_export import GltfWriter, y_up
 from phibench.datasets.store.files import require_writable, write_bytes, write_text
 from phibench.datasets.store.layers import write_exr
-from phibench.render.plugins.mirror_plugins import grid_triangles
 from phibench.render.plugins.plugin_tree import BitmapPlugin, Plugin, Rgb, SceneSetting, Triangles, Value, mitsuba_dict
+from phibench.render.plugins.room_plugins import grid_triangles
 from phibench.render.plugins.standard_scene import LIGHTS, Light, carried, etendue, standard_scene
 from phibench.render.setup.variant import activate
 from phibench.scenes.camera import Camera

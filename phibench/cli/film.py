@@ -325,7 +325,7 @@ class RobotOptions:
         from phibench.datasets.common.errors import DatasetError
         from phibench.estimator.geometry.rig_parameters import prior_sigmas
         from phibench.robot.loop.arena import baked_arenas
-        from phibench.robot.loop.setups import named_setup
+        from phibench.robot.loop.episodes import named_setup
         from phibench.scenes.validation import within
 
         chosen = named_setup(self.setting)
@@ -483,7 +483,7 @@ def show_loop(
 
 
 def _print(rows: list[Episode]) -> None:
-    from phibench.robot.loop.setups import loop_score
+    from phibench.robot.loop.episodes import loop_score
 
     print(f"{'episode':>7s} {'outcome':18s} {'s':>5s} {'m':>5s} {'strokes':>7s} {'D m':>6s} {'stated m':>8s}  cause")
     for row in rows:

@@ -25,9 +25,8 @@ import numpy as np
 from phibench.render.optics.faces import FaceTable, IntArray
 from phibench.render.optics.room_tracer import BEAM_REACH_M, RoomGeometry, deposit, room_geometry, transmittance
 from phibench.render.optics.truth import spot_truth
-from phibench.render.plugins.mirror_plugins import mirror_plugin
 from phibench.render.plugins.plugin_tree import BitmapPlugin, Plugin, Rgb, SceneSetting, Value
-from phibench.render.plugins.room_plugins import diffuse, placed, room_plugins
+from phibench.render.plugins.room_plugins import diffuse, mirror_plugin, placed, room_plugins
 from phibench.render.room.camera_plugin import MM_PER_M
 from phibench.scenes.camera import Camera
 from phibench.scenes.frames import Array, Pose, Vector, as_matrix, as_vector

@@ -17,8 +17,8 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from phibench.robot.loop.environment import COST_REFUSED, ApproachTarget, numbers_of_action
+from phibench.robot.loop.episodes import SETTINGS
 from phibench.robot.loop.policies import SearchingPolicy
-from phibench.robot.loop.setups import SETTINGS
 from phibench.robot.loop.simulator import LATE, RUNNING, Action, Known, Setup
 
 FEATURES = ("sin bearing", "cos bearing", "way left", "way left, enlarged", "sigma", "stroke", "missed", "time")

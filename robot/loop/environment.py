@@ -6,7 +6,7 @@
 `gymnasium.make("phibench.robot.loop.environment:phibench/ApproachTarget-v0")` does both. The flat one has a vector of
 -1 to 1 for actions and one of float32 for observations, as most learners ask for.
 
-Settings `-easy-v0` and `-hard-v0` of both stand beside them (`robot.loop.setups`).
+Settings `-easy-v0` and `-hard-v0` of both stand beside them (`robot.loop.episodes`).
 
 Reward: -0.01 a second, -0.01 for a command that is refused, +1 when the distance is stated right at the stand-off
 distance, -1 when it is stated wrongly or the robot runs into something. `terminated` says the last three, `truncated`
@@ -27,9 +27,9 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
+from phibench.robot.loop.episodes import SETTINGS, named_setup
 from phibench.robot.loop.robot_pixels import WINDOW_PX, pixel_form
 from phibench.robot.loop.sensing import EXPOSURES_S
-from phibench.robot.loop.setups import SETTINGS, named_setup
 from phibench.robot.loop.simulator import (
     CODES,
     COLLISION,

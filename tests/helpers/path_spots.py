@@ -10,9 +10,8 @@ import numpy as np
 
 from phibench.render.optics.spot_layer import spot_layer
 from phibench.render.optics.truth import spot_truth
-from phibench.render.plugins.mirror_plugins import grid_plugin, mirror_bsdf, mirror_plugin
 from phibench.render.plugins.plugin_tree import Plugin, mitsuba_dict
-from phibench.render.plugins.room_plugins import to_scene_mm
+from phibench.render.plugins.room_plugins import grid_plugin, mirror_bsdf, mirror_plugin, to_scene_mm
 from phibench.render.room.camera_plugin import MM_PER_M, sensor_dict
 from phibench.render.room.surfaces import load_scene
 from phibench.scenes.frames import rotation_facing

@@ -11,9 +11,8 @@ from helpers.oracles import TARGETS
 
 from phibench.datasets.scene.scene_export import as_radiance
 from phibench.render.optics.ray_tracer import trace_pixels
-from phibench.render.plugins.mirror_plugins import mirror_bsdf
 from phibench.render.plugins.plugin_tree import BitmapPlugin, Plugin, Rgb, Triangles, mitsuba_dict
-from phibench.render.plugins.room_plugins import to_scene_mm
+from phibench.render.plugins.room_plugins import mirror_bsdf, to_scene_mm
 from phibench.render.plugins.standard_scene import carried, etendue, sensor_plugin, standard_scene
 from phibench.render.setup.variant import activate
 from phibench.scenes.camera import Camera

@@ -20,6 +20,7 @@ from phibench.robot.loop.episodes import (
     LOST,
     Episode,
     episode_frame,
+    loop_score,
     run_episode,
     run_episodes,
     run_foreign,
@@ -27,7 +28,6 @@ from phibench.robot.loop.episodes import (
 from phibench.robot.loop.foreign_policies import PolicyFile, policy_of
 from phibench.robot.loop.policies import CODED, POLICIES, ApproachPlan, Identifier
 from phibench.robot.loop.sensing import SEEN, SpotReading
-from phibench.robot.loop.setups import loop_score
 from phibench.robot.loop.simulator import CODES, COLLISION, REACHED, Action, Observation, Setup, Simulator, Task
 from phibench.scenes.motion.vehicle import PlanarPose
 from phibench.scenes.validation import SceneError
