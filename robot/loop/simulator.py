@@ -148,7 +148,10 @@ class Task:
 
     def __post_init__(self) -> None:
         within("Task", "lights", self.lights, 0, LIGHT_ROWS - 1)
-        within("Task", "stand_off_m", self.stand_off_m, 0.7, self.distances_m[0])
+        near, far = self.distances_m
+        if not near <= far:
+            raise SceneError(f"Task.distances_m = {near:g}, {far:g}: the nearest target comes first")
+        within("Task", "stand_off_m", self.stand_off_m, 0.7, near)
         within("Task", "step_s", self.step_s, 0.01, 1.0)
         within("Task", "power", self.power, 1e-3, 5.0)
         within("Task", "obstacle_m", self.obstacle_m, 0.0, 0.3)

@@ -276,6 +276,11 @@ def test_obstacles_pitch_the_robot_and_too_high_steps_are_refused() -> None:
         Simulator(Setup(task=Task(obstacle_m=0.2, obstacle_run_m=0.0))).start("ramp", 1)
 
 
+def test_distances_in_the_wrong_order() -> None:
+    with pytest.raises(SceneError, match="distances_m = 3, 1: the nearest target comes first"):
+        Task(distances_m=(3.0, 1.0))
+
+
 @pytest.mark.study
 def test_the_process_reaches_its_target_in_twenty_rooms(capsys) -> None:
     """200 episodes: at least 95 % reached; pull of 1 / D over all beliefs 0.9 to 1.1.
