@@ -1,4 +1,4 @@
-"""Overview of a data set: a table, and a contact sheet with the true spot positions marked."""
+"""Overview of a data set: a table, a JSON summary, and a contact sheet with the true spot positions marked."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Coordinate frames and rigid poses.
+"""Coordinate frames, rigid poses, rotations, and the array, vector and matrix types that all modules share.
 
 Conventions, stated here once and obeyed everywhere:
 

@@ -1,4 +1,4 @@
-"""Mirrors: what each of them says of itself, and the sphere with its form error.
+"""Mirrors: the protocol `Mirror` that all follow, the sphere, and form errors (`Form`) with their derivatives.
 
 The form error adds low-order harmonics to the sphere's radius. The surface is r(n) = R + sum of c_k h_k(n), with
 n = (x, y, z) a unit direction in the sphere's own frame (`T_camera_sphere`). `Rig.perturbed` lays its axes along the

@@ -1,4 +1,4 @@
-"""Rig: camera and mirror on one carriage that moves along the stroke axis.
+"""Rig of camera and mirror on a carriage, strokes and their positions, the `View` of one image, and the robot's pose.
 
 `Rig` describes the down position; `Rig.at(offset_m)` gives the `View` that one image is taken from.
 """

@@ -1,4 +1,4 @@
-"""Room and robot: everything that light can hit except the mirror.
+"""Room, boards and robot, all that light can hit but the mirror; and the named rooms and rigs that recipes choose.
 
 The robot is the ESCALADE360 as simple solids. The paper gives its overall dimensions, which the solids have, and tracks
 with flippers after the PackBot; the split into body, tracks and flippers is ours. So are the mast that lifts the sensor

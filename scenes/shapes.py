@@ -1,4 +1,4 @@
-"""Shapes of rooms: rectangles, cuboids, prisms and triangle meshes. All are polyhedra with exact plane faces.
+"""Shapes of rooms (rectangles, cuboids, prisms, meshes: polyhedra with exact plane faces), and their textures.
 
 A curved thing is a prism with many sides or a mesh. What is rendered, what truth is computed from and what the laser
 hits are the same plane faces.

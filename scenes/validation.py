@@ -1,4 +1,4 @@
-"""Range checks for scene descriptions, and readable messages for pydantic errors in recipe tables.
+"""Range checks that raise `SceneError`, printable lines and nearest names for messages, pydantic's faults in words.
 
 Each message is one sentence: path, value, allowed range and advice. The first half checks numbers of the descriptions
 in `scenes` and raises `SceneError`. The second half words pydantic's errors in a table that a file fills.

@@ -1,4 +1,4 @@
-"""Task of a room: its irradiance, computed once or taken from the user's cache, and its line of `rooms.jsonl`."""
+"""Task that bakes a room's light map, the map's reader, and the user's cache of maps: entries, limit, clearing."""
 
 from __future__ import annotations
 

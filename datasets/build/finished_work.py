@@ -1,4 +1,4 @@
-"""Work that earlier runs have left in a folder: finished, which no run loses unasked, or refused.
+"""Work that earlier runs left in a folder (finished, which no run loses unasked, or refused), and its file of draws.
 
 Work is finished when the journal has its line and its files have the bytes that the line tells. Where lines of the
 journal are lost, SHA256SUMS of a finished data set vouches for files. Camera frames are no such work: they are drawn

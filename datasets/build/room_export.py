@@ -1,4 +1,4 @@
-"""Rooms as files: a panorama from a point of a room, and a mesh of it; of rooms that need nobody else's file.
+"""Writer of catalogue and generated rooms as panorama or mesh files, on request or as tasks of a data set.
 
 Both come with the table of a recipe that reads them. The robot is left out: it stands in every room by itself.
 

@@ -1,6 +1,6 @@
-"""Parts and documents of a data set: which folder will do, its tasks run by the engine, its small files assembled.
+"""Tasks of a data set: their list with keys, the folder they may use, their run, and the small files made at the end.
 
-The first part guards the output folder: it must hold no other data set, and have room on its disk. The last part gives
+The second part guards the output folder: it must hold no other data set, and have room on its disk. The last gives
 the small files as bytes, from plan and journal, so that each can be checked and written anew.
 """
 

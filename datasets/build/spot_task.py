@@ -1,4 +1,4 @@
-"""Task of one sample's spot in both views: exact answer, layer, certificate. Needs NumPy only."""
+"""Task of one sample's spot in both views: exact answer, layer, certificate, manifest row. Needs NumPy only."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Task record, its cache key (a hash of its inputs), and `perform`, which runs one task.
+"""Task record, its key (a hash of its inputs), outcomes, the protocol of executors, and `perform`, which runs one.
 
 A task is a pure function whose outputs are files.
 """

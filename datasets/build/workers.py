@@ -1,4 +1,4 @@
-"""Worker processes: our own on this machine, or those of a running scheduler of dask.
+"""Worker processes, our own or those of a scheduler of dask; and the environment and versions that they render with.
 
 One process and one Dr.Jit thread per worker. Our own get tasks through a pipe each and listen nowhere: whoever could
 connect to a scheduler would run code as its user, and other users of a machine share its loopback device. They end with

@@ -1,4 +1,4 @@
-"""Input files read within bounds: bytes, text, JSON, TOML, Parquet tables, NumPy arrays and pictures.
+"""Input files read within bounds (text, JSON, TOML, Parquet, arrays, pictures), and types of bounded names and texts.
 
 Every file that somebody else may have written goes through `InputFile`. It looks at the kind and the size of a file
 before it reads, bounds depth, numbers and texts of a document, and compares it with a model. A fault is one sentence:

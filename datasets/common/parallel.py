@@ -1,4 +1,4 @@
-"""`map` over worker processes, for many independent items on one machine.
+"""`map` over worker processes of one machine, and what such processes share: one thread each, memory given back.
 
 Workers are spawned, never forked: a fork copies the locks of other threads and can hang. Each runs one BLAS thread, so
 that N workers keep N cores busy. The number of workers changes no result. Data sets are made by

@@ -1,4 +1,4 @@
-"""Texts of strangers in what is written for people, and tables of text: for terminals, Markdown, LaTeX and CSV.
+"""Texts of strangers made safe to print, short forms of results, and tables for terminals, Markdown, LaTeX and CSV.
 
 Strangers' texts are names of methods and cameras, notes of files, reasons. One function for each kind of output, and no
 output without one. A text stays readable, is one line, and is nothing but text: no markup, no link, no command, no

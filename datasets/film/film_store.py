@@ -1,4 +1,4 @@
-"""Files of films: names, `film.json`, `film.parquet`, spot windows, key views; writing and checking of them.
+"""Files of films: names, `film.json`, `film.parquet`, spot windows, key views; writing, reading and checking of them.
 
 film.json                  the data set: recipe, code, what each film holds and its proof; written last
 recipe.toml

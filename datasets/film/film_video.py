@@ -1,4 +1,4 @@
-"""Films as video files: the camera's own JPEGs or YUYV in AVI or Matroska, MP4 for looking at, and data to learn from.
+"""Writer of films as videos (JPEG or YUYV in AVI or Matroska, MP4) and LeRobot data sets; reader of a video's frames.
 
 JPEGs and YUYV frames go into the container as they are; reading gives the same bytes back. MP4 for looking at is
 compressed again. `write_lerobot` lays videos and a Parquet row a frame out as LeRobot's data sets of version 3.0.

@@ -1,4 +1,4 @@
-"""Camera that moves through rooms whose light was baked before: frames of any pose, without Mitsuba.
+"""Rooms baked into a folder, and a camera that moves through them: frames of any pose, drawn without Mitsuba.
 
 `bake_rooms` makes a folder: `rooms.json`, which says what each room is made from, and a light map for each. Baking
 needs Mitsuba and takes some CPU-s a room. `open_baked_rooms` reads them anywhere. `MovingCamera` then draws whole

@@ -1,4 +1,4 @@
-"""One frame on disk (PNG, JPEG or EXR), and the index of a folder of frames.
+"""Writer of one frame (PNG, JPEG or EXR) and its preview; writer and reader of the index of a folder of frames.
 
 A frame is written as PNG, as the chain's JPEG, or as EXR; a frame that a viewer shows dark gets a preview for
 people. The index has one row per file: its SHA-256, every number that it depends on, and the truth of its image. It is

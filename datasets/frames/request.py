@@ -1,4 +1,4 @@
-"""FrameRequest: preset, exposure, brightness of lamps and laser, carriage speed, crop and camera seed of a frame.
+"""Requests of frames (preset, exposure, levels, speed, crop, seed), a data set's options, number checks for others.
 
 A request is checked and frozen. The preset is one of the sensor's. `FrameOptions` are what a caller asks of a data
 set's frames; `sample_request` makes the request of a sample of them and of the recipe's `[frames]`.

@@ -1,4 +1,4 @@
-"""Sensor card: the numbers of a sensor that an estimator may know, without the simulator's mathematics."""
+"""Sensor card (a sensor's numbers that an estimator may know), and reader and writer of measured sensor files."""
 
 from __future__ import annotations
 

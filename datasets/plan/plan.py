@@ -1,4 +1,4 @@
-"""Plan of a data set: the poses, spots and pairs that a recipe stands for. Nothing is rendered or written.
+"""Plan of a data set: poses, spots and pairs of a recipe or of one of its shards. Nothing is rendered or written.
 
 Shard i of n is a contiguous run of samples, by position in the recipe: machines need not agree on anything. Neighbours
 share views. A view that two shards need is rendered by both, to the same bytes. A shard is a data set of its own,

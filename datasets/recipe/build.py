@@ -1,4 +1,4 @@
-"""Rig, room, targets and spots of `scenes`, made from a recipe."""
+"""Rig, room, targets and spots of `scenes`, made from a recipe's tables; and faults of its rig, mirror and holder."""
 
 from __future__ import annotations
 

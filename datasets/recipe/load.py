@@ -1,4 +1,4 @@
-"""Reading of recipe files: TOML text, its faults in two stages, and the same text with other numbers in it.
+"""Reading of recipes, by file or by shipped name: TOML text, its faults in two stages, the text with other numbers.
 
 All faults of the tables come in one go; where there are none, all faults of the scene do (`checks`).
 

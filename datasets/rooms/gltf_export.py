@@ -1,4 +1,4 @@
-"""Room as a glTF file (.glb): one node for each shape, textures as PNG inside, lamps and screens as emission.
+"""Writer of glTF files (.glb): a room with one node for each shape, textures as PNG inside, lamps as emission.
 
 World z becomes y, as glTF has it. Albedos are written for the bands R, G, B, textures in sRGB of 8 bits. An emission of
 1 is 1 W/(m^2 sr), with `KHR_materials_emissive_strength` above 1. The sun, coats and the albedo at the laser's

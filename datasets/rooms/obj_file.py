@@ -1,4 +1,4 @@
-"""OBJ files and their MTL materials, by the definition of Wavefront (appendix B1 of the Advanced Visualizer, 1995).
+"""Reader of OBJ files and their MTL materials, by Wavefront's definition (Advanced Visualizer, appendix B1, 1995).
 
 Relative indices count back from the vertices read so far. Faces of any number of corners become triangles. Curves and
 free-form surfaces are refused by name; points and lines have no surface. A part is an object with one material.

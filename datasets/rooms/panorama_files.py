@@ -1,4 +1,4 @@
-"""Pictures with linear light: photographs, OpenEXR and Radiance HDR, and equirectangular panoramas of them.
+"""Reader of pictures with linear light: photographs, OpenEXR, Radiance HDR, and equirectangular panoramas of them.
 
 Photographs of 8 bits count as sRGB and are turned upright as their EXIF data say. EXR and HDR files hold linear values.
 All give an array of bands R, G, B in any unit, upper row first.

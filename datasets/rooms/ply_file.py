@@ -1,4 +1,4 @@
-"""PLY files: ASCII and binary of either byte order, faces and strips, colours of vertices or faces, a named picture.
+"""Reader of PLY files: ASCII and binary of either byte order, faces, strips, colours of vertices or faces, a picture.
 
 Greg Turk's definition, "The PLY Polygon File Format" (1994): a header names elements, their counts and properties. What
 names mean is custom: x, y, z; red, green, blue; vertex_indices; s, t with a picture in `comment TextureFile`; colours

@@ -1,4 +1,4 @@
-"""Files of rooms: panoramas and meshes that a recipe names, below one folder, each with the SHA-256 that it must have.
+"""Files of rooms (panoramas and meshes that a recipe names, each with its SHA-256), checked reading, and `RoomError`.
 
 The folder is the recipe's own. A data set keeps a copy of each file in its folder `rooms/`, by the same names.
 """

@@ -1,4 +1,4 @@
-"""SHA256SUMS of a data set, for ``sha256sum -c``: written last, read first.
+"""SHA256SUMS of a data set, written last and read first: files checked by it; and folders held while they are filled.
 
 A folder that has the file is complete. Names are relative to the folder, with forward slashes.
 """

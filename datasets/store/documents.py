@@ -1,4 +1,4 @@
-"""Metadata files of a data set, as JSON, JSON lines and Parquet: info, manifest, rigs, sensitivities.
+"""Metadata of a data set (info, manifest, rigs), written and read; and JSON and Parquet forms of objects and rows.
 
 Doubles survive exactly. Numbers that do not exist are NaN in Python and null in JSON and Parquet.
 

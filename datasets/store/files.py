@@ -1,4 +1,4 @@
-"""Atomic files and locks: a file is complete under its final name, or not there at all.
+"""Files written whole or not at all, their SHA-256, locks of a folder, and reading of JSON lines as documents.
 
 A file is written under a temporary name, flushed to the disk, then renamed.
 

@@ -1,4 +1,4 @@
-"""Pairs in files: one line of `pairs.jsonl` for each, and its images under `frames/`.
+"""Reader of pairs in files (one line of `pairs.jsonl` each, images under `frames/`), and the models of such lines.
 
 Sealed sets and frames sets hold their pairs so. The lines of a sealed set say what a user knows; those of a frames set
 hold the truth, too. Every file is checked against its hash when it is read.

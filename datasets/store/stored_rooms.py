@@ -1,4 +1,4 @@
-"""rooms.jsonl: the rooms of a data set, each built from its source when it is asked for."""
+"""Reader of rooms.jsonl: the rooms of a data set, each built from its source when it is asked for."""
 
 from __future__ import annotations
 

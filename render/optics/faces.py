@@ -1,4 +1,4 @@
-"""Faces of shapes as arrays: planes with their own coordinates, and the triangles that fill them.
+"""Faces of shapes as arrays: planes with their own coordinates, triangles that fill them, and grids of their texels.
 
 A patch is a plane face: a rectangle, the end of a prism, a triangle of a mesh. Its local coordinates are metres from
 its centre along two unit axes; its size is that of the rectangle around it. Triangles name the patch that they lie on.

@@ -1,4 +1,4 @@
-"""Room tracer in float64: first plane face along rays, as the exact counterpart of the renderer's float32 hits.
+"""Room tracer in float64: first plane face along rays, blocked segments, and the light that a laser leaves on faces.
 
 A room is the table of its plane faces (`faces`) and a tree of them (`face_tree`). What belongs to the room is made
 ready once and stays with the room; robot, carriage and holder are added for each view.

@@ -1,4 +1,4 @@
-"""Exact truth in float64: the chief ray of one spot, and of every pixel centre, through the mirror.
+"""Exact truth in float64, of one spot and every pixel centre: chief ray over the mirror, the three phi, distance D.
 
 `spot_truth` solves for the chief ray of a spot in closed form, or by Fermat's path. `truth_layer` traces the chief ray
 of every pixel centre: exact and unfiltered. Both give the three angles that the paper calls phi, and the azimuth

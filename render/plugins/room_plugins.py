@@ -1,4 +1,4 @@
-"""Room, robot, holder and lamps as standard Mitsuba plugins.
+"""Mirror, room, robot, holder, glass tube and lamps as standard Mitsuba plugins.
 
 Plain rectangles and cuboids are Mitsuba's own; every other shape is a mesh of its faces, with the place of its corners
 on its texture. Meshes lie in their shape's own frame, those of `Mesh` in the world's, so that both stroke positions

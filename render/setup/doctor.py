@@ -1,4 +1,4 @@
-"""Check of the installation: Python, packages, LLVM, cores, disk, and one rendered image whose values are known.
+"""Command that checks the installation: Python, packages, LLVM, cores, disk, and one rendered image of known values.
 
 Run ``python -m phibench.render.setup.doctor``. Every fault comes with one line that says what to do. Nothing is
 changed.
