@@ -301,6 +301,7 @@ strongest light that goes out with the laser.
 """,
 }
 _NAMES = "NameChoice"
+_LONGEST_ROW = 160  # characters; what a longer one allows stands below the table
 _ABSENT: dict[type[BaseModel], str] = {RigTable: "as preset", HolderTable: "follows R", FramesTable: "as preset"}
 # What `allowed` says in a sentence of a fault stands in a table's cell in fewer words.
 _IN_CELLS = (
@@ -345,6 +346,7 @@ def _section(heading: str, model: type[BaseModel]) -> Iterator[str]:
     headings = ["key", "unit", "allowed", *(f"preset `{name}`" for name in presets), "default", "meaning"]
     yield _line(headings)
     yield _line(["---"] * len(headings))
+    listed = {}
     for key, field in model.model_fields.items():
         of_presets = [_number(preset_value(RIGS[name](), key)) for name in presets]
         cells = [
@@ -355,7 +357,12 @@ def _section(heading: str, model: type[BaseModel]) -> Iterator[str]:
             _property_default(key) if model is RoomPropertiesTable else _default(field, model),
             str(field.description),
         ]
+        if len(_line(cells)) > _LONGEST_ROW:
+            listed[key], cells[2] = cells[2], "listed below"
         yield _line(cells)
+    for key, told in listed.items():
+        yield ""
+        yield textwrap.fill(f"Allowed for `{key}`: {told}.", 120, break_on_hyphens=False)
     yield ""
 
 

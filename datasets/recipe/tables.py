@@ -52,7 +52,7 @@ def _pixel_presets() -> tuple[str, ...]:
     """Names of the shipped presets that end in pixels; `settings` is not imported, as no spot depends on a sensor."""
     file = Path(__file__).parents[2] / "render" / "sensor" / "settings_presets.toml"
     presets = tomllib.loads(file.read_text(encoding="utf-8"))["presets"]
-    return tuple(name for name, table in presets.items() if table["output"] != "electrons")
+    return tuple(name for name, table in presets.items() if table.get("output") != "electrons")
 
 
 if TYPE_CHECKING:

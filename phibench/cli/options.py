@@ -48,7 +48,7 @@ _MOST_FILES = 200  # that a Tab shows: more is no help
 def presets(_: CompletionContext) -> tuple[str, ...]:
     """Presets of the sensor that end in pixels."""
     tables = tomllib.loads(_PRESETS.read_text(encoding="utf-8"))["presets"]
-    return tuple(name for name, table in tables.items() if table["output"] != "electrons")
+    return tuple(name for name, table in tables.items() if table.get("output") != "electrons")
 
 
 def pictures(_: CompletionContext) -> tuple[str, ...]:
