@@ -1,4 +1,4 @@
-"""Records of a dense score: one row per pair and part of its pixels, the whole and its strata.
+"""Records of a dense score: D of answers and its errors, one row per pair and part of its pixels (whole, strata).
 
 Pixels that count are those whose room point both images show. Errors are relative, D / truth - 1, over the pixels that
 are answered; an unanswered pixel lowers the share that is answered and the recall, and nothing else.

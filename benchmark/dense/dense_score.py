@@ -1,6 +1,7 @@
-"""Scores of dense methods: each pair is drawn once, shown to every method in its own process, compared with its truth.
+"""Dense methods run, each in its own process, and scored; their scores saved, read again and compared.
 
-Processes, limits and isolation are those of spots (`isolation.runner`).
+Each pair is drawn once, shown to every method and compared with its truth. Processes, limits and isolation are those
+of spots (`isolation.runner`).
 """
 
 from __future__ import annotations

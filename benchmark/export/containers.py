@@ -1,4 +1,4 @@
-"""Containers of an export: one shard of pairs as a Parquet file, a tar for WebDataset, or plain files.
+"""Writer of an export's shards as Parquet, WebDataset tar or plain files; and features of its rows for Hugging Face.
 
 The same pairs give the same bytes: entries stand in the order of the pairs, and no container holds a time or a name of
 a user.

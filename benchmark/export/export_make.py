@@ -1,4 +1,4 @@
-"""Export of a data set's pairs in the formats of other tools, with index, card, licence and hashes.
+"""Export of a data set's pairs in formats of other tools, with index, card, licence and hashes; and its check.
 
 Each shard is a part of the folder (`datasets.build.parts`), so that a run that ended early goes on where it was.
 """

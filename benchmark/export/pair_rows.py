@@ -1,4 +1,4 @@
-"""Rows of an export: one for each pair of images in one draw of the noise, and the split that it belongs to.
+"""Request of an export (`ExportRequest`), its rows, one per pair of images and draw of the noise, and their splits.
 
 Splits are made of whole groups. Two samples that share a rig or a room are in one group, whatever the draw: what is
 learned about one of them would be known of the other.

@@ -1,4 +1,4 @@
-"""Process of code of others: started, asked, ended; and what it prints. Of a method: asked for pairs.
+"""Isolated processes of others' code: `GuestProcess` of a method or policy, `MethodProcess` that is asked for pairs.
 
 The process gets a short environment, in which no data set's path stands, and an empty working directory. It stays warm
 from pair to pair. After a failure it is killed with all that it started, and the next pair gets a new one.

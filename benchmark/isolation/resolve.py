@@ -1,4 +1,4 @@
-"""Methods by reference (file, built-in, package), looked up and hashed but not run; and limits under which they run.
+"""Methods by reference, looked up and hashed but not run; limits under which they run; writer of the example method.
 
 A reference is ``my_phi.py:extract`` (a file and a function in it), the name of a built-in method, or the name under
 which an installed package registers a method (entry-point group ``phibench.methods``). It is resolved without running

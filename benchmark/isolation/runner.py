@@ -1,4 +1,4 @@
-"""Runner: methods over a set of pairs, each in processes of its own.
+"""Runner: methods over a set of pairs, each in processes of its own, or a function in this process.
 
 What a method does to its process costs the pair at hand, and the run goes on. The truth stays in this process: a
 method's process gets the fields of `Pair` and nothing else. Where the system can do it, the process reads neither the

@@ -1,4 +1,4 @@
-"""Found, missed and false detections, errors of answers, and bounds of pairs that errors are held against.
+"""Rules of a score (`Rules`): found, missed, false detections; errors of answers; bounds that they are held against.
 
 Definitions, used by all metrics:
 

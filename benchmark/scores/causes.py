@@ -1,4 +1,4 @@
-"""Causes of images without a right position: exactly one for each, the first that holds along the path of the light.
+"""Causes (`CAUSES`) of images without a right position, one each: the first along the light's path; and their counts.
 
 An image that is not found is of one kind: *unseen* (no spot visible, and rightly no position), *missed* (a spot, no
 position: "no answer" in tables) or *false* (a position where there is no spot, or too far from it). Its cause is one

@@ -1,4 +1,4 @@
-"""Comparison of two scores of the same pairs: paired differences with intervals over the samples that both have.
+"""Comparison of two scores of the same pairs: paired differences with intervals over samples; notes on what differs.
 
 Errors are compared over the images (or pairs) that both methods found. A method that skips the hard ones gains nothing
 from it. Rates, and figures that count missed spots, are compared over all visible spots.

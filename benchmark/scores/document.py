@@ -1,4 +1,4 @@
-"""Score document: one JSON file per run of one method, with its records beside it as Parquet under the same stem.
+"""Models of the score document, the JSON of one method's run (method, metrics, strata, worst images), and its maker.
 
 The document names the SHA-256 of the records' file, and that of the results in them, which two equal runs share.
 Numbers are in SI units; null stands where there is no number.

@@ -1,4 +1,4 @@
-"""Confidence intervals over samples: BCa bootstrap for metrics, Clopper-Pearson for rates.
+"""Statistics over samples with confidence intervals, by BCa bootstrap or Clopper-Pearson, and tests of differences.
 
 Images of one sample share its errors. All noise realisations and both images of a sample are therefore resampled
 together. A resample is a weight per sample, its number of occurrences. Statistics take weights, shape (b, n), so that

@@ -1,4 +1,4 @@
-"""Metrics of a score over the records of its images and pairs.
+"""Metrics of a score: the table of all (`METRICS`), and their values over the records of images and pairs.
 
 `METRICS` says what each metric is, over which records (`FAMILIES`), in which unit, and which way is better. Units in
 `METRICS` and in files are SI; `Metric.shown` gives the unit of tables.

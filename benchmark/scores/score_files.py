@@ -1,4 +1,4 @@
-"""Files of scores: a document as JSON, its records beside it as Parquet under the same stem."""
+"""Files of scores, written and read: a document as JSON, its records beside it as Parquet under the same stem."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tables of scores: for a terminal of 80 columns, or as CSV, Markdown, LaTeX and JSON.
+"""Tables of scores for a terminal, or as CSV, Markdown, LaTeX and JSON; and words and cells that other tables share.
 
 Units are those of `Metric.shown`: mrad for phi, per cent for rates and relative errors. CSV and JSON hold the numbers
 of the files instead: SI, in full.

@@ -1,4 +1,4 @@
-"""Check of a score file that somebody hands in: one sentence for each fault.
+"""Check of a score file that somebody hands in, one sentence for each fault; and the JSON schema of score files.
 
 Nothing is believed that can be computed again. The file itself says which numbers follow from which: counts, metrics,
 intervals and flags from its records. With the data set at hand the whole score is built again from the answers

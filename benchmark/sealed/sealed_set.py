@@ -1,4 +1,4 @@
-"""Sealed set: a folder of frames without truth, the hidden truth file, and the command that makes both.
+"""Sealed set: maker of a folder of frames without truth and of the hidden truth file; warnings and secret seeds.
 
 seal.json       settings of the set, and the SHA-256 that the truth must have
 pairs.jsonl     per pair what a user knows: rig, stroke, sensor, boxes, files

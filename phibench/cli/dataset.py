@@ -1,4 +1,4 @@
-"""Commands `phibench dataset ...`: make, check and show data sets, and what follows from one without a method."""
+"""Commands `phibench dataset ...`: make, repair, merge, check, show data sets; frames, panoramas, sensitivities."""
 
 from __future__ import annotations
 

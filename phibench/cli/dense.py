@@ -1,4 +1,4 @@
-"""Commands `phibench dense ...`: methods that give D for every pixel, written, checked, scored and compared."""
+"""Commands `phibench dense ...`: methods of D per pixel listed, checked, scored, drawn, compared; pairs exported."""
 
 from __future__ import annotations
 

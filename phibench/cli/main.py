@@ -1,4 +1,4 @@
-"""The command line ``phibench``: a thin layer over the packages.
+"""The command line `phibench`: all commands put together; `cache`, `completion` and `doctor`; exit codes of errors.
 
 Exit codes: 0 done, 1 checked and found wanting, 2 a mistake of the user or the machine in one sentence, 3 a fault of
 phibench, 130 Ctrl-C, 129 SIGHUP, 143 SIGTERM.

@@ -1,4 +1,4 @@
-"""Commands `phibench score`, `bench`, `compare` and `report`: methods on the pairs of a data set."""
+"""Commands `phibench score`, `bench`, `compare`, `report` and `results`: methods on the pairs of a data set."""
 
 from __future__ import annotations
 

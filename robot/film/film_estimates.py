@@ -1,4 +1,4 @@
-"""Estimates from a film: depth by joint bundle of all frames, of the first ones or of both ends, and its targets.
+"""Estimates from a film: depth by all frames, the first ones or both ends; bound at equal light; tracks of targets.
 
 Each takes what a robot has: raw frames with the laser on and off, their times, encoder readings, the rig that it knows,
 and how the carriage was told to go. The true scene is not asked.

@@ -1,4 +1,4 @@
-"""Frames of a film as a robot has them: laser on and off, the carriage when a spot's row was read, motion blur.
+"""Frames of a film as a robot has them, laser on and off: carriage at a spot's row, motion blur, room interpolated.
 
 The laser is on in every other frame, switched as the spot's row is read, or blinks by the film's own code. Positions
 belong to the time at which the spot's row is in the middle of its exposure. The encoder is read at the frame's time;

@@ -1,4 +1,4 @@
-"""Episodes of a policy: one row each, however the policy ends."""
+"""Episodes of a built-in or foreign policy, run and scored, one row each; and the named setups of the loop."""
 
 from __future__ import annotations
 

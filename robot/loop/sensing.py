@@ -1,4 +1,4 @@
-"""Exact measurement model of the loop: spots in the image for a place of the robot, with the bound as their noise.
+"""Exact measurement model of the loop: spots in the image, with the bound as noise; and directions of rays, angles.
 
 The image of a spot follows from the estimator's own projection in the rig that the robot really has; its standard
 deviation is the Cramer-Rao bound of a coordinate at its light (`limits.processed_bound.SpotSigma`) for each of the

@@ -1,4 +1,4 @@
-"""Simulator of the loop: a robot in a room, its target, and what a policy does step by step; without `gymnasium`.
+"""Simulator of the loop, its setup and task: robot, room, target, actions and observations; without `gymnasium`.
 
 A step lasts `Task.step_s` and ends with a frame. An episode ends when the policy states the distance, when the robot
 runs into something, or when the time is over. Stated well is: D true to `Task.depth_share`, and the robot at the
