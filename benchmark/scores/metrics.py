@@ -204,12 +204,8 @@ METRICS: dict[str, Metric] = {
         "higher",
         "the same, bound of the raw pixels",
     ),
-    "pull_deviation": Metric(
-        "pull", "deviation", ("pull_u", "pull_v"), "1", "none", "deviation of L^-1 e within 3 px; 1 is right"
-    ),
-    "pull_rms": Metric(
-        "pull", "rms of each", ("pull_u", "pull_v"), "1", "none", "rms of L^-1 e within 3 px; 1 is right"
-    ),
+    "pull_deviation": Metric("pull", "deviation", ("pull_u", "pull_v"), "1", "none", "deviation of pulls, 1 is right"),
+    "pull_rms": Metric("pull", "rms of each", ("pull_u", "pull_v"), "1", "none", "rms of pulls, 1 is right"),
     "bias_phi_rad": Metric("phi", "mean", ("phi_error_rad",), "rad", "none", "mean error of phi"),
     **_errors("phi", ("phi_error_rad",), "phi_error_rad", "rad", "phi_rad", "error of phi"),
     "efficiency_phi": Metric(
@@ -288,9 +284,7 @@ METRICS: dict[str, Metric] = {
         "higher",
         "D: rms at the pair's bound / rms",
     ),
-    "beyond_5_sigma": Metric(
-        "claimed", "rate", ("beyond_5",), "1", "lower", "answers beyond 5 claimed sigma, those beyond 3 px too"
-    ),
+    "beyond_5_sigma": Metric("claimed", "rate", ("beyond_5",), "1", "lower", "answers beyond 5 claimed sigma"),
     "localise": Metric(
         "localised", "geometric", ("localise_log",), "1", "lower", "error / bound, geometric mean; none counts 3 px"
     ),
@@ -302,15 +296,11 @@ METRICS: dict[str, Metric] = {
     "perfect_localise_pair": Metric(
         "localised pair", "geometric", ("perfect_pair_log",), "1", "none", "the same for both images as one point"
     ),
-    "find": Metric(
-        "image", "ratio", ("detected", "visible_or_false"), "1", "higher", "Jaccard index: found / (visible + false)"
-    ),
+    "find": Metric("image", "ratio", ("detected", "visible_or_false"), "1", "higher", "Jaccard index of found spots"),
     "false_per_empty": Metric(
         "empty", "rate", ("false_detection",), "1", "lower", "images without the spot that have an answer"
     ),
-    "average_recall": Metric(
-        "pair", "mean", ("depth_recall",), "1", "higher", "D within 0.5, 1, 2, 5, 10 and 20 %, mean share of them"
-    ),
+    "average_recall": Metric("pair", "mean", ("depth_recall",), "1", "higher", "average recall of D, 0.5 to 20 %"),
     "interval_score": Metric(
         "interval", "mean", ("interval_score",), "1", "lower", "95 % interval score / 3.92 sigma of the bound"
     ),
