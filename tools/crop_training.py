@@ -186,8 +186,8 @@ def items_of(crops: SpotCrops, settings: TrainingSettings) -> Items:
         for _ in range(views):
             first = _first_px(crop, draw)
             part = tuple(slice(x, x + side) for x in first[::-1])
-            blind = draw.random() < settings.without_off or crop.image_off is None
-            made = crop_input(crop.image[part], None if blind else crop.image_off[part], crop.card)
+            off = None if draw.random() < settings.without_off else crop.image_off
+            made = crop_input(crop.image[part], None if off is None else off[part], crop.card)
             planes[len(rest)], scalars[len(rest)] = made.planes, made.scalars
             rest.append((crop.uv_px - first, crop.card.output != "mjpeg", crop.sample_id))
     uv, turned, samples = (np.array(column) for column in zip(*rest, strict=True))
