@@ -1,4 +1,4 @@
-"""For several studies: errors of D where the rig is misaligned and the estimator takes the nominal one.
+"""For several studies: errors of D of misaligned rigs (one, thousands, rendered spots), and a simulated calibration.
 
 A spot's pixel in either image is that of the true rig's chief ray; a pixel outside of the image counts as none. The
 error is (estimate - D) / D, with D from the true sphere. Its *change* is the error less that of the aligned rig. So an

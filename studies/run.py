@@ -1,4 +1,4 @@
-"""Running a study, and its folder: `study.json`, `findings.md`, settings, Parquet tables, drawings.
+"""Running a study; its folder written and read (`study.json`, `findings.md`, tables, drawings); studies by name.
 
 `run_study` is `phibench study`; `section` reads a folder back for the report. A full study can also be published: its
 document goes beside the page of the study, whose numbers a test holds against it.

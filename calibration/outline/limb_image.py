@@ -1,4 +1,4 @@
-"""Images as planes of linear light, and the model of the light across the limb of a polished sphere.
+"""Images as planes of linear light, model of the light across a polished sphere's limb, and type `PoseMeasurement`.
 
 Planes: a pixel of a demosaiced image is a weighted sum of mosaic pixels around it. The sum is kept as taps. So a model
 of the light goes through the same sum, and nothing has to be inverted. Integer (u, v) are pixel centres; RGGB mosaic,

@@ -1,4 +1,4 @@
-"""Least squares of the outline: pixels and rays around it, sectors with free coefficients, one Gauss-Newton step.
+"""Least squares of the outline: circles and spheres to start from, pixels around it, sectors, one Gauss-Newton step.
 
 s is the sphere centre in the camera frame, a0 = asin(R / |s|) the angle of the limb from it. d is the distance of a
 pixel from the limb, across it, outwards positive, pixels. `step_from` is the entry: it gives the step of s and blur

@@ -1,4 +1,4 @@
-"""Alignment of the paper: with the camera vertical, move the mirror sideways until its image is centred.
+"""Alignment of the paper, by moving the mirror until its image is centred; circle, sharpness, pictures, sentences.
 
 The mirror is aligned when its centre lies on the vertical through the lens. The outline gives the centre. The nominal
 tilt and principal point of the camera give the vertical; their errors usually dominate. The paper's check, that all

@@ -1,4 +1,4 @@
-"""Point of a picture through which the room's vertical edges pass: the paper's check of the alignment (section 5).
+"""Point through which the room's vertical edges pass, the paper's check of the alignment; camera's tilt from edges.
 
 With the lens on the vertical through the mirror's centre, every vertical edge lies in a plane with that vertical. Its
 image is then a straight line through the middle of the mirror's outline. No number of camera or mirror is needed, so

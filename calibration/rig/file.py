@@ -1,4 +1,4 @@
-"""Calibration files: corrections of a rig with their covariance and their source, as strict, versioned JSON.
+"""Calibration files, written and read: corrections of a rig with covariance and source, as strict, versioned JSON.
 
 Version 2 is written. Version 1 is read: it says `believed_rig` for `nominal_rig`, has four other names of parameters
 (`rig_parameters.RENAMED`), and gives the focal length in pixels.

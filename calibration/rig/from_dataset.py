@@ -1,4 +1,4 @@
-"""Calibration from the images of a data set: outlines, and on request upright edges and spots at known distances.
+"""Calibration from images of a data set, its verdict: outlines; if asked, upright edges, spots at known distances.
 
 Its verdict has three marks. "bad": the data contradict each other or the priors beyond chance. "doubtful": something
 unusual that a person should look at. "good": neither. Parameters that only the prior knows are named under every mark.

@@ -1,4 +1,4 @@
-"""Laser spots at known places, for calibration: found pixels, and simulated measurements of where each spot is.
+"""Laser spots at known places, for calibration: the method that finds them, and simulated measurements of places.
 
 Pixels are found by a built-in method; distance, height and azimuth are as if a person had measured them.
 A "measured" place is the truth plus an error drawn from the sample's own stream. The stated sigma is the real one.

@@ -1,4 +1,4 @@
-"""Folder of frames from which a sensor is measured: dark, flat, exposure series, edges, chessboards.
+"""Reader of a folder of frames from which a sensor is measured: its groups, notes, pictures and JPEG headers.
 
     capture.toml               optional: what the files do not say
     dark/*                     lens capped

@@ -1,4 +1,4 @@
-r"""Descriptor file of EMVA 1288: a text that lists exposure times, light and pictures of one camera.
+r"""Reader of a descriptor file of EMVA 1288: a text that lists exposure times, light and pictures of one camera.
 
     v 3.0                        release of the standard
     n 12 640 480                 bits, width, height

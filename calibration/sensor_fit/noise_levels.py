@@ -1,4 +1,4 @@
-"""Noise of processed flat frames: covariances of the codes from frame to frame, with a jackknife over blocks.
+"""Noise of processed flat frames, by covariances from frame to frame with a jackknife; and the fit of the tone curve.
 
 Planes are those of the frames, Y', Cb, Cr of "yuyv", whose chroma has half of the columns, or R, G, B. Besides each
 plane's own covariances there are those of the first plane (of R, G, B: of green) with the two others.

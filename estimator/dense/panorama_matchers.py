@@ -1,4 +1,4 @@
-"""Matches between the panoramas of a pair by OpenCV: semi-global block matching, dense flow, and sparse features.
+"""Dense methods by OpenCV on the panoramas of a pair: semi-global block matching, dense flow, sparse features.
 
 A point of the room keeps its azimuth, nearly, and moves down with the stroke: columns of the panoramas are epipolar
 lines of an aligned rig. Block matching takes them for such, as the published methods do. Flow and features are free.

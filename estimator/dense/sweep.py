@@ -1,4 +1,4 @@
-"""Sweep over inverse distance through the exact geometry of the rig, and a fit of planes to the images.
+"""Built-in method `dense_sweep`: sweep over inverse distance through the rig's exact geometry, and a fit of planes.
 
 1. Cost: for each 1 / D the up image is fetched at the place where each grid point of the down panorama would be seen.
    The map is exact, so that it holds for misaligned rigs and needs no epipolar lines (R. T. Collins, CVPR 1996).

@@ -1,4 +1,4 @@
-"""Camera rays reflected at the mirror, whatever its shape (`mirror_geometry`).
+"""Camera rays reflected at a mirror of any shape, with derivatives; images of points of the room; what blocks rays.
 
 Estimators assume a perfect surface. The form error serves the true rig, whose errors `sensitivities` predicts.
 

@@ -1,4 +1,4 @@
-"""Cramer-Rao bound of one spot on raw pixels: position, phi, and D of a pair.
+"""Cramer-Rao bound of one spot on raw pixels (position, phi, and D of a pair); signal to noise, raw and processed.
 
 The bound sums the Fisher information of the pixels about their means mu, in electrons^-2. Three models of the noise:
 

@@ -1,4 +1,4 @@
-"""Built-in method `chain_fit`: both spots through the camera's own processing, for images that it has processed."""
+"""Built-in method `chain_fit`: both spots through the camera's processing; a spot's outputs and likelihood."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Likelihood maps of the spots of processed images: misfit over (u, v), flux and levels profiled out.
+"""Likelihood maps of spots of processed images, flux and levels profiled out; the covariance that a fit may claim.
 
 The quasi-likelihood is that of `chain_fit`: r^T C^-1 r of a JPEG's coefficients with C kept from the fit, or the law
 of each raw pixel or own code. At each place flux and levels come from one step of Gauss-Newton, and what a second would

@@ -1,4 +1,4 @@
-"""Light of a pair's images: the few functions that a method of one's own begins with.
+"""For a method of one's own: light of the laser in a pair's images, masks of mirror and lamps, and the noise.
 
 >>> import numpy as np
 >>> from phibench.estimator.interface import Answer, Pair, Spot

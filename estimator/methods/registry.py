@@ -1,4 +1,4 @@
-"""Built-in methods that find the spot, by name; `METHODS` holds those whose packages are installed.
+"""Built-in methods that find the spot, by name (`KNOWN`; `METHODS` if installed), with the simple and learned ones.
 
 To add a method, add one entry to `_ALL`. The first part has those without a noise model: extractors of `simple_spots`,
 which work on the picture as a viewer shows it, `detect`, and extractors of other packages, rows to compare with; each

@@ -1,4 +1,4 @@
-"""Detection of the laser spot in both whole frames of a pair, without a hint.
+"""Detection of the laser spot in both whole frames, without a hint; epipolar curve, mirror's box and mask, lamps.
 
 Per image: the strongest places of a matched filter inside the mirror's outline and away from lamps, each tested for
 shape and colour (`candidates`). Then both images together: the ray of a pixel of the down image passes points at

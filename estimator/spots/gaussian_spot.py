@@ -1,4 +1,4 @@
-"""Pixel model of a spot: Gaussians integrated over pixels, with derivatives by position, flux and width.
+"""Pixel model of a spot: Gaussians integrated over pixels, their derivatives, Fisher matrix, bound and scoring step.
 
 A spot is an upright Gaussian, sigma along u and another along v, with a mixed second moment to first order; or several
 such parts side by side, where a mirror draws the lens's aperture to something else. Pixels are integrated:

@@ -1,4 +1,4 @@
-"""Linear light of camera images: demosaicing, JPEG and colour planes on the estimator's side.
+"""Kinds of camera images (`KINDS`) and their linear light: demosaicing, JPEG, colour planes, noise of their pixels.
 
 Images are as a camera delivers them: raw DN of a mosaic or of pixels without filters, 8-bit R, G, B, or Y'CbCr 4:2:2.
 

@@ -1,4 +1,4 @@
-"""Prediction of a spot's image from the rig: its blur, and its electrons per second.
+"""Prediction of a spot's image from the rig and the `Laser`: its blur, and its electrons per second.
 
 Blur: second moments of lens, defocus with the mirror's astigmatism, and the beam's size. The size matters: a spot of
 4 mm at 1 m adds 0.02 to 0.05 px^2 to 0.5 px^2. A fit that leaves it out is off by up to 0.04 px there, and by 0.01 px

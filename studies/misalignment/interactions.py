@@ -1,4 +1,4 @@
-"""Interactions of misalignments: first-order and total Sobol indices of the relative error of D.
+"""Interactions of misalignments, as Sobol indices of the relative error of D; and errors after a change of focus.
 
 I. M. Sobol, Math. Comput. Simul. 55, 271 (2001); estimators of A. Saltelli et al., Comput. Phys. Commun. 181, 259
 (2010), as scipy has them. The parameters are uniform from minus to plus the study's magnitude, independent of each

@@ -1,4 +1,4 @@
-"""Tables and findings of the study `misalignment`.
+"""Tables, tolerances, ranking and findings of the study `misalignment`.
 
 Main table: a row per parameter, value, spot and estimator. Tolerance table: the value of each parameter that costs a
 given part of D. Findings and the small tables of the report are made from both.

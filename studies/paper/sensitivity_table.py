@@ -1,4 +1,4 @@
-"""Table of how D reacts to each error of the rig, per sample and estimator; data sets made with this table in them.
+"""Table of how D reacts to each error of the rig; data sets made, repaired and merged with this table in them.
 
 `datasets` may not import the estimators. `make`, `repair` and `merge` therefore stand here: they render through
 `datasets` and write the table beside the result. The command line and Python programs get the same folder.
