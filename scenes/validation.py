@@ -1,15 +1,18 @@
-"""Range checks that raise `SceneError`, printable lines and nearest names for messages, pydantic's faults in words.
+"""Range checks that raise `SceneError`, printable lines and nearest names for messages, faults of tables in words.
 
 Each message is one sentence: path, value, allowed range and advice. The first half checks numbers of the descriptions
-in `scenes` and raises `SceneError`. The second half words pydantic's errors in a table that a file fills.
+in `scenes` and raises `SceneError`. The second half reads TOML files that come with the package, and words pydantic's
+errors in a table that a file fills.
 """
 
 from __future__ import annotations
 
 import difflib
 import math
+import tomllib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel, ValidationError
@@ -132,6 +135,20 @@ class Fault:
 
     def __str__(self) -> str:
         return f"{self.path}: {self.text}"
+
+
+def shipped_tables(path: Path) -> dict[str, Any]:
+    """Tables of a TOML file that comes with the package.
+
+    Raises
+    ------
+    SceneError
+        If it is no TOML: the file and the line.
+    """
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise SceneError(f"{path} is not valid TOML: {printable_line(str(error))}; mend it") from error
 
 
 def structural_faults(model: type[BaseModel], raw: object) -> list[Fault]:

@@ -10,6 +10,7 @@ the number there is a threshold, and a verdict. The terminal, Markdown and the H
 
 from __future__ import annotations
 
+import inspect
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -307,9 +308,13 @@ class StudyResult:
     notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
+        parts = (("tables", self.tables.values(), pl.DataFrame), ("findings", self.findings, Finding))
+        for name, values, kind in (*parts, ("drawings", self.drawings, Drawing)):
+            if wrong := [type(value).__name__ for value in values if not isinstance(value, kind)]:
+                raise DatasetError(f"StudyResult.{name} holds a {wrong[0]}; each must be a {kind.__name__}")
         labels = [finding.label for finding in self.findings]
         if twice := sorted({label for label in labels if labels.count(label) > 1}):
-            raise ValueError(f"findings with the same label: {'; '.join(twice)}")
+            raise DatasetError(f"findings with the same label: {'; '.join(twice)}")
 
 
 class Settings(BaseModel):
@@ -335,7 +340,7 @@ class Study(Generic[S]):
     Parameters
     ----------
     name : str
-        As in `phibench study NAME`; its settings are in `NAME.toml` beside the code.
+        As in `phibench study NAME`; its settings are in `settings.toml` beside the code.
     title : str
         Heading of its section in the report.
     question : str
@@ -350,6 +355,14 @@ class Study(Generic[S]):
     question: str
     settings: type[S]
     run: Callable[[S, StudyDatasets], StudyResult]
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.settings, type) or not issubclass(self.settings, Settings):
+            raise DatasetError(f"Study.settings = {self.settings!r}: must be a class derived from Settings")
+        try:
+            inspect.signature(self.run).bind(None, None)
+        except (TypeError, ValueError) as error:
+            raise DatasetError("Study.run must be a function of (settings, datasets)") from error
 
 
 QUICK = "quick"

@@ -10,6 +10,7 @@ import hashlib
 import importlib
 import json
 import time
+import traceback
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal
@@ -25,7 +26,7 @@ from phibench.datasets.store.documents import parquet_bytes
 from phibench.datasets.store.files import require_writable, sha256, write_bytes, write_text
 from phibench.datasets.store.provenance import provenance
 from phibench.datasets.store.schema import Document
-from phibench.scenes.validation import nearest
+from phibench.scenes.validation import nearest, printable_line
 from phibench.studies.framework import (
     Drawing,
     Finding,
@@ -191,12 +192,27 @@ def find_study(name: str) -> Study[Any]:
     Raises
     ------
     DatasetError
-        If there is none.
+        If there is none, or its module cannot be imported or lacks a part of a study: the file, the line, and what.
     """
     if name not in NAMES:
         raise DatasetError(f"no study '{name}'; {nearest(name, NAMES)}")
-    study = importlib.import_module(f"phibench.studies.{name}.study").STUDY
-    assert isinstance(study, Study)
+    path = f"studies/{name}/study.py"
+    try:
+        module = importlib.import_module(f"phibench.studies.{name}.study")
+    except (MemoryError, OSError):
+        raise
+    except Exception as error:  # whatever its author's code raises
+        lines = [f.lineno for f in traceback.extract_tb(error.__traceback__) if f.filename.endswith(path)]
+        place = f" line {lines[-1]}" if lines else ""
+        fault = printable_line(f"{type(error).__name__}: {error}")
+        raise DatasetError(f"{path}{place} has a fault: {fault}") from error
+    study = getattr(module, "STUDY", None)
+    if not isinstance(study, Study):
+        raise DatasetError(f"{path} has no STUDY; end it with STUDY = Study(name, title, question, settings, run)")
+    if study.name != name:
+        raise DatasetError(f"{path}: its STUDY is called '{study.name}'; give it the name of its folder, '{name}'")
+    if not (module.__doc__ or "").startswith(f"Study `{name}`: "):
+        raise DatasetError(f'{path}: its first line must be """Study `{name}`: its help."""')
     return study
 
 
@@ -240,6 +256,8 @@ def run_study(
         require_writable(document)
     start = time.monotonic()
     result = study.run(chosen, StudyDatasets(data or out / DATA, console or progress_console(), workers))
+    if not isinstance(result, StudyResult):
+        raise DatasetError(f"studies/{name}: run gives a {type(result).__name__}; it must give a StudyResult")
     write_study(out, study, chosen, quick, result)
     if publish is not None:
         publish_study(publish, study, chosen, result, time.monotonic() - start)

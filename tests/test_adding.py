@@ -112,11 +112,13 @@ from phibench.datasets.recipe.tables import RigTable
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.render.optics.truth import spot_truth
 from phibench.scenes.laser import LaserSpot
+from phibench.studies.mirror.tables import MirrorEntry
 rig = build_rig(RigTable.model_validate({"mirror": {"shape": "oblate", "rim_radius_m": 0.05}}))
 spot = LaserSpot((2.0, 0.0, 0.5), (-1.0, 0.0, 0.0), 0.004)
 down, up = (spot_truth(rig.at(h), spot, ()) for h in (0.0, 0.3))
 pixels = (np.array([truth.u_px, truth.v_px]) for truth in (down, up))
 print(rig.mirror.profile.conic, down.visible, abs(float(depth_exact(rig, 0.3, *pixels).depth_m) - 2.0) < 1e-9)
+print(MirrorEntry(shape="oblate", conic=0.3).rig(0.05).mirror.profile.conic)
 """
 
 # A study: its folder is its command.
@@ -248,7 +250,7 @@ ADDITIONS = {
         USE_PRESET,
         "255 True\n('night-raw8',) True True\nTrue\nnight-raw8\n",
     ),
-    "conic": Addition(add_conic, ("datasets/recipe/mirror_tables.py",), USE_CONIC, "0.2 True True\n"),
+    "conic": Addition(add_conic, ("datasets/recipe/mirror_tables.py",), USE_CONIC, "0.2 True True\n0.3\n"),
     "study": Addition(
         add_study,
         ("studies/echo/settings.toml", "studies/echo/study.py"),

@@ -32,7 +32,7 @@ from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import SETTINGS_BYTES, InputFile
 from phibench.datasets.store.schema import Document
 from phibench.scenes.frames import Array
-from phibench.scenes.validation import printable_line
+from phibench.scenes.validation import printable_line, structural_faults
 
 Kind = Literal["bayer-raw", "mono-raw", "yuyv", "srgb8", "mjpeg"]
 RAW = ("bayer-raw", "mono-raw")
@@ -254,7 +254,10 @@ def read_notes(path: Path) -> CaptureNotes:
     if not path.exists():
         return CaptureNotes()
     file = InputFile(path, "docs/capture.md has an example", CaptureError, SETTINGS_BYTES)
-    return file.validated(CaptureNotes, file.toml())
+    tables = file.toml()
+    if faults := structural_faults(CaptureNotes, tables):
+        raise file.fault(f"is damaged: {'; '.join(map(str, faults))}")
+    return CaptureNotes.model_validate(tables)
 
 
 def _group(folder: Path, name: str, seconds: float | None = None) -> FrameGroup | None:

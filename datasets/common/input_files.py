@@ -238,7 +238,7 @@ class InputFile:
     def validated(self, model: type[M], document: dict[str, Any]) -> M:
         """Document of a strict model, of JSON that is read already; lists do for tuples."""
         try:
-            return model.model_validate_json(json.dumps(document))
+            return model.model_validate_json(json.dumps(document, default=str))  # TOML has dates
         except (ValidationError, ValueError, RecursionError) as error:
             text = first_fault(error) if isinstance(error, ValidationError) else printable_line(str(error), 200)
             raise self.fault(f"is damaged: {text}") from error

@@ -10,6 +10,7 @@ from pydantic import Field
 
 from phibench.datasets.recipe.distributions import Table
 from phibench.scenes.holder import LARGEST_INDEX, OF_TUBES
+from phibench.scenes.validation import SceneError, nearest
 
 Tilt = Annotated[float, Field(ge=-0.5, le=0.5)]
 Unit = Annotated[float, Field(ge=0.0, le=1.0)]
@@ -48,6 +49,10 @@ class HolderTable(OfHolder):
     )
 
 
+OF_SHAPES = ("vertex_radius_m", "conic", "half_angle_deg", "even_terms")
+"""Keys of `[rig.mirror]` that belong to some shapes alone."""
+
+
 @dataclass(frozen=True)
 class MirrorShape:
     """Shape of `[rig.mirror]`, a profile of revolution.
@@ -62,6 +67,11 @@ class MirrorShape:
         Open range of k.
     lens_in_focus : bool
         Without a vertex radius the lens is in its outer focus.
+
+    Raises
+    ------
+    SceneError
+        If a key is none, or the numbers are no conic; the sentence holds the whole line.
     """
 
     keys: tuple[str, ...]
@@ -70,10 +80,32 @@ class MirrorShape:
     high: float = math.inf
     lens_in_focus: bool = False
 
+    def __post_init__(self) -> None:
+        if fault := self._fault():
+            raise SceneError(f"{self} is no shape of [rig.mirror]: {fault}")
+
+    def _fault(self) -> str:
+        """Reason why there is no such shape; empty if there is one."""
+        if not isinstance(self.keys, tuple) or not self.keys:
+            return 'keys must be a tuple with at least one name, such as ("conic",)'
+        if unknown := [key for key in self.keys if key not in OF_SHAPES]:
+            return f"there is no key '{unknown[0]}'; {nearest(str(unknown[0]), OF_SHAPES)}"
+        if self.conic is None:
+            free = math.isinf(self.low) and math.isinf(self.high) and not self.lens_in_focus
+            return "" if self.keys == ("half_angle_deg",) and free else "without conic it is a cone; give its conic"
+        if "half_angle_deg" in self.keys:
+            return "half_angle_deg is a cone's; remove it from the keys"
+        if not self.low < self.conic < self.high:
+            return f"conic = {self.conic:g} must be {self.side or 'finite'}"
+        if self.lens_in_focus and self.high > -1.0:
+            return f"lens_in_focus is for conics below -1; high = {self.high:g} must be -1 or less"
+        return ""
+
     @property
     def side(self) -> str:
-        """Range of k in words."""
-        return f"below {self.high:g}" if math.isinf(self.low) else f"above {self.low:g}"
+        """Range of k in words; empty where every k will do."""
+        ends = (("above", self.low), ("below", self.high))
+        return " and ".join(f"{word} {end:g}" for word, end in ends if math.isfinite(end))
 
 
 SHAPES = {
@@ -88,8 +120,6 @@ if TYPE_CHECKING:
     ShapeName = str
 else:
     ShapeName = Literal[tuple(SHAPES)]
-OF_SHAPES = tuple(dict.fromkeys(key for shape in SHAPES.values() for key in shape.keys))
-"""Keys of `[rig.mirror]` that belong to some shapes alone."""
 
 
 class MirrorTable(Table):

@@ -6,7 +6,6 @@ here and nowhere else. `recipe/checks` checks several keys together. `recipe/loa
 
 from __future__ import annotations
 
-import tomllib
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -38,6 +37,7 @@ from phibench.scenes.mirror import OF_REVOLVED
 from phibench.scenes.misalignment import PARAMETERS
 from phibench.scenes.random_streams import LARGEST_SEED
 from phibench.scenes.room import BOARD_SIZE_M
+from phibench.scenes.validation import SceneError, shipped_tables
 
 MIN_STROKE_M, MAX_STROKE_M = 1e-3, 10.0  # below a millimetre there is no parallax to measure
 DatasetName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$", max_length=64)]
@@ -51,7 +51,9 @@ Response = Annotated[tuple[Unit, ...], Field(strict=False, min_length=3, max_len
 def _pixel_presets() -> tuple[str, ...]:
     """Names of the shipped presets that end in pixels; `settings` is not imported, as no spot depends on a sensor."""
     file = Path(__file__).parents[2] / "render" / "sensor" / "settings_presets.toml"
-    presets = tomllib.loads(file.read_text(encoding="utf-8"))["presets"]
+    presets = shipped_tables(file).get("presets")
+    if not isinstance(presets, dict) or not all(isinstance(table, dict) for table in presets.values()):
+        raise SceneError(f"{file} needs a table [presets.NAME] for each preset; mend it")
     return tuple(name for name, table in presets.items() if table.get("output") != "electrons")
 
 

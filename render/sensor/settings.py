@@ -10,14 +10,13 @@ transfer functions have the names that V4L2 gives them.
 from __future__ import annotations
 
 import itertools
-import tomllib
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
-from phibench.scenes.validation import nearest, structural_faults
+from phibench.scenes.validation import nearest, shipped_tables, structural_faults
 
 PRESETS_FILE = Path(__file__).with_name("settings_presets.toml")
 _UNIT_SUM = 1e-6  # of weights that were written with six digits
@@ -146,13 +145,25 @@ def sensor(preset: str = "mjpeg", **changes: Any) -> Sensor:
     return _checked(preset, {"name": preset, **tables["webcam"], **tables["presets"][preset], **changes})
 
 
+class PresetsFile(BaseModel):
+    """Content of `settings_presets.toml`; the numbers of a preset are checked when it is asked for."""
+
+    model_config = ConfigDict(strict=True, extra="forbid")
+
+    webcam: dict[str, Any] = Field(description="what all presets share")
+    presets: dict[str, dict[str, Any]] = Field(description="what each preset changes")
+
+
 def _tables() -> dict[str, Any]:
     return _read(PRESETS_FILE)
 
 
 @cache
 def _read(path: Path) -> dict[str, Any]:
-    return tomllib.loads(path.read_text(encoding="utf-8"))
+    tables = shipped_tables(path)
+    if faults := structural_faults(PresetsFile, tables):
+        raise SensorError(f"{path}: " + "; ".join(map(str, faults)))
+    return tables
 
 
 def _checked(name: str, raw: dict[str, Any]) -> Sensor:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 from pydantic import Field
 
 from phibench.datasets.recipe.build import build_rig, idle_mirror_keys
-from phibench.datasets.recipe.mirror_tables import MirrorTable
+from phibench.datasets.recipe.mirror_tables import SHAPES, MirrorTable
 from phibench.datasets.recipe.tables import RigTable
 from phibench.scenes.frames import Array, BoolArray
 from phibench.scenes.rig import Rig
@@ -36,10 +36,16 @@ _Angles = Annotated[tuple[Annotated[float, Field(ge=0.0, le=180.0)], ...], Field
 _Blurs = Annotated[tuple[Annotated[float, Field(ge=0.3, le=10.0)], ...], Field(strict=False, min_length=2)]
 
 
+if TYPE_CHECKING:
+    ShapeOrSphere = str
+else:
+    ShapeOrSphere = Literal[("sphere", *SHAPES)]
+
+
 class MirrorEntry(Settings):
     """A mirror; keys as in `[rig.mirror]` of a recipe, and a sphere, whose rim is its equator."""
 
-    shape: Literal["sphere", "ellipsoid", "paraboloid", "hyperboloid", "cone", "polynomial"]
+    shape: ShapeOrSphere
     vertex_radius_m: float | None = Field(default=None, gt=0.0, le=1.0)
     conic: float | None = Field(default=None, ge=-100.0, le=100.0)
     half_angle_deg: float | None = Field(default=None, ge=3.0, le=87.0)

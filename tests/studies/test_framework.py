@@ -12,9 +12,11 @@ import pytest
 from pydantic import Field
 from rich.console import Console
 
+import phibench.studies
 from phibench.benchmark.reports.report import write_report
 from phibench.cli.main import main
 from phibench.datasets.common.errors import DatasetError
+from phibench.studies import run
 from phibench.studies.framework import (
     Finding,
     Settings,
@@ -28,7 +30,7 @@ from phibench.studies.framework import (
     number,
     read_settings,
 )
-from phibench.studies.run import find_study, publish_study, read_study, section, write_study
+from phibench.studies.run import find_study, publish_study, read_study, run_study, section, write_study
 
 
 class Counting(Settings):
@@ -103,8 +105,49 @@ def test_tables_leave_empty_columns_out() -> None:
 
 
 def test_a_label_stands_once() -> None:
-    with pytest.raises(ValueError, match="same label: a"):
+    with pytest.raises(DatasetError, match="same label: a"):
         StudyResult({}, (Finding("a", 1.0), Finding("a", 2.0)))
+
+
+HEAD = '''"""Study `{name}`: a folder with a fault."""
+from phibench.studies.framework import Finding, Settings, Study, StudyResult
+class Own(Settings):
+    pass
+def run(settings, datasets):
+    return {result}
+'''
+
+
+@pytest.mark.parametrize(
+    ("end", "result", "begin"),
+    [
+        ("", "None", "studies/{}/study.py has no STUDY; end it with"),
+        ('STUDY = Study("{}", "T", "Q?", Own)', "None", "studies/{}/study.py line 7 has a fault: TypeError"),
+        ('STUDY = Study("{}", "T", "Q?", Own, ran)', "None", "studies/{}/study.py line 7 has a fault: NameError"),
+        ('STUDY = Study("{}", "T", "Q?", run, Own)', "None", "studies/{}/study.py line 7 has a fault: DatasetError"),
+        ('STUDY = Study("{}", "T", "Q?", Own, run)\nimport sos', "None", "studies/{}/study.py line 8 has a fault: Mod"),
+        ('STUDY = Study("{}", "T", "Q?", Own, lambda s: s)', "None", "studies/{}/study.py line 7 has a fault: Data"),
+        ("STUDY = (", "None", "studies/{}/study.py has a fault: SyntaxError: '(' was never closed (study.py, line 7)"),
+        ('STUDY = Study("other", "T", "Q?", Own, run)', "None", "studies/{}/study.py: its STUDY is called 'other'"),
+        ('__doc__ = "x"\nSTUDY = Study("{}", "T", "Q?", Own, run)', "None", "studies/{}/study.py: its first line must"),
+        ('STUDY = Study("{}", "T", "Q?", Own, run)', "None", "studies/{}: run gives a NoneType; it must give"),
+        ('STUDY = Study("{}", "T", "Q?", Own, run)', "StudyResult(dict(a=1), ())", "StudyResult.tables holds a int"),
+        ('STUDY = Study("{}", "T", "Q?", Own, run)', "StudyResult(dict(), (1.0,))", "StudyResult.findings holds a"),
+    ],
+)
+def test_a_fault_in_a_study_names_its_file(
+    end: str, result: str, begin: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    name = tmp_path.name  # a module is imported once, and each case has another
+    (tmp_path / "studies" / name).mkdir(parents=True)
+    code = HEAD.format(name=name, result=result) + end.replace("{}", name) + "\n"
+    (tmp_path / "studies" / name / "study.py").write_text(code, encoding="utf-8")
+    (tmp_path / "none.toml").write_text("", encoding="utf-8")
+    monkeypatch.setattr(phibench.studies, "__path__", [*phibench.studies.__path__, str(tmp_path / "studies")])
+    monkeypatch.setattr(run, "NAMES", (name,))
+    with pytest.raises(DatasetError) as caught:
+        run_study(name, tmp_path / "out", settings=tmp_path / "none.toml", console=Console(quiet=True))
+    assert str(caught.value).startswith(begin.replace("{}", name))
 
 
 @pytest.fixture

@@ -213,7 +213,7 @@ def _bad_seconds(folder: Path) -> None:
         (_saturate, "saturated"),
         (_scaled, "not scaled"),
         (_damage, "not a picture"),
-        (_unknown_note, "exposure"),
+        (_unknown_note, "exposure: unknown key; did you mean 'exposure_s'"),
         (_bad_seconds, "exposure time"),
     ],
 )

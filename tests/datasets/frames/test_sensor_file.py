@@ -50,6 +50,7 @@ def test_what_is_written_is_read_again(tmp_path: Path) -> None:
         ("exposure_s = 0.1", "belongs to a frame"),
         ("preset = 3", "no text"),
         ("[sigma]\nread_noise_e = 'much'", "sigma.read_noise_e"),
+        ("[sigma]\nread_noise_e = 1979-05-27", "sigma.read_noise_e"),
         ("preset = ", "TOML"),
     ],
 )

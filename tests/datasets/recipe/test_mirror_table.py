@@ -10,9 +10,10 @@ import pytest
 from helpers.room_files import recipe
 
 from phibench.datasets.common.errors import RecipeError
-from phibench.datasets.recipe.build import build_rig
+from phibench.datasets.recipe import mirror_tables
+from phibench.datasets.recipe.build import build_rig, fixed_conic_faults
 from phibench.datasets.recipe.load import check_recipe
-from phibench.datasets.recipe.mirror_tables import OF_SHAPES, MirrorTable
+from phibench.datasets.recipe.mirror_tables import OF_SHAPES, MirrorShape, MirrorTable
 from phibench.datasets.recipe.tables import RigTable
 from phibench.datasets.store.documents import from_json, to_json
 from phibench.scenes.revolved_mirror import RevolvedMirror
@@ -57,7 +58,37 @@ def test_the_lens_is_in_the_focus_of_a_hyperboloid(z_c_m: float) -> None:
 
 
 def test_every_key_has_its_shapes() -> None:
+    assert set(OF_SHAPES) == {key for shape in mirror_tables.SHAPES.values() for key in shape.keys}
     assert set(OF_SHAPES) == set(MirrorTable.model_fields) - {"shape", "rim_radius_m", "tilt_x_rad", "tilt_y_rad"}
+
+
+@pytest.mark.parametrize(
+    ("line", "reason"),
+    [
+        ({"keys": "conic", "conic": 0.2}, "keys must be a tuple"),
+        ({"keys": ("vertex_radius", "conic"), "conic": 0.2}, "there is no key 'vertex_radius'; did you mean"),
+        ({"keys": ("vertex_radius_m", "conic")}, "without conic it is a cone; give its conic"),
+        ({"keys": ("half_angle_deg",), "low": 0.0}, "without conic it is a cone; give its conic"),
+        ({"keys": ("half_angle_deg", "conic"), "conic": 0.2}, "half_angle_deg is a cone's"),
+        ({"keys": ("conic",), "conic": -0.2, "low": 0.0}, "conic = -0.2 must be above 0"),
+        ({"keys": ("conic",), "conic": 2.5, "low": 0.0, "high": 2.0}, "conic = 2.5 must be above 0 and below 2"),
+        ({"keys": ("conic",), "conic": 0.5, "low": 1.0, "high": 0.0}, "conic = 0.5 must be above 1 and below 0"),
+        ({"keys": ("conic",), "conic": np.nan}, "conic = nan must be finite"),
+        ({"keys": ("conic",), "conic": -2.0, "high": 0.0, "lens_in_focus": True}, "lens_in_focus is for conics below"),
+    ],
+)
+def test_a_wrong_line_of_the_shapes_is_refused_and_named(line: dict[str, Any], reason: str) -> None:
+    with pytest.raises(SceneError) as caught:
+        MirrorShape(**line)
+    said = str(caught.value)
+    assert said.startswith(f"MirrorShape(keys={line['keys']!r}, conic={line.get('conic')}, low=")
+    assert f"is no shape of [rig.mirror]: {reason}" in said
+
+
+def test_a_range_with_two_ends_is_said_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(mirror_tables.SHAPES, "ellipsoid", MirrorShape(("conic",), 0.2, low=0.0, high=2.0))
+    faults = fixed_conic_faults("m", MirrorTable(shape="ellipsoid", conic=3.0), ("ellipsoid",))
+    assert 'm.conic: is 3; a conic of shape = "ellipsoid" is above 0 and below 2' in str(faults[0])
 
 
 @pytest.mark.parametrize(

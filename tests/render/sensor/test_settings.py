@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import get_args
 
@@ -10,6 +11,7 @@ import pytest
 from helpers.sensor_light import room
 
 from phibench.datasets.recipe.tables import Preset
+from phibench.render.sensor import settings
 from phibench.render.sensor.camera_chain import Chain
 from phibench.render.sensor.electrons import NoiseStream
 from phibench.render.sensor.processing import compressed, eight_bit, linear_rgb, linear_signal, rendered
@@ -95,6 +97,25 @@ def test_a_fault_is_one_sentence(change: dict, complaint: str) -> None:
     assert "\n" not in text
     with pytest.raises(SensorError, match=complaint):
         sensor("mjpeg").replace(**change)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("[webcam]\noutput = \n", " is not valid TOML: Invalid value (at line 2, column 10)"),
+        ("[webcam]\n[presets]\n[preset.dark]\n", ": preset: unknown key; did you mean 'presets'?"),
+        ("[webcam]\n[presets]\ndark = 3\n", ": presets.dark: 3 is not allowed; give a table"),
+        ("[webcam]\n", ": presets: missing; add a table"),
+    ],
+)
+def test_a_broken_file_of_presets_is_named(
+    text: str, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "settings_presets.toml"
+    file.write_text(text, encoding="utf-8")
+    monkeypatch.setattr(settings, "PRESETS_FILE", file)
+    with pytest.raises(ValueError, match=f"^{re.escape(f'{file}{words}')}"):
+        sensor()
 
 
 def test_a_typo_names_the_nearest_preset() -> None:
