@@ -464,6 +464,7 @@ def show_loop(
         Time that a policy of yours has for one answer.
     """
     from phibench.benchmark.isolation.resolve import RunLimits
+    from phibench.datasets.common.progress import Steps, progress_console
     from phibench.datasets.frames.request import whole_number
     from phibench.datasets.store.files import require_writable
     from phibench.robot.loop.foreign_policies import PolicyFile, PolicyProcess
@@ -478,7 +479,10 @@ def show_loop(
             limits, hidden = RunLimits(seconds=seconds), [robot.rooms] if robot.rooms is not None else []
             chosen = PolicyProcess(PolicyFile.of(policy), setup.known, limits, hidden)
             ends.callback(chosen.close)
-        print(f"{out}: {show_episode(setup, out, chosen, seed, episode)}")
+        most = math.ceil(setup.task.longest_s / setup.task.step_s) + 1
+        with Steps(progress_console(), "pictures, at most", most) as steps:
+            outcome = show_episode(setup, out, chosen, seed, episode, told=steps.advance)
+    print(f"{out}: {outcome}")
     return 0
 
 
