@@ -1,41 +1,7 @@
 "use strict";
-// Draws the page of one sample. Image coordinates: pixel (u, v) has its centre at integers, so that it covers
-// [u - 0.5, u + 0.5]; "corner" coordinates below are u + 0.5, counted from the image's upper left corner.
-
-const data = JSON.parse(document.getElementById("data").textContent);
-const byId = (id) => document.getElementById(id);
-const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
-const state = { chosen: null, zoom: "whole" };
-const DEGREES = 180 / Math.PI;
+// Draws the page of one sample; page_tools.js has what it shares with other pages.
 
 // Planes.
-
-function bytes(text) {
-  return Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
-}
-
-async function codes(text, width, height) {
-  const stream = new Blob([bytes(text)]).stream().pipeThrough(new DecompressionStream("deflate"));
-  const halves = new Uint8Array(await new Response(stream).arrayBuffer());
-  const count = width * height, result = new Uint16Array(count);
-  for (let row = 0; row < height; row++) {
-    let value = 0;
-    for (let k = row * width; k < (row + 1) * width; k++) {
-      value = (value + halves[k] + 256 * halves[count + k]) & 65535;
-      result[k] = value;
-    }
-  }
-  return result;
-}
-
-function image(text) {
-  return new Promise((resolve, reject) => {
-    const picture = new Image();
-    picture.onload = () => resolve(picture);
-    picture.onerror = () => reject(new Error("a picture of this page is damaged"));
-    picture.src = "data:image/jpeg;base64," + text;
-  });
-}
 
 async function unpacked(position) {
   const view = data.views[position];
@@ -46,17 +12,6 @@ async function unpacked(position) {
   }
   if (view.spot) view.spot.codes = await codes(view.spot.data, view.spot.width, view.spot.height);
   view.canvas = byId(position);
-}
-
-// Decimals of a step: 1e-3 -> 3, 2.5e-5 -> 6.
-function decimals(step) {
-  for (let n = 0; n < 12; n++) if (Math.abs(step * 10 ** n - Math.round(step * 10 ** n)) < 1e-6) return n;
-  return 12;
-}
-
-function valueAt(view, name, index) {
-  const plane = view.planes[name];
-  return plane.offset + plane.step * plane.codes[index];
 }
 
 function spotAt(view, u, v) {
@@ -81,60 +36,6 @@ function truthAt(position, u, v) {
 
 // Pictures.
 
-// Transform of a canvas: canvas pixel = (corner coordinate - origin) * scale.
-function frameOf(view) {
-  const box = view.canvas.getBoundingClientRect();
-  const wide = view.canvas.clientWidth, high = view.canvas.clientHeight;
-  let scale = wide / view.width, x0 = 0, y0 = 0;
-  if (state.zoom === "spot" && view.mark) {
-    scale = wide / 40;
-    x0 = Math.round(view.mark[0]) + 0.5 - 20;
-    y0 = Math.round(view.mark[1]) + 0.5 - (high / scale) / 2;
-  }
-  return { scale, x0, y0, left: box.left + view.canvas.clientLeft, top: box.top + view.canvas.clientTop, wide, high };
-}
-
-function toCanvas(frame, u, v) {
-  return [(u + 0.5 - frame.x0) * frame.scale, (v + 0.5 - frame.y0) * frame.scale];
-}
-
-function pixelAt(view, clientX, clientY) {
-  const frame = frameOf(view);
-  const u = Math.floor((clientX - frame.left) / frame.scale + frame.x0);
-  const v = Math.floor((clientY - frame.top) / frame.scale + frame.y0);
-  return u >= 0 && v >= 0 && u < view.width && v < view.height ? [u, v] : null;
-}
-
-function context(canvas) {
-  const ratio = window.devicePixelRatio || 1;
-  const wide = Math.round(canvas.clientWidth * ratio), high = Math.round(canvas.clientHeight * ratio);
-  if (canvas.width !== wide || canvas.height !== high) [canvas.width, canvas.height] = [wide, high];
-  const ctx = canvas.getContext("2d");
-  ctx.setTransform(ratio, 0, 0, ratio, 0, 0);
-  ctx.clearRect(0, 0, canvas.clientWidth, canvas.clientHeight);
-  return ctx;
-}
-
-function polyline(ctx, frame, points) {
-  ctx.beginPath();
-  let down = false;
-  for (const point of points) {
-    if (!point) { down = false; continue; }
-    const [x, y] = toCanvas(frame, point[0], point[1]);
-    if (down) ctx.lineTo(x, y); else ctx.moveTo(x, y);
-    down = true;
-  }
-  ctx.stroke();
-}
-
-function haloed(ctx, text, x, y, fill) {
-  ctx.lineWidth = 3;
-  ctx.strokeStyle = "#000a";
-  ctx.strokeText(text, x, y);
-  ctx.fillStyle = fill;
-  ctx.fillText(text, x, y);
-}
-
 function drawLine(ctx, frame, line, wide, mark) {
   ctx.strokeStyle = "#0009";
   ctx.lineWidth = 3.5;
@@ -155,24 +56,6 @@ function drawLine(ctx, frame, line, wide, mark) {
       taken.push([x, y]);
       haloed(ctx, String(depth), x + 5, y - 4, "#fff");
     }
-  }
-}
-
-function drawMark(ctx, frame, mark) {
-  const [x, y] = toCanvas(frame, mark[0], mark[1]);
-  const gap = Math.max(4, 1.2 * frame.scale), length = Math.max(11, 3 * frame.scale);
-  for (const [style, width] of [["#000b", 4], [colour("--mark"), 1.8]]) {
-    ctx.strokeStyle = style;
-    ctx.lineWidth = width;
-    ctx.beginPath();
-    for (const [dx, dy] of [[1, 0], [-1, 0], [0, 1], [0, -1]]) {
-      ctx.moveTo(x + dx * gap, y + dy * gap);
-      ctx.lineTo(x + dx * length, y + dy * length);
-    }
-    if (state.zoom === "spot") { // the exact place, where it can be told
-      ctx.moveTo(x - 4, y); ctx.lineTo(x + 4, y); ctx.moveTo(x, y - 4); ctx.lineTo(x, y + 4);
-    }
-    ctx.stroke();
   }
 }
 
@@ -206,11 +89,7 @@ function drawView(position) {
   if (byId("lines").checked && view.line) drawLine(ctx, frame, view.line, frame.wide, view.mark);
   if (byId("marks").checked && view.mark) drawMark(ctx, frame, view.mark);
   if (state.chosen && state.chosen.position === position) {
-    const [cx, cy] = toCanvas(frame, state.chosen.u - 0.5, state.chosen.v - 0.5);
-    const side = Math.max(frame.scale, 7), inset = (side - frame.scale) / 2;
-    ctx.strokeStyle = colour("--pick");
-    ctx.lineWidth = 2;
-    ctx.strokeRect(cx - inset, cy - inset, side, side);
+    drawChosen(ctx, frame, state.chosen.u, state.chosen.v);
   }
 }
 
@@ -236,13 +115,7 @@ function choose(position, u, v) {
   }
   rows.push(["R, G, B", codeAt(view, u, v).join(", ")]);
   rows.push(["spot layer", `${spotAt(view, u, v).toPrecision(3)} e⁻/s`]);
-  const readout = byId("readout");
-  readout.replaceChildren(...rows.map((row) => {
-    const line = document.createElement("div");
-    for (const text of row) line.appendChild(document.createElement("span")).textContent = text;
-    return line;
-  }));
-  Object.assign(readout.dataset, { position, u, v, object: chosen.name, ...values, rgb: codeAt(view, u, v).join(",") });
+  writeReadout(rows, { position, u, v, object: chosen.name, ...values, rgb: codeAt(view, u, v).join(",") });
   drawAll();
 }
 
@@ -250,31 +123,6 @@ function drawAll() {
   drawView("down");
   drawView("up");
   drawRoom();
-}
-
-function followPictures() {
-  for (const position of ["down", "up"]) {
-    const view = data.views[position];
-    const take = (event) => {
-      const pixel = pixelAt(view, event.clientX, event.clientY);
-      if (pixel) choose(position, ...pixel);
-    };
-    view.canvas.addEventListener("pointermove", take);
-    view.canvas.addEventListener("pointerdown", take);
-    view.canvas.addEventListener("keydown", (event) => {
-      const step = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[event.key];
-      if (!step) return;
-      event.preventDefault();
-      const at = state.chosen && state.chosen.position === position ? state.chosen : middleOf(view);
-      const u = Math.min(Math.max(at.u + step[0], 0), view.width - 1);
-      choose(position, u, Math.min(Math.max(at.v + step[1], 0), view.height - 1));
-    });
-  }
-}
-
-function middleOf(view) {
-  const [u, v] = view.mark || [view.width / 2, view.height / 2];
-  return { u: Math.round(u), v: Math.round(v) };
 }
 
 // The page.
@@ -326,7 +174,7 @@ function followAddress() {
 async function main() {
   await Promise.all([unpacked("down"), unpacked("up")]);
   writeTexts();
-  followPictures();
+  followPictures(["down", "up"]);
   followRoom();
   markSides();
   lookAtRoom();
@@ -339,11 +187,6 @@ async function main() {
   window.addEventListener("hashchange", followAddress);
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", drawAll);
   followAddress();
-  document.body.dataset.ready = "yes";
 }
 
-main().catch((error) => {
-  document.body.dataset.ready = "no";
-  byId("facts").textContent = `This page could not be drawn: ${error.message}`;
-  console.error(error);
-});
+start(main);

@@ -3,6 +3,7 @@
 One HTML file with one script of its own. It opens from disk and fetches nothing. Truth planes travel as 16-bit numbers
 with a stated step, the same number of pixels as the image: what the page shows at a pixel is the truth plane's value
 there, rounded to that step. `sample_page.js` draws images, `sample_room.js` the room; `sample_page.html` frames them.
+Style and tools are shared with the page of a dense answer.
 """
 
 from __future__ import annotations
@@ -40,8 +41,9 @@ STEPS = {
     "azimuth_rad": 1e-4,
 }
 """Step of each truth plane in the page. Lengths take twice, four times, ... of it in rooms that need more than 65 m."""
-_PARTS = ("sample_page.html", "sample_room.js", "sample_page.js")
-_MOST = 65_534  # largest code; 16 bits
+MOST_CODE = 65_534
+"""Largest 16-bit code of a value; the next one says that there is none."""
+_SHARED = ("page_tools.js", "sample_room.js")
 _GRID_PX = 16  # between the reflection points that the 3-D view interpolates
 _LINE_POINTS = 400  # of an epipolar line: no corner is seen
 _NEAREST_M, _FARTHEST_M = 0.01, 1000.0  # along the ray of an epipolar line
@@ -77,11 +79,19 @@ def write_sample_page(sample: Sample, path: str | Path) -> Path:
 
 def sample_page(sample: Sample) -> str:
     """HTML text of the page of a sample."""
+    return filled_page(Path(__file__).with_suffix(".html"), page_data(sample))
+
+
+def filled_page(template: Path, data: dict[str, Any]) -> str:
+    """Page of a template: shared style and scripts, the script that lies beside it, and the data."""
     here = Path(__file__)
     # "<" would end the script where a name holds "</script>"
-    data = json.dumps(page_data(sample), allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
-    page, *scripts = (here.with_name(name).read_text(encoding="utf-8") for name in _PARTS)
-    return page.replace("@DATA@", data).replace("@SCRIPT@", "\n".join(scripts))
+    text = json.dumps(data, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
+    files = [*(here.with_name(name) for name in _SHARED), template.with_suffix(".js")]
+    script = "\n".join(file.read_text(encoding="utf-8") for file in files)
+    style = here.with_name("page_style.css").read_text(encoding="utf-8")
+    page = template.read_text(encoding="utf-8").replace("@STYLE@\n", style)
+    return page.replace("@DATA@", text).replace("@SCRIPT@\n", script)
 
 
 def page_data(sample: Sample) -> dict[str, Any]:
@@ -95,7 +105,7 @@ def page_data(sample: Sample) -> dict[str, Any]:
         "stroke_m": row.stroke_m,
         "objects": list(sample.object_names),
         "views": {p: _view(sample, p, frames[p], frames[f"{p}_off"]) for p in POSITIONS},
-        "scene": _scene(sample),
+        "scene": scene_of(sample),
     }
 
 
@@ -108,8 +118,8 @@ def _view(sample: Sample, position: str, on: Frame, off: Frame) -> dict[str, Any
     return {
         "width": camera.width_px,
         "height": camera.height_px,
-        "on": _base64(on.jpeg),
-        "off": _base64(off.jpeg),
+        "on": base64_text(on.jpeg),
+        "off": base64_text(off.jpeg),
         "exposure_s": on.sensor.exposure_s,
         "visible": row.visible,
         "cause": row.cause,
@@ -120,7 +130,7 @@ def _view(sample: Sample, position: str, on: Frame, off: Frame) -> dict[str, Any
         "line": epipolar_line(sample, other),
         "spot": _spot(sample, position),
         "planes": _planes(sample.truth(position)),
-        "reflection": _reflection_grid(sample.view(position)),
+        "reflection": reflection_grid(sample.view(position)),
     }
 
 
@@ -183,45 +193,46 @@ def _spot(sample: Sample, position: str) -> dict[str, Any] | None:
     peak = float(planes.max(initial=0.0))
     if peak <= 0.0:
         return None  # no light of the spot falls on this image
-    codes = np.rint(planes[0] / peak * _MOST).astype(np.uint16)
+    codes = np.rint(planes[0] / peak * MOST_CODE).astype(np.uint16)
     return {
         "u0": window.u0_px,
         "v0": window.v0_px,
         "width": planes.shape[2],
         "height": planes.shape[1],
-        "step": peak / _MOST,
-        "data": _packed(codes),
+        "step": peak / MOST_CODE,
+        "data": packed(codes),
     }
 
 
 def _planes(truth: dict[str, NDArray[Any]]) -> dict[str, dict[str, Any]]:
     """Truth planes as 16-bit codes; `object_id` is the code itself, 65535 where there is nothing."""
     seen = truth["object_id"] >= 0
-    result = {"object_id": {"step": 1, "offset": 0, "data": _packed(np.where(seen, truth["object_id"], _MOST + 1))}}
+    result = {"object_id": {"step": 1, "offset": 0, "data": packed(np.where(seen, truth["object_id"], MOST_CODE + 1))}}
     for name, step in STEPS.items():
         values = np.where(seen, truth[name], 0.0).astype(float)
         span = float(values.max() - values.min())
-        while span > step * _MOST:
+        while span > step * MOST_CODE:
             step *= 2.0
         offset = step * np.floor(values.min() / step)  # a multiple of the step: values end in few decimals
         codes = np.where(seen, np.rint((values - offset) / step), 0.0)
-        result[name] = {"step": step, "offset": float(offset), "data": _packed(codes)}
+        result[name] = {"step": step, "offset": float(offset), "data": packed(codes)}
     return result
 
 
-def _packed(codes: Array | NDArray[np.uint16]) -> str:
+def packed(codes: Array | NDArray[np.uint16]) -> str:
     """16-bit codes, shape (H, W), as base64: differences along rows, low bytes before high bytes, deflated."""
     rows = np.asarray(codes).astype(np.int64)
     steps = np.diff(rows, axis=1, prepend=0).astype(np.uint16)
     halves = np.stack([steps & 255, steps >> 8]).astype(np.uint8)
-    return _base64(zlib.compress(halves.tobytes(), 9))
+    return base64_text(zlib.compress(halves.tobytes(), 9))
 
 
-def _base64(data: bytes) -> str:
+def base64_text(data: bytes) -> str:
+    """Bytes as text."""
     return base64.b64encode(data).decode("ascii")
 
 
-def _reflection_grid(view: View) -> dict[str, Any]:
+def reflection_grid(view: View) -> dict[str, Any]:
     """Reflection points of every 16th pixel, world, metres: rows of (x, y, z) or None. For drawing rays only."""
     camera = view.rig.camera
     v, u = np.mgrid[0 : camera.height_px : _GRID_PX, 0 : camera.width_px : _GRID_PX]
@@ -236,7 +247,8 @@ def _rounded(point: Any, digits: int = 3) -> list[float] | None:
 # Rig and room in 3-D.
 
 
-def _scene(sample: Sample) -> dict[str, Any]:
+def scene_of(sample: Sample) -> dict[str, Any]:
+    """Faces of the room, both places of the rig, and the spot: what the 3-D view draws."""
     down, up = (sample.view(p) for p in POSITIONS)
     shapes = sample.room.shapes(down)
     first, brought = len(shapes) - len(sample.room.brought(down)), sample.room.brought(up)

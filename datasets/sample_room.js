@@ -22,6 +22,12 @@ function lookAtRoom() {
   for (let step = 0; step < 60 && !allSeen(corners); step++) orbit.distance *= 1.05;
 }
 
+// World x to the right, world y upwards.
+function lookFromAbove() {
+  lookAtRoom();
+  Object.assign(orbit, { yaw: -Math.PI / 2, pitch: 1.5 });
+}
+
 function allSeen(points) {
   const { wide, high, focal } = screen(byId("room")), { look } = camera();
   return points.map(look).every(([x, y, z]) =>
@@ -39,7 +45,7 @@ function lookAtMirror() {
   orbit.distance = 1.2 + 1.9 * Math.abs(rigs[1].centre[2] - rigs[0].centre[2]);
   orbit.pitch = 0.12;
   const spot = data.scene.spot;
-  orbit.yaw = Math.atan2(spot[1] - orbit.target[1], spot[0] - orbit.target[0]) + Math.PI / 2;
+  if (spot) orbit.yaw = Math.atan2(spot[1] - orbit.target[1], spot[0] - orbit.target[0]) + Math.PI / 2;
 }
 
 // Eye coordinates (right, up, ahead) of a world point.
@@ -153,7 +159,7 @@ function drawRigs(ctx, look, flat, focal) {
     for (const line of rig.mirror) path(line, "#9aa7b4", 1);
   }
   const spot = data.scene.spot, axis = data.scene.rigs[0].centre;
-  path([[axis[0], axis[1], spot[2]], spot], colour("--mark"), 1.4, [6, 4]);
+  if (spot) path([[axis[0], axis[1], spot[2]], spot], colour("--mark"), 1.4, [6, 4]);
   for (const rig of data.scene.rigs) {
     if (rig.chief_ray.length) path(rig.chief_ray, colour("--ray"), rig.visible ? 1.8 : 1, rig.visible ? [] : [2, 4]);
     dot(rig.lens, 2.5, "#30363d");
@@ -164,13 +170,23 @@ function drawRigs(ctx, look, flat, focal) {
     const hit = ["x_m", "y_m", "z_m"].map((name) => Number(chosen.values[name]));
     path([rig.lens, reflectionAt(chosen) || rig.centre, hit], colour("--pick"), 1.8);
     dot(hit, 4, colour("--pick"));
+    if (chosen.answer) drawAnswer(ctx, look(chosen.answer), flat);
   }
+  if (!spot) return;
   dot(spot, 4.5, colour("--ray"));
   const label = look([(axis[0] + spot[0]) / 2, (axis[1] + spot[1]) / 2, spot[2]]);
   ctx.font = "13px system-ui, sans-serif";
   if (label[2] > NEAR) {
     const [x, y] = flat(label); // below the rays, which come from above
     haloed(ctx, `D = ${data.depth_m.toFixed(3)} m`, x - 20, y + 24, "#fff");
+  }
+}
+
+// A ring where an answer puts the chosen point: another shape than the truth's dot, for eyes that see no colours.
+function drawAnswer(ctx, point, flat) {
+  if (point[2] < NEAR) return;
+  for (const [style, width] of [["#000b", 5], [colour("--curve"), 2.4]]) {
+    ctx.beginPath(); ctx.arc(...flat(point), 8, 0, 7); ctx.strokeStyle = style; ctx.lineWidth = width; ctx.stroke();
   }
 }
 

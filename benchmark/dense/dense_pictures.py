@@ -29,8 +29,10 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _WIDTH_PX = 720  # of the panoramas: half a degree
-_ERROR = 0.1  # relative, at the ends of the colours
-_NEAR_M, _FAR_M = 0.4, 10.0  # ends of the colours of D
+ERROR = 0.1
+"""Relative error at the ends of the colours."""
+NEAR_M, FAR_M = 0.4, 10.0
+"""D at the ends of the colours."""
 _OBSTACLE_M = (0.05, 1.0)  # heights between which a thing is in a robot's way
 _SECTORS = 180  # of two degrees
 _SECTOR_PART = 0.02  # of a sector's points that may be nearer than its free space: lone errors
@@ -38,7 +40,7 @@ _SECTOR_POINTS = 5  # fewer say nothing
 _RANGE_M = 6.0  # of the map
 CAUSE_GROUPS = ("seen in both", "hidden by a thing", "rim, back or outside", "robot or holder", "nothing")
 _GROUP_OF = {"robot": 3, "holder": 3, "nothing": 4}
-_CAUSE_COLOURS = ("#d9d9d9", "#d55e00", "#e69f00", "#0072b2", "#000000")
+CAUSE_COLOURS = ("#d9d9d9", "#d55e00", "#e69f00", "#0072b2", "#000000")
 
 
 @dataclass(frozen=True)
@@ -53,12 +55,26 @@ class DensePicture:
         The answer's D.
     name : str
         Of the method.
+    sigma_depth_m : array, shape (H, W), or None
+        Of the answer, if the method has one.
     """
 
     pair: DensePair
     truth: DenseTruth
     depth_m: Array
     name: str
+    sigma_depth_m: Array | None = None
+
+    @cached_property
+    def error(self) -> Array:
+        """Relative error of D, shape (H, W)."""
+        with np.errstate(invalid="ignore"):
+            return np.asarray(self.depth_m / self.truth.depth_m - 1.0)
+
+    @cached_property
+    def known(self) -> BoolArray:
+        """Mask of the answered pixels whose room point both images show."""
+        return np.asarray(np.isfinite(self.error) & self.truth.scored)
 
     @cached_property
     def maps(self) -> PanoramaMaps:
@@ -86,8 +102,7 @@ class DensePicture:
         """Panoramas of the image, the answer, its error and the causes, one below the other."""
         from matplotlib.colors import ListedColormap, LogNorm
 
-        error = self.depth_m / self.truth.depth_m - 1.0
-        known = np.isfinite(error) & self.truth.scored
+        error, known = self.error, self.known
         grey = luma_codes(self.pair.down, self.pair.card)
         with styled({"axes.grid": False}, (8.0, 10.4), layout="constrained") as figure:
             axes = figure.subplots(4, 1)
@@ -98,7 +113,7 @@ class DensePicture:
                 self.depth_m,
                 f"D by {self.name}: {share:.0%} answered; white is unknown",
                 cmap="viridis",
-                norm=LogNorm(_NEAR_M, _FAR_M),
+                norm=LogNorm(NEAR_M, FAR_M),
             )
             bar = figure.colorbar(shown, ax=axes[1], label="D, m", ticks=[0.5, 1, 2, 5, 10], format="{x:g}")
             bar.ax.minorticks_off()
@@ -109,11 +124,11 @@ class DensePicture:
                 np.where(known, 100.0 * error, np.nan),
                 title,
                 cmap="RdBu",
-                vmin=-100 * _ERROR,
-                vmax=100 * _ERROR,
+                vmin=-100 * ERROR,
+                vmax=100 * ERROR,
             )
             figure.colorbar(shown, ax=axes[2], label="%, blue is too far", extend="both")
-            colours = ListedColormap(list(_CAUSE_COLOURS))
+            colours = ListedColormap(list(CAUSE_COLOURS))
             shown = self._panel(
                 axes[3], self.groups, "where the up image shows the same point", cmap=colours, vmin=-0.5, vmax=4.5
             )
@@ -145,9 +160,9 @@ class DensePicture:
                 label=f"free space by {self.name}",
             )
             at = self._obstacle_mask(self.depth_m)
-            error = 100.0 * (self.depth_m / self.truth.depth_m - 1.0)[at]
+            error = 100.0 * self.error[at]
             points = axes.scatter(
-                given[:, 0], given[:, 1], c=error, s=0.4, cmap="RdBu", vmin=-100 * _ERROR, vmax=100 * _ERROR
+                given[:, 0], given[:, 1], c=error, s=0.4, cmap="RdBu", vmin=-100 * ERROR, vmax=100 * ERROR
             )
             points.set_rasterized(True)
             figure.colorbar(points, ax=axes, label="error of D, %, blue is too far", extend="both")
@@ -216,7 +231,14 @@ def picture_of(
         raise DatasetError(f"{reference} gave no answer for {wanted}: {outcome.failure}: {outcome.message}")
     truth = pairs.truth(number)
     depth_m = depths_of(outcome.dense, truth.given_rig, truth.given_stroke_m)
-    return DensePicture(pairs.pair(number), truth, depth_m, reference.rsplit("/", 1)[-1])
+    sigma = outcome.dense.sigma_depth_m
+    return DensePicture(
+        pairs.pair(number),
+        truth,
+        depth_m,
+        reference.rsplit("/", 1)[-1],
+        None if sigma is None else np.asarray(sigma, float),
+    )
 
 
 def free_space(points_m: Array) -> Array:

@@ -173,7 +173,8 @@ def picture(
     directory: DataFolder,
     *,
     method: str,
-    out: OutFolder,
+    out: Path | None = None,
+    html: Path | None = None,
     sample: str | None = None,
     preset: Preset = DEFAULT_PRESET,
     limits: Limits = LIMITS,
@@ -184,20 +185,34 @@ def picture(
     ----------
     method
         A name that `phibench dense list` shows, or FILE.py:FUNCTION.
+    out
+        Folder for two pictures.
+    html
+        File of an interactive page: each pixel with its true and its answered D and place, and the room.
     sample
         Id or number of the sample; the first by default.
     preset
         What the camera delivers: "mjpeg", "yuyv", "srgb8", "bayer-raw" or "mono-raw".
     """
+    from phibench.benchmark.dense.dense_page import DensePage
     from phibench.benchmark.dense.dense_pictures import picture_of
     from phibench.benchmark.dense.dense_score import chosen_pairs
     from phibench.benchmark.isolation.resolve import DENSE, resolve
-    from phibench.datasets.store.files import write_bytes
+    from phibench.datasets.common.errors import DatasetError
+    from phibench.datasets.store.files import require_writable, write_bytes
 
+    if out is None and html is None:
+        raise DatasetError("name what to write: --out FOLDER for pictures, --html FILE for an interactive page")
     resolve(method, DENSE)  # one that is not there is told before anything begins
-    drawn = picture_of(method, chosen_pairs(directory, preset, 1), sample, limits.of_run)
-    for name, data in (("panoramas.png", drawn.panoramas_png()), ("above.png", drawn.from_above_png())):
-        print(f"written: {write_bytes(out / name, data)}")
+    if html is not None:
+        require_writable(html)
+    pairs = chosen_pairs(directory, preset, 1)
+    drawn = picture_of(method, pairs, sample, limits.of_run)
+    if out is not None:
+        for name, data in (("panoramas.png", drawn.panoramas_png()), ("above.png", drawn.from_above_png())):
+            print(f"written: {write_bytes(out / name, data)}")
+    if html is not None:
+        print(f"written: {DensePage(drawn, pairs).write(html)}")
     return 0
 
 

@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 import base64
-import html
 import io
 import json
 import re
-import shutil
-import subprocess
-import zlib
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
+from helpers.pages import NEEDS_BROWSER, browsed, page_json, unpacked
 from PIL import Image
 
 from phibench.cli.main import main
@@ -31,8 +27,6 @@ from phibench.render.optics.room_tracer import room_geometry
 from phibench.render.optics.truth import spot_truth
 from phibench.scenes.rig import POSITIONS
 
-CHROMIUM = next((name for name in ("chromium", "chromium-browser", "google-chrome") if shutil.which(name)), "")
-NEEDS_BROWSER = pytest.mark.skipif(not CHROMIUM, reason="no Chromium here")
 # float32 on disk: 7 digits of 10 m are 1e-6 m, far below a step
 ROUNDING = 1.001
 
@@ -40,12 +34,6 @@ ROUNDING = 1.001
 @pytest.fixture
 def sample(tiny_dataset: Path) -> Sample:
     return open_dataset(tiny_dataset)[0]
-
-
-def unpacked(text: str, width: int, height: int) -> np.ndarray:
-    """Codes of a packed plane, in NumPy."""
-    low, high = np.frombuffer(zlib.decompress(base64.b64decode(text)), np.uint8).reshape(2, height, width).astype(int)
-    return np.cumsum(low + 256 * high, axis=1) % 65536
 
 
 def test_planes_of_the_page_are_the_truth_to_half_a_step(sample: Sample) -> None:
@@ -174,24 +162,6 @@ def test_samples_are_taken_by_number_or_name(tiny_dataset: Path, tmp_path: Path,
     assert [data["views"][p]["visible"] for p in POSITIONS] == [dataset.rows[1].position(p).visible for p in POSITIONS]
     assert main(["dataset", "show", str(tiny_dataset), "--html", str(tmp_path / "a.html" / "b.html")]) == 2
     assert "was not written" in capsys.readouterr().err
-
-
-def page_json(path: Path) -> dict[str, Any]:
-    found = re.search(r'<script type="application/json"[^>]*>(.*?)</script>', path.read_text(encoding="utf-8"), re.S)
-    assert found
-    return json.loads(found[1])
-
-
-def browsed(page: Path, address: str, tmp_path: Path, *options: str) -> tuple[dict[str, str], str]:
-    """Attributes of the read-out after the address was opened in Chromium, and what the console said."""
-    command = [CHROMIUM, "--headless=new", "--no-sandbox", "--virtual-time-budget=20000", "--enable-logging=stderr"]
-    command += [f"--user-data-dir={tmp_path / 'browser'}", *options, "--dump-dom", f"{page.as_uri()}#{address}"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
-    assert 'data-ready="yes"' in done.stdout, done.stderr[-2000:]
-    readout = re.search(r'<div id="readout"([^>]*)>', done.stdout)
-    assert readout
-    attributes = {k: html.unescape(v) for k, v in re.findall(r'data-([\w-]+)="([^"]*)"', readout[1])}
-    return attributes, "\n".join(line for line in done.stderr.splitlines() if "CONSOLE" in line)
 
 
 def places(sample: Sample) -> Iterator[tuple[str, int, int]]:

@@ -11,6 +11,7 @@ from helpers.revolved_rigs import revolved
 from phibench.benchmark.dense.dense_pairs import DenseTruth
 from phibench.benchmark.dense.dense_records import COLUMNS, TruthErrors, ause, pair_records
 from phibench.estimator.dense.dense_interface import DenseAnswer
+from phibench.render.optics.ray_tracer import trace_pixels
 from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.room import default_rig
 
@@ -138,6 +139,66 @@ def test_the_seam_compares_both_of_its_sides(truth: DenseTruth, errors: TruthErr
     depth[: middle + 1] += 0.3
     row = pair_records(errors, DenseAnswer(depth), 0.1).row(0, named=True)
     assert row["seam_m"] == pytest.approx(0.3, rel=1e-9)
+
+
+def test_the_seam_is_the_consistency_error_as_published(truth: DenseTruth, errors: TruthErrors) -> None:
+    """First and last column of a panorama, row by row, as Helvipad's code sums them; its edges by azimuths alone."""
+    rng = np.random.default_rng(8)
+    depth = truth.depth_m * (1.0 + 0.1 * rng.normal(size=truth.depth_m.shape))
+    depth[rng.random(depth.shape) < 0.2] = np.nan
+    X = truth.found.point_world_m - truth.true_rig.at(0.0).sphere_centre_m
+    azimuth = np.where(X[..., 0] < 0.0, np.arctan2(X[..., 1], X[..., 0]), np.nan)  # behind the robot
+    total, count = 0.0, 0
+    for u in np.flatnonzero(np.isfinite(azimuth).any(axis=0)):
+        positive, negative = (np.where(sign * azimuth[:, u] > 0.0, np.abs(azimuth[:, u]), -1.0) for sign in (1, -1))
+        first, last = int(positive.argmax()), int(negative.argmax())  # left edge of the panorama, and right edge
+        if min(positive[first], negative[last]) < 0.0:
+            continue
+        ends = [(v, u) for v in (first, last)]
+        if not all(truth.scored[end] and np.isfinite(depth[end]) for end in ends) or abs(first - last) != 1:
+            continue
+        true, given = (plane[ends[0]] - plane[ends[1]] for plane in (truth.depth_m, depth))
+        total, count = total + abs(true - given), count + 1
+    assert count > 20
+    row = pair_records(errors, DenseAnswer(depth), 0.1).row(0, named=True)
+    assert row["seam_m"] == pytest.approx(total / count, rel=1e-12)
+
+
+def test_disparity_and_range_obey_helvipads_corrected_formula(truth: DenseTruth, errors: TruthErrors) -> None:
+    """range = B (sin / tan(disparity) - cos) of the angle from straight down; the first release had + cos.
+
+    Points of a wrong answer are those of the renderer's rays. Means are the published ones, over all answered pixels.
+    """
+    down, stroke_m = truth.true_rig.at(0.0), truth.stroke_m
+    depth = np.where(truth.scored, 1.07 * truth.depth_m, np.nan)
+    v, u = np.nonzero(truth.scored)
+    ray = trace_pixels(down, np.stack([u, v], axis=1).astype(float))
+    out, way = (ray.points_m - down.sphere_centre_m)[:, :2], ray.directions[:, :2]
+    a, b, c = (way**2).sum(axis=1), (out * way).sum(axis=1), (out**2).sum(axis=1) - depth[v, u] ** 2
+    t = (-b + np.sqrt(b * b - a * c)) / a
+    points = {"true": truth.found.point_world_m[v, u], "given": ray.points_m + t[:, None] * ray.directions}
+    degrees = {}
+    for name, X in points.items():
+        reach = np.linalg.norm(X - down.sphere_centre_m, axis=1)
+        theta = np.arccos((down.sphere_centre_m - X)[:, 2] / reach)  # from straight down
+        disparity = np.arctan2(stroke_m * np.sin(theta), reach + stroke_m * np.cos(theta))
+        again = stroke_m * (np.sin(theta) / np.tan(disparity) - np.cos(theta))
+        assert np.abs(again / reach - 1.0).max() < ROUNDING
+        legacy = stroke_m * (np.sin(theta) / np.tan(disparity) + np.cos(theta))
+        assert np.median(np.abs(legacy / reach - 1.0)) > 0.05
+        degrees[name] = np.degrees(disparity)
+    off = degrees["given"] - degrees["true"]
+    row = pair_records(errors, DenseAnswer(depth), 0.1).row(0, named=True)
+    expected = {
+        "disparity_mae_deg": np.abs(off).mean(),
+        "disparity_square_deg2": (off**2).mean(),
+        "disparity_mare": np.abs(off / degrees["true"]).mean(),
+        "mae_m": 0.07 * truth.depth_m[v, u].mean(),
+        "square_m2": 0.07**2 * (truth.depth_m[v, u] ** 2).mean(),
+        "mean": 0.07,
+    }
+    for name, value in expected.items():
+        assert row[name] == pytest.approx(value, rel=1e-7), name
 
 
 CENTRAL = {
