@@ -53,6 +53,7 @@ def test_powers_are_those_of_a_straight_line_in_the_logarithms() -> None:
     assert (images.value, rays.value) == pytest.approx((2.5, 2.0))
 
 
+@pytest.mark.slow
 def test_the_error_per_pixel_is_that_of_the_rays() -> None:
     """Frames at 1.5 and 3 m, and with twice the distance: scatter of D over that of the pixels against the rays alone.
 

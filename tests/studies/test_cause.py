@@ -114,6 +114,7 @@ class _Line(DepthModel):
         return float(scipy.stats.norm.logpdf([0.5, -1.0], point, 0.3).sum())
 
 
+@pytest.mark.slow
 def test_evidence_and_posterior_of_a_closed_form(settings: CauseSettings) -> None:
     """Evidence N(y; 0, 1 + s^2) of each; 200 live points: sampler's error 0.13, four of which are one alarm in 16000.
 
@@ -144,6 +145,7 @@ def test_pooled_runs() -> None:
     assert pooled([first], "test") is first
 
 
+@pytest.mark.slow
 def test_made_up_data_give_back_their_cause(settings: CauseSettings) -> None:
     """A tilt of 1.1 degrees at 0.2 px beats noise alone by far; noise alone does not make a tilt favoured."""
     pytest.importorskip("dynesty")

@@ -132,6 +132,7 @@ def test_slopes_are_the_limit_of_whole_changes() -> None:
     assert np.all(found["focus_distance_m"] == 0.0)  # moves no chief ray
 
 
+@pytest.mark.slow
 def test_tolerance_solves_the_whole_change() -> None:
     """Against brentq on the same cost: the power law between steps of 10 % is good to (ln 1.1)^2 / 8 = 0.1 %."""
 
@@ -241,6 +242,7 @@ def test_calibration_needs_its_spots_in_the_image() -> None:
         SETUP.calibrated(RIG, 0.425, Misalignment(cx_px=900.0))
 
 
+@pytest.mark.slow
 def test_rendered_spots_move_as_predicted() -> None:
     """One place, all parameters: centroids and chief rays drift apart by a thousandth of a pixel at most."""
     places = Places(np.array([2.18]), np.radians([30.0]), 0.5, 0.425)

@@ -57,6 +57,7 @@ def test_pairs_and_truths_are_those_of_the_set_in_any_order() -> None:
         assert_same_truth(made.truth(1), plain.truth(1))  # of a pair that nobody asked for
 
 
+@pytest.mark.slow
 def test_pairs_of_a_data_set_are_the_same_bytes(bench_dataset: Path) -> None:
     """Pictures, with boxes; the test above has raw images."""
     plain = dataset_pairs(open_finished(bench_dataset), "mjpeg", boxes_px=64)

@@ -83,6 +83,7 @@ def depth_pulls(rigs: int, with_calibration: bool) -> np.ndarray:
     return np.concatenate(pulls)
 
 
+@pytest.mark.slow
 def test_the_predicted_error_of_depth_holds_the_calibration() -> None:
     """12 rigs of 5 pairs. The pulls of one rig share its error, so that the sum over rigs of the mean square of 5 lies
     between independent and fully common errors; the worst case, common ones, is chi-square with 12 degrees.

@@ -60,6 +60,7 @@ def test_rooms_without_a_ball_are_refused() -> None:
             find_circle(photo.light)
 
 
+@pytest.mark.slow
 def test_the_same_photograph_at_twice_the_size_has_the_same_outline() -> None:
     """Pictures above 1024 px are shrunk by whole blocks: pixel centres at (i + 1/2) b - 1/2.
 
@@ -77,6 +78,7 @@ def test_the_same_photograph_at_twice_the_size_has_the_same_outline() -> None:
     assert (large.sigma_px < again.sigma_px).all()
 
 
+@pytest.mark.slow
 def test_a_long_photograph_is_measured_in_finer_squares() -> None:
     """At 1280 x 960 the outline is within 1 px of the true one, nearer than the search at half the size has it."""
     photo = ball_photograph(np.random.default_rng([7, 3]), size=(960, 1280))
@@ -116,6 +118,7 @@ def test_edges_of_a_disc_have_their_place() -> None:
     assert np.abs(place[:, 0]).max() < 0.2
 
 
+@pytest.mark.slow
 def test_a_grey_picture_is_enough() -> None:
     photo = photograph(1)
     circle = find_circle(photo.light.mean(axis=-1))

@@ -42,7 +42,9 @@ def ball(
 CASES = [((-1.5, 0.0, 0.7), 1.0), ((0.0, -1.5, 0.8), 1.0), ((-2.0, 0.0, 1.2), 1.0), ((1.2, 1.2, 0.9), 1.5)]
 
 
-@pytest.mark.parametrize(("pool", "blur_px"), CASES)
+@pytest.mark.parametrize(
+    ("pool", "blur_px"), [*CASES[:2], *(pytest.param(*case, marks=pytest.mark.slow) for case in CASES[2:])]
+)
 def test_a_limb_without_contrast_is_found_or_refused(pool: tuple[float, float, float], blur_px: float) -> None:
     """Within 3 claimed sigma in each of three numbers, or refused; edges alone are 4 to 8 sigma off here."""
     true = (300.3, 295.6, 230.0)

@@ -110,6 +110,7 @@ def test_a_stated_circle_is_taken():
     assert ball.edges == 1.0
 
 
+@pytest.mark.slow
 def test_a_panorama_coarser_than_the_photograph_is_averaged():
     """Noise falls with the number of the photograph's pixels in one of the panorama's, 9 x 9 in the middle."""
     light = photograph(centre=np.array([0.0, 0.0, 0.30]))

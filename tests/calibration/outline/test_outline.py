@@ -246,7 +246,7 @@ def lamps_on_a_dark_plate(rig: Rig, part: float) -> np.ndarray:
     return np.where(beyond, light[:, 5, 5][:, None, None] * plate, light).astype(np.float32)
 
 
-@pytest.mark.parametrize("part", [0.2, 0.5])
+@pytest.mark.parametrize("part", [pytest.param(0.2, marks=pytest.mark.slow), 0.5])
 def test_lamps_that_fill_the_limb_before_a_dark_plate(part: float) -> None:
     """The edge of the full pixels is 3 px outside the limb: 8 of the sigmas that it was once claimed to have.
 

@@ -92,6 +92,7 @@ def with_edges(light: np.ndarray, rig: Rig) -> np.ndarray:
     return np.asarray(light * (1.0 + 0.5 * bright * ((away > 0.4 * radius) & (away < 0.94 * radius))), np.float32)
 
 
+@pytest.mark.slow
 def test_vertical_edges_make_the_papers_check(tmp_path, capsys) -> None:
     """An aligned rig whose edges pass through the middle: found, drawn, and worth more than 0.1 deg and 5 px."""
     light = with_edges(limb_light(Rig(), np.random.default_rng(33), room=room), Rig())

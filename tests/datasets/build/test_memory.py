@@ -37,7 +37,8 @@ for number in range(1, count + 1):
 
 
 @pytest.mark.skipif(not Path("/proc/self/statm").is_file(), reason="needs /proc")
-@pytest.mark.parametrize("count", [24, pytest.param(500, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("count", [24, 500])
 def test_many_views_in_one_process(
     tmp_path: Path, python: Callable[..., "subprocess.CompletedProcess[str]"], count: int
 ) -> None:

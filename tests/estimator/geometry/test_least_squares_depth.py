@@ -22,6 +22,7 @@ def depth_of(rig: Rig, point: np.ndarray) -> float:
     return float(np.linalg.norm((point - rig.at(0.0).sphere_centre_m)[:2]))
 
 
+@pytest.mark.slow
 def test_exact_pixels_of_misaligned_rigs_give_the_exact_depth() -> None:
     """Rounding of pixels, 1e-13, times at most 2 m per pixel and some sums."""
     rng = np.random.default_rng(5)

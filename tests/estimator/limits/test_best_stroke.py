@@ -247,6 +247,7 @@ def test_a_rig_as_built_errs_beyond_first_order_as_drawn_rigs_do() -> None:
     assert rms > 2.0 * float(curve.sigma_calibration_m[0])
 
 
+@pytest.mark.slow
 def test_errors_of_a_rig_as_built_grow_with_the_third_order_at_short_strokes_and_shrink_at_long_ones() -> None:
     """Against drawn rigs, exact pixels, at the distance of the paper's Table 1; the linear part misses on both sides.
 
@@ -320,6 +321,7 @@ def test_what_cannot_be_seen_has_no_stroke() -> None:
     assert cut.limits == (IMAGE_EDGE,)
 
 
+@pytest.mark.slow
 def test_strokes_whose_error_is_unknown_have_a_cause() -> None:
     """At 0.2 m and 1 mW a spot has more electrons than the bound's table; a free stroke has a finite error."""
     preset_spot = spot_bound(RIG, sensor_card("mjpeg"))

@@ -72,6 +72,7 @@ def test_parts_stay_apart() -> None:
     assert one.sigma_calibration_m == pytest.approx(2.0 * abs(one.gradient[RIG_PARAMETERS.index("cx_px")]), rel=1e-12)
 
 
+@pytest.mark.slow
 def test_rig_gradient_does_not_depend_on_its_steps() -> None:
     """Five-point stencils: half the steps change nothing but rounding, for aligned and misaligned rigs."""
     rng, checked = np.random.default_rng(91), 0

@@ -90,6 +90,7 @@ def test_near_spots_are_as_far_off_as_claimed() -> None:
     assert pulls2(None).mean() > 1.6
 
 
+@pytest.mark.slow
 def test_full_pixels_are_left_out() -> None:
     """Ten times the light, 3 full pixels at most: read noise brings one of a dozen below the last code.
 

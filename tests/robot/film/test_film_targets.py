@@ -196,6 +196,7 @@ def nees_of(film: StagedFilm, tracker: TargetTracker, number: int, encoder_m: Ar
     return belief.nees(np.array(spots[number].position_world_m))
 
 
+@pytest.mark.slow
 def test_depth_of_a_tracked_target_takes_the_room_off_by_frames_with_the_code_off(film_images: Path) -> None:
     """NEES of one film, chi squared of 3: 1e-3 beyond 16.3. A stroke that is told too long by 10 % is noticed."""
     film, tracker, encoder = stroke_film(room_of(film_images), "tracked", 0, 60.0, (), STROKE)

@@ -335,6 +335,7 @@ def test_films_of_a_rig_that_is_not_known_exactly() -> None:
     assert untold.nees(run.place()) > 30.0 * most
 
 
+@pytest.mark.slow
 def test_films_of_such_a_rig_with_an_inexact_encoder() -> None:
     """Readings that err by 5 mm: mean NEES of twelve films in its band; where the encoder is not told of, above it."""
     strokes, found = np.linspace(0.0, 0.4, 8), []
@@ -439,6 +440,7 @@ def moves() -> list[tuple[float, float, float, float]]:
     return [moved(number) for number in range(12)]
 
 
+@pytest.mark.slow
 def test_a_moving_target_is_tracked_and_two_frames_are_not_enough(moves) -> None:
     """The last pair takes the motion between its frames for depth: wrong by much more than it claims."""
     nees, belief, pair, claim = np.array(moves).T
