@@ -239,6 +239,8 @@ class Crop:
         Column and row of the crop's first pixel on the sensor, modulo 16.
     card : SensorCard
         Numbers of the sensor, with the exposure that was chosen.
+    response : 3 floats
+        Of its filters R, G, B at the laser's line.
     sample_id, position, preset : str
         Where the crop comes from, and where the camera's chain ends.
     laser_level : float
@@ -250,6 +252,7 @@ class Crop:
     uv_px: Array
     phase_px: NDArray[np.int64]
     card: SensorCard
+    response: tuple[float, ...]
     sample_id: str
     position: str
     preset: str
@@ -343,8 +346,8 @@ class SpotCrops:
         with in_one_sentence():
             image = chain.frame(light, NoiseStream((*names, "noise")), region)
             off = chain.frame(light.laser_off(), NoiseStream((*names, "off")), region) if self.laser_off else None
-        card = card_of(chain.sensor)
-        return Crop(image, off, place, phase, card, side.sample_id, side.position, request.preset, level)
+        named = side.sample_id, side.position, request.preset
+        return Crop(image, off, place, phase, card_of(chain.sensor), side.response, *named, level)
 
     def _camera(self, side: _Side, number: int) -> tuple[FrameRequest, Chain]:
         """Request of a spot's sample, and its camera with the exposure of the whole down image."""
@@ -377,6 +380,7 @@ class _Side:
     origin: tuple[int, int]
     coarse: NDArray[np.float32]
     f_number: float
+    response: tuple[float, ...]
 
     def moved(self, uv_px: Array, size_px: int, lamp_level: float, laser_level: float) -> Light:
         """Light on a square of `size_px` pixels, with the spot's centre at `uv_px` in it."""
@@ -428,6 +432,7 @@ def _sides_of(sample: Sample, settings: CropSettings) -> Iterator[_Side]:
             (u0, v0),
             coarse,
             sample.rig.camera.f_number,
+            sample.rig.camera.detector.laser_filter_response,
         )
 
 

@@ -100,12 +100,12 @@ def _print(preset: str, name: str, square: Array, others: Array, squared: Array,
 def _asked(test: Path, preset: str, rows: list[dict[str, Any]], networks: dict[str, Network]) -> dict[str, Answers]:
     """Answers of networks for the spots of records."""
     every: dict[str, tuple[list[Array], list[Array]]] = {name: ([], []) for name in networks}
-    for row, (on, off, card, first) in zip(rows, _parts(test, preset, rows), strict=True):
+    for row, (on, off, card, response, first) in zip(rows, _parts(test, preset, rows), strict=True):
         for name, network in networks.items():
             place = np.array([row["u_px"], row["v_px"]]) - first
             for _ in range(2):  # once more about the answer
                 origin = crop_origin((float(place[0]), float(place[1])))
-                answer = network.position(crop_input(cut(on, origin), cut(off, origin), card))
+                answer = network.position(crop_input(cut(on, origin), cut(off, origin), card, response))
                 place = answer.uv_px + origin
             every[name][0].append(place + first - [row["u_true_px"], row["v_true_px"]])
             every[name][1].append(answer.covariance_px2)
@@ -123,7 +123,7 @@ def _parts(test: Path, preset: str, rows: list[dict[str, Any]]) -> Iterator[tupl
 
 
 def _part(sample: CachedSample, pair_draw: PairDraw, position: str, uv_px: tuple[float, float]) -> tuple[Any, ...]:
-    """Pixels about a place with the laser on and off, the sensor's card, and their first column and row."""
+    """Pixels about a place, laser on and off, the sensor's card, the filters' response, first column and row."""
     source = sample.source(pair_draw)
     side = source.sides[position]
     height, width = side.light.size
@@ -138,7 +138,8 @@ def _part(sample: CachedSample, pair_draw: PairDraw, position: str, uv_px: tuple
         )
         for light, laser in ((side.light, True), (side.light.laser_off(), False))
     ]
-    return (*images, card_of(side.chain.sensor), np.array([u0, v0]))
+    response = sample.nominal_rig.camera.detector.laser_filter_response
+    return (*images, card_of(side.chain.sensor), response, np.array([u0, v0]))
 
 
 def found(scores: Path) -> None:

@@ -29,28 +29,34 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.common.input_files import MIB, InputFile
 from phibench.datasets.frames.request import FrameOptions
 from phibench.datasets.read import open_finished
 from phibench.datasets.training import Crop, CropSettings, SpotCrops
-from phibench.estimator.learned.network_input import PLANES, SCALARS, SIDE_PX, crop_input
+from phibench.estimator.learned.network_file import read_model
+from phibench.estimator.learned.network_input import PLANES, SCALARS, SIDE_PX, VIEWS, WINDOW_PX, CropView, crop_input
 from phibench.estimator.learned.networks import (
     CONVOLUTIONS,
     CORRECTION_PX,
     CROP,
     DENSE,
     INSTALL_TRAINING,
+    MIDDLE_PX,
     PLANES_OUT,
     REDUCED,
+    Network,
     NetworkError,
     Weights,
     cell_places,
     covariances,
+    weight_shapes,
     write_network,
 )
 from phibench.scenes.frames import Array
 from phibench.scenes.random_streams import generator
 
 HELD_OUT = 20  # rooms
+RESCALED = 6000  # crops that a scale alone is taken from
 POOL_SEED = 5  # of the crops, which networks of all seeds share
 REQUESTS: Mapping[str, Sequence[Mapping[str, Any]]] = {
     "bayer-raw": [{"read_noise_e": 3.0}, {"read_noise_e": 6.0}],
@@ -176,7 +182,7 @@ class Items:
 
 def items_of(crops: SpotCrops, settings: TrainingSettings) -> Items:
     """Views of all crops; some of them without laser-off image."""
-    views, side = settings.views, SIDE_PX + 1
+    views, side = settings.views, WINDOW_PX
     n = len(crops) * views
     planes, scalars = np.empty((n, PLANES, side, side), np.float16), np.empty((n, SCALARS), np.float32)
     rest: list[tuple[Array, bool, str]] = []
@@ -187,7 +193,7 @@ def items_of(crops: SpotCrops, settings: TrainingSettings) -> Items:
             first = _first_px(crop, draw)
             part = tuple(slice(x, x + side) for x in first[::-1])
             off = None if draw.random() < settings.without_off else crop.image_off
-            made = crop_input(crop.image[part], None if off is None else off[part], crop.card)
+            made = crop_input(crop.image[part], None if off is None else off[part], crop.card, crop.response)
             planes[len(rest)], scalars[len(rest)] = made.planes, made.scalars
             rest.append((crop.uv_px - first, crop.card.output != "mjpeg", crop.sample_id))
     uv, turned, samples = (np.array(column) for column in zip(*rest, strict=True))
@@ -291,6 +297,8 @@ def _plain(p: Parameters) -> Weights:
 
 def _told(answers: Answers) -> str:
     """Loss and errors in words: the mean of ln of a distance weighs bright spots as faint ones."""
+    if not answers.sure.any():
+        return "no claim below a pixel"
     distance = np.hypot(*answers.error_px.T)
     a = -0.5 * np.log(np.linalg.det(answers.covariance_px2))
     loss = float((np.minimum(answers.squared_pull, _TAIL) - a).mean())
@@ -351,18 +359,29 @@ class Answers:
         return np.asarray(np.trace(self.covariance_px2, axis1=1, axis2=2) < 2.0 * _SURE_PX**2)
 
 
-def answers_of(weights: Weights, items: Items, scale: float = 1.0) -> Answers:
-    """Answers for items, as they are."""
+def answers_of(weights: Weights, items: Items, view: CropView = VIEWS[0]) -> Answers:
+    """Answers for a view of items, turned back; without a scale of the covariance."""
     torch = torch_on_one_thread()
     p = {name: torch.from_numpy(value) for name, value in weights.items()}
     with torch.no_grad():
         parts = [
             crop_forward(torch, p, *map(torch.from_numpy, (planes, items.scalars[k : k + 256])))
             for k in range(0, len(items.planes), 256)
-            for planes in [items.planes[k : k + 256, :, :SIDE_PX, :SIDE_PX].astype(np.float32)]
+            for planes in [np.ascontiguousarray(view.of(items.planes[k : k + 256]), np.float32)]
         ]
     uv, factor = (np.concatenate([part[k].numpy() for part in parts]).astype(float) for k in (0, 1))
-    return Answers(uv - items.uv_px, covariances(factor, scale))
+    turn = view.matrix
+    error = (uv - MIDDLE_PX) @ turn - (items.uv_px - MIDDLE_PX)
+    return Answers(error, turn.T @ covariances(factor, 1.0) @ turn)
+
+
+def mean_answers(weights: Weights, items: Items) -> Answers:
+    """Answers for items, means over their views as of `Network.position`."""
+    shown = np.array([items.turned | (not view.turned) for view in VIEWS], float)
+    shown /= shown.sum(axis=0)
+    every = [answers_of(weights, items, view) for view in VIEWS]
+    error = np.einsum("vn,vni->ni", shown, [one.error_px for one in every])
+    return Answers(error, np.einsum("vn,vnij->nij", shown, [one.covariance_px2 for one in every]))
 
 
 def scale_of(answers: Answers) -> float:
@@ -388,13 +407,35 @@ def train(folder: Path, out: Path, settings: TrainingSettings) -> Path:
 
 def train_on(items: Items, seen: Sequence[str], held: Sequence[str], out: Path, settings: TrainingSettings) -> Path:
     """Train on views of some samples, take the covariance's scale from others, and write the file."""
-    checks = items.of(held)
-    weights = train_crop(items.of(seen), settings, checks)
-    scale = scale_of(answers_of(weights, checks))
-    answers = answers_of(weights, checks, scale)
-    _say(f"rooms held out: rms pull {np.sqrt(answers.squared_pull[answers.sure].mean()):.2f}, scale {scale:.2f}")
-    entries = {"covariance_scale": scale, "settings": json.dumps(asdict(settings), sort_keys=True)}
-    return write_network(out, CROP, weights, entries)
+    checks, given = items.of(held), items.of(seen)
+    if len(given.planes) < settings.batch or not len(checks.planes):
+        raise NetworkError(
+            f"{settings.crops} crops are too few for training and {HELD_OUT} rooms held out: ask for more --crops"
+        )
+    weights = train_crop(given, settings, checks)
+    entries = {"settings": json.dumps(asdict(settings), sort_keys=True)}
+    return write_network(out, CROP, weights, entries | {"covariance_scale": _scale(weights, checks)})
+
+
+def _scale(weights: Weights, checks: Items) -> float:
+    answers = mean_answers(weights, checks)
+    if not answers.sure.any():
+        raise NetworkError("no spot of the rooms held out is claimed to a pixel: train on more --crops or --passes")
+    scale = scale_of(answers)
+    pull = np.sqrt(answers.squared_pull[answers.sure].mean() / scale)
+    _say(f"rooms held out, mean of views: {_told(answers)}, rms pull {pull:.2f}, scale {scale:.2f}")
+    return scale
+
+
+def rescaled(folder: Path, network: Path, out: Path, settings: TrainingSettings) -> Path:
+    """Write a network of crops with a covariance's scale from crops of the rooms that its seed held out."""
+    model = read_model(InputFile(network, "train it: docs/learned.md", NetworkError, MIB).read())
+    held = rooms_of(folder, settings.seed)[1]
+    checks = items_of(crops_of(folder, settings, held, RESCALED, POOL_SEED), settings)
+    Network(network, CROP)  # refuses what is none
+    weights = {name: model.tensors[name].copy() for name in weight_shapes(CROP)}
+    kept = {key: value for key, value in model.metadata.items() if key not in ("name", "version", "sha256")}
+    return write_network(out, CROP, weights, kept | {"covariance_scale": _scale(weights, checks)})
 
 
 def torch_on_one_thread() -> Any:
@@ -439,10 +480,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--preset", action="append", choices=list(REQUESTS), help="may be given again; all by default")
     parser.add_argument("--crops", type=one_or_more, default=TrainingSettings.crops, help="of all rooms")
     add_passes(parser, TrainingSettings.passes, "times that the crops are used")
+    parser.add_argument("--rescale", type=Path, metavar="FILE", help="a network that only gets a new covariance scale")
     given = parser.parse_args(arguments)
     settings = TrainingSettings(given.seed, tuple(given.preset or REQUESTS), given.crops, given.passes)
     try:
-        print(train(given.folder, given.out, settings))
+        if given.rescale is None:
+            print(train(given.folder, given.out, settings))
+        else:
+            print(rescaled(given.folder, given.rescale, given.out, settings))
     except DatasetError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

@@ -155,19 +155,19 @@ def spot_crops(
 
 
 def _cut(crops: SpotCrops) -> Iterator[tuple[Any, ...]]:
-    """Pixels on and off of 64 x 64 that begin with red, card, and the spot's place in them."""
+    """Pixels on and off of 64 x 64 that begin with red, card, the filters' response, and the spot's place in them."""
     for k in range(len(crops)):
         crop = crops.crop(k)
         u0, v0 = crop.phase_px % 2
         part = (slice(v0, v0 + TILE_PX), slice(u0, u0 + TILE_PX))
         assert crop.image_off is not None, "asked for"
-        yield crop.image[part], crop.image_off[part], crop.card, crop.uv_px - [u0, v0]
+        yield crop.image[part], crop.image_off[part], crop.card, crop.response, crop.uv_px - [u0, v0]
 
 
 def spot_tiles(crops: SpotCrops) -> Tiles:
     """Tiles with a spot, at all phases."""
     tiles = []
-    for on, off, card, uv in _cut(crops):
+    for on, off, card, _, uv in _cut(crops):
         planes, _ = frame_input(on, off, card)
         tiles.append((planes, *targets(planes, [uv], [])))
     return Tiles(*(np.stack(column) for column in zip(*tiles, strict=True)))
@@ -307,14 +307,14 @@ def thresholds_of(weights: Weights, maps: Sequence[FrameMap]) -> dict[str, tuple
 def answers_at_found(detector: Path, crops: SpotCrops, thresholds: Mapping[str, tuple[float, float]]) -> Answers:
     """Answers of the shipped network of crops at the places where a detector found the spot, its own scale left out."""
     finder, crop, errors, covariances = Network(detector, DETECT), shipped(CROP), [], []
-    for on, off, card, uv in _cut(crops):
+    for on, off, card, response, uv in _cut(crops):
         planes, red = frame_input(on, off, card)
         heat = np.asarray(finder.run(planes=planes[None])[0][0, 0], float)
         peaks = heat_peaks(heat, red, np.ones(heat.shape, bool), thresholds[kind_of(card)][0])
         if not len(peaks.heat):
             continue
         place = 2.0 * peaks.cells[np.argmax(peaks.red_e)] + 0.5
-        spot = refined(crop, on, off, card, (float(place[0]), float(place[1])), 1.0)
+        spot = refined(crop, on, off, card, response, (float(place[0]), float(place[1])), 1.0)
         if spot.uv_px is None or np.hypot(*(error := np.array(spot.uv_px) - uv)) > _NEAR_PX:
             continue
         errors.append(error)

@@ -2,7 +2,8 @@
 
 Crops have 32 x 32 pixels and begin at an even column and row, so that red pixels of the mosaic come first. Raw pixels
 are interpolated bilinearly, which loses nothing; 8-bit codes go back through tone curve, colour matrix and white
-balance. What is left of the difference on - off is then free of exposure, gain and the brightness of the room.
+balance. What is left of the difference on - off is then free of exposure, gain and the brightness of the room. G and B
+are brought to the filters of the training: at a bright spot the place hangs on how much of the laser they let through.
 
 Noise is measured in the border of the crop itself.
 
@@ -11,6 +12,7 @@ A whole frame is brought to cells of 2 x 2 pixels: the difference on - off behin
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,6 +26,7 @@ from phibench.estimator.spots.raw_pixels import raw_electrons
 from phibench.scenes.frames import Array, BoolArray
 
 SIDE_PX = 32
+WINDOW_PX = SIDE_PX + 1  # with red at all four corners: mirrored and turned, it still begins with red
 PLANES = 4  # R, G, B of the difference, and full pixels
 SCALARS = 7  # see `crop_input`
 FRAME_PLANES = 3  # significance behind R and G, and full pixels
@@ -35,6 +38,8 @@ _SIGMA_OF_MAD = 1.4826
 _LEAST_SIGMA = 0.1  # of the card's: rounding and JPEG may leave a border without any noise
 _CUT = 3.0  # of relative values: beyond it there is another light
 _COMPRESSED = 3.0  # significances beyond it count by their logarithm
+_TRAINED = np.array([1.0, 0.10, 0.03])  # response of R, G, B at the laser's line, in `bench-dev`
+_MOST_GAIN = 3.0  # of a filter that lets less through: its noise grows as much
 _NOISE_STEP = 4  # every fourth cell in both directions is enough for a median
 
 
@@ -44,13 +49,41 @@ class CropInput:
 
     Attributes
     ----------
-    planes : shape (4, 32, 32), float32
+    planes : shape (4, 33, 33), float32
         Difference behind R, G, B over the spot's amplitude; 1 where a pixel is full.
-    scalars : shape (5,), float32
+    scalars : shape (7,), float32
     """
 
     planes: NDArray[np.float32]
     scalars: NDArray[np.float32]
+
+    @property
+    def views(self) -> tuple[CropView, ...]:
+        """Those of `VIEWS` that training has shown: MJPEG with chroma of half the width is not turned."""
+        return tuple(view for view in VIEWS if not (view.turned and self.scalars[-1]))
+
+
+@dataclass(frozen=True)
+class CropView:
+    """A window mirrored left to right (u = -1), top to bottom (v = -1), and then turned: rows become columns."""
+
+    u: int
+    v: int
+    turned: bool
+
+    def of(self, planes: NDArray[Any]) -> NDArray[Any]:
+        """Crops of 32 x 32 pixels, from windows of 33 x 33 in the last two axes."""
+        seen = planes[..., :: self.v, :: self.u]
+        return (np.swapaxes(seen, -1, -2) if self.turned else seen)[..., :SIDE_PX, :SIDE_PX]
+
+    @property
+    def matrix(self) -> Array:
+        """Of vectors (u, v) in the window, which becomes that in the view; orthogonal."""
+        flip = np.diag([float(self.u), float(self.v)])
+        return flip[::-1] if self.turned else flip
+
+
+VIEWS = tuple(CropView(u, v, turned) for turned in (False, True) for v in (1, -1) for u in (1, -1))
 
 
 def crop_origin(uv_px: tuple[float, float]) -> tuple[int, int]:
@@ -59,7 +92,7 @@ def crop_origin(uv_px: tuple[float, float]) -> tuple[int, int]:
     return int(u0), int(v0)
 
 
-def cut(image: Image, origin_px: tuple[int, int], side_px: int = SIDE_PX) -> Image:
+def cut(image: Image, origin_px: tuple[int, int], side_px: int = WINDOW_PX) -> Image:
     """Part of an image, shape (H, W, ...), that may reach over its border.
 
     Beyond the border stands what is mirrored about the border pixel, which keeps the mosaic's colours in order.
@@ -86,14 +119,16 @@ def filter_planes(image: Image, card: SensorCard) -> tuple[Array, BoolArray]:
     return np.asarray(colours.values_e, float), np.asarray(colours.full.any(axis=0))
 
 
-def crop_input(on: Image, off: Image | None, card: SensorCard) -> CropInput:
-    """Input for a crop of 32 x 32 pixels.
+def crop_input(on: Image, off: Image | None, card: SensorCard, response: Sequence[float]) -> CropInput:
+    """Input for a window of 33 x 33 pixels.
 
     Parameters
     ----------
-    on, off : shape (32, 32, ...)
+    on, off : shape (33, 33, ...)
         Pixels with the laser on, and off where there are such; without them the border's median is the background.
     card : SensorCard
+    response : 3 floats
+        Of the filters R, G, B at the laser's line: `Detector.laser_filter_response`.
 
     Returns
     -------
@@ -116,7 +151,7 @@ def crop_input(on: Image, off: Image | None, card: SensorCard) -> CropInput:
     sigma = float(np.sqrt(variance_e2(np.array(level), card, alike=off is not None) * (1.0 if off is None else 2.0)))
     measured = _SIGMA_OF_MAD * float(np.median(np.abs(difference[0, border])))
     amplitude = max(float(_smoothed(difference[0])[_MIDDLE, _MIDDLE].max()), 0.5 * sigma)
-    relative = np.clip(difference / amplitude, -_CUT, _CUT)
+    relative = np.clip(difference / amplitude * _gains(response)[:, None, None], -_CUT, _CUT)
     scalars = (
         np.log(amplitude / sigma),
         np.log(measured / sigma + _LEAST_SIGMA),
@@ -127,6 +162,12 @@ def crop_input(on: Image, off: Image | None, card: SensorCard) -> CropInput:
         float(card.output == "mjpeg"),
     )
     return CropInput(np.concatenate([relative, full[None]]).astype(np.float32), np.array(scalars, np.float32))
+
+
+def _gains(response: Sequence[float]) -> Array:
+    """Factors that bring the laser's light behind R, G, B to the filters of the training, red left as it is."""
+    share = np.asarray(response, float) / response[0] if response[0] > 0.0 else _TRAINED
+    return np.asarray(_TRAINED / np.maximum(share, _TRAINED / _MOST_GAIN))
 
 
 def _smoothed(plane: Array) -> Array:

@@ -35,6 +35,7 @@ from phibench.estimator.learned.network_input import (
     PLANES,
     SCALARS,
     SIDE_PX,
+    WINDOW_PX,
     CropInput,
     crop_input,
     crop_origin,
@@ -44,7 +45,7 @@ from phibench.scenes.frames import Array, BoolArray
 from phibench.scenes.validation import printable_line
 
 CROP, DETECT = "learned_crop", "learned_detect"
-VERSIONS = {CROP: "2", DETECT: "1"}
+VERSIONS = {CROP: "3", DETECT: "1"}
 """Versions of what a network gets, of its layers and of what it answers; a change of any raises it."""
 INSTALL = "pip install 'phibench[learned]'"
 INSTALL_TRAINING = "pip install 'phibench[learned-training]' (the CPU's wheel of PyTorch is enough: docs/learned.md)"
@@ -65,8 +66,8 @@ class NetworkError(DatasetError):
 
 
 SHIPPED = {
-    CROP: "cca79ae848c0d329c343f023fbfaee370b95ea4fbfe8f83cff45e5ba70280f83",
-    DETECT: "22409949de63642024a8147dca4ed10d52ae427a8ee50b8c8c0781e0f36abc76",
+    CROP: "06d4af03b8395c205c8735e04a92101b3129b2ef561a77448f75e75c2641c561",
+    DETECT: "7e0456bfd8ef032910bac1cbb4d69606011fc377fb3e12590bc4a58330ac320b",
 }
 """SHA-256 that the files of this release state; part of the code, so that a method's hash changes with its weights."""
 
@@ -163,10 +164,18 @@ class Network:
         return alone, each
 
     def position(self, crop: CropInput, scale: float | None = None) -> Position:
-        """Position of the spot in a crop, with its covariance; by default with the network's own scale."""
-        uv, factor = self.run(planes=crop.planes[None], scalars=crop.scalars[None])
-        scale = self.scale if scale is None else scale
-        return Position(np.asarray(uv[0], float), covariances(np.asarray(factor, float), scale)[0])
+        """Position of the spot in a window, with its covariance; by default with the network's own scale.
+
+        Means over the mirrored and turned views: what the network gets wrong in one, it often gets right in another.
+        """
+        views = crop.views
+        planes = np.stack([view.of(crop.planes) for view in views])
+        uv, factor = self.run(planes=planes, scalars=np.repeat(crop.scalars[None], len(views), axis=0))
+        claimed = covariances(np.asarray(factor, float), self.scale if scale is None else scale)
+        back = [view.matrix.T for view in views]
+        places = [turn @ (place - MIDDLE_PX) for turn, place in zip(back, uv.astype(float), strict=True)]
+        spreads = [turn @ one @ turn.T for turn, one in zip(back, claimed, strict=True)]
+        return Position(np.mean(places, axis=0) + MIDDLE_PX, np.mean(spreads, axis=0))
 
 
 def covariances(factors: Array, scale: float) -> Array:
@@ -425,6 +434,8 @@ _GRAPHS: Mapping[str, Callable[[Any], Graph]] = {CROP: _crop_graph, DETECT: _det
 
 # -- spots of a pair -------------------------------------------------------------------------------------------------
 
+MIDDLE_PX = (WINDOW_PX - 1) / 2.0
+"""Of a window, about which its views are mirrored."""
 _LOOKS = 3  # a crop about the place that the last one gave; the second is nearly always the same
 _REACH_PX = 7.0  # of the crop's middle: farther away there are no cells
 
@@ -434,6 +445,7 @@ def refined(
     image: Image,
     dark: Image | None,
     card: SensorCard,
+    response: Sequence[float],
     uv_px: tuple[float, float],
     scale: float | None = None,
 ) -> Spot:
@@ -445,13 +457,15 @@ def refined(
     image, dark : shape (H, W, ...)
         With the laser on, and off where there is such a frame.
     card : SensorCard
+    response : 3 floats
+        Of the filters R, G, B at the laser's line.
     uv_px : (u, v)
     scale : float, optional
         Factor of the covariance instead of the network's.
     """
     origin = crop_origin(uv_px)
     for _ in range(_LOOKS):
-        made = crop_input(cut(image, origin), None if dark is None else cut(dark, origin), card)
+        made = crop_input(cut(image, origin), None if dark is None else cut(dark, origin), card, response)
         answer = found.position(made, scale)
         if not np.abs(answer.uv_px - (SIDE_PX - 1) / 2.0).max() < _REACH_PX:
             return Spot.missing("no spot near the place")

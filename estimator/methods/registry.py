@@ -53,8 +53,8 @@ def learned_crop(file: Path | None = None) -> Method:
         u0, v0 = region.origin_px
         pair, name = region.pair, region.position
         place = (peak[0] + u0, peak[1] + v0)
-        crop = _named(CROP, file)
-        spot = refined(crop, pair.images[name], pair.images.get(f"{name}_off"), pair.card, place)
+        images = pair.images[name], pair.images.get(f"{name}_off")
+        spot = refined(_named(CROP, file), *images, pair.card, _response(pair), place)
         return at_detection(region.found, spot)
 
     return each_spot(find)
@@ -114,7 +114,12 @@ def _spot(crop: Network, scale: float, pair: Pair, position: str, found: Candida
     if row is None:
         return Spot.missing("no spot found")
     u, v = (float(x) for x in found.uv_px[row])
-    return refined(crop, pair.images[position], pair.images[f"{position}_off"], pair.card, (u, v), scale)
+    images = pair.images[position], pair.images[f"{position}_off"]
+    return refined(crop, *images, pair.card, _response(pair), (u, v), scale)
+
+
+def _response(pair: Pair) -> tuple[float, ...]:
+    return pair.rig.camera.detector.laser_filter_response
 
 
 Finder = Callable[[SearchRegion], Spot]

@@ -17,6 +17,9 @@ from phibench.estimator.learned.network_file import read_model
 from phibench.estimator.learned.network_input import (
     SCALARS,
     SIDE_PX,
+    VIEWS,
+    WINDOW_PX,
+    CropInput,
     crop_input,
     crop_origin,
     cut,
@@ -66,14 +69,17 @@ def test_beyond_the_border_stands_its_mirror_image_in_the_mosaics_order() -> Non
     colours = v % 2 + u % 2
     for origin in ((-6, -4), (30, 20), (8, 2)):
         part = cut(colours, origin)
-        assert part.shape == (SIDE_PX, SIDE_PX)
+        assert part.shape == (WINDOW_PX, WINDOW_PX)
         np.testing.assert_array_equal(part, (np.indices(part.shape) % 2).sum(axis=0))
-    np.testing.assert_array_equal(cut(u, (8, 2)), u[2:34, 8:40])
+    np.testing.assert_array_equal(cut(u, (7, 2)), u[2:35, 7:40])
+
+
+DEV = (1.0, 0.10, 0.03)  # response of the filters of `bench-dev`
 
 
 def spot_e(uv: tuple[float, float], electrons: float) -> np.ndarray:
-    """Smooth spot, the same in all filters, shape (32, 32)."""
-    v, u = np.indices((SIDE_PX, SIDE_PX))
+    """Smooth spot, the same in all filters, shape (33, 33)."""
+    v, u = np.indices((WINDOW_PX, WINDOW_PX))
     return np.asarray(electrons * np.exp(-0.5 * ((u - uv[0]) ** 2 + (v - uv[1]) ** 2) / 3.0**2))
 
 
@@ -85,13 +91,42 @@ def test_gain_and_room_are_not_in_the_planes() -> None:
     made = []
     for gain, room_e in ((1.0, 200.0), (2.0, 900.0)):
         card = replace(sensor_card("bayer-raw"), dn_per_e=gain * 0.1, full_well_e=1e5, top_dn=60000)
-        off = np.rint(card.black_level_dn + card.dn_per_e * np.full((SIDE_PX, SIDE_PX), room_e)).astype(np.uint16)
+        off = np.rint(card.black_level_dn + card.dn_per_e * np.full((WINDOW_PX, WINDOW_PX), room_e)).astype(np.uint16)
         on = np.rint(card.black_level_dn + card.dn_per_e * (room_e + spot_e((14.7, 16.2), 2500.0))).astype(np.uint16)
-        made.append(crop_input(on, off, card))
+        made.append(crop_input(on, off, card, DEV))
     assert made[0].scalars.shape == (SCALARS,)
     assert np.abs(made[0].planes - made[1].planes).max() < 3.0 * 0.5 / 250.0
     assert np.abs(made[0].planes[0].max() - 1.0) < 0.1
     assert made[0].scalars[3] < made[1].scalars[3]  # the room's level is a number by itself
+
+
+def test_filters_that_let_more_of_the_laser_through_give_the_same_planes() -> None:
+    """A wide spot without noise of 2500 DN behind two sets of filters: half a DN on and off, in both sets."""
+    made = []
+    for response in (DEV, (0.9, 0.18, 0.08)):
+        card = replace(sensor_card("bayer-raw"), dn_per_e=0.1, full_well_e=1e5, top_dn=60000)
+        v, u = np.indices((WINDOW_PX, WINDOW_PX))
+        light = spot_e((14.7, 16.2), 25_000.0 / response[0]) * np.array(response)[v % 2 + u % 2]
+        on, off = (np.rint(card.black_level_dn + card.dn_per_e * x).astype(np.uint16) for x in (200.0 + light, 200.0))
+        made.append(crop_input(on, np.full_like(on, off), card, response).planes[:3])
+    assert np.abs(made[0] - made[1]).max() < 4 * 0.5 / 2500.0
+    assert np.abs(made[0][0].max() - 1.0) < 0.1
+    assert 0.02 < made[0][2].max() < 0.04
+    nothing = crop_input(on, np.full_like(on, off), card, (1.0, 0.0, 0.0))
+    assert np.isfinite(nothing.planes).all()
+
+
+def test_views_of_a_window_show_the_spot_where_their_matrix_says() -> None:
+    """The largest pixel of a spot in a corner of the window, in all eight views; red stays at the first pixel."""
+    v, u = np.indices((WINDOW_PX, WINDOW_PX))
+    red = ((v % 2 == 0) & (u % 2 == 0)).astype(float)
+    assert len({tuple(view.matrix.ravel()) for view in VIEWS}) == 8
+    for view in VIEWS:
+        seen = view.of(np.stack([spot_e((9.0, 20.0), 1.0), red]))
+        assert seen.shape == (2, SIDE_PX, SIDE_PX)
+        place = view.matrix @ (np.array([9.0, 20.0]) - 16.0) + 16.0
+        assert np.unravel_index(int(np.argmax(seen[0])), seen[0].shape) == (place[1], place[0])
+        np.testing.assert_array_equal(seen[1], red[:SIDE_PX, :SIDE_PX])
 
 
 def test_raw_and_8_bit_planes_are_the_same_electrons() -> None:
@@ -174,6 +209,25 @@ def test_shipped_networks_are_small_and_give_the_same_bytes(name: str) -> None:
         inputs = {"planes": inputs["planes"][:, :3]}
     first, second = (Network(file, name).run(**inputs) for _ in range(2))
     assert all(np.array_equal(a, b) for a, b in zip(first, second, strict=True))
+
+
+@needs_runtime
+def test_a_mirrored_window_has_the_mirrored_answer() -> None:
+    """A window of a spot beside the middle, in three views: floats of 6e-8 through six layers, places of 20 pixels."""
+    card = sensor_card("bayer-raw")
+    noise = generator("mirrored windows").normal(0.0, 15.0, (2, WINDOW_PX, WINDOW_PX))
+    v, u = np.indices((WINDOW_PX, WINDOW_PX))
+    light = 1500.0 * np.exp(-0.5 * ((u - 14.3) ** 2 + (v - 17.1) ** 2) / 1.3**2) * np.array(DEV)[v % 2 + u % 2]
+    on, off = (card.black_level_dn + np.rint(card.dn_per_e * (300.0 + x)) for x in (light + noise[0], noise[1]))
+    whole = crop_input(on, off, card, DEV)
+    found = shipped(CROP).position(whole)
+    assert np.abs(found.uv_px - [14.3, 17.1]).max() < 0.5
+    for turn in (lambda x: x[..., ::-1], lambda x: x[..., ::-1, :], lambda x: np.swapaxes(x, -1, -2)):
+        seen = shipped(CROP).position(replace(whole, planes=np.ascontiguousarray(turn(whole.planes))))
+        marked = turn(np.stack([u, v]).astype(float))  # where each pixel of the turned window comes from
+        slopes = np.array([[marked[i, 0, 1] - marked[i, 0, 0], marked[i, 1, 0] - marked[i, 0, 0]] for i in (0, 1)])
+        np.testing.assert_allclose(slopes @ seen.uv_px + marked[:, 0, 0], found.uv_px, rtol=0, atol=1e-4)
+        np.testing.assert_allclose(slopes @ seen.covariance_px2 @ slopes.T, found.covariance_px2, rtol=1e-3, atol=1e-7)
 
 
 def convolved(x: np.ndarray, kernel: np.ndarray, offset: np.ndarray, stride: int) -> np.ndarray:
@@ -347,6 +401,24 @@ def test_training_gives_the_same_weights_and_the_file_their_answers(tiny_dataset
     answers = answers_of(first, items)
     np.testing.assert_allclose(uv - items.uv_px, answers.error_px, rtol=0, atol=1e-4)  # float32, sums of 1000 terms
     np.testing.assert_allclose(covariances(factor.astype(float), 1.0), answers.covariance_px2, rtol=1e-3)
+    means = crop_training.mean_answers(first, items)
+    for k in range(len(items.planes)):
+        one = found.position(CropInput(items.planes[k].astype(np.float32), items.scalars[k]))
+        np.testing.assert_allclose(one.uv_px - items.uv_px[k], means.error_px[k], rtol=0, atol=1e-4)
+        np.testing.assert_allclose(one.covariance_px2, means.covariance_px2[k], rtol=1e-3)
+
+
+@needs_torch
+def test_a_network_that_claims_no_pixel_has_no_scale(tiny_dataset: Path, tmp_path: Path, monkeypatch: Any) -> None:
+    from phibench.datasets.read import open_dataset
+
+    samples = [row.sample_id for row in open_dataset(tiny_dataset).rows if row.sample_id.startswith("seen")]
+    monkeypatch.setattr(crop_training, "_FIRST_LN", -9.0)
+    monkeypatch.setattr(crop_training, "rooms_of", lambda folder, seed: (samples, samples))
+    settings = TrainingSettings(presets=("srgb8",), crops=8, passes=1, batch=8, rate=0.0)
+    for chosen, text in ((settings, "train on more --crops"), (replace(settings, batch=17), "8 crops are too few")):
+        with pytest.raises(NetworkError, match=text):
+            crop_training.train(tiny_dataset, tmp_path / "out.onnx", chosen)
 
 
 @needs_torch
