@@ -45,6 +45,8 @@ def learned_crop(file: Path | None = None) -> Method:
     >>> from phibench.estimator.methods.registry import learned_crop
     >>> extract = learned_crop(Path("my_crop.onnx"))  # in my_phi.py: phibench score ... --method my_phi.py:extract
     """
+    if file is not None:
+        network(file, CROP)  # a wrong file is refused before the first pair
 
     def find(region: SearchRegion) -> Spot:
         peak = region.place
@@ -71,6 +73,9 @@ def learned_detect(detector: Path | None = None, crop: Path | None = None) -> Me
     detector, crop : Path, optional
         Files of the networks; by default those that phibench ships.
     """
+    for name, file in ((DETECT, detector), (CROP, crop)):
+        if file is not None:
+            network(file, name)
 
     def method(pair: Pair) -> Answer:
         finder = _named(DETECT, detector)

@@ -36,7 +36,7 @@ from phibench.estimator.learned.networks import (
     sealed,
     shipped,
 )
-from phibench.estimator.methods.registry import METHODS
+from phibench.estimator.methods.registry import METHODS, learned_crop, learned_detect
 from phibench.scenes.random_streams import generator
 from tools import crop_training, frame_training
 from tools.crop_training import Answers, TrainingSettings, scale_of
@@ -299,6 +299,14 @@ def test_files_that_will_not_do_are_refused_in_one_sentence(name: str, tmp_path:
     monkeypatch.setattr(networks, "SHIPPED", {CROP: "0" * 64, DETECT: "0" * 64})
     with pytest.raises(NetworkError, match="belongs to another release"):
         shipped(name)
+
+
+@pytest.mark.parametrize(
+    "method", [learned_crop, lambda file: learned_detect(file), lambda file: learned_detect(crop=file)]
+)
+def test_a_method_of_a_wrong_file_is_refused_before_the_first_pair(method: Any, tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match=r"nothing\.onnx is missing; install phibench anew"):
+        method(tmp_path / "nothing.onnx")
 
 
 def _renamed(model: bytes, name: str) -> bytes:
