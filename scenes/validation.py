@@ -88,9 +88,9 @@ def printable_line(text: str, most: int = 200) -> str:
 def close_names(name: str, known: Iterable[str]) -> list[str]:
     """Nearest known name, if one is near: a list of one or none. Nearest is one with a unit, or another unit."""
     names = list(known)
-    stem = _without_unit(name)
+    stem = without_unit(name)
     stem = _ALSO_CALLED.get(stem, stem)
-    alike = [one for one in names if _without_unit(one) == stem]
+    alike = [one for one in names if without_unit(one) == stem]
     longer = [one for one in names if one.lower().startswith(f"{stem}_")]
     return alike[:1] or (longer if len(longer) == 1 else difflib.get_close_matches(name, names, 1, 0.5))
 
@@ -100,7 +100,7 @@ _ALSO_CALLED = {"f": "fx", "focal": "fx", "focal_length": "fx", "distance": "z_c
 _UNITS = ("px", "m", "cm", "mm", "um", "nm", "deg", "rad", "s", "ms", "us", "e", "w", "mw", "dn")
 
 
-def _without_unit(name: str) -> str:
+def without_unit(name: str) -> str:
     """Name in small letters without the unit at its end: `fx_px` and `fx` are one name."""
     stem, _, unit = name.lower().rpartition("_")
     return stem if stem and unit in _UNITS else name.lower()

@@ -478,9 +478,9 @@ def _torn(spot: SeenSpot, position: str) -> str:
     """Sentence on a light that is no spot."""
     if spot.unlike < UNLIKE:
         return ""
-    u, v = spot.uv_px
+    (u, v), percent = spot.uv_px, 100.0 * min(spot.unlike, 1.0)
     return (
-        f"doubtful: the spot {position} at ({u:.0f}, {v:.0f}) px has not the shape of one, {100.0 * spot.unlike:.0f} % "
+        f"doubtful: the spot {position} at ({u:.0f}, {v:.0f}) px has not the shape of one, {percent:.0f} % "
         "of its light do not fit; the beam may meet an edge or graze a surface, turn the laser a little"
     )
 

@@ -174,6 +174,12 @@ def known_fault(pair: Pair, photos: PairPhotos) -> DatasetError | None:
                 f"laser on and off are exchanged: the spot is in {photos.down.off[0].path} and "
                 f"{photos.up.off[0].path}; give these to --down and --up, the others to --down-off and --up-off"
             )
+        crossed = replace(pair, down=pair.up_off, up=pair.down_off, down_off=pair.up, up_off=pair.down)
+        if _both(detect(crossed)):
+            return DatasetError(
+                f"laser on and off are exchanged, and down and up, too: give {photos.up.off[0].path} to --down, "
+                f"{photos.down.off[0].path} to --up, {up} to --down-off and {down} to --up-off"
+            )
     return next(_strokes_faults(pair), None)
 
 
@@ -248,7 +254,8 @@ def _both(found: PairDetection) -> bool:
 MOVED_PX = 0.3
 """Shift from which on a laser-off picture does not show what is behind the spot: edges leave a light of their own."""
 _NARROW_PX, _WIDE_PX = 0.7, 4.0  # a difference of Gaussians: edges stay, noise and shading go
-_MOST_PX = 24  # larger ones are of another position, or no shift
+_MOST_PX = 128  # larger ones leave too little that both pictures show
+_PARTS, _FEWEST_PARTS = 5, 4  # of a picture's sides, and parts of it that must show a shift
 _CLEAR = 0.5  # correlation that a shift must have, over that of the picture with itself
 _RELIT = 0.05  # relative change of the room's light that is no drift of a lamp
 
@@ -265,7 +272,8 @@ def shift_px(one: Image, other: Image) -> tuple[float, float] | None:
     correlation = fft.fftshift(fft.irfft2(spectrum, a.shape)) / max(
         math.sqrt(float(np.sum(a**2) * np.sum(b**2))), 1e-30
     )
-    most, (v0, u0) = _MOST_PX // block, (a.shape[0] // 2, a.shape[1] // 2)
+    v0, u0 = a.shape[0] // 2, a.shape[1] // 2
+    most = min(_MOST_PX // block, v0 - 1, u0 - 1)
     around = correlation[v0 - most : v0 + most + 1, u0 - most : u0 + most + 1]
     v, u = np.unravel_index(int(np.argmax(around)), around.shape)
     if around[v, u] < _CLEAR or min(v, u) == 0 or v == around.shape[0] - 1 or u == around.shape[1] - 1:
@@ -279,9 +287,22 @@ def moved_between(pair: Pair) -> Iterator[tuple[str, float]]:
     for position in POSITIONS:
         if f"{position}_off" not in pair.images:
             continue
-        shift = shift_px(pair.images[f"{position}_off"], pair.images[position])
-        if shift is not None and math.hypot(*shift) >= MOVED_PX:
-            yield position, math.hypot(*shift)
+        off, on = pair.images[f"{position}_off"], pair.images[position]
+        shift = shift_px(off, on)
+        way = 0.0 if shift is None else math.hypot(*shift)
+        if way >= MOVED_PX or (way := _turned_px(off, on)) >= MOVED_PX:
+            yield position, way
+
+
+def _turned_px(one: Image, other: Image) -> float:
+    """Way of parts of two pictures, pixels, of which a turn hides the mean: their upper quartile; 0 of few parts."""
+    height, width = (size // _PARTS // 2 * 2 for size in one.shape[:2])
+    ways = []
+    for row, column in np.ndindex(_PARTS, _PARTS):
+        part = np.s_[row * height : (row + 1) * height, column * width : (column + 1) * width]
+        if (shift := shift_px(one[part], other[part])) is not None:
+            ways.append(math.hypot(*shift))
+    return float(np.quantile(ways, 0.75)) if len(ways) >= _FEWEST_PARTS else 0.0
 
 
 def relit_between(pair: Pair) -> Iterator[tuple[str, float]]:

@@ -196,6 +196,14 @@ def rounding_variance(mean: float, temporal_sd: float, spatial_sd: float) -> flo
     return float(rounded_moments(mean, temporal_sd, spatial_sd)[1]) - temporal_sd**2
 
 
+def rounding_doubt(temporal_sd: float, spatial_sd: float) -> float:
+    """Standard deviation of `rounding_variance` over all places of a mean within a code: shading takes it to many."""
+    if temporal_sd > 0.7:
+        return 0.0
+    ends = [rounding_variance(place, temporal_sd, spatial_sd) for place in (0.0, 0.5)]
+    return abs(ends[1] - ends[0]) / 8.0**0.5  # a cosine's, of this height from end to end
+
+
 def before_rounding(sums: BlockSums, frame_dn2: float = 0.0) -> Array:
     """(mean, temporal variance, spatial variance) of dark frames before rounding, shape (replicates, 3).
 

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from pydantic import Field
 
-from phibench.datasets.common.camera_pictures import PGM, pgm_values
+from phibench.datasets.common.camera_pictures import read_camera_picture
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import SETTINGS_BYTES, InputFile
 from phibench.datasets.store.schema import Document
@@ -215,19 +215,22 @@ def read_frame(path: Path, notes: CaptureNotes) -> tuple[Kind, NDArray[Any]]:
     file = InputFile(path, "give the camera's own frame", CaptureError, _FRAME_BYTES)
     if path.suffix.lower() == ".yuyv":
         return "yuyv", _yuyv(file, notes)
-    data = file.read()
-    picture = None if data[:2] in PGM else file.picture(("PNG", "PPM", "JPEG", "TIFF", "BMP"), data)
-    if picture is not None and picture.format in ("JPEG", "MPO"):
-        return "mjpeg", np.asarray(picture.convert("RGB"))
-    if picture is None or picture.mode in ("I;16", "I", "I;16B", "I;16L", "L"):
-        values = pgm_values(file, data) if picture is None else np.asarray(picture).astype(np.uint16)
+    picture = read_camera_picture(file)
+    if picture.orientation != 1:
+        raise file.fault(
+            f"is turned by EXIF (orientation {picture.orientation}): `exiftool -Orientation= FILE` ends that"
+        )
+    if picture.kind == "jpeg":
+        return "mjpeg", picture.pixels
+    if picture.kind == "yuyv":
+        return "yuyv", picture.pixels
+    if picture.kind == "raw" or picture.mode == "L":
+        values = picture.pixels if picture.kind == "raw" else picture.pixels[..., 0].astype(np.uint16)
         if notes.format in (None, *RAW):
             return ("mono-raw" if notes.format == "mono-raw" else "bayer-raw"), values
         raise file.fault(f"has one plane, and {MANIFEST} says {notes.format}")
-    if picture.mode == "LA":
-        return "yuyv", np.asarray(picture)
-    if picture.mode == "RGB":
-        return "srgb8", np.asarray(picture)
+    if picture.mode in ("RGB", "RGBA", "RGBX"):
+        return "srgb8", picture.pixels
     raise file.fault(f"has the mode {picture.mode}: one plane (raw), two (YUYV) or R, G, B are read")
 
 

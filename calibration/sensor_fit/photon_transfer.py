@@ -34,6 +34,7 @@ from phibench.scenes.frames import Array
 
 _MARGIN_SIGMAS = 6.0  # a level is used if so many deviations of its noise lie below saturation
 _HIDDEN_DN = 0.15  # noise below it leaves too few codes to be told from rounding
+_NARROW_DN = 0.4  # noise below it does not smooth the steps of codes: 1 % of a code is left of them
 _THIRD_CODE = 30.0  # values of a third code, below which the noise is that of any width
 _ROUNDING_DN = 12.0**-0.5  # of a level that rounding hides
 _CUT = 1e-3  # of dark values at the converter's lower end: below, their variance lacks less than 1 %
@@ -130,6 +131,14 @@ def _frames(capture: Capture, group: FrameGroup, top: int) -> NDArray[Any]:
         raise CaptureError(
             f"{capture.folder / group.name} has the code {int(frames.max())}, and {capture.notes.bits} bits end at "
             f"{top}: write `bits` into capture.toml, and give codes that are not scaled to 16 bits"
+        )
+    codes = np.flatnonzero(np.bincount(frames[0].ravel()))
+    step = int(np.diff(codes).min()) if len(codes) > 2 else 1
+    if step > 1:  # rounding is a whole step then, and not one code
+        unused = step.bit_length() - 1
+        raise CaptureError(
+            f"{capture.folder / group.name} has codes {step} or more apart, which a program scaled: shift them right "
+            f"by {unused} bits, and write bits = {capture.notes.bits - unused} into capture.toml"
         )
     if min(frames.shape[1:]) < 32:
         raise CaptureError(f"{capture.folder / group.name}: {frames.shape[2]} x {frames.shape[1]} pixels; {_SHAPE}")
@@ -379,6 +388,8 @@ class _Fit:
         return min(float(ndtr((-0.5 - float(self.black[0])) / spread)), self.dark.zero)
 
     def _prnu(self, used: list[_Level], response: Response) -> None:
+        # behind less noise, rounding hides or doubles small differences of pixels
+        used = [level for level in used if level.sums.temporal_dn2[0] > _NARROW_DN**2 + 1.0 / 12.0] or used
         shown = np.stack([self._signal(level) for level in used])
         signal = np.stack([response.linear(y) / response.slope(y) for y in shown])  # dy / y' is the change of x
         pattern = np.stack([level.sums.spatial_dn2 for level in used]) - self.dark.spatial_dn2

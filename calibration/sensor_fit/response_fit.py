@@ -27,7 +27,7 @@ import numpy as np
 import scipy
 from scipy.optimize import least_squares
 
-from phibench.calibration.sensor_fit.block_sums import jackknife_sigma, rounding_variance
+from phibench.calibration.sensor_fit.block_sums import jackknife_sigma, rounding_doubt, rounding_variance
 from phibench.scenes.frames import Array
 
 _TERMS = (1, 2, 3)
@@ -126,10 +126,11 @@ class Response:
         if self.is_bent:
             top = np.asarray(self.reach_dn)
             loss = 100.0 * float(1.0 - top / self.linear(top))
+            way = "loses" if loss > 0.0 else "gains"
             said.append(
                 f"a straight line does not fit: mean square of its residuals {self.straight_misfit:.3g}, and its gain "
                 f"{self.straight_gain:.4g} +- {self.straight_sigma:.2g} DN/e; the bent response of "
-                f"measured.response_coefficients loses {loss:.1f} % at {self.reach_dn:.0f} DN above black, and "
+                f"measured.response_coefficients {way} {abs(loss):.1f} % at {self.reach_dn:.0f} DN above black, and "
                 "gain_dn_per_e is its slope at black"
             )
         if self.refused:
@@ -172,13 +173,19 @@ def fit_response(levels: Sequence[NoiseOfLevel], dark_dn2: Array, range_dn: floa
                 for one, v in zip(levels, model, strict=True)
             ]
         )
-        fitter = _Fitter(signal / range_dn, signal, seen - rounding[:, None], dark_dn2, sigma)
+        unknown = np.array(
+            [rounding_doubt(float(np.sqrt(v)), one.spread_dn) for one, v in zip(levels, model, strict=True)]
+        )
+        fitter = _Fitter(signal / range_dn, signal, seen - rounding[:, None], dark_dn2, np.hypot(sigma, unknown))
         sets = [one for terms in _sets(names, len(levels)) if (one := fitter.fit(terms)) is not None]
         if not sets or sets[0].terms or sets[0].x[0, 0] <= 0.0:
             raise ValueError
         best = min(sets, key=lambda one: one.chi2 + len(one.terms) * np.log(len(levels)))
         model = np.maximum(fitter.variance(best.terms, best.x[0], 0), 0.0)
-    return _mean(sets, len(levels), names, range_dn, float(signal[:, 0].max()))
+    # what each level's rounding leaves open moves K of the straight line by so much
+    share = fitter.sigma**-2.0 * signal[:, 0] / np.sum((signal[:, 0] / fitter.sigma) ** 2)
+    by_rounding = float(np.linalg.norm(share * unknown))
+    return _mean(sets, len(levels), names, range_dn, float(signal[:, 0].max()), by_rounding)
 
 
 def _sets(names: int, count: int) -> list[tuple[int, ...]]:
@@ -233,8 +240,8 @@ class _Fitter:
         return -float(by_gain @ by_bend) / float(by_gain @ by_gain)
 
 
-def _mean(sets: list[_Set], count: int, names: int, range_dn: float, reach_dn: float) -> Response:
-    """Mean of the sets by their weights."""
+def _mean(sets: list[_Set], count: int, names: int, range_dn: float, reach_dn: float, by_rounding: float) -> Response:
+    """Mean of the sets by their weights; `by_rounding` is a standard deviation of the gain."""
     freedom = [max(count - 1 - len(fitted.terms), 1) for fitted in sets]
     misfits = [fitted.chi2 / n for fitted, n in zip(sets, freedom, strict=True)]
     least = min(misfits)
@@ -247,7 +254,7 @@ def _mean(sets: list[_Set], count: int, names: int, range_dn: float, reach_dn: f
     mean = np.tensordot(weight, x, axes=1)
     spread2 = weight @ (x[:, 0] - mean[0]) ** 2
     unseen = _unseen_bend(sets, names)
-    spread2[0] += weight[0] * (sets[0].gain_by_bend * unseen) ** 2
+    spread2[0] += weight[0] * (sets[0].gain_by_bend * unseen) ** 2 + by_rounding**2
     noise2 = (birge - 1.0) * np.array([jackknife_sigma(column) ** 2 for column in mean.T])
     sigmas = np.sqrt(np.array([jackknife_sigma(column) ** 2 for column in mean.T]) + spread2 + noise2)
     straight = sets[0].x[:, 0]

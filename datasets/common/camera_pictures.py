@@ -2,8 +2,9 @@
 
 * JPEG: colour or grey, with its quantisation tables and the subsampling of its chroma. One of R, G, B without chroma
   is colour like any other. Of a multi-picture file of a telephone the first one is taken; others are its previews.
-* PNG and TIFF of 8 bits: colour, grey or a palette; a grey picture has three equal colours.
-* PNG and TIFF of 16 bits: one channel is the mosaic's DN; of colours the upper 8 bits are taken, as viewers do.
+* PNG, TIFF and BMP of 8 bits: colour, grey or a palette; a grey picture has three equal colours.
+* PNG and TIFF of 16 bits: one channel is the mosaic's DN; of colours the upper 8 bits are taken, as viewers do. Colours
+  of 10 or 12 bits that are not scaled to 16 are refused.
 * PPM of 8 bits, and PGM, binary or plain, whose values are the mosaic's DN as they stand.
 * PNG of grey with a second plane of 8 bits: YUYV, as `phibench dataset frames` writes it.
 
@@ -19,15 +20,16 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 
+from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import PICTURE_PIXELS, InputFile
 from phibench.scenes.validation import printable_line
 
 _JPEG = ("JPEG", "MPO")  # Pillow calls a JPEG with previews after it MPO
-FORMATS = ("JPEG", "PNG", "TIFF", "PPM")
+FORMATS = ("JPEG", "PNG", "TIFF", "BMP", "PPM")
 PGM = (b"P5", b"P2")
-IN_WORDS = "JPEG, PNG, TIFF, PPM or PGM"
+IN_WORDS = "JPEG, PNG, TIFF, BMP, PPM or PGM"
 Kind = Literal["jpeg", "rgb", "yuyv", "raw"]
 Subsampling = Literal["4:4:4", "4:2:2", "4:2:0"]
 
@@ -37,6 +39,8 @@ _WHITE_IS_0 = 0  # TIFF's photometric interpretation
 _PHOTOMETRIC = 0x0106  # TIFF's tag
 # factors of Y in a JPEG
 _SAMPLING: dict[tuple[int, int], Subsampling] = {(1, 1): "4:4:4", (2, 1): "4:2:2", (2, 2): "4:2:0"}
+_BITS = 258  # TIFF's tag: bits of each colour
+_UPPER_CODES = 16  # of the upper 8 bits: colours below have 12 of 16 bits, or fewer
 _SIXTEEN = ("I;16", "I;16B", "I;16L", "I")
 _PGM = re.compile(rb"P[25](?:\s+|\s*#[^\n]*\n\s*)+(\d+)(?:\s+|\s*#[^\n]*\n\s*)+(\d+)(?:\s+|\s*#[^\n]*\n\s*)+(\d+)\s")
 
@@ -54,6 +58,8 @@ class CameraPicture:
         The file has one channel of 8 bits, or three that are equal everywhere.
     camera : str
         Maker and model of EXIF; "" where there is none.
+    mode : str
+        Pillow's name of what the file stores, such as "L" or "RGB"; "" of a PGM.
     orientation : int
         Of EXIF, 1 to 8: how the stored rows were turned to make these.
     tables : arrays of shape (8, 8)
@@ -66,6 +72,7 @@ class CameraPicture:
     kind: Kind
     grey: bool = False
     camera: str = ""
+    mode: str = ""
     orientation: int = 1
     tables: tuple[NDArray[Any], ...] = field(default=(), repr=False)
     subsampling: Subsampling | None = None
@@ -84,7 +91,7 @@ def read_camera_picture(file: InputFile, data: bytes | None = None) -> CameraPic
         raise file.fault(other)
     if data[:2] in PGM:
         return CameraPicture(_sealed(pgm_values(file, data)), "raw")
-    picture = file.picture(FORMATS, data)
+    picture = _opened(file, data)
     with (
         file.decoding("is a damaged picture"),
         warnings.catch_warnings(),
@@ -94,7 +101,28 @@ def read_camera_picture(file: InputFile, data: bytes | None = None) -> CameraPic
         # Pillow turns a TIFF as it decodes it, and forgets so
         told = _directory(data).get(_ORIENTATION, 1) if decoded.kind == "raw" and picture.format == "TIFF" else 1
         _orientation(file, told, decoded.kind)
+        if decoded.kind == "rgb" and _has_16_bits(picture, data) and decoded.pixels.max() < _UPPER_CODES:
+            raise file.fault("has colours of 16 bits that end below 4096: scale them to 65535, or save 8 bits a colour")
     return decoded
+
+
+def _opened(file: InputFile, data: bytes) -> Image.Image:
+    try:
+        return file.picture(FORMATS, data)
+    except DatasetError as error:
+        if data[:4] in _TIFF and isinstance(error.__cause__, UnidentifiedImageError):
+            raise file.fault(
+                "is a TIFF of another kind than 1 to 16 bits, such as one of floats; `magick FILE -depth 8 out.png` "
+                "converts it"
+            ) from error
+        raise
+
+
+def _has_16_bits(picture: Image.Image, data: bytes) -> bool:
+    """Tell whether each colour of a PNG or TIFF has 16 bits, of which Pillow gives the upper 8."""
+    if picture.format == "PNG":
+        return data[24:25] == b"\x10"  # of IHDR, the first chunk: after width and height
+    return picture.format == "TIFF" and max(picture.tag_v2.get(_BITS, (8,))) == 16  # type: ignore[attr-defined]
 
 
 def _of_decoded(file: InputFile, picture: Image.Image) -> CameraPicture:
@@ -106,7 +134,9 @@ def _of_decoded(file: InputFile, picture: Image.Image) -> CameraPicture:
     kind, pixels = _pixels(file, picture)
     orientation = _orientation(file, exif.get(_ORIENTATION, 1), kind)
     grey = picture.mode in ("L", "LA", "1") or (kind in ("jpeg", "rgb") and _is_grey(pixels))
-    upright_picture = CameraPicture(_sealed(upright(pixels, orientation)), kind, grey, camera, orientation)
+    upright_picture = CameraPicture(
+        _sealed(upright(pixels, orientation)), kind, grey, camera, picture.mode, orientation
+    )
     return _with_tables(file, picture, upright_picture) if kind == "jpeg" else upright_picture
 
 
@@ -182,11 +212,16 @@ def _pixels(file: InputFile, picture: Image.Image) -> tuple[Kind, NDArray[Any]]:
         if picture.format == "TIFF" and picture.tag_v2.get(_PHOTOMETRIC) == _WHITE_IS_0:  # type: ignore[attr-defined]
             raise file.fault("is a TIFF of 16 bits in which 0 is white: save it with 0 as black")
         return "raw", values.astype(np.uint16)
-    if (picture.format, picture.mode) == ("PNG", "LA") and np.asarray(picture)[..., 1].min(initial=255) < 255:
-        return "yuyv", np.array(picture)  # a plane that is full everywhere is no chroma, but says: opaque
+    if (picture.format, picture.mode) == ("PNG", "LA") and not _is_opacity(np.asarray(picture)[..., 1]):
+        return "yuyv", np.array(picture)
     if picture.mode not in ("RGB", "RGBA", "RGBX", "L", "LA", "P", "PA", "1"):
         raise file.fault(f"is a {picture.format} file of mode {picture.mode}: grey or R, G, B of 8 or 16 bits is read")
     return ("jpeg" if picture.format in _JPEG else "rgb"), np.array(picture.convert("RGB"))
+
+
+def _is_opacity(plane: NDArray[Any]) -> bool:
+    """Tell whether most pixels of a second plane are wholly opaque or wholly clear: chroma hardly ever ends there."""
+    return bool(np.isin(plane, (0, 255)).mean() > 0.5)
 
 
 def pgm_values(file: InputFile, data: bytes) -> NDArray[np.uint16]:
@@ -225,6 +260,7 @@ _RAW_SUFFIXES = {
     ".dng": "DNG", ".cr2": "Canon CR2", ".cr3": "Canon CR3", ".nef": "Nikon NEF", ".arw": "Sony ARW",
     ".orf": "Olympus ORF", ".rw2": "Panasonic RW2", ".raf": "Fujifilm RAF", ".pef": "Pentax PEF",
 }  # fmt: skip
+_TIFF = (b"II*\0", b"MM\0*")
 _RAW_MAGIC = {
     b"FUJIFILMCCD-RAW": "Fujifilm RAF",
     b"IIRO": "Olympus ORF",
@@ -238,7 +274,9 @@ _BRANDS = {
 }
 _MAGIC = {
     b"GIF8": "GIF",
-    b"BM": "BMP",
+    b"P7": "PAM",
+    b"PF": "PFM",
+    b"Pf": "PFM",
     b"\0\0\0\x0cjP": "JPEG 2000",
     b"\xff\x4f\xff\x51": "JPEG 2000",
     b"\xff\x0a": "JPEG XL",
@@ -250,6 +288,8 @@ _MAGIC = {
 
 def _other_format(data: bytes, suffix: str) -> str:
     """Fault of a format that is known and not read; "" for all others."""
+    if not data:
+        return "is empty"
     if data[4:8] == b"ftyp":
         brand = data[8:12]  # ISO base media: after size and "ftyp"
         named = next((name for name, (brands, _) in _BRANDS.items() if brand in brands), None)
@@ -274,7 +314,7 @@ def _raw_format(data: bytes, suffix: str) -> str:
     """Name of a camera's own raw format: by its first bytes, or a TIFF with DNG's tag or a known suffix."""
     if named := next((name for magic, name in _RAW_MAGIC.items() if data.startswith(magic)), None):
         return named
-    if data[:4] not in (b"II*\0", b"MM\0*"):
+    if data[:4] not in _TIFF:
         return ""  # no TIFF, in which raw formats are kept
     if data[8:10] == b"CR":
         return "Canon CR2"

@@ -21,6 +21,7 @@ from phibench.datasets.rooms.gltf_arrays import GltfDocument
 from phibench.datasets.rooms.mesh_parts import (
     BLACK,
     BRIGHTEST,
+    ROUNDED,
     WHITE,
     Companions,
     MeshPart,
@@ -164,7 +165,7 @@ class _Reader:
             ]
             matrix[:3, :3] *= document.numbers(node, "scale", (1.0, 1.0, 1.0))
             matrix[:3, 3] = document.numbers(node, "translation", (0.0, 0.0, 0.0))
-        if not np.isfinite(matrix).all() or not np.array_equal(matrix[3], [0.0, 0.0, 0.0, 1.0]):
+        if not np.isfinite(matrix).all() or np.abs(matrix[3] - [0.0, 0.0, 0.0, 1.0]).max() > ROUNDED:
             raise self._misplaced(node)
         return matrix
 
@@ -269,11 +270,13 @@ class _Reader:
         strength = document.table(extensions, "KHR_materials_emissive_strength").get("emissiveStrength", 1.0)
         light = tuple(x * float(strength) for x in document.numbers(row, "emissiveFactor", BLACK))
         colour = three_numbers(document.numbers(base, factor, (1.0, 1.0, 1.0, 1.0))[:3])
+        shown = printable_line(str(row.get("name", "")), 60)
         if not colour or not three_numbers(light):
-            shown = printable_line(str(row.get("name", "")), 60)
             raise self.file.fault(
                 f"has a material '{shown}' with a colour or emission that is not three numbers from 0 up"
             )
+        if max(colour) > 1.0 + ROUNDED:
+            raise self.file.fault(f"has a material '{shown}' with a {factor} up to {max(colour):g}: it ends at 1")
         mode, opacity = row.get("alphaMode", "OPAQUE"), document.numbers(base, factor, (1.0, 1.0, 1.0, 1.0))[3]
         cutoffs = {"OPAQUE": None, "MASK": float(row.get("alphaCutoff", 0.5)), "BLEND": 0.0}
         if mode not in cutoffs:

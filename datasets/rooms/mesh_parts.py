@@ -149,6 +149,8 @@ BLACK: Vector = (0.0, 0.0, 0.0)
 WHITE: Vector = (1.0, 1.0, 1.0)
 BRIGHTEST = 1e6
 """Of an emission, in units of the file."""
+ROUNDED = 1e-6
+"""By which numbers that are written as 32-bit floats may be off: a colour may end at 1.000001."""
 _GREY_16 = ("I", "I;16", "I;16L", "I;16B")
 _OF_8_BITS = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBX")
 _OUTSIDE = 1e-5  # by which coordinates may leave a picture that does not repeat

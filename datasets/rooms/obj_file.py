@@ -17,6 +17,7 @@ from phibench.datasets.rooms.mesh_parts import (
     BRIGHTEST,
     MOST_PARTS,
     MOST_TRIANGLES,
+    ROUNDED,
     WHITE,
     Companions,
     Cutting,
@@ -67,6 +68,12 @@ class _Material:
     picture: _Map | None = None
     light_picture: _Map | None = None
     mask: _Map | None = None
+    opacity: float | None = None
+    transparency: float = 0.0
+
+    @property
+    def is_hidden(self) -> bool:
+        return self.opacity is not None and self.opacity <= 0.0
 
 
 @dataclass
@@ -191,6 +198,8 @@ def obj_parts(file: InputFile, companions: Companions) -> list[MeshPart]:
         material = materials.get(name)
         if material is None and name and reader.libraries:
             raise file.fault(f"uses the material '{printable_line(name, 60)}', which none of its libraries has")
+        if material is not None and material.is_hidden:
+            continue  # wholly transparent
         title = "_".join(filter(None, (label, name))) or file.path.stem
         parts.append(_part(file, companions, title, group, vertices, material, cutting))
     return parts
@@ -245,7 +254,13 @@ def _part(
 
 def _check_holes(file: InputFile, companions: Companions, material: _Material) -> None:
     """Refuse a picture of the opacity that has holes: what is half transparent counts as opaque."""
-    if material.mask is not None and companions.picture(material.mask.name).min() == 0:
+    if material.mask is None:
+        return
+    owner = companions.named(material.mask.name)
+    alpha = companions.opacity(owner, owner.read())
+    # a picture that is opaque everywhere tells the opacity by its brightness
+    mask = companions.picture(material.mask.name) if alpha is None or alpha.min() == 255 else alpha
+    if mask.min() == 0:
         shown = printable_line(material.name, 60)
         raise file.fault(f"has holes in the material '{shown}' (map_d): cut its faces along them, or take map_d away")
 
@@ -289,6 +304,11 @@ def _materials(file: InputFile, companions: Companions, libraries: list[str]) ->
         for name in names:
             library = companions.named(name)
             for material in _library(library):
+                if material.transparency >= 1.0 and material.opacity is None:
+                    raise library.fault(
+                        f"states Tr 1 and no d of '{printable_line(material.name, 60)}', by which programs mean opaque "
+                        "or wholly transparent: write d 1 or d 0"
+                    )
                 materials.setdefault(material.name, material)
     return materials
 
@@ -316,6 +336,10 @@ def _with_line(file: InputFile, material: _Material, key: str, values: list[str]
         return replace(material, picture=picture) if key == "map_kd" else replace(material, light_picture=picture)
     if key == "map_d":
         return replace(material, mask=_map(file, material.name, key, values))
+    if key == "d" and values:
+        return replace(material, opacity=float(values[-1]))  # after -halo, where it stands
+    if key == "tr" and values:
+        return replace(material, transparency=float(values[0]))
     return material  # gloss and relief are not kept, nor is a half transparency
 
 
@@ -326,6 +350,8 @@ def _colour(file: InputFile, name: str, key: str, values: list[str]) -> Vector:
     colour = three_numbers(words[:3])
     if not colour:
         raise file.fault(f"has a {key} of '{printable_line(name, 60)}' that is not three numbers from 0 up")
+    if key == "kd" and max(colour) > 1.0 + ROUNDED:
+        raise file.fault(f"has a Kd of '{printable_line(name, 60)}' up to {max(colour):g}: write it from 0 to 1")
     return colour
 
 

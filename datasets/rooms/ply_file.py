@@ -45,6 +45,9 @@ _TYPES = {
 _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _CORNERS = ("vertex_indices", "vertex_index")
 _COLOURS = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
+_OTHER_COLOURS = {name for names in _COLOURS for name in names} | {
+    "ambient_red", "gray", "grey", "luminance", "rgb", "rgba", "color", "colour", "f_dc_0", "albedo_red",
+}  # fmt: skip
 _PLACES = (("s", "t"), ("texture_u", "texture_v"), ("u", "v"))
 _MOST_CORNERS = 10_000  # of one polygon
 _MOST_ENTRIES = 3 * MOST_TRIANGLES  # of one kind
@@ -323,6 +326,8 @@ def _picture_paint(
         return None
     if len(set(pictures)) > 1:
         raise file.fault("names several pictures, of which each face would have one: that is not read")
+    if np.any(np.asarray(face.get("texnumber", []), float) != 0.0):
+        raise file.fault("has faces with a texnumber other than 0, and names one picture: give all faces that one")
     places = next((names for names in _PLACES if all(name in vertex for name in names)), None)
     if "texcoord" in face:
         uv = _face_places(file, face["texcoord"], faces)
@@ -349,7 +354,21 @@ def _colour_paint(
     if of_faces is not None:
         return Paint(face_colours=of_faces[faces.owner])
     of_vertices = _own_colours(file, "vertex", tables, kinds)
-    return None if of_vertices is None else Paint(face_colours=of_vertices[faces.triangles].mean(axis=1))
+    if of_vertices is None:
+        _refuse_other_colours(file, tables)
+        return None
+    return Paint(face_colours=of_vertices[faces.triangles].mean(axis=1))
+
+
+def _refuse_other_colours(file: InputFile, tables: dict[str, Table]) -> None:
+    """Refuse colours by names that are not read: the plain albedo would take their place without a word."""
+    for element in ("vertex", "face"):
+        for name in tables.get(element, {}):
+            if name.lower() in _OTHER_COLOURS:
+                raise file.fault(
+                    f"has colours of each {element} as '{printable_line(name, 60)}', which is not read: name them red, "
+                    "green and blue, or take them away"
+                )
 
 
 def _own_colours(

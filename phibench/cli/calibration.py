@@ -197,7 +197,7 @@ def align(
     Parameters
     ----------
     image
-        Frame of the camera: JPEG, PNG, TIFF, PPM or PGM; turned upright as its EXIF data say.
+        Frame of the camera: JPEG, PNG, TIFF, BMP, PPM or PGM; turned upright as its EXIF data say.
     out
         PNG to write: the outline and an arrow, 20 times as long as the move; by default `<image>-align.png` in
         the current folder.

@@ -74,7 +74,7 @@ def from_mirror_ball(
     Parameters
     ----------
     photo
-        JPEG, PNG, TIFF, PPM, PGM, OpenEXR or Radiance HDR file; turned upright as its EXIF data say.
+        JPEG, PNG, TIFF, BMP, PPM, PGM, OpenEXR or Radiance HDR file; turned upright as its EXIF data say.
     out
         Panorama to write: .exr (linear light, and what is seen) or .png.
     surroundings_m

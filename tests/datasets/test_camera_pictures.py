@@ -26,7 +26,7 @@ def read(path: Path):
 
 
 def test_lossless_formats_give_the_pixels_and_their_kind(tmp_path: Path) -> None:
-    for suffix in ("png", "tif", "ppm"):
+    for suffix in ("png", "tif", "bmp", "ppm"):
         Image.fromarray(COLOUR).save(tmp_path / f"colour.{suffix}")
         found = read(tmp_path / f"colour.{suffix}")
         assert (found.kind, found.grey) == ("rgb", False)
@@ -81,7 +81,10 @@ def test_pictures_are_turned_upright(tmp_path: Path, orientation: int) -> None:
 
 
 def test_a_plane_of_opacity_is_no_chroma(tmp_path: Path) -> None:
-    for second, kind in ((np.full_like(GREY, 255), "rgb"), (np.full_like(GREY, 128), "yuyv")):
+    cut = np.where(np.arange(32) < 20, 255, 0).astype(np.uint8) * np.ones_like(GREY)  # the background made clear
+    half = np.where(np.arange(32) < 15, 128, 255).astype(np.uint8) * np.ones_like(GREY)
+    planes = (np.full_like(GREY, 255), "rgb"), (cut, "rgb"), (half, "rgb"), (np.full_like(GREY, 128), "yuyv")
+    for second, kind in planes:
         Image.fromarray(np.stack([GREY, second], axis=-1)).save(tmp_path / "a.png")
         assert read(tmp_path / "a.png").kind == kind
 
@@ -169,7 +172,7 @@ FOREIGN = {
     "Fujifilm RAF": ("a.raf", b"FUJIFILMCCD-RAW 0201", "dcraw"),
     "WebP": ("a.webp", b"RIFF\x24\0\0\0WEBPVP8 ", "dwebp"),
     "GIF": ("a.gif", b"GIF89a" + bytes(20), "magick"),
-    "BMP": ("a.png", b"BM" + bytes(60), "magick"),  # under another name
+    "PFM": ("a.png", b"PF\n1 1\n-1.0\n" + bytes(12), "magick"),  # under another name
     "JPEG XL": ("a.jxl", b"\xff\x0a" + bytes(20), "magick"),
 }
 
@@ -186,7 +189,22 @@ def test_other_formats_are_refused_by_name(tmp_path: Path, name: str) -> None:
     assert "\n" not in text
 
 
+@pytest.mark.parametrize("suffix", ["png", "tif"])
+def test_colours_that_are_not_scaled_to_16_bits_are_told(tmp_path: Path, suffix: str) -> None:
+    """12 bits as they are gave a picture of 16 codes; scaled ones have their upper 8 bits."""
+    colours = np.stack([DEEP >> 4, DEEP >> 5, DEEP >> 6], axis=-1)  # up to 4095
+    for factor, message in ((1, "scale them to 65535"), (16, "")):
+        assert cv2.imwrite(str(tmp_path / f"a.{suffix}"), colours[..., ::-1] * factor)
+        if message:
+            with pytest.raises(DatasetError, match=message):
+                read(tmp_path / f"a.{suffix}")
+        else:
+            np.testing.assert_array_equal(read(tmp_path / f"a.{suffix}").pixels, colours >> 4)
+
+
 def test_what_a_camera_does_not_write_is_told(tmp_path: Path) -> None:
+    (tmp_path / "empty.png").write_bytes(b"")
+    assert cv2.imwrite(str(tmp_path / "floats.tif"), COLOUR.astype(np.float32))
     Image.fromarray(COLOUR).convert("CMYK").save(tmp_path / "print.jpg")
     pages = [Image.fromarray(GREY), Image.fromarray(GREY)]
     pages[0].save(tmp_path / "pages.tif", save_all=True, append_images=pages[1:])
@@ -197,6 +215,8 @@ def test_what_a_camera_does_not_write_is_told(tmp_path: Path) -> None:
     Image.fromarray(DEEP).save(buffer, "PNG", exif=exif)
     (tmp_path / "turned.png").write_bytes(buffer.getvalue())
     for file, word in (
+        ("empty.png", "is empty"),
+        ("floats.tif", "a TIFF of another kind"),
         ("print.jpg", "CMYK"),
         ("pages.tif", "2 pictures"),
         ("video.mp4", "ffmpeg"),

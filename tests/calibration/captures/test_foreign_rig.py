@@ -107,6 +107,15 @@ LINES = {
     "kc = [ -0.026 ; 1.06 ; 0.001 ; -0.002 ; 0.0 ];\nnx = 1280;\nny = 720;\n",
     "ROS": "[image]\n\nwidth\n1280\n\nheight\n720\n\n[c310]\n\ncamera matrix\n1432.5 0.0 640.25\n0.0 1431.75 355.5\n"
     "0.0 0.0 1.0\n\ndistortion\n-0.026 1.06 0.001 -0.002 0.0\n\nrectification\n1.0 0.0 0.0\n",
+    # Metashape: u = w / 2 + cx + (f + b1) x, the first pixel at 0.5, p1 and p2 in the other order
+    "Metashape": "<calibration>\n  <projection>frame</projection>\n  <width>1280</width>\n  <height>720</height>\n"
+    "  <f>1431.75</f>\n  <cx>0.75</cx>\n  <cy>-4</cy>\n  <b1>0.75</b1>\n  <k1>-0.026</k1>\n  <k2>1.06</k2>\n"
+    "  <p1>-0.002</p1>\n  <p2>0.001</p2>\n</calibration>\n",
+    "Nerfstudio": '{"camera_model": "OPENCV", "fl_x": 1432.5, "fl_y": 1431.75, "cx": 640.75, "cy": 356.0, "w": 1280, '
+    '"h": 720, "k1": -0.026, "k2": 1.06, "p1": 0.001, "p2": -0.002, "frames": []}',
+    "RealSense": '{"width": 1280, "height": 720, "ppx": 640.25, "ppy": 355.5, "fx": 1432.5, "fy": 1431.75, '
+    '"model": "brown_conrady", "coeffs": [-0.026, 1.06, 0.001, -0.002, 0.0]}',
+    "another program": "fx: 1432.5\nfy: 1431.75\ncx: 640.25\ncy: 355.5\nk1: -0.026\nk2: 1.06\np1: 0.001\np2: -0.002\n",
     "CamOdoCal": "model_type: PINHOLE\nprojection_parameters:\n   fx: 1432.5\n   fy: 1431.75\n   cx: 640.25\n"
     "   cy: 355.5\ndistortion_parameters:\n   k1: -0.026\n   k2: 1.06\n   p1: 0.001\n   p2: -0.002\n",
 }
@@ -153,6 +162,36 @@ def test_a_model_of_mirror_and_camera_cannot_be_split(tmp_path: Path, program: s
     assert "mirror and camera in one" in text
     assert "cannot be split" in text
     assert "fx_px =" not in text
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ('{"rig": {"fx_px": 1430.0}}', "but JSON: write a line [rig]"),
+        ("rig:\n  fx_px: 1430\n", "but YAML"),
+        ("<robot/>", "but XML"),
+        ('{"kind": "phibench calibration", "version": 2}', "--calibration"),
+        ("\x89PNG\r\n", "is a picture: give it with --down"),
+        ('preset = "bayer-raw"\nadc_bits = 10\n', "is a sensor file: give it with --sensor"),
+        ("[recipe]\n[rig]\n", "is a recipe: copy its tables"),
+        ("[mirror]\nradius_m = 0.03\n", "write [rig.mirror]"),
+        ("[camera]\nfx_px = 1430.0\n", "camera: unknown key; camera and mirror are described in the table [rig]"),
+        ("[rig]\nresolution = [1280, 720]\n", "write width_px and height_px"),
+        ("[rig]\nmirror_diameter_mm = 60\n", "half its diameter, is radius_m"),
+        ("[rig.mirror]\ndiameter_m = 0.06\n", "and needs no [rig.mirror]"),
+        ("[rig]\nfx_mm = 4.0\n", "millimetres over the pixel pitch as fx_px"),
+        ("[rig]\nstroke_m = 0.4\n", "--stroke-m"),
+        ("[rig.laser]\ndiameter_m = 0.003\n", "a line [laser]"),
+        ("[rig]\ndistortion = [0.1, 0.0]\n", "write k1, k2, p1, p2 and k3"),
+    ],
+)
+def test_another_file_or_key_is_told_what_it_is(tmp_path: Path, text: str, words: str) -> None:
+    path = tmp_path / "rig.toml"
+    path.write_bytes(text.encode("latin-1"))
+    with pytest.raises(DatasetError) as error:
+        read_rig_file(path)
+    assert words in str(error.value)
+    assert "did you mean" not in str(error.value)
 
 
 def test_what_is_none_of_them_is_no_toml(tmp_path: Path) -> None:

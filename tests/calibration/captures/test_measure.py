@@ -148,6 +148,13 @@ def test_laser_on_and_off_exchanged_is_told(case: Case, capsys) -> None:
 
 
 @pytest.mark.usefixtures("unaligned")
+def test_all_four_pictures_exchanged_are_told(case: Case, capsys) -> None:
+    crossed = {"down": case.raw["up_off"], "up": case.raw["down_off"]}
+    crossed |= {"down_off": case.raw["up"], "up_off": case.raw["down"]}
+    assert "laser on and off are exchanged, and down and up, too" in refused(capsys, case.arguments(crossed))
+
+
+@pytest.mark.usefixtures("unaligned")
 def test_laser_on_and_off_exchanged_at_one_position_is_told(case: Case, capsys) -> None:
     one = {**case.raw, "up": case.raw["up_off"], "up_off": case.raw["up"]}
     said = refused(capsys, case.arguments(one))
@@ -185,6 +192,26 @@ def test_a_camera_that_moved_between_on_and_off_is_told(case: Case, tmp_path: Pa
     # a parabola through the correlation errs by up to 0.1 px
     assert found is not None
     assert found[1] in ("2.9", "3.0", "3.1")
+
+
+@pytest.mark.usefixtures("unaligned")
+@pytest.mark.parametrize(("degrees", "far_px"), [(2.0, 0), (0.0, 40)])
+def test_a_camera_that_turned_or_moved_far_is_told(
+    case: Case, tmp_path: Path, degrees: float, far_px: int, capsys
+) -> None:
+    """A turn about the middle moves the whole by nothing: the light was called too faint."""
+    moved = {}
+    for name in ("down_off", "up_off"):
+        with Image.open(case.jpg[name][0]) as picture:
+            turned = picture.rotate(degrees, Image.Resampling.BICUBIC) if degrees else picture.copy()
+            shifted = Image.fromarray(np.roll(np.array(turned), far_px, axis=1))
+            moved[name] = [tmp_path / f"{name}.jpg"]
+            shifted.save(moved[name][0], qtables=picture.quantization, subsampling="4:2:2")
+    main(case.arguments({**case.jpg, **moved}))
+    said = "".join(capsys.readouterr())
+    found = re.search(r"the camera moved between laser on and off, by ([\d.]+) px", said)
+    assert found is not None
+    assert float(found[1]) == pytest.approx(far_px, abs=0.3) if far_px else float(found[1]) > 1.0  # 2 deg of 30 px
 
 
 @pytest.mark.usefixtures("unaligned")

@@ -75,7 +75,7 @@ def test_a_straight_response_has_no_finding(tmp_path: Path, camera: BentCamera, 
     found = fit_sensor(write_transfer(tmp_path / "c", camera, seed, SHARES)).file
     assert not found.tables.findings
     assert abs(found.numbers["gain_dn_per_e"] - camera.gain) < 4.0 * found.tables.sigma["gain_dn_per_e"]
-    assert found.tables.sigma["gain_dn_per_e"] < 0.02 * camera.gain
+    assert found.tables.sigma["gain_dn_per_e"] < 0.04 * camera.gain
 
 
 def test_a_bend_that_noise_does_not_show_is_in_sigma() -> None:
@@ -177,6 +177,21 @@ def test_a_black_level_between_two_codes_has_their_distance_for_sigma(tmp_path: 
     assert abs(found.numbers["black_level_dn"] - black) < 0.5
     assert abs(found.numbers["gain_dn_per_e"] - 0.02) < 4.0 * found.tables.sigma["gain_dn_per_e"]
     assert "rounding hides it" in found.tables.not_determined["read_noise_e"]
+
+
+def test_levels_of_less_noise_than_a_code_do_not_bend_the_line(tmp_path: Path) -> None:
+    """Noise of 0.2 to 0.65 codes: rounding depends on where in a code a level lies. Within 4 sigma, below 4 % each.
+
+    The gain was twice the camera's, at 7 of its sigmas, and a bend of 40 % was found. A pattern of 0.1 codes is not
+    seen in the darkest levels: 0.5 % came out as 0.43 %, at 22 sigmas.
+    """
+    camera = BentCamera(0.002, 15.0, 2.9, bits=8)
+    shares = tuple(0.002 * e / 252.1 for e in (10e3, 25e3, 45e3, 65e3, 85e3, 105e3))
+    found = fit_sensor(write_transfer(tmp_path / "c", camera, 5, shares, kind="bayer-raw")).file
+    value, sigma = found.numbers, found.tables.sigma
+    assert sigma["gain_dn_per_e"] < 0.04 * camera.gain
+    for name, truth in (("gain_dn_per_e", camera.gain), ("prnu", camera.prnu)):
+        assert abs(value[name] - truth) < 4.0 * sigma[name]
 
 
 def test_hot_pixels_are_not_called_cut(tmp_path: Path) -> None:

@@ -187,6 +187,33 @@ def _scaled(folder: Path) -> None:
         Image.fromarray((np.asarray(Image.open(path)) * 64).astype(np.uint16)).save(path)
 
 
+def _scaled_whole(folder: Path) -> None:
+    """As programs do that fill 16 bits: 10 bits with their upper ones behind them."""
+    for path in folder.rglob("*.png"):
+        dn = np.asarray(Image.open(path)).astype(np.uint16)
+        Image.fromarray((dn << 6) | (dn >> 4)).save(path)
+    notes = (folder / "capture.toml").read_text()
+    (folder / "capture.toml").write_text(notes.replace("bits = 10", "bits = 16"))
+
+
+def _turned(folder: Path) -> None:
+    exif = Image.Exif()
+    exif[0x0112] = 2
+    for path in folder.rglob("*.png"):
+        Image.fromarray(np.zeros((128, 128, 3), np.uint8)).save(path, exif=exif)
+
+
+def _palette(folder: Path) -> None:
+    for path in folder.rglob("*.png"):
+        Image.fromarray(np.zeros((128, 128, 3), np.uint8)).quantize(4).save(path)
+
+
+def _cmyk(folder: Path) -> None:
+    for path in folder.rglob("*.png"):
+        Image.new("CMYK", (128, 128)).save(path.with_suffix(".jpg"))
+        path.unlink()
+
+
 def _damage(folder: Path) -> None:
     (folder / "flat/00/000.png").write_bytes(b"no picture")
 
@@ -212,6 +239,10 @@ def _bad_seconds(folder: Path) -> None:
         (_drift, "auto exposure"),
         (_saturate, "saturated"),
         (_scaled, "not scaled"),
+        (_scaled_whole, "right by 6 bits, and write bits = 10"),
+        (_turned, "turned by EXIF"),
+        (_palette, "the mode P"),
+        (_cmyk, "CMYK"),
         (_damage, "not a picture"),
         (_unknown_note, "exposure: unknown key; did you mean 'exposure_s'"),
         (_bad_seconds, "exposure time"),

@@ -141,6 +141,19 @@ def test_a_transform_of_coordinates_is_the_definitions_example(tmp_path: Path) -
     np.testing.assert_allclose([*low, *high], [0.0, 0.0, 0.5, 0.5], atol=1e-7)  # v upwards: the lower left
 
 
+def test_factors_end_at_one(tmp_path: Path) -> None:
+    """Up to the rounding of 32 bits, in the last row of a matrix, too: more was clipped without a word."""
+    document = Gltf()
+    document.material(name="wall", pbrMetallicRoughness={"baseColorFactor": [1.0000001, 0.5, 0.5, 1.0]})
+    document.tree["nodes"][0]["matrix"] = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1.0000001]
+    part = document.one(tmp_path)
+    assert part.paint is not None
+    assert part.paint.colour == (1.0, 0.5, 0.5)
+    document.tree["materials"][0]["pbrMetallicRoughness"]["baseColorFactor"][0] = 1.8
+    with pytest.raises(RoomError, match=r"'wall' with a baseColorFactor up to 1\.8: it ends at 1"):
+        document.read(tmp_path)
+
+
 def test_vertex_colours_multiply_the_material(tmp_path: Path) -> None:
     document = Gltf()
     tints = np.array([[65535, 0, 0]] * 4, np.uint16)

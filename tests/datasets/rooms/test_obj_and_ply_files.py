@@ -91,6 +91,8 @@ def test_materials_of_an_obj_have_their_options(tmp_path: Path) -> None:
         ("mtllib one.mtl\n" + V + "usemtl a\nf 1 2 3\n", "newmtl a\nKd 1 2\n", "three numbers from 0 up"),
         ("mtllib one.mtl\n" + V + "usemtl a\nf 1 2 3\n", "newmtl a\nmap_Kd -mm 0 2 p.png\n", "-mm"),
         ("mtllib one.mtl\n" + V + "usemtl a\nf 1 2 3\n", "newmtl a\nmap_Kd p.png\n", "p.png', which is missing"),
+        ("mtllib one.mtl\n" + V + "usemtl a\nf 1 2 3\n", "newmtl a\nKd 200 100 50\n", "Kd of 'a' up to 200: write it"),
+        ("mtllib one.mtl\n" + V + "usemtl a\nf 1 2 3\n", "newmtl a\nTr 1\n", "write d 1 or d 0"),
         (V[:-2] + "0 1 0 0\nf 1 2 3 4\n", "", "give all a colour, or none"),
     ],
 )
@@ -98,6 +100,25 @@ def test_what_an_obj_cannot_say_is_refused(tmp_path: Path, text: str, materials:
     with pytest.raises(RoomError, match=words) as caught:
         obj(tmp_path, text, materials)
     assert "\n" not in str(caught.value)
+
+
+def test_what_is_wholly_transparent_is_not_there(tmp_path: Path) -> None:
+    """Of materials with d, by Wavefront's definition; a picture's alpha counts, or its brightness without one."""
+    text = "mtllib one.mtl\nvt 0 0\nvt 1 0\nvt 1 1\n" + V + "usemtl wall\nf 1 2 3\nusemtl pane\nf 1/1 3/2 4/3\n"
+    for line, seen in (("d 0.0", 1), ("d -halo 0.0", 1), ("d 0.1", 2), ("d 1\nTr 1", 2)):
+        assert len(obj(tmp_path, text, f"newmtl wall\nKd 0.5\nnewmtl pane\n{line}\n")) == seen
+    for name, pixel, holes in (
+        ("a.png", (9, 9, 9, 0), True),
+        ("b.png", (0, 0, 0, 9), False),
+        ("c.png", (0, 0, 0), True),
+    ):
+        Image.fromarray(np.full((2, 2, len(pixel)), pixel, np.uint8)).save(tmp_path / name)
+        materials = f"newmtl wall\nnewmtl pane\nmap_d {name}\n"
+        if holes:
+            with pytest.raises(RoomError, match="holes in the material 'pane'"):
+                obj(tmp_path, text, materials)
+        else:
+            assert len(obj(tmp_path, text, materials)) == 2
 
 
 def test_trimesh_reads_the_same_obj(tmp_path: Path) -> None:
@@ -207,6 +228,37 @@ def test_trimesh_reads_the_same_ply(tmp_path: Path) -> None:
     [part], other = read_mesh(path), trimesh.load_mesh(path, process=False)
     np.testing.assert_allclose(part.vertices, other.vertices)
     np.testing.assert_array_equal(part.triangles, other.faces)
+
+
+@pytest.mark.parametrize("names", ["Red Green Blue", "ambient_red ambient_green ambient_blue", "gray", "rgb"])
+@pytest.mark.parametrize("owner", ["vertex", "face"])
+def test_colours_by_other_names_are_told(tmp_path: Path, names: str, owner: str) -> None:
+    """They were passed over, and the plain albedo took their place."""
+    own = "".join(f"property uchar {name}\n" for name in names.split())
+    values = " 200" * len(names.split())
+    head = "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+    text = f"{head}{own if owner == 'vertex' else ''}element face 1\nproperty list uchar int vertex_indices\n"
+    text += f"{own if owner == 'face' else ''}end_header\n"
+    text += "".join(f"{place}{values if owner == 'vertex' else ''}\n" for place in ("0 0 0", "1 0 0", "1 1 0"))
+    (tmp_path / "a.ply").write_text(f"{text}3 0 1 2{values if owner == 'face' else ''}\n")
+    with pytest.raises(RoomError, match=f"colours of each {owner} as '{names.split()[0]}'"):
+        read_mesh(tmp_path / "a.ply")
+
+
+@pytest.mark.parametrize("number", [0, 1, -1])
+def test_a_face_may_name_the_one_picture_alone(tmp_path: Path, number: int) -> None:
+    Image.fromarray(np.full((2, 2, 3), 9, np.uint8)).save(tmp_path / "a.png")
+    (tmp_path / "a.ply").write_text(
+        "ply\nformat ascii 1.0\ncomment TextureFile a.png\nelement vertex 3\nproperty float x\nproperty float y\n"
+        "property float z\nelement face 1\nproperty list uchar int vertex_indices\n"
+        "property list uchar float texcoord\nproperty int texnumber\nend_header\n"
+        f"0 0 0\n1 0 0\n1 1 0\n3 0 1 2 6 0 0 1 0 1 1 {number}\n"
+    )
+    if number:
+        with pytest.raises(RoomError, match="texnumber other than 0"):
+            read_mesh(tmp_path / "a.ply")
+    else:
+        assert len(read_mesh(tmp_path / "a.ply")) == 1
 
 
 @pytest.mark.parametrize("order", ["little", "big"])
