@@ -88,15 +88,19 @@ def printable_line(text: str, most: int = 200) -> str:
 def close_names(name: str, known: Iterable[str]) -> list[str]:
     """Nearest known name, if one is near: a list of one or none. Nearest is one with a unit, or another unit."""
     names = list(known)
-    stem = without_unit(name)
-    stem = _ALSO_CALLED.get(stem, stem)
+    stem, stems = without_unit(name), {without_unit(one) for one in names}
+    stem = also if (also := _ALSO_CALLED.get(stem)) in stems else stem
     alike = [one for one in names if without_unit(one) == stem]
     longer = [one for one in names if one.lower().startswith(f"{stem}_")]
     return alike[:1] or (longer if len(longer) == 1 else difflib.get_close_matches(name, names, 1, 0.5))
 
 
-_ALSO_CALLED = {"f": "fx", "focal": "fx", "focal_length": "fx", "distance": "z_c", "pixel_size": "pixel_pitch"}
-"""Names, without units, that people give to lengths of a rig, with those that they have here."""
+_ALSO_CALLED = {
+    "f": "fx", "focal": "fx", "focal_length": "fx", "distance": "z_c", "pixel_size": "pixel_pitch",
+    "gain": "gain_dn_per", "conversion_gain": "gain_dn_per", "system_gain": "gain_dn_per", "k": "gain_dn_per",
+    "bit_depth": "adc_bits", "offset": "black_level", "dark_current": "dark_e_per", "dark_noise": "read_noise",
+}  # fmt: skip
+"""Names, without units, that people give to numbers of a rig or a sensor, with those that they have here."""
 _UNITS = ("px", "m", "cm", "mm", "um", "nm", "deg", "rad", "s", "ms", "us", "e", "w", "mw", "dn")
 
 

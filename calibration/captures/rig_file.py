@@ -95,10 +95,15 @@ def read_rig_file(path: Path) -> MeasuredRig:
 
 def _other_file(raw: dict[str, Any]) -> str:
     """Fault of a file of ours that is no rig file; "" for all others."""
+    if raw.keys() & {"format", "bits", "exposure_s"}:
+        return "describes frames, not a rig: `phibench sensor fit` takes their folder"
     if raw.keys() & {"adc_bits", "gain_dn_per_e", "black_level_dn", "read_noise_e", "full_well_e"}:
         return "is a sensor file: give it with --sensor, and the numbers of camera and mirror with --rig"
     if raw.keys() & {"recipe", "samples", "rooms", "targets", "sampling"}:
         return "is a recipe: copy its tables [rig], [rig.mirror], [rig.holder] and [laser] into a file of their own"
+    if (preset := raw.get("preset")) is not None and preset not in RIGS:
+        names = ", ".join(RIGS)
+        return f"begins with a preset that is no rig's: give a sensor file with --sensor; presets of [rig] are {names}"
     return ""
 
 

@@ -113,7 +113,13 @@ def read_calibration(path: str | Path, nominal: Rig | None = None) -> Calibratio
         If the file is missing, of another version, damaged, or of another rig.
     """
     path = Path(path)
-    raw = _file(path).json()
+    data = _file(path).read()
+    if data.lstrip()[:1] != b"{":
+        raise CalibrationError(
+            f"{path} is no calibration, which is JSON that `phibench calibrate` writes; give a rig file with --rig, "
+            "and a sensor file with --sensor"
+        )
+    raw = _file(path).json(data)
     if raw.get("kind") != "phibench calibration":
         raise CalibrationError(f"{path} is not a calibration: make one with `phibench calibrate`")
     if raw.get("version") not in (1, VERSION):

@@ -236,6 +236,12 @@ def read_sensor_file(path: str | Path) -> SensorFile:
     """
     file = InputFile(Path(path), "docs/capture.md has an example", limit_bytes=SETTINGS_BYTES)
     document = file.toml()
+    if "rig" in document:
+        raise file.fault("is a rig file: give it with --rig")
+    if document.keys() & {"format", "bits", "width_px", "height_px"}:
+        raise file.fault("describes frames, not a sensor: `phibench sensor fit` makes a sensor file of their folder")
+    if isinstance(document.get("sensor"), dict):
+        raise file.fault("has a table [sensor]: write its keys above all tables, without that line")
     tables = file.validated(FitTables, {key: document.pop(key) for key in FitTables.model_fields if key in document})
     preset = document.pop("preset", "mjpeg")
     if not isinstance(preset, str):

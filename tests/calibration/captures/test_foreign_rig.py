@@ -173,6 +173,8 @@ def test_a_model_of_mirror_and_camera_cannot_be_split(tmp_path: Path, program: s
         ('{"kind": "phibench calibration", "version": 2}', "--calibration"),
         ("\x89PNG\r\n", "is a picture: give it with --down"),
         ('preset = "bayer-raw"\nadc_bits = 10\n', "is a sensor file: give it with --sensor"),
+        ('format = "bayer-raw"\nwidth_px = 160\nbits = 12\n', "describes frames, not a rig"),
+        ('preset = "mono-raw"\n', "a preset that is no rig's"),
         ("[recipe]\n[rig]\n", "is a recipe: copy its tables"),
         ("[mirror]\nradius_m = 0.03\n", "write [rig.mirror]"),
         ("[camera]\nfx_px = 1430.0\n", "camera: unknown key; camera and mirror are described in the table [rig]"),

@@ -155,6 +155,9 @@ def test_another_rig_a_missing_file_and_no_json_are_refused(tmp_path, bundle) ->
         read_calibration(path, other)
     with pytest.raises(CalibrationError, match="is missing"):
         read_calibration(tmp_path / "none.json")
+    path.write_text("[rig]\nfx_px = 1430.0\n")
+    with pytest.raises(CalibrationError, match="give a rig file with --rig"):
+        read_calibration(path)
     path.write_text("{")
     with pytest.raises(CalibrationError, match="not JSON"):
         read_calibration(path)
