@@ -51,6 +51,7 @@ from phibench.datasets.store.checksums import (
 from phibench.datasets.store.croissant import LICENSE_TEXT
 from phibench.datasets.store.documents import parquet_bytes
 from phibench.datasets.store.files import sha256, write_text
+from phibench.datasets.store.pair_files import is_frames_set
 from phibench.datasets.store.provenance import code_behind
 from phibench.scenes.rig import POSITIONS
 
@@ -200,10 +201,10 @@ def scored_pairs(dataset: Dataset, request: ExportRequest) -> DatasetPairs:
 
 
 def is_export(folder: Path) -> bool:
-    """True of an export, and of a folder of exports as `export_frames_sets` writes it."""
+    """True of an export, of a frames set, and of a folder of exports as `export_frames_sets` writes it."""
     is_data_set = (folder / schema.INFO).is_file()
     signs_exports = (folder / schema.CHECKSUMS).is_file() and any(folder.glob(f"*/{INFO}"))
-    return (folder / INFO).is_file() or (signs_exports and not is_data_set)
+    return (folder / INFO).is_file() or is_frames_set(folder) or (signs_exports and not is_data_set)
 
 
 def verify_export(folder: str | Path) -> list[str]:

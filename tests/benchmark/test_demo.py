@@ -1,9 +1,11 @@
 """The demo as a newcomer runs it: five pairs of five kinds, three methods, one page, and the example changed."""
 
+import shutil
 from pathlib import Path
 
 import pytest
 
+from phibench.benchmark.export.export_make import verify_export
 from phibench.benchmark.pair_sets.frames_set import FramesSet
 from phibench.benchmark.reports import figures
 from phibench.benchmark.reports.bench import DEMO_METHODS, EXAMPLE, FRAMES, REPORT, SHIPPED
@@ -20,6 +22,16 @@ def failing(pair):
 def silent(pair):
     return Answer(Spot.missing("dark"), Spot.missing("dark"))
 """
+
+
+def test_the_shipped_frames_are_verified_as_a_frames_set(tmp_path: Path) -> None:
+    """It has no dataset.json and no journal, which a data set with layers must have."""
+    assert verify_export(SHIPPED) == []
+    copy = tmp_path / "frames"
+    shutil.copytree(SHIPPED, copy)
+    lost = next(copy.rglob("*.up.jpg"))
+    lost.unlink()
+    assert verify_export(copy) == [f"{lost.relative_to(copy).as_posix()} is missing"]
 
 
 def test_the_pairs_are_of_five_kinds() -> None:
