@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from phibench.benchmark.pair_sets.frames_set import FramesSet
 from phibench.datasets import read
-from phibench.datasets.frames.sensor_card import SensorFile
+from phibench.datasets.frames.sensor_file import SensorFile
 from phibench.datasets.store.pair_files import is_frames_set
 
 if TYPE_CHECKING:

@@ -15,10 +15,10 @@ from typing import TypedDict, Unpack
 
 from rich.console import Console
 
+from phibench.datasets.build.draws_file import draws_bytes, read_draws, seen_causes, write_draws
 from phibench.datasets.build.finished_work import (
     OR_REPLACE,
     LostWorkError,
-    draws_bytes,
     finished_without,
     forget_others,
     incomplete_text,
@@ -27,20 +27,10 @@ from phibench.datasets.build.finished_work import (
     left_out_text,
     lost_work,
     possible,
-    read_draws,
     refused_samples,
-    seen_causes,
     settled_samples,
-    write_draws,
 )
-from phibench.datasets.build.forecast import (
-    Forecast,
-    forecast,
-    pair_forecasts,
-    pair_table,
-    rim_lines,
-    slowdown,
-)
+from phibench.datasets.build.forecast import Forecast, forecast, slowdown
 from phibench.datasets.build.journal import Journal
 from phibench.datasets.build.parts import unfinished
 from phibench.datasets.build.room_export import (
@@ -66,6 +56,7 @@ from phibench.datasets.build.workers import Environment, NoRendererError, Worker
 from phibench.datasets.common.errors import DatasetError, IncompleteError
 from phibench.datasets.common.progress import progress_console
 from phibench.datasets.plan.draws import Causes, unexported
+from phibench.datasets.plan.pair_forecasts import pair_forecasts, pair_table, rim_lines
 from phibench.datasets.plan.plan import Plan, make_plan
 from phibench.datasets.recipe.checks import warnings
 from phibench.datasets.recipe.load import find_recipe, parse_recipe, recipe_files, recipe_text, with_numbers

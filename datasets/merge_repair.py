@@ -34,7 +34,8 @@ from phibench.datasets.store.documents import (
     recipe_sha256,
     same_content,
 )
-from phibench.datasets.store.files import only_run, sha256, write_atomic
+from phibench.datasets.store.files import sha256, write_atomic
+from phibench.datasets.store.folder_lock import only_run
 from phibench.datasets.store.layers import read_exr
 from phibench.datasets.store.provenance import provenance
 from phibench.datasets.store.schema import CHECKSUMS, DatasetInfo

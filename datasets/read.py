@@ -9,7 +9,6 @@
 from __future__ import annotations
 
 import re
-import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -26,7 +25,7 @@ from phibench.datasets.common.shown_text import ShortForm
 from phibench.datasets.frames.distractors import Distractor, distractors
 from phibench.datasets.frames.request import FrameOptions, FrameRequest, sample_request
 from phibench.datasets.frames.source import Frames, FrameSource
-from phibench.datasets.recipe.build import spot_albedo
+from phibench.datasets.recipe.recipe_scene import spot_albedo
 from phibench.datasets.recipe.tables import Recipe
 from phibench.datasets.store.checksums import check_documents
 from phibench.datasets.store.documents import Rigs, read_info, read_manifest, read_rigs, to_table
@@ -379,16 +378,6 @@ class Sample(ShortForm):
         """Other lights of the sample; computed when first asked for."""
         return distractors(self)
 
-    def frame(self, position: str, laser: bool = True) -> NDArray[np.float64]:
-        """Old name of `expected_image`, kept for one version."""
-        _renamed("Sample.frame", "Sample.expected_image")
-        return self.expected_image(position, laser)
-
-    def frames(self, preset: str = "mjpeg", draw: int = 0, *, laser_off: bool = False, **options: Any) -> Frames:
-        """Old name of `camera_frames`, kept for one version."""
-        _renamed("Sample.frames", "Sample.camera_frames")
-        return self.camera_frames(preset, draw, laser_off=laser_off, **options)
-
     @property
     def stream_names(self) -> tuple[str, int, str]:
         """Names of this sample's noise streams: data set, its seed, sample id."""
@@ -402,10 +391,6 @@ class Sample(ShortForm):
 def _place(spot: SpotRow) -> str:
     """Position of a spot in its image, or why there is none."""
     return f"({spot.centre.u_px:.2f}, {spot.centre.v_px:.2f}) px" if spot.visible else f"not visible: {spot.cause}"
-
-
-def _renamed(old: str, new: str) -> None:
-    warnings.warn(f"{old} is now {new}; the old name goes with the next version", DeprecationWarning, stacklevel=3)
 
 
 def open_dataset(folder: str | Path) -> Dataset:

@@ -19,9 +19,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError, whole_number
 from phibench.datasets.common.shown_text import ShortForm
-from phibench.datasets.frames.request import FrameOptions, FrameRequest, in_one_sentence, sample_request, whole_number
+from phibench.datasets.frames.request import FrameOptions, FrameRequest, in_one_sentence, sample_request
 from phibench.datasets.frames.sensor_card import SensorCard, card_of
 from phibench.datasets.frames.source import FrameSource
 from phibench.datasets.read import Dataset, Sample, open_finished

@@ -26,8 +26,8 @@ from phibench.render.sensor.settings import sensor
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import Rig
 from phibench.scenes.room import TargetBoard, lab
+from phibench.studies.isotropy.azimuth_errors import sideways
 from phibench.studies.isotropy.binocular import Binocular, Laws, tried
-from phibench.studies.isotropy.noise import sideways
 from phibench.studies.misaligned_rigs import spot_of
 
 APART_M, DEPTH_M, HEIGHT_M, AZIMUTH_DEG = 0.425, 2.5, 0.50, 105.0

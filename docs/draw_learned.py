@@ -118,7 +118,7 @@ def _parts(test: Path, preset: str, rows: list[dict[str, Any]]) -> Iterator[tupl
     draws = pair_draws(dataset, preset)
     for row in rows:
         if kept is None or kept.row.sample_id != row["sample_id"]:
-            kept = CachedSample(dataset[row["sample_id"]])
+            kept = CachedSample.of(dataset[row["sample_id"]])
         yield _part(kept, draws[row["number"]], row["image"], (row["u_px"], row["v_px"]))
 
 

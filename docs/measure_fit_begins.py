@@ -21,9 +21,9 @@ from phibench.datasets.frames.request import FrameRequest
 from phibench.datasets.frames.source import FrameSource
 from phibench.datasets.read import Dataset, Sample, open_dataset
 from phibench.estimator.interface import Answer, Box, Pair
-from phibench.estimator.methods.draw_pairs import DrawnPairs
 from phibench.estimator.methods.locate import SharedPair, detected
 from phibench.estimator.methods.registry import METHODS
+from phibench.estimator.methods.simulated_pairs import DrawnPairs
 from phibench.scenes.rig import POSITIONS
 
 BOX_PX = 40
@@ -49,7 +49,7 @@ class Seen:
 
 def dimmed(sample: Sample, preset: str, share: float, draw: int, laser_off: bool) -> PairDraw:
     """Pair whose spot has a share of the full well in its brightest pixel, the brighter of both images."""
-    held = CachedSample(sample)
+    held = CachedSample.of(sample)
     request = FrameRequest(preset, "auto", laser_level=1e-3)
     sensor = FrameSource.from_request(held, request).sides["down"].chain.sensor
     peaks = [float(held.spot(p).electrons_per_s.max(initial=0.0)) for p in POSITIONS]

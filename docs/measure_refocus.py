@@ -10,7 +10,7 @@ from dataclasses import replace
 
 from phibench.estimator.geometry.paper_depth import load_published
 from phibench.scenes.rig import Rig
-from phibench.studies.misalignment.interactions import FOCUS_M, LENS_M, OLD, OUTLINE, refocus, thin_lens
+from phibench.studies.misalignment.refocus import FOCUS_M, LENS_M, OLD, OUTLINE, refocus, thin_lens
 
 HEIGHT_M = 0.50
 

@@ -328,7 +328,8 @@ Names = Annotated[tuple[str, ...], Field(strict=False)]
 Numbers = Annotated[tuple[float, ...], Field(strict=False)]
 Metres = Annotated[tuple[Annotated[float, Field(ge=0.2, le=20.0)], ...], Field(strict=False, min_length=1)]
 Heights = Annotated[tuple[Annotated[float, Field(ge=0.0, le=3.0)], ...], Field(strict=False, min_length=1)]
-Presets = Annotated[tuple[Literal["bayer-raw", "srgb8", "mjpeg"], ...], Field(strict=False, min_length=1)]
+StudyPreset = Literal["bayer-raw", "srgb8", "mjpeg"]
+Presets = Annotated[tuple[StudyPreset, ...], Field(strict=False, min_length=1)]
 
 S = TypeVar("S", bound=Settings)
 

@@ -18,7 +18,7 @@ from typing import Any, Literal
 from pydantic import Field
 from rich.console import Console
 
-from phibench.benchmark.reports.report import Section
+from phibench.benchmark.reports.report_sections import Section
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import FileName, InputFile
 from phibench.datasets.common.progress import progress_console

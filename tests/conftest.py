@@ -254,7 +254,7 @@ def sealed(secret_dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> An
 @pytest.fixture(scope="session")
 def submitted(sealed: Any, method: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Submission of `method` to `sealed`."""
-    from phibench.benchmark.scores.document import Declared
+    from phibench.benchmark.scores.score_document import Declared
     from phibench.benchmark.sealed.submission import submit
 
     out = tmp_path_factory.mktemp("submission") / "submission.json"

@@ -107,7 +107,7 @@ def add_conic(copy: Copy) -> None:
 
 USE_CONIC = """
 import numpy as np
-from phibench.datasets.recipe.build import build_rig
+from phibench.datasets.recipe.recipe_scene import build_rig
 from phibench.datasets.recipe.tables import RigTable
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.render.optics.truth import spot_truth

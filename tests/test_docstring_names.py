@@ -18,7 +18,6 @@ for _room in (room for top in DISTRICTS for room in [ROOT / top, *(ROOT / top).r
     ROOMS.setdefault(_room.name, []).append(_room)
 # folders whose name is that of an argument as well: `frames.down`, `sensor.output`, a recipe's `mirror.form`
 ARGUMENTS = {"frames", "limits", "mirror", "misalignment", "rig", "room", "sensor"}
-OLD = {"phibench.estimator.seat.pair"}
 FILE_ENDS = {"py", "toml", "json", "jsonl", "md", "html", "js", "exr", "npz", "parquet", "png", "csv", "yuyv"}
 
 
@@ -35,7 +34,7 @@ def named(file: Path) -> Iterator[str]:
     """Dotted names that begin with a folder of the library, in docstrings and comments."""
     for name in NAME.findall(file.read_text(encoding="utf-8")):
         parts = name.removeprefix("phibench.").split(".")
-        if parts[0] in ROOMS.keys() - ARGUMENTS and parts[-1] not in FILE_ENDS and name not in OLD:
+        if parts[0] in ROOMS.keys() - ARGUMENTS and parts[-1] not in FILE_ENDS:
             yield name
 
 

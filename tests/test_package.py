@@ -16,7 +16,7 @@ import pytest
 import yaml
 
 import phibench
-from phibench.benchmark.isolation.resolve import MethodError
+from phibench.benchmark.isolation.method_references import MethodError
 from phibench.benchmark.isolation.runner import asked_here
 from phibench.datasets.common.errors import DatasetError
 from phibench.estimator import interface
@@ -108,25 +108,6 @@ def test_the_module_is_the_command_line(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "phibench", "--help"]
     child = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False)
     assert (child.returncode, child.stdout.split()[:3]) == (0, ["Usage:", "phibench", "COMMAND"]), child.stderr
-
-
-def test_a_method_file_with_the_old_import_works_and_warns(python: Python) -> None:
-    code = "from phibench.estimator.seat.pair import Answer, Pair, Spot\nimport phibench; print(Pair is phibench.Pair)"
-    child = python(f"import warnings; warnings.simplefilter('always')\n{code}")
-    assert child.stdout.strip() == "True", child.stderr
-    assert "<string>:2: DeprecationWarning: phibench.estimator.seat.pair is now" in child.stderr
-    assert python("from phibench.estimator.seat import pair; pair.Answer").returncode == 0
-
-
-def test_the_old_names_of_a_sample_work_and_warn(tiny_dataset: Path) -> None:
-    sample = phibench.open_dataset(tiny_dataset)[0]
-    with pytest.warns(DeprecationWarning, match=r"Sample\.frame is now Sample\.expected_image") as caught:
-        old = sample.frame("up", laser=False)
-    assert caught[0].filename == __file__
-    assert np.array_equal(old, sample.expected_image("up", laser=False))
-    with pytest.warns(DeprecationWarning, match=r"Sample\.frames is now Sample\.camera_frames"):
-        frames = sample.frames("bayer-raw", 2, exposure=0.01)
-    assert np.array_equal(frames.up, sample.camera_frames("bayer-raw", 2, exposure=0.01).up)
 
 
 def test_phi_is_that_of_the_rendered_truth(tiny_dataset: Path) -> None:

@@ -179,7 +179,7 @@ def frame_maps(folder: Path, samples: Sequence[str], turn: int = 0) -> list[Fram
     maps: list[FrameMap] = []
     draws = {one: {draw.sample_id: draw for draw in pair_draws(dataset, one, 1)} for one in REQUESTS}
     for number, name in enumerate(samples):
-        cached = CachedSample(dataset[name])
+        cached = CachedSample.of(dataset[name])
         for preset, requests in REQUESTS.items():
             for overrides in requests[(number + turn) % 2 :: 2]:
                 draw = draws[preset][name]

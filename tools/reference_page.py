@@ -13,10 +13,10 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from phibench.datasets.recipe.build import CAMERA_KEYS
 from phibench.datasets.recipe.distributions import DistributionTable, TargetChoice
 from phibench.datasets.recipe.film_tables import DriveTable, FilmLightTable, FilmTable, VibrationTable
 from phibench.datasets.recipe.mirror_tables import HolderTable, MirrorTable, ReflectionTable
+from phibench.datasets.recipe.recipe_scene import CAMERA_KEYS
 from phibench.datasets.recipe.room_tables import (
     GeometryTable,
     LampTable,

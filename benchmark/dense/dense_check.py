@@ -15,8 +15,8 @@ from functools import partial
 import numpy as np
 
 from phibench.benchmark.dense.dense_easy import EasyDensePairs, EasyTruth, points_of
-from phibench.benchmark.isolation.check import Check
-from phibench.benchmark.isolation.resolve import DENSE, RunLimits, resolve
+from phibench.benchmark.isolation.method_check import Check
+from phibench.benchmark.isolation.method_references import DENSE, RunLimits, resolve
 from phibench.benchmark.isolation.runner import Harness
 from phibench.estimator.dense.dense_interface import DensePair
 from phibench.estimator.geometry.reflection import image_of
@@ -44,7 +44,7 @@ def check_dense(
     count: int = PAIRS,
     told: Callable[[int], None] = lambda done: None,
 ) -> Check:
-    """Run a dense method on easy pairs; parameters and errors as for `isolation.check.check_method`."""
+    """Run a dense method on easy pairs; parameters and errors as for `isolation.method_check.check_method`."""
     pairs, done = EasyDensePairs(preset, count), list[Outcome]()
     with Harness([resolve(reference, DENSE)], limits) as harness:
         for (outcome,) in harness.outcomes(pairs, range(count)):

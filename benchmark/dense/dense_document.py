@@ -16,9 +16,9 @@ import polars as pl
 from pydantic import Field
 
 from phibench.benchmark.scores.answer_errors import Rules
-from phibench.benchmark.scores.document import MethodCard, MetricDescription, Value, results_sha256
 from phibench.benchmark.scores.intervals import Clusters, Statistic, estimates, mean_of, rms_of
 from phibench.benchmark.scores.metrics import MetricEstimate
+from phibench.benchmark.scores.score_document import MethodCard, MetricDescription, Value, results_sha256
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.store.provenance import code_behind, program_version, provenance
 from phibench.datasets.store.schema import Document

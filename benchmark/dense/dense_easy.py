@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from phibench.benchmark.isolation.easy_pairs import EasyCamera
-from phibench.benchmark.isolation.resolve import MethodError
+from phibench.benchmark.isolation.method_references import MethodError
 from phibench.datasets.frames.sensor_card import SensorCard, sensor_card
 from phibench.estimator.dense.dense_interface import DensePair
 from phibench.estimator.geometry.reflection import image_of, room_rays

@@ -16,7 +16,7 @@ import numpy as np
 from phibench.benchmark.dense.dense_pairs import DensePairs, DenseTruth
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import InputFile
-from phibench.datasets.exposures.draw import require_outside
+from phibench.datasets.exposures.draw_frames import require_outside
 from phibench.datasets.frames.frame_files import suffix, write_frame
 from phibench.datasets.store.checksums import filling, signed, write_documents
 from phibench.datasets.store.files import sha256

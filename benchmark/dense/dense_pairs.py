@@ -16,7 +16,7 @@ import numpy as np
 
 from phibench.benchmark.pair_sets.dataset_pairs import DatasetPairs, dataset_pairs
 from phibench.benchmark.pair_sets.wanted_pairs import of_calibration
-from phibench.calibration.rig.file import Calibration
+from phibench.calibration.rig.calibration_file import Calibration
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.exposures.pair_draws import PairDraw
 from phibench.datasets.frames.sensor_card import card_of
@@ -26,7 +26,7 @@ from phibench.estimator.dense.dense_interface import DensePair
 from phibench.estimator.geometry.reflection import image_of, up_image
 from phibench.estimator.geometry.rig_parameters import stroke_of
 from phibench.estimator.interface import Image
-from phibench.estimator.methods.draw_pairs import DrawnPairs
+from phibench.estimator.methods.simulated_pairs import DrawnPairs
 from phibench.scenes.frames import Array, BoolArray
 from phibench.scenes.rig import Rig, View
 
@@ -170,8 +170,7 @@ class DensePairs:
             If the estimator's projection puts a counterpart elsewhere.
         """
         with self._drawn.named(number):
-            pair_draw, cached, source = self._drawn.drawn_from(number)
-            sample = cached.sample
+            pair_draw, sample, source = self._drawn.drawn_from(number)
             found = sample.correspondence("down")
             certify(found, sample.view("up"))
             rig, stroke_m = self._given(sample.nominal_rig, sample.row.nominal_stroke_m)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from phibench.benchmark.dense.dense_pairs import DensePairs, DenseTruth
 from phibench.benchmark.dense.dense_records import depths_of
-from phibench.benchmark.isolation.resolve import DENSE, RunLimits, resolve
+from phibench.benchmark.isolation.method_references import DENSE, RunLimits, resolve
 from phibench.benchmark.isolation.runner import Harness
 from phibench.benchmark.reports.figures import encoded, styled
 from phibench.datasets.common.errors import DatasetError

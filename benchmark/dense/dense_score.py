@@ -31,14 +31,14 @@ from phibench.benchmark.dense.dense_document import (
 )
 from phibench.benchmark.dense.dense_pairs import DensePairs, DenseTruth, dense_pairs
 from phibench.benchmark.dense.dense_records import COLUMN_TYPES, TruthErrors, pair_records
-from phibench.benchmark.isolation.resolve import DENSE, MethodError, RunLimits, code_of_function, resolve
+from phibench.benchmark.isolation.method_references import DENSE, MethodError, RunLimits, code_of_function, resolve
 from phibench.benchmark.isolation.runner import Harness, Ran, asked_here, function_name, ran_here
 from phibench.benchmark.pair_sets.wanted_pairs import open_scored
 from phibench.benchmark.scores.answer_errors import Rules
 from phibench.benchmark.scores.compare import Difference, compared, rules_of
-from phibench.benchmark.scores.document import MethodCard
+from phibench.benchmark.scores.score_document import MethodCard
 from phibench.benchmark.scores.score_files import read_document, read_records, write_score
-from phibench.calibration.rig.file import read_calibration
+from phibench.calibration.rig.calibration_file import read_calibration
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import InputFile
 from phibench.datasets.common.progress import Steps, progress_console

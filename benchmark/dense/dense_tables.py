@@ -8,7 +8,7 @@ import polars as pl
 
 from phibench.benchmark.dense.dense_document import DENSE_METRICS, DenseScore
 from phibench.benchmark.scores.compare import Difference
-from phibench.benchmark.scores.document import Value
+from phibench.benchmark.scores.score_document import Value
 from phibench.benchmark.scores.score_tables import cell_parts
 from phibench.datasets.common.shown_text import TextTable, text_of
 

@@ -31,11 +31,11 @@ from phibench.benchmark.pair_sets.dataset_pairs import DatasetPairs, dataset_pai
 from phibench.benchmark.pair_sets.frames_set import frames_row, frames_set_documents
 from phibench.datasets.build.parts import Brought, bring_all
 from phibench.datasets.build.tasks import BuildTask, Made
-from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError, whole_number
 from phibench.datasets.common.input_files import InputFile
 from phibench.datasets.common.progress import progress_console
-from phibench.datasets.exposures.draw import require_outside, sample_key
-from phibench.datasets.frames.request import FrameOptions, whole_number
+from phibench.datasets.exposures.draw_frames import require_outside, sample_key
+from phibench.datasets.frames.request import FrameOptions
 from phibench.datasets.frames.source import FrameSource, has_place
 from phibench.datasets.read import Dataset, open_dataset, open_finished
 from phibench.datasets.recipe.tables import FramesTable

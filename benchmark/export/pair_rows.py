@@ -11,9 +11,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
-from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError, whole_number
 from phibench.datasets.frames.frame_files import png_bytes, suffix
-from phibench.datasets.frames.request import FrameOptions, whole_number
+from phibench.datasets.frames.request import FrameOptions
 from phibench.datasets.frames.source import Frames, FrameSource
 from phibench.datasets.read import Dataset
 from phibench.datasets.store.documents import to_table

@@ -18,10 +18,10 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Protocol, TypeVar
 
+from phibench.benchmark.isolation.guest_process import MethodProcess, outcome_of
 from phibench.benchmark.isolation.isolation import Isolation
 from phibench.benchmark.isolation.method_provenance import loaded_names, packages_of
-from phibench.benchmark.isolation.process import MethodProcess, outcome_of
-from phibench.benchmark.isolation.resolve import MethodError, Reference, RunLimits, resolve
+from phibench.benchmark.isolation.method_references import MethodError, Reference, RunLimits, resolve
 from phibench.benchmark.isolation.transport import AnyPair
 from phibench.benchmark.isolation.worker import reply_of, require_method, text_of
 from phibench.estimator.interface import Outcome

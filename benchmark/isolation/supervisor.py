@@ -21,7 +21,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from phibench.datasets.store.leftovers import remove_tree
+from phibench.datasets.store.temporary_folders import remove_tree
 
 HUNG_UP = 97
 """Exit code of a supervisor whose runner hung up before the worker ended."""

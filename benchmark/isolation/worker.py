@@ -32,7 +32,7 @@ from typing import TYPE_CHECKING, Any
 
 from phibench.benchmark.isolation.answers import answer_text, planes_text, to_bytes
 from phibench.benchmark.isolation.method_provenance import loaded_names
-from phibench.benchmark.isolation.resolve import MethodError, Reference, RunLimits
+from phibench.benchmark.isolation.method_references import MethodError, Reference, RunLimits
 from phibench.benchmark.isolation.transport import Connection, ReceivedPair, SharedPages, TransportError, unpack
 from phibench.estimator.dense.dense_interface import DensePair
 from phibench.estimator.interface import Method

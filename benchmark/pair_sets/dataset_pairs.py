@@ -20,7 +20,8 @@ from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.shown_text import ShortForm
 from phibench.datasets.exposures.expected import ExpectedRegion, expected_of_light
 from phibench.datasets.exposures.pair_draws import CachedSample, FrameCounts, PairDraw, pair_draws, search_boxes
-from phibench.datasets.frames.sensor_card import SensorCard, SensorFile, card_of
+from phibench.datasets.frames.sensor_card import SensorCard, card_of
+from phibench.datasets.frames.sensor_file import SensorFile
 from phibench.datasets.frames.source import FrameSource, PositionLight
 from phibench.datasets.read import Dataset, open_dataset
 from phibench.datasets.store import schema
@@ -30,7 +31,7 @@ from phibench.datasets.store.provenance import provenance
 from phibench.estimator.interface import Pair
 from phibench.estimator.limits.position_bound import SpotLimit, processed_snr, raw_snr, spot_limit
 from phibench.estimator.limits.processed_bound import chain_limit, on_off_limit, processed_on_off_limit
-from phibench.estimator.methods.draw_pairs import DrawnPairs
+from phibench.estimator.methods.simulated_pairs import DrawnPairs
 from phibench.estimator.pair_set import Distraction, ImageTruth, PairTruth
 from phibench.estimator.spots.gaussian_spot import SpotBlur
 from phibench.estimator.spots.image_planes import PROCESSED

@@ -12,7 +12,7 @@ from phibench.benchmark.pair_sets.dataset_pairs import TASK_VERSION, DatasetPair
 from phibench.benchmark.pair_sets.frames_set import FramesSet
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.exposures.pair_draws import FrameCounts
-from phibench.datasets.frames.sensor_card import read_sensor_file
+from phibench.datasets.frames.sensor_file import read_sensor_file
 from phibench.datasets.read import Dataset, Sample, open_finished
 from phibench.datasets.store.pair_files import is_frames_set, is_imported
 from phibench.estimator.geometry.rig_parameters import stroke_of
@@ -21,7 +21,7 @@ from phibench.estimator.pair_set import PairSet, PairTruth, tell_answered, truth
 
 if TYPE_CHECKING:  # 25 modules of the calibration, which most scores do without
     from phibench.calibration.captures.imported_set import ImportedSet
-    from phibench.calibration.rig.file import Calibration
+    from phibench.calibration.rig.calibration_file import Calibration
 
 
 @dataclass(frozen=True)
@@ -118,7 +118,7 @@ def wanted_pairs(dataset: Dataset | ImportedSet | FramesSet, choice: PairChoice)
     taken = (choice.preset, choice.draws, choice.pairs, choice.hints, choice.boxes_px, camera, counts)
     if choice.calibration is None:
         return _of_track(dataset_pairs(dataset, *taken), choice)
-    from phibench.calibration.rig.file import read_calibration
+    from phibench.calibration.rig.calibration_file import read_calibration
 
     read = read_calibration(choice.calibration)
     return CalibratedPairs(_of_track(dataset_pairs(of_calibration(dataset, read), *taken), choice), read)
@@ -151,7 +151,7 @@ def frame_counts(on: int, off: int) -> FrameCounts:
 def _real_pairs(imported: ImportedSet, choice: PairChoice) -> PairSet:
     from phibench.calibration.captures.imported_set import imported_pairs
     from phibench.calibration.captures.spot_shape import with_shape
-    from phibench.calibration.rig.file import read_calibration
+    from phibench.calibration.rig.calibration_file import read_calibration
 
     if choice.preset not in (None, imported.preset):
         raise DatasetError(f"{imported.folder} holds pictures of the kind '{imported.preset}': leave --preset out")
@@ -223,7 +223,7 @@ def of_calibration(dataset: Dataset, calibration: Calibration) -> Dataset:
         If the nominal rig of a sample is not the one that the calibration started from, or the samples have several
         true rigs and the calibration was made from none of them.
     """
-    from phibench.calibration.rig.file import CalibrationError
+    from phibench.calibration.rig.calibration_file import CalibrationError
 
     for sample in dataset:
         if sample.nominal_rig != calibration.nominal:

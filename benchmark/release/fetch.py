@@ -21,7 +21,7 @@ from typing import IO, TYPE_CHECKING, Any
 
 from rich.console import Console
 
-from phibench.benchmark.release.benchmark import MANIFEST, Archive, ReleasedPart, chosen_parts, read_manifest_file
+from phibench.benchmark.release.release_parts import MANIFEST, Archive, ReleasedPart, chosen_parts, read_manifest_file
 from phibench.benchmark.release.release_source import Partial, Source
 from phibench.datasets.build.forecast import megabytes
 from phibench.datasets.common.errors import DatasetError
@@ -30,8 +30,9 @@ from phibench.datasets.common.progress import Steps, progress_console
 from phibench.datasets.film.film_store import verify as film_faults
 from phibench.datasets.store import schema
 from phibench.datasets.store.checksums import damaged, differing_files, read_checksums, writing_to
-from phibench.datasets.store.files import only_run, sha256, write_text
-from phibench.datasets.store.leftovers import (
+from phibench.datasets.store.files import sha256, write_text
+from phibench.datasets.store.folder_lock import only_run
+from phibench.datasets.store.temporary_folders import (
     TEMPORARY_PREFIX,
     OwnedFolder,
     folder_for_work,

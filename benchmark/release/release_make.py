@@ -24,7 +24,7 @@ from typing import IO
 from rich.console import Console
 
 from phibench.benchmark.export.export_make import export_frames_sets
-from phibench.benchmark.release.benchmark import (
+from phibench.benchmark.release.release_parts import (
     FORMAT,
     MANIFEST,
     STARTER_PAIRS,
@@ -56,8 +56,8 @@ from phibench.datasets.store.checksums import differing_files, filling, read_che
 from phibench.datasets.store.croissant import LICENSE_TEXT, LICENSE_URL, croissant_text, file_object
 from phibench.datasets.store.documents import read_info
 from phibench.datasets.store.files import sha256, write_atomic, write_text
-from phibench.datasets.store.leftovers import folder_for_work
 from phibench.datasets.store.pair_files import FRAMES_SET
+from phibench.datasets.store.temporary_folders import folder_for_work
 
 Seal = Callable[[Path, Path], object]
 """Sealing of a data set: (folder, public folder); `benchmark.sealed.sealed_set.seal`."""

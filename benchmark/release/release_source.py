@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
-from phibench.benchmark.release.benchmark import MANIFEST, Archive
+from phibench.benchmark.release.release_parts import MANIFEST, Archive
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import SETTINGS_BYTES
 from phibench.datasets.store.files import sha256

@@ -14,7 +14,7 @@ from typing import Any
 
 from phibench.benchmark.pair_sets.dataset_pairs import tracks_of
 from phibench.benchmark.reports.track_tables import preset_name
-from phibench.benchmark.scores.document import MetricDescription, ScoreDocument
+from phibench.benchmark.scores.score_document import MetricDescription, ScoreDocument
 from phibench.benchmark.scores.score_files import read_score
 from phibench.benchmark.scores.score_tables import RANKS_OF_TRACKS, rig_known
 from phibench.datasets.common.errors import DatasetError

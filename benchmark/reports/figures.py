@@ -20,8 +20,8 @@ import polars as pl
 import scipy
 from numpy.typing import ArrayLike
 
-from phibench.benchmark.scores.document import ScoreDocument, StratumScore, Value
 from phibench.benchmark.scores.metrics import METRICS
+from phibench.benchmark.scores.score_document import ScoreDocument, StratumScore, Value
 from phibench.scenes.frames import Array
 
 if TYPE_CHECKING:  # Matplotlib takes half a second, and most commands that import this file draw nothing

@@ -16,7 +16,8 @@ from typing import Any
 
 import polars as pl
 
-from phibench.benchmark.reports.report import Section, report_html, tracks_section
+from phibench.benchmark.reports.report import report_html
+from phibench.benchmark.reports.report_sections import Section, tracks_section
 from phibench.benchmark.reports.track_tables import track_tables
 from phibench.benchmark.scores.answer_errors import Rules
 from phibench.benchmark.scores.compare import (
@@ -27,8 +28,8 @@ from phibench.benchmark.scores.compare import (
     same_pairs,
 )
 from phibench.benchmark.scores.comparison_tables import differences_json
-from phibench.benchmark.scores.document import ScoreDocument, StratumScore
 from phibench.benchmark.scores.metrics import METRICS, applies
+from phibench.benchmark.scores.score_document import ScoreDocument, StratumScore
 from phibench.benchmark.scores.score_files import read_records, read_score
 from phibench.benchmark.scores.score_tables import (
     BY_WORD,

@@ -11,8 +11,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from phibench.benchmark.pair_sets.dataset_pairs import TRACKS, Track, tracks_of
-from phibench.benchmark.scores.document import ScoreDocument
 from phibench.benchmark.scores.metrics import METRICS
+from phibench.benchmark.scores.score_document import ScoreDocument
 from phibench.benchmark.scores.score_tables import BY_WORD, FLAGGED, RANKS_OF_TRACKS, rig_known, shown_parts, starred
 from phibench.datasets.common.shown_text import TextTable
 

@@ -20,7 +20,6 @@ import polars as pl
 
 from phibench.benchmark.pair_sets.dataset_pairs import tracks_of
 from phibench.benchmark.scores.answer_errors import Rules
-from phibench.benchmark.scores.document import ScoreDocument
 from phibench.benchmark.scores.intervals import (
     Clusters,
     Estimate,
@@ -32,6 +31,7 @@ from phibench.benchmark.scores.intervals import (
 )
 from phibench.benchmark.scores.metrics import FAMILIES, METRICS, Metric, prepared, statistic_of, trusted
 from phibench.benchmark.scores.records import missed_relative, with_missed
+from phibench.benchmark.scores.score_document import ScoreDocument
 from phibench.benchmark.scores.score_files import read_records, read_score
 from phibench.datasets.common.errors import DatasetError
 from phibench.scenes.frames import Array

@@ -16,12 +16,10 @@ import polars as pl
 
 from phibench.benchmark.scores.answer_errors import (
     Rules,
-    SpotBoundsOfImages,
     best_constant,
     from_centre_px,
     in_ray_units,
     kept,
-    pair_bounds,
     phi_of,
     phi_variance,
     pixel_errors,
@@ -29,14 +27,15 @@ from phibench.benchmark.scores.answer_errors import (
     usable_covariance,
     whitened,
 )
+from phibench.benchmark.scores.beyond_images import searched_px2
 from phibench.benchmark.scores.intervals import NORMAL_95
+from phibench.benchmark.scores.pair_bounds import SpotBoundsOfImages, pair_bounds
 from phibench.benchmark.scores.record_columns import COLUMNS, OF_FRAMES, TYPES
 from phibench.datasets.common.errors import DatasetError
 from phibench.estimator.geometry.least_squares_depth import nominal_depth
 from phibench.estimator.geometry.phi import outline_circle
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.estimator.interface import OK, Answer, Outcome, Spot
-from phibench.estimator.limits.beyond_images import searched_px2
 from phibench.estimator.pair_set import ImageTruth, PairSet, PairTruth
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import POSITIONS, Rig
@@ -162,7 +161,7 @@ def _image_columns(
         **dict(zip(("u_axis_px", "v_axis_px"), _stack(spot.axis_px for spot in spots).T, strict=True)),
         "from_centre_px": from_centre_px(true, xy),
         "bayer": [_bayer(x) for x in xy],
-        "status": [_status(*both, position) for both in zip(answers, outcomes, strict=True)],
+        "status": [_status(*both) for both in zip(answers, outcomes, strict=True)],
         "u_px": uv[:, 0],
         "v_px": uv[:, 1],
         "du_px": error.du_px,
@@ -343,7 +342,7 @@ def _position(spot: Spot | None) -> tuple[float, float]:
     return spot.uv_px
 
 
-def _status(spot: Spot | None, outcome: Outcome, position: str) -> str:
+def _status(spot: Spot | None, outcome: Outcome) -> str:
     if spot is None:
         return outcome.failure or "no answer"
     return spot.status if spot.status != OK or np.isfinite(_position(spot)).all() else "no position"

@@ -15,8 +15,8 @@ from typing import Any, Unpack
 import polars as pl
 from rich.console import Console
 
-from phibench.benchmark.isolation.pairs_ahead import PairsAhead
-from phibench.benchmark.isolation.resolve import MethodError, RunLimits, code_of_function, resolve
+from phibench.benchmark.isolation.method_references import MethodError, RunLimits, code_of_function, resolve
+from phibench.benchmark.isolation.prefetched_pairs import PairsAhead
 from phibench.benchmark.isolation.runner import Harness, Ran, asked_here, function_name, ran_here
 from phibench.benchmark.pair_sets.dataset_pairs import DatasetPairs
 from phibench.benchmark.pair_sets.frames_set import FramesSet
@@ -29,8 +29,8 @@ from phibench.benchmark.pair_sets.wanted_pairs import (
 )
 from phibench.benchmark.scores.answer_errors import Rules
 from phibench.benchmark.scores.causes import KeptFits, with_causes
-from phibench.benchmark.scores.document import Declared, Division, MethodCard, ScoreDocument, Worst, document_of
 from phibench.benchmark.scores.records import in_order, missed_relative, record_table, with_missed
+from phibench.benchmark.scores.score_document import Declared, Division, MethodCard, ScoreDocument, Worst, document_of
 from phibench.benchmark.scores.score_files import UnfinishedError, records_kept, write_score
 from phibench.benchmark.scores.score_tables import score_table
 from phibench.benchmark.scores.worst_images import worst, worst_of, worst_records

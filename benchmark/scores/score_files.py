@@ -11,8 +11,8 @@ from typing import Protocol, TypeVar
 
 import polars as pl
 
-from phibench.benchmark.scores.document import KIND, VERSION, MethodCard, ScoreDocument
 from phibench.benchmark.scores.record_columns import COLUMN_TYPES
+from phibench.benchmark.scores.score_document import KIND, VERSION, MethodCard, ScoreDocument
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import InputFile
 from phibench.datasets.store.files import sha256, write_bytes, write_text

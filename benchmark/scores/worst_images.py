@@ -16,7 +16,7 @@ import polars as pl
 from numpy.typing import NDArray
 from PIL import Image
 
-from phibench.benchmark.scores.document import EncodedPicture, Worst
+from phibench.benchmark.scores.score_document import EncodedPicture, Worst
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.estimator.pair_set import Pairs
 from phibench.estimator.spots.camera_codes import rgb_picture

@@ -18,13 +18,13 @@ import numpy as np
 import polars as pl
 from rich.console import Console
 
-from phibench.benchmark.isolation.resolve import RunLimits
+from phibench.benchmark.isolation.method_references import RunLimits
 from phibench.benchmark.pair_sets.dataset_pairs import BOX_PX, TASK_VERSION, TRACKS
 from phibench.benchmark.pair_sets.wanted_pairs import PairChoice, wanted_pairs
 from phibench.benchmark.scores.answer_errors import Rules, usable_covariance, whitened
-from phibench.benchmark.scores.document import ScoreDocument, Worst, document_of, results_sha256
 from phibench.benchmark.scores.record_columns import COLUMN_TYPES
 from phibench.benchmark.scores.records import missed_relative, with_missed
+from phibench.benchmark.scores.score_document import ScoreDocument, Worst, document_of, results_sha256
 from phibench.benchmark.scores.score_files import read_records, read_score
 from phibench.benchmark.scores.score_tables import failure_line
 from phibench.benchmark.sealed.rebuilt_score import (
@@ -160,7 +160,7 @@ def _of_document(document: ScoreDocument) -> Iterator[str]:
 
 def _of_calibration(document: ScoreDocument, table: pl.DataFrame, calibration: Path | None) -> Told:
     """Faults of what is said of the rig: the hash of the calibration, and whether D of scored samples went into it."""
-    from phibench.calibration.rig.file import read_calibration  # 25 modules, which most scores do without
+    from phibench.calibration.rig.calibration_file import read_calibration  # 25 modules, which most scores do without
 
     stated, made_from = document.pair_set.get("calibration"), document.pair_set.get("calibrated_from") or {}
     if stated is None:

@@ -40,7 +40,6 @@ from phibench.datasets.recipe.load import RECIPES, load_recipe
 from phibench.datasets.recipe.tables import Recipe
 from phibench.datasets.store.checksums import checksums_text, read_checksums, writing_to
 from phibench.datasets.store.files import sha256, write_bytes, write_secret, write_text
-from phibench.datasets.store.leftovers import OwnedFolder, folder_for_work
 from phibench.datasets.store.pair_files import (
     FRAMES,
     MOST_PAIRS,
@@ -49,6 +48,7 @@ from phibench.datasets.store.pair_files import (
     public_fields,
 )
 from phibench.datasets.store.schema import CHECKSUMS, SEALED_TRUTH, Document
+from phibench.datasets.store.temporary_folders import OwnedFolder, folder_for_work
 from phibench.estimator.interface import Pair
 from phibench.scenes.random_streams import LARGEST_SEED, LEAST_SECRET_SEED, generator
 

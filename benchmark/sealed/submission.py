@@ -19,10 +19,10 @@ from typing import Annotated, Any
 from pydantic import Field
 
 from phibench.benchmark.isolation.answers import AnswerError, checked
-from phibench.benchmark.isolation.resolve import Reference, RunLimits, resolve
+from phibench.benchmark.isolation.method_references import Reference, RunLimits, resolve
 from phibench.benchmark.isolation.runner import Harness, Ran
 from phibench.benchmark.pair_sets.frames_set import pair_of_files, read_truth_file
-from phibench.benchmark.scores.document import Declared, MethodCard
+from phibench.benchmark.scores.score_document import Declared, MethodCard
 from phibench.benchmark.sealed.sealed_set import SEAL, Seal, read_seal
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import InputFile, Name, Text

@@ -31,7 +31,7 @@ from phibench.calibration.rig.from_dataset import (
     Photograph,
     write_bundle,
 )
-from phibench.calibration.rig.spots import method_for
+from phibench.calibration.rig.known_spots import method_for
 from phibench.calibration.rig.vertical_edges import find_vertical
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.read import place_of

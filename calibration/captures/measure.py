@@ -51,10 +51,11 @@ from phibench.calibration.outline.limb_image import PoseMeasurement
 from phibench.calibration.outline.outline import find_outline
 from phibench.calibration.outline.outline_result import Outline, mean_outline
 from phibench.calibration.rig.bundle import calibrate
-from phibench.calibration.rig.file import Calibration, read_calibration
-from phibench.calibration.rig.spots import method_for
+from phibench.calibration.rig.calibration_file import Calibration, read_calibration
+from phibench.calibration.rig.known_spots import method_for
 from phibench.datasets.common.errors import DatasetError
-from phibench.datasets.frames.sensor_card import SensorCard, SensorFile, read_sensor_file
+from phibench.datasets.frames.sensor_card import SensorCard
+from phibench.datasets.frames.sensor_file import SensorFile, read_sensor_file
 from phibench.estimator.geometry.least_squares_depth import GeneralDepth, depth_general
 from phibench.estimator.geometry.rig_parameters import PARAMETERS, prior_sigmas, stroke_of
 from phibench.estimator.geometry.status import Status, describe
@@ -363,7 +364,7 @@ def _corrected(setting: KnownNumbers, outlines: Sequence[Outline], why: str) -> 
     nominal = setting.known.rig
     if setting.calibration is not None:
         held = setting.calibration
-        return held.rig, held.covariance, held.values, _calibration_note(held, nominal, outlines)
+        return held.rig, held.covariance, held.values, _calibration_note(held, outlines)
     if not outlines:
         values, covariance = np.zeros(len(PARAMETERS)), np.diag(prior_sigmas() ** 2)
         return nominal, covariance, values, f"rig: as in the rig file, with the errors of a ruler; no outline: {why}"
@@ -387,7 +388,7 @@ _MOVED_SIGMAS = 5.0  # of the outline against the calibration's: 1e-5 of rigs th
 _GROWN = 0.003  # of the outline's size: one rig's outlines in ten rooms differ by less
 
 
-def _calibration_note(held: Calibration, nominal: Rig, outlines: Sequence[Outline]) -> str:
+def _calibration_note(held: Calibration, outlines: Sequence[Outline]) -> str:
     """Sentence on the calibration, and whether the mirror is still where it was."""
     made, text = held.made_from.get("sphere_in_camera_m"), "rig: of the calibration file"
     if not made or not outlines:

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from phibench.datasets.common.camera_pictures import IN_WORDS, Kind, Subsampling, read_camera_picture
 from phibench.datasets.common.input_files import InputFile
-from phibench.datasets.frames.sensor_card import SensorCard, SensorFile, card_of, sensor_card
+from phibench.datasets.frames.sensor_card import SensorCard, card_of, sensor_card
+from phibench.datasets.frames.sensor_file import SensorFile
 from phibench.datasets.rooms.panorama_files import is_linear, read_light
 from phibench.estimator.interface import Image
 from phibench.estimator.spots.camera_codes import quantisation

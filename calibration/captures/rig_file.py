@@ -19,8 +19,8 @@ from pydantic import Field
 from phibench.calibration.captures.foreign_calibration import foreign_calibration, foreign_container
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import SETTINGS_BYTES, InputFile
-from phibench.datasets.recipe.build import build_rig, idle_holder_keys
 from phibench.datasets.recipe.distributions import Table
+from phibench.datasets.recipe.recipe_scene import build_rig, idle_holder_keys
 from phibench.datasets.recipe.tables import LaserTable, RigTable
 from phibench.scenes.laser import Beam
 from phibench.scenes.rig import Rig

@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from phibench.calibration.rig.file import Calibration
+from phibench.calibration.rig.calibration_file import Calibration
 from phibench.datasets.common.errors import DatasetError
 from phibench.estimator.geometry.status import Status
 from phibench.estimator.interface import Answer, Pair, Spot

@@ -22,7 +22,7 @@ from PIL import Image, ImageDraw
 
 from phibench.calibration.outline.ball_circle import LONGEST_PX, BallCircle, find_circle, shrunk
 from phibench.calibration.outline.edge_ring import Circle
-from phibench.calibration.outline.outline_fit import sphere_from_circle, sphere_from_rays
+from phibench.calibration.outline.first_circle import sphere_from_circle, sphere_from_rays
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.rooms.panorama_room import PanoramaSettings
 from phibench.datasets.store.layers import write_exr

@@ -26,18 +26,16 @@ from scipy import ndimage
 
 from phibench.calibration.outline.ball_circle import BallCircle, on_limb
 from phibench.calibration.outline.edge_ring import TURNS
-from phibench.calibration.outline.limb_image import Plane, binned, full_pixels, limb_angle_rad, planes_of
-from phibench.calibration.outline.outline_fit import (
+from phibench.calibration.outline.first_circle import (
     PICTURE_BLUR_PX2,
-    OutlinePixels,
-    Step,
-    band,
     circles_by_size,
     grey,
     radii_px,
     sphere_from_rays,
-    step_from,
 )
+from phibench.calibration.outline.limb_image import Plane, binned, full_pixels, limb_angle_rad, planes_of
+from phibench.calibration.outline.outline_fit import OutlinePixels, Step, band, step_from
+from phibench.calibration.outline.outline_jpeg import without_jpeg
 from phibench.calibration.outline.outline_result import (
     MIN_ARC,
     SECTORS,
@@ -50,7 +48,6 @@ from phibench.calibration.outline.outline_result import (
     require_size,
     require_unlit,
     shared_px2,
-    without_jpeg,
 )
 from phibench.calibration.outline.rim_outline import RimOutline, RimSearch
 from phibench.datasets.frames.sensor_card import SensorCard

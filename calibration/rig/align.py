@@ -22,9 +22,9 @@ from skimage.measure import blur_effect
 from phibench.calibration.outline.ball_circle import BallCircle, find_circle
 from phibench.calibration.outline.contour import aside_by_tilt_m
 from phibench.calibration.outline.edge_ring import Circle
+from phibench.calibration.outline.first_circle import grey, rig_circle
 from phibench.calibration.outline.limb_image import planes_of
 from phibench.calibration.outline.outline import find_outline
-from phibench.calibration.outline.outline_fit import grey, rig_circle
 from phibench.calibration.outline.outline_result import Outline
 from phibench.calibration.rig.edge_meeting import (
     CameraTilt,

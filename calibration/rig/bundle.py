@@ -29,8 +29,8 @@ from numpy.typing import NDArray
 from scipy import optimize
 
 from phibench.calibration.outline.contour import place_of_outline, tilts_of_ellipse
+from phibench.calibration.outline.first_circle import sphere_from_rays
 from phibench.calibration.outline.limb_image import PoseMeasurement
-from phibench.calibration.outline.outline_fit import sphere_from_rays
 from phibench.calibration.rig.vertical_edges import vertical_of
 from phibench.datasets.common.errors import DatasetError
 from phibench.estimator.geometry.reflection import image_of, reflect, reflect_jacobian

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
+from phibench.calibration.outline.first_circle import grey
 from phibench.calibration.outline.limb_image import planes_of
-from phibench.calibration.outline.outline_fit import grey
 from phibench.calibration.outline.outline_result import SECTORS, Outline, binned_rig
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.datasets.store.files import write_bytes

@@ -30,14 +30,8 @@ from phibench.calibration.sensor_fit.noise_levels import ToneFit, fit_tone, stac
 from phibench.calibration.sensor_fit.photon_transfer import TransferFit, fit_transfer
 from phibench.calibration.sensor_fit.processed_noise import ProcessedNoise, fit_noise
 from phibench.datasets.common.input_files import InputFile
-from phibench.datasets.frames.sensor_card import (
-    FitTables,
-    MeasuredQuantity,
-    SensorCard,
-    SensorFile,
-    allowed_numbers,
-    sensor_card,
-)
+from phibench.datasets.frames.sensor_card import SensorCard, sensor_card
+from phibench.datasets.frames.sensor_file import FitTables, MeasuredQuantity, SensorFile, allowed_numbers
 from phibench.scenes.frames import Array
 
 # Intrinsics and distortion from views of one chessboard, by OpenCV, with sigmas.

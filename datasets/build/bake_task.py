@@ -24,9 +24,9 @@ from phibench.datasets.rooms.room_sources import RoomSource, room_of
 from phibench.datasets.store import schema
 from phibench.datasets.store.documents import to_json
 from phibench.datasets.store.files import write_bytes, write_text
-from phibench.datasets.store.leftovers import remove_leftovers
 from phibench.datasets.store.provenance import code_behind
 from phibench.datasets.store.schema import RoomInfo
+from phibench.datasets.store.temporary_folders import remove_leftovers
 from phibench.render.room.light_map import ARRAYS, BakeSettings, LightMap, bake, encoded, fixed_shapes, texel_count
 from phibench.render.setup.llvm_library import LlvmError, cache_root
 from phibench.render.setup.variant import renders_with

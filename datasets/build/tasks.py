@@ -20,7 +20,8 @@ from typing import Any, Protocol
 
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.rooms.room_files import RoomError
-from phibench.datasets.store.files import sha256, working
+from phibench.datasets.store.files import sha256
+from phibench.datasets.store.folder_lock import working
 from phibench.datasets.store.provenance import code_sha256
 from phibench.scenes.validation import SceneError
 

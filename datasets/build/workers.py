@@ -26,9 +26,8 @@ from typing import Any
 
 from phibench.datasets.build.tasks import BuildTask, Done, Executor, Failed, Outcome, fault_text, perform, worker_name
 from phibench.datasets.build.view_task import start_renderer
-from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError, whole_number
 from phibench.datasets.common.parallel import ONE_THREAD, end_with_the_parent, environment_of_children
-from phibench.datasets.frames.request import whole_number
 from phibench.datasets.store.files import write_text
 from phibench.datasets.store.provenance import code_sha256, provenance
 

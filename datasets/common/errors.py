@@ -1,6 +1,9 @@
-"""Errors of recipes and data sets; every message is for the person at the terminal."""
+"""Errors of recipes and data sets, and the check of a whole number; messages are for the person at the terminal."""
 
 from __future__ import annotations
+
+import operator
+from typing import Any
 
 
 class DatasetError(ValueError):
@@ -17,3 +20,20 @@ class RefusedSampleError(DatasetError):
 
 class IncompleteError(DatasetError):
     """A run that has finished all samples but those that were refused; the message has one line for each of these."""
+
+
+def whole_number(name: str, value: Any, low: int = 0) -> int:
+    """Return `value` as a Python int: a NumPy integer would name another noise stream.
+
+    Raises
+    ------
+    DatasetError
+        If it is not an integer of at least `low`.
+    """
+    try:
+        number = None if isinstance(value, bool) else operator.index(value)
+    except TypeError:
+        number = None
+    if number is None or number < low:
+        raise DatasetError(f"{name} = {value!r}: must be an integer, {low} or above")
+    return number

@@ -16,20 +16,18 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from phibench.datasets.common.errors import DatasetError
-from phibench.datasets.frames.distractors import Distractor, present
-from phibench.datasets.frames.request import FrameOptions, FrameRequest, sample_stream, whole_number
-from phibench.datasets.frames.sensor_card import SensorFile
+from phibench.datasets.common.errors import DatasetError, whole_number
+from phibench.datasets.frames.distractors import Distractor, distractors, present
+from phibench.datasets.frames.request import FrameOptions, FrameRequest, sample_stream
+from phibench.datasets.frames.sensor_file import SensorFile
 from phibench.datasets.frames.source import FrameSource, has_place
 from phibench.datasets.read import Dataset, Sample
 from phibench.datasets.recipe.tables import FramesTable
 from phibench.datasets.store.layers import SpotWindow
-from phibench.datasets.store.schema import ManifestRow
 from phibench.render.sensor.light import Region
 from phibench.scenes.camera import Camera
-from phibench.scenes.laser import LaserSpot
 from phibench.scenes.random_streams import generator
-from phibench.scenes.rig import POSITIONS, Rig, View
+from phibench.scenes.rig import POSITIONS
 
 BOX_MARGIN_PX = 4
 """The light of a hinted spot has its centre at least this far from the edges of its box."""
@@ -197,45 +195,19 @@ def _start(random: np.random.Generator, centre_px: float | None, side_px: int, m
     return int(random.integers(low, high + 1))
 
 
-@dataclass(frozen=True)
-class CachedSample:
-    """A sample that keeps its layers; it is what `FrameSource` needs of one."""
+@dataclass(frozen=True, repr=False)
+class CachedSample(Sample):
+    """A sample that keeps its layers and other lights, for many draws."""
 
-    sample: Sample = field(repr=False)
-
-    @property
-    def row(self) -> ManifestRow:
-        """Exact numbers."""
-        return self.sample.row
-
-    @property
-    def rig(self) -> Rig:
-        """The sample's rig."""
-        return self.sample.rig
-
-    @property
-    def nominal_rig(self) -> Rig:
-        """The nominal rig: the one that estimators are given."""
-        return self.sample.nominal_rig
-
-    @property
-    def laser_spot(self) -> LaserSpot:
-        """The laser spot."""
-        return self.sample.laser_spot
-
-    @property
-    def stream_names(self) -> tuple[str, int, str]:
-        """Data set, its seed, sample id."""
-        return self.sample.stream_names
+    @classmethod
+    def of(cls, sample: Sample) -> CachedSample:
+        """The same sample, keeping what it has read."""
+        return cls(sample.dataset, sample.row)
 
     @cached_property
     def distractors(self) -> tuple[Distractor, ...]:
         """Other lights of the sample."""
-        return self.sample.distractors
-
-    def view(self, position: str) -> View:
-        """Rig at a position."""
-        return self.sample.view(position)
+        return distractors(self)
 
     def ambient(self, position: str) -> NDArray[np.float32]:
         """Ambient layer, shape (3, H, W)."""
@@ -247,7 +219,7 @@ class CachedSample:
 
     @cached_property
     def _layers(self) -> dict[str, tuple[NDArray[np.float32], SpotWindow]]:
-        return {position: (self.sample.ambient(position), self.sample.spot(position)) for position in POSITIONS}
+        return {position: (Sample.ambient(self, position), Sample.spot(self, position)) for position in POSITIONS}
 
     def source(self, pair_draw: PairDraw) -> FrameSource:
         """Source of the frames of a pair draw, distractors included.

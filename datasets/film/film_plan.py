@@ -10,8 +10,8 @@ import numpy as np
 
 from phibench.datasets.common.errors import DatasetError, RecipeError
 from phibench.datasets.plan.plan import PairPlan, Plan, make_plan
-from phibench.datasets.recipe.build import spot_albedo
 from phibench.datasets.recipe.film_tables import FilmLightTable, FilmTable
+from phibench.datasets.recipe.recipe_scene import spot_albedo
 from phibench.datasets.recipe.spot_placement import by_ray
 from phibench.datasets.recipe.tables import OWN_ALBEDO, LaserTable, Recipe
 from phibench.datasets.rooms.room_files import RoomFiles

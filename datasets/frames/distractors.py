@@ -14,8 +14,8 @@ from typing import Protocol
 
 import numpy as np
 
-from phibench.datasets.recipe.build import spot_albedo
 from phibench.datasets.recipe.distributions import DistributionTable, quantile
+from phibench.datasets.recipe.recipe_scene import spot_albedo
 from phibench.datasets.recipe.spot_placement import by_ray, on_board
 from phibench.datasets.recipe.tables import DistractorTable, Recipe
 from phibench.datasets.store.layers import SpotWindow

@@ -1,4 +1,4 @@
-"""Requests of frames (preset, exposure, levels, speed, crop, seed), a data set's options, number checks for others.
+"""Requests of frames (preset, exposure, levels, speed, crop, seed), and a data set's options.
 
 A request is checked and frozen. The preset is one of the sensor's. `FrameOptions` are what a caller asks of a data
 set's frames; `sample_request` makes the request of a sample of them and of the recipe's `[frames]`.
@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import math
 import numbers
-import operator
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
@@ -21,7 +20,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError, whole_number
 from phibench.datasets.common.input_files import InputFile
 from phibench.datasets.recipe.distributions import DistributionTable, quantile
 from phibench.datasets.recipe.tables import SENSOR_KEYS, FramesTable
@@ -205,23 +204,6 @@ def _number(name: str, value: Any, low: float, high: float) -> float:
     number = math.nan if isinstance(value, bool) or not isinstance(value, numbers.Real) else float(value)
     if not low <= number <= high:
         raise DatasetError(f"{name} = {value!r}: must be a number from {low:g} to {high:g}")
-    return number
-
-
-def whole_number(name: str, value: Any, low: int = 0) -> int:
-    """Return `value` as a Python int: a NumPy integer would name another noise stream.
-
-    Raises
-    ------
-    DatasetError
-        If it is not an integer of at least `low`.
-    """
-    try:
-        number = None if isinstance(value, bool) else operator.index(value)
-    except TypeError:
-        number = None
-    if number is None or number < low:
-        raise DatasetError(f"{name} = {value!r}: must be an integer, {low} or above")
     return number
 
 

@@ -28,8 +28,15 @@ from phibench.datasets.plan.sampling import (
     rig_fault,
     rows_of,
 )
-from phibench.datasets.recipe.build import build_target, by_keys, ceiling_m, make_spot, room_source, true_stroke_m
 from phibench.datasets.recipe.distributions import DistributionTable, quantile
+from phibench.datasets.recipe.recipe_scene import (
+    build_target,
+    by_keys,
+    ceiling_m,
+    make_spot,
+    room_source,
+    true_stroke_m,
+)
 from phibench.datasets.recipe.room_tables import RoomPropertiesTable, RoomsTable
 from phibench.datasets.recipe.spot_placement import Boards
 from phibench.datasets.recipe.tables import DrawnRigsTable, RandomTable, Recipe

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 from phibench.datasets.common.errors import DatasetError, RecipeError
 from phibench.datasets.plan.draws import Kept, draw_rigs, draw_rooms, rebuilt, room_files
 from phibench.datasets.plan.sampling import RandomSample, draw_samples, have_own_rigs
-from phibench.datasets.recipe.build import build_misalignment, build_rig, build_spot, true_stroke_m
+from phibench.datasets.recipe.recipe_scene import build_misalignment, build_rig, build_spot, true_stroke_m
 from phibench.datasets.recipe.tables import DrawnRigsTable, RandomTable, Recipe
 from phibench.datasets.rooms.room_files import RoomError, RoomFiles
 from phibench.datasets.rooms.room_sources import ONLY_ROOM, RoomSource, room_of

@@ -23,7 +23,9 @@ from typing import Any, Literal
 import numpy as np
 
 from phibench.datasets.common.errors import RecipeError
-from phibench.datasets.recipe.build import (
+from phibench.datasets.recipe.distributions import DistributionTable, pick, quantile
+from phibench.datasets.recipe.mirror_tables import DRAWN_OF_MIRROR, OF_SHAPES, SHAPES, HolderTable, MirrorTable
+from phibench.datasets.recipe.recipe_scene import (
     build_misalignment,
     build_rig,
     build_target,
@@ -31,8 +33,6 @@ from phibench.datasets.recipe.build import (
     ceiling_m,
     true_stroke_m,
 )
-from phibench.datasets.recipe.distributions import DistributionTable, pick, quantile
-from phibench.datasets.recipe.mirror_tables import DRAWN_OF_MIRROR, OF_SHAPES, SHAPES, HolderTable, MirrorTable
 from phibench.datasets.recipe.spot_placement import Boards, Placed, place, shown_as
 from phibench.datasets.recipe.tables import (
     DRAWABLE,

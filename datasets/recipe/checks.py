@@ -11,7 +11,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from phibench.datasets.recipe.build import (
+from phibench.datasets.recipe.distributions import DistributionTable, Table
+from phibench.datasets.recipe.recipe_scene import (
     build_misalignment,
     build_rig,
     build_room,
@@ -27,7 +28,6 @@ from phibench.datasets.recipe.build import (
     rig_fault_of,
     true_stroke_m,
 )
-from phibench.datasets.recipe.distributions import DistributionTable, Table
 from phibench.datasets.recipe.room_checks import low_rooms, room_faults, tables_of_rooms
 from phibench.datasets.recipe.spot_placement import cut_part, free_margin_m
 from phibench.datasets.recipe.tables import (

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from phibench.datasets.recipe.build import build_spot, grown_diameter_m, make_spot
+from phibench.datasets.recipe.recipe_scene import build_spot, grown_diameter_m, make_spot
 from phibench.datasets.recipe.tables import OWN_ALBEDO, LaserTable, TargetTable
 from phibench.render.optics.faces import FaceTable
 from phibench.render.optics.room_tracer import BEAM_REACH_M, RoomGeometry, RoomHits, own_geometry, room_geometry

@@ -64,7 +64,6 @@ else:
 Probability = Annotated[float, Field(ge=0.0, le=1.0)]
 OWN_ALBEDO = "surface"
 """Value of `laser.albedo`: that of each surface."""
-LEVELS = ("laser_level", "lamp_level")
 SENSOR_KEYS = ("jpeg_quality", "sharpen_amount", "analogue_gain", "read_noise_e", "prnu")
 """Keys of `[frames]` that are numbers of the sensor's preset."""
 SENSOR_OF_FRAME = (

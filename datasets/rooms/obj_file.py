@@ -185,7 +185,7 @@ def obj_parts(file: InputFile, companions: Companions) -> list[MeshPart]:
             reader.line(words)
     if max(len(reader.vertices), len(reader.places)) > _MOST_VERTICES:
         raise file.fault(f"has more than {_MOST_VERTICES} vertices or texture coordinates")
-    materials = _materials(file, companions, reader.libraries)
+    materials = _materials(companions, reader.libraries)
     check_count(file, reader.triangles)
     points = np.array(reader.vertices, float).reshape(-1, 3)
     places = np.array(reader.places, float).reshape(-1, 2)
@@ -296,7 +296,7 @@ def _pictured(
 # Materials.
 
 
-def _materials(file: InputFile, companions: Companions, libraries: list[str]) -> dict[str, _Material]:
+def _materials(companions: Companions, libraries: list[str]) -> dict[str, _Material]:
     materials: dict[str, _Material] = {}
     for line in libraries:
         # one name with blanks, or several names

@@ -105,4 +105,4 @@ DENSE_METHODS: dict[str, DenseBuiltIn] = {method.name: method for method in _ALL
 """All of them, also where OpenCV is missing: `refusal` says so."""
 
 KNOWN = DENSE_METHODS
-"""The name by which `benchmark.isolation.resolve` looks in every registry of methods."""
+"""The name by which `benchmark.isolation.method_references` looks in every registry of methods."""

@@ -69,7 +69,7 @@ def depth_paper(
     radius_m : float
         R.
     covariance_rad2 : array, shape (..., 2, 2)
-        Covariance of (phi1, phi2), optional; see `covariance_of`.
+        Covariance of (phi1, phi2), optional.
 
     Returns
     -------

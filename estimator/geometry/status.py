@@ -87,13 +87,6 @@ def propagate(gradient: Array, covariance: Array | None) -> Array:
     return np.sqrt(np.einsum("...i,...ij,...j->...", gradient, np.asarray(covariance, float), gradient))
 
 
-def covariance_of(sigma_1: ArrayLike, sigma_2: ArrayLike, correlation: ArrayLike = 0.0) -> Array:
-    """Covariance matrix, shape (..., 2, 2), of two values from their standard deviations and correlation."""
-    s1, s2, rho = np.broadcast_arrays(*(np.asarray(x, float) for x in (sigma_1, sigma_2, correlation)))
-    cross = rho * s1 * s2
-    return np.stack([np.stack([s1 * s1, cross], -1), np.stack([cross, s2 * s2], -1)], -2)
-
-
 def stroke_status(stroke_m: ArrayLike) -> StatusArray:
     """Status of strokes: NOT_FINITE, OUT_OF_RANGE unless above 0."""
     h = np.asarray(stroke_m, float)

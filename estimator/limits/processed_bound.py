@@ -43,7 +43,7 @@ from phibench.estimator.processed.chain_model import (
     raw_variance_e2,
 )
 from phibench.estimator.processed.fit_chain import own_codes, unrounded
-from phibench.estimator.processed.fit_jpeg import grid_px
+from phibench.estimator.processed.fit_processed import grid_px
 from phibench.estimator.processed.quasi_score import CoefficientWindow
 from phibench.estimator.spots.camera_codes import hidden_share, quantised
 from phibench.estimator.spots.gaussian_spot import (

@@ -16,7 +16,7 @@ from scipy.ndimage import convolve1d, gaussian_filter
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.estimator.geometry.status import Status, flag, keep
 from phibench.estimator.processed.chain_model import UNIT_MATRIX, ChainModel, chain_model, window_px
-from phibench.estimator.processed.fit_jpeg import JpegRegion, fit_region, grid_px, region_window
+from phibench.estimator.processed.fit_processed import JpegRegion, fit_region, grid_px, region_window
 from phibench.estimator.processed.quasi_score import CoefficientWindow, WindowFit
 from phibench.estimator.spots.camera_codes import RGB_FROM_YCC, light_of, mcu_px, rgb_codes, tone_slope
 from phibench.estimator.spots.fit_raw import LEAST_SNR, SpotData, SpotFit, fit_law, spot_data

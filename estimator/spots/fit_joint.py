@@ -37,7 +37,6 @@ class JointFit(DepthEstimate):
     ----------
     uv_down_px, uv_up_px : shape (n, 2)
     covariance_down_px2, covariance_up_px2 : shape (n, 2, 2), under the constraint
-    flux_down_e, flux_up_e : shape (n,)
     chi2 : shape (n,)
         By how much -2 log L exceeds that of the images fitted separately: one degree of freedom; large where the two
         spots are not one point, or the rig differs from the nominal one.
@@ -47,8 +46,6 @@ class JointFit(DepthEstimate):
     uv_up_px: Array
     covariance_down_px2: Array
     covariance_up_px2: Array
-    flux_down_e: Array
-    flux_up_e: Array
     chi2: Array
 
 
@@ -269,7 +266,7 @@ def _result(
     )
     C_up = G @ C3 @ np.swapaxes(G, 1, 2)
     sigma = np.sqrt(C3[:, 2, 2]) / (q * q)
-    values = (1.0 / q, sigma, psi[:, :2], theta_up[:, :2], C3[:, :2, :2], C_up, psi[:, 3], psi[:, k + 1], chi2)
+    values = (1.0 / q, sigma, psi[:, :2], theta_up[:, :2], C3[:, :2, :2], C_up, chi2)
     depth, sigma, *rest = (keep(value, status) for value in values)
     return JointFit(depth, sigma, status, *rest)
 

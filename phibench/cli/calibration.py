@@ -14,7 +14,7 @@ from phibench.cli.options import DEFAULT_PRESET, DataFolder, Flag, Preset, Senso
 
 if TYPE_CHECKING:
     from phibench.calibration.rig.from_dataset import CalibrationSources
-    from phibench.calibration.rig.spots import Ruler
+    from phibench.calibration.rig.known_spots import Ruler
 
 _LAB = (
     "sigma of the outline: checked in the room `lab`; in a room with more lamps or edges widen it with "
@@ -71,7 +71,7 @@ class SourceOptions:
         DatasetError
             If it is given without spots, or is out of its range.
         """
-        from phibench.calibration.rig.spots import Ruler
+        from phibench.calibration.rig.known_spots import Ruler
         from phibench.datasets.common.errors import DatasetError
 
         if not self.spots and (math.isfinite(self.height_sigma_m) or math.isfinite(self.azimuth_sigma_deg)):
@@ -107,7 +107,7 @@ def calibrate(
     from phibench.calibration.captures.imported_calibration import calibrate_imported
     from phibench.calibration.captures.imported_set import open_imported
     from phibench.calibration.rig.from_dataset import calibrate_dataset
-    from phibench.calibration.rig.spots import Ruler
+    from phibench.calibration.rig.known_spots import Ruler
     from phibench.datasets.common.errors import DatasetError
     from phibench.datasets.store.files import require_writable
     from phibench.datasets.store.pair_files import is_imported
@@ -208,7 +208,7 @@ def align(
     """
     from phibench.calibration.captures.picture_files import read_picture, sensor_choice
     from phibench.calibration.captures.rig_file import read_rig_file, require_camera_size
-    from phibench.calibration.outline.outline_fit import rig_circle
+    from phibench.calibration.outline.first_circle import rig_circle
     from phibench.calibration.rig.align import (
         alignment,
         camera_in_words,
@@ -225,7 +225,7 @@ def align(
         write_circle_picture,
     )
     from phibench.datasets.common.errors import DatasetError
-    from phibench.datasets.frames.sensor_card import read_sensor_file
+    from phibench.datasets.frames.sensor_file import read_sensor_file
 
     stated.require_sound()
     given = stated.given()

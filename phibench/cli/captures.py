@@ -173,7 +173,7 @@ def fit(frames: Path, *, out: Path, page: Path | None = None) -> int:
     """
     from phibench.calibration.sensor_fit.fit import fit_sensor
     from phibench.calibration.sensor_fit.fit_page import numbers_of, remarks_of, require_page, write_page
-    from phibench.datasets.frames.sensor_card import write_sensor_file
+    from phibench.datasets.frames.sensor_file import write_sensor_file
     from phibench.datasets.store.files import require_writable
 
     for target in filter(None, (out, page)):  # before the minutes of the fit

@@ -353,8 +353,8 @@ def frames(
     laser_off
         Also every image without the spot.
     """
-    from phibench.datasets.exposures.draw import draw_frames
-    from phibench.datasets.frames.sensor_card import read_sensor_file
+    from phibench.datasets.exposures.draw_frames import draw_frames
+    from phibench.datasets.frames.sensor_file import read_sensor_file
 
     file = None if sensor is None else read_sensor_file(sensor)
     preset = preset or (DEFAULT_PRESET if file is None else file.preset)

@@ -41,7 +41,7 @@ DenseMethods = Annotated[
 @dense.command(name="list")
 def list_() -> int:
     """List the dense methods: built in, and of installed packages."""
-    from phibench.benchmark.isolation.resolve import DENSE, installed
+    from phibench.benchmark.isolation.method_references import DENSE, installed
     from phibench.estimator.dense.dense_methods import KNOWN
 
     for method in KNOWN.values():
@@ -62,7 +62,7 @@ def new(path: Path) -> int:
     path
         Python file to write; one that is there is not touched.
     """
-    from phibench.benchmark.isolation.resolve import DENSE, write_example
+    from phibench.benchmark.isolation.method_references import DENSE, write_example
 
     written = write_example(path, DENSE)
     print(f"{written}: try it with `phibench dense check {written}:depth`")
@@ -89,7 +89,7 @@ def check(
         Also show what the method prints: the last 20 lines of every pair.
     """
     from phibench.benchmark.dense.dense_check import PAIRS, check_dense
-    from phibench.benchmark.isolation.resolve import DENSE, resolve
+    from phibench.benchmark.isolation.method_references import DENSE, resolve
     from phibench.datasets.common.progress import Steps, progress_console
 
     resolve(reference, DENSE)  # one that is not there is told before anything begins
@@ -141,8 +141,8 @@ def score(
     """
     from phibench.benchmark.dense.dense_score import chosen_pairs, run_dense, saved_dense
     from phibench.benchmark.dense.dense_tables import dense_board, dense_failures
-    from phibench.benchmark.isolation.resolve import DENSE, resolve
-    from phibench.benchmark.scores.document import MethodCard
+    from phibench.benchmark.isolation.method_references import DENSE, resolve
+    from phibench.benchmark.scores.score_document import MethodCard
     from phibench.benchmark.scores.score_files import score_files
     from phibench.datasets.common.errors import DatasetError
     from phibench.datasets.common.shown_text import show_grid, table_console
@@ -197,7 +197,7 @@ def picture(
     from phibench.benchmark.dense.dense_page import DensePage
     from phibench.benchmark.dense.dense_pictures import picture_of
     from phibench.benchmark.dense.dense_score import chosen_pairs
-    from phibench.benchmark.isolation.resolve import DENSE, resolve
+    from phibench.benchmark.isolation.method_references import DENSE, resolve
     from phibench.datasets.common.errors import DatasetError
     from phibench.datasets.store.files import require_writable, write_bytes
 

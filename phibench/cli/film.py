@@ -321,7 +321,7 @@ class RobotOptions:
         """
         import numpy as np
 
-        from phibench.calibration.rig.file import read_calibration
+        from phibench.calibration.rig.calibration_file import read_calibration
         from phibench.datasets.common.errors import DatasetError
         from phibench.estimator.geometry.rig_parameters import prior_sigmas
         from phibench.robot.loop.arena import baked_arenas
@@ -364,8 +364,8 @@ def bake(*, out: OutFolder, rooms: Whole = 5, seed: str = "rooms", workers: Work
     seed
         Name of the stream that the rooms are drawn from.
     """
+    from phibench.datasets.common.errors import whole_number
     from phibench.datasets.film.moving_camera import bake_rooms
-    from phibench.datasets.frames.request import whole_number
     from phibench.robot.loop.arena import offers_targets
 
     whole_number("--rooms", rooms, 1)
@@ -398,9 +398,9 @@ def run(
     out
         Parquet file for the rows.
     """
-    from phibench.benchmark.isolation.resolve import RunLimits
+    from phibench.benchmark.isolation.method_references import RunLimits
+    from phibench.datasets.common.errors import whole_number
     from phibench.datasets.common.progress import Steps, progress_console
-    from phibench.datasets.frames.request import whole_number
     from phibench.datasets.store.files import require_writable, write_atomic
     from phibench.robot.loop.episodes import LOST, episode_frame, episodes_of, run_foreign
     from phibench.robot.loop.foreign_policies import PolicyFile
@@ -463,9 +463,9 @@ def show_loop(
     seconds
         Time that a policy of yours has for one answer.
     """
-    from phibench.benchmark.isolation.resolve import RunLimits
+    from phibench.benchmark.isolation.method_references import RunLimits
+    from phibench.datasets.common.errors import whole_number
     from phibench.datasets.common.progress import Steps, progress_console
-    from phibench.datasets.frames.request import whole_number
     from phibench.datasets.store.files import require_writable
     from phibench.robot.loop.foreign_policies import PolicyFile, PolicyProcess
     from phibench.studies.loop.drawings import show_episode

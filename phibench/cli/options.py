@@ -22,15 +22,15 @@ from cyclopts import Group, Parameter, Token
 if TYPE_CHECKING:
     from cyclopts.completion import CompletionContext
 
-    from phibench.benchmark.isolation.resolve import RunLimits
-    from phibench.benchmark.scores.document import Declared
+    from phibench.benchmark.isolation.method_references import RunLimits
+    from phibench.benchmark.scores.score_document import Declared
 
 START, DATA, METHODS, SENSOR, KEEPERS, INSTALLATION = (
     Group.create_ordered(name)
     for name in ("Start with", "Data sets", "Methods", "Sensor and paper", "Publish and study", "Installation")
 )
 DEFAULT_PRESET = "mjpeg"  # what the C310 delivers; a data set's own presets go before it
-SECONDS = 30.0  # of one pair; the same numbers as in `isolation.resolve.RunLimits`, whose module is slow to import
+SECONDS = 30.0  # of one pair; those of `method_references.RunLimits`, slow to import
 MEMORY_MB = 4096.0  # of a method; a network and its arrays fit
 
 
@@ -228,7 +228,7 @@ class Limits:
         MethodError
             If a number is out of its range.
         """
-        from phibench.benchmark.isolation.resolve import RunLimits
+        from phibench.benchmark.isolation.method_references import RunLimits
 
         return RunLimits(self.seconds, self.memory_mb, fresh=self.fresh, allow=self.allow)
 
@@ -260,7 +260,7 @@ class OwnWord:
         DatasetError
             If something is said and every method is built in.
         """
-        from phibench.benchmark.scores.document import Declared
+        from phibench.benchmark.scores.score_document import Declared
 
         if self.division is not None or self.self_calibrates:
             _require_own(references)

@@ -130,7 +130,7 @@ def release(
         Say how many samples, bytes and CPU-hours each part takes; render nothing.
     """
     from phibench.benchmark.release import release_make
-    from phibench.benchmark.release.benchmark import chosen_parts
+    from phibench.benchmark.release.release_parts import chosen_parts
     from phibench.benchmark.sealed.sealed_set import seal
 
     request = release_make.ReleaseRequest(chosen_parts(part), out, work, secret_seed, samples, use, workers=workers)

@@ -97,7 +97,7 @@ def from_mirror_ball(
         write_outline,
         write_panorama,
     )
-    from phibench.datasets.frames.sensor_card import read_sensor_file
+    from phibench.datasets.frames.sensor_file import read_sensor_file
     from phibench.datasets.store.files import require_writable
 
     stated = ball_of.stated

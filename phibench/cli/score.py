@@ -25,7 +25,7 @@ from phibench.cli.options import (
 )
 
 if TYPE_CHECKING:
-    from phibench.benchmark.scores.document import ScoreDocument
+    from phibench.benchmark.scores.score_document import ScoreDocument
     from phibench.estimator.pair_set import PairSet
 
 Rank = Annotated[
@@ -145,9 +145,9 @@ def score(
     out
         JSON file for the score, records beside it as Parquet; with several methods their names are added to it.
     """
-    from phibench.benchmark.isolation.resolve import resolve
-    from phibench.benchmark.scores.document import MethodCard
+    from phibench.benchmark.isolation.method_references import resolve
     from phibench.benchmark.scores.score import run_and_score, saved_each
+    from phibench.benchmark.scores.score_document import MethodCard
     from phibench.benchmark.scores.score_files import records_kept, score_files
     from phibench.benchmark.scores.score_tables import nothing_answered, print_scores
     from phibench.datasets.common.errors import DatasetError

@@ -106,7 +106,7 @@ method = App(name="method", group=START, help="Write, check and list methods, wh
 @method.command(name="list")
 def list_methods() -> int:
     """List the methods: built in, optional, and of installed packages."""
-    from phibench.benchmark.isolation.resolve import installed
+    from phibench.benchmark.isolation.method_references import installed
     from phibench.datasets.common.shown_text import TextTable, show_grid, wide_console
     from phibench.estimator.methods.registry import KNOWN
     from phibench.estimator.spots.image_planes import KINDS
@@ -145,8 +145,8 @@ def check(
     show_output
         Also show what the method prints: the last 20 lines of every pair.
     """
-    from phibench.benchmark.isolation.check import PAIRS, check_method
-    from phibench.benchmark.isolation.resolve import resolve
+    from phibench.benchmark.isolation.method_check import PAIRS, check_method
+    from phibench.benchmark.isolation.method_references import resolve
     from phibench.datasets.common.progress import Steps, progress_console
 
     resolve(reference)  # one that is not there is told before anything begins
@@ -167,7 +167,7 @@ def new(path: Path) -> int:
     path
         Python file to write; one that is there is not touched.
     """
-    from phibench.benchmark.isolation.resolve import write_example
+    from phibench.benchmark.isolation.method_references import write_example
 
     written = write_example(path)
     print(f"{written}: try it with `phibench method check {written}:extract`")

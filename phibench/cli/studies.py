@@ -114,7 +114,7 @@ def paper(
 
 def _tables(directory: Path, calibration: Path | None, wide: bool, out: Path | None) -> int:
     from phibench.benchmark.pair_sets.wanted_pairs import of_calibration
-    from phibench.calibration.rig.file import read_calibration
+    from phibench.calibration.rig.calibration_file import read_calibration
     from phibench.datasets.common.shown_text import show_grid, table_console
     from phibench.datasets.read import open_finished
     from phibench.studies.paper.paper_tables import bias_table, table
@@ -193,7 +193,7 @@ class StrokeSetting:
             If a file or a number will not do.
         """
         from phibench.calibration.captures.rig_file import read_rig_file
-        from phibench.calibration.rig.file import read_calibration
+        from phibench.calibration.rig.calibration_file import read_calibration
         from phibench.datasets.common.errors import DatasetError
         from phibench.datasets.frames.sensor_card import sensor_card
         from phibench.estimator.limits.best_stroke import best_stroke

@@ -18,10 +18,11 @@ from numpy.typing import NDArray
 
 from phibench.render.optics.faces import TexelGrid, texel_sizes_m
 from phibench.render.optics.room_tracer import room_geometry
+from phibench.render.room.lamp_outlines import LampOutlines
 from phibench.render.room.light_map import BakeSettings, LightMap, fixed_shapes, light_carriage
 from phibench.render.room.noise_budget import BUDGET
 from phibench.render.room.refinement import render_refined
-from phibench.render.room.shading import LampOutlines, Look
+from phibench.render.room.shading import Look
 from phibench.render.room.subpixel_grid import CellSampler, Crop, FilmGrid, Stack
 from phibench.render.room.surfaces import Surfaces
 from phibench.render.setup.variant import activate

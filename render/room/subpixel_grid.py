@@ -23,7 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from phibench.render.room.shading import LampOutlines, Look
+from phibench.render.room.lamp_outlines import LampOutlines
+from phibench.render.room.shading import Look
 from phibench.render.room.surfaces import aligned
 from phibench.scenes.camera import Camera
 from phibench.scenes.validation import SceneError

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from phibench.render.sensor.settings import Sensor
-from phibench.render.sensor.srgb import srgb_decoded, srgb_encoded
+from phibench.render.sensor.srgb import srgb_encoded
 from phibench.scenes.frames import Array
 
 LUMA = (0.299, 0.587, 0.114)  # ITU-R BT.601, the Y' of YUYV and of JPEG
@@ -158,15 +158,6 @@ def tone_encoded(linear: Array, sensor: Sensor) -> Array:
     if sensor.transfer_points is not None:
         return np.interp(x, *np.transpose(sensor.transfer_points)).astype(x.dtype)
     return np.where(x < _BETA, of(4.5) * x, of(_ALPHA) * np.power(x, of(0.45)) - of(_ALPHA - 1.0))
-
-
-def tone_decoded(encoded: Array, sensor: Sensor) -> Array:
-    """Linear light of encoded values."""
-    if sensor.transfer_function == "srgb":
-        return srgb_decoded(encoded)
-    if sensor.transfer_points is not None:
-        return np.interp(encoded, *np.transpose(sensor.transfer_points)[::-1])
-    return np.where(encoded < 4.5 * _BETA, encoded / 4.5, ((encoded + _ALPHA - 1.0) / _ALPHA) ** (1.0 / 0.45))
 
 
 def shrunk(planes: Array, factor: int) -> Array:

@@ -230,7 +230,7 @@ def prove(llvm: Llvm) -> str:
 
 @contextlib.contextmanager
 def _held(folder: str) -> Iterator[None]:
-    """Lock a temporary folder: `datasets/store/leftovers.py` removes one that nobody holds."""
+    """Lock a temporary folder: `datasets/store/temporary_folders.py` removes one that nobody holds."""
     import fcntl
 
     handle = os.open(folder, os.O_RDONLY)

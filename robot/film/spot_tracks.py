@@ -259,12 +259,6 @@ class SpotTrack:
         return self.first + np.arange(len(self))
 
     @property
-    def seen_frames(self) -> NDArray[np.int64]:
-        """Numbers of the frames in which the spot was detected and its pixels kept: not those before `follow`."""
-        seen = self.frames[np.array(self.detected)]
-        return seen[len(seen) - len(self.windows) :]
-
-    @property
     def dark(self) -> int:
         """Frames since the last spot."""
         return next((k for k, seen in enumerate(reversed(self.detected)) if seen), len(self))
@@ -462,7 +456,7 @@ def _assigned(tracks: Sequence[SpotTrack], expected: Array, spots: FrameSpots) -
 
 
 def fitted_positions(track: SpotTrack, rig: Rig, card: SensorCard, depth_m: float = 2.5) -> FilmPositions:
-    """Positions in the frames in which a track's spot was detected, `track.seen_frames`, with their covariance.
+    """Positions in the frames in which a track's spot was detected and its pixels kept, with their covariance.
 
     The fixed pattern counts as new in every frame, and the room as a level per filter. Raw pixels only.
 

@@ -1,4 +1,4 @@
-"""Policies of others, each in a process as a method has one: `isolation.process.GuestProcess`.
+"""Policies of others, each in a process as a method has one: `isolation.guest_process.GuestProcess`.
 
 What is known and what is observed go there as pickles of ours. What comes back is JSON: seven numbers, or a sentence.
 `serve` runs in the process.
@@ -17,11 +17,11 @@ from pathlib import Path
 from typing import Any, cast
 
 from phibench.benchmark.isolation.answers import plain, to_bytes
+from phibench.benchmark.isolation.guest_process import GuestProcess
 from phibench.benchmark.isolation.isolation import Isolation
+from phibench.benchmark.isolation.method_references import MethodError, Reference, RunLimits, parsed, resolve
 from phibench.benchmark.isolation.printed_output import advised
-from phibench.benchmark.isolation.process import GuestProcess
 from phibench.benchmark.isolation.readable_files import access_of
-from phibench.benchmark.isolation.resolve import MethodError, Reference, RunLimits, parsed, resolve
 from phibench.benchmark.isolation.transport import Connection, TransportError
 from phibench.benchmark.isolation.worker import function_of_file, limited, sentence_of, size_bytes
 from phibench.robot.loop.policies import Policy

@@ -11,7 +11,7 @@ in the robot at frame i, by the arcs of the tracks back from now, and o_i, d_i t
 
 should be 0. Residuals are e_i = J_i^-1 r_i in pixels, J_i = dr_i / d(pixel). In angles, whose scale J_i depends on the
 rig, a fit would prefer rigs that make the same noise a smaller angle: by half a standard deviation in 40 frames.
-The covariance of e_i has the pixel's noise in each frame, and what frames share (`kept_frames`).
+The covariance of e_i has the pixel's noise in each frame, and what frames share (`frame_history`).
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from phibench.estimator.geometry.reflection import reflect
 from phibench.estimator.geometry.rig_parameters import RigBias, changed, stroke_of
 from phibench.robot.film.film_positions import FilmPositions
 from phibench.robot.loop.belief import ANY_TARGET, LEAST_Q, SKID, SLIP, VELOCITY, Belief, TargetBelief, TargetPrior
-from phibench.robot.loop.kept_frames import Course, FrameHistory, TrackSteps, shared_by_motion, shared_px2
+from phibench.robot.loop.frame_history import Course, FrameHistory, TrackSteps, shared_by_motion, shared_px2
 from phibench.robot.loop.sensing import Direction, angle_slopes, angles, direction_with, turned, wrapped
 from phibench.scenes.frames import Array
 from phibench.scenes.motion.vehicle import Stance, Vehicle

@@ -22,8 +22,8 @@ from phibench.scenes.rig import Rig, View
 from phibench.scenes.room import carriage
 from phibench.scenes.shapes import Mesh, Shape, Uniform
 from phibench.studies.framework import Finding
+from phibench.studies.isotropy.azimuth_errors import NORMAL_95, fitted_px, flat_pair, sideways
 from phibench.studies.isotropy.lines import moved
-from phibench.studies.isotropy.noise import NORMAL_95, fitted_px, flat_pair, sideways
 from phibench.studies.misaligned_rigs import spot_of
 
 _ROWS, _COLUMNS = 36, 72  # of the ball's mesh: chords lie up to 0.1 % of the radius inside

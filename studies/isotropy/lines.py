@@ -33,7 +33,6 @@ class Line:
     ----------
     depths_m : shape (n,)
     uv_px : shape (n, 2), exact
-    rendered_px : shape (n, 2), centroids of rendered spots; empty where none were rendered
     down_px : shape (2,)
     beside_radius_px : float
         Largest distance of the points from the line through the image of the mirror's centre and the down pixel.
@@ -49,7 +48,6 @@ class Line:
 
     depths_m: Array
     uv_px: Array
-    rendered_px: Array
     down_px: Array
     beside_radius_px: float
     beside_line_px: float
@@ -80,17 +78,15 @@ def epipolar_line(
     t = range_at(ray.origin_world_m - down.sphere_centre_m, ray.direction_world, depths_m)
     X = ray.origin_world_m + t[:, None] * ray.direction_world
     uv = seen_px(up, X)
-    rendered = centroids_px(up, X) if render else np.empty((0, 2))
     centre = outline_circle(nominal)[0]
     columns = _columns(nominal, stroke_m, down_px, uv, grid)
     return Line(
         depths_m,
         uv,
-        rendered,
         down_px,
         float(np.max(beside(uv, centre, down_px))),
         float(np.max(beside_best(uv))),
-        float(np.max(beside(rendered, centre, down_px))) if render else float("nan"),
+        float(np.max(beside(centroids_px(up, X), centre, down_px))) if render else float("nan"),
         columns[1:],
         float(np.ptp(columns)),
     )

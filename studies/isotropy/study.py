@@ -48,19 +48,7 @@ from phibench.studies.framework import (
     line_style,
     text_table,
 )
-from phibench.studies.isotropy.binocular import Binocular, Laws, tried
-from phibench.studies.isotropy.lines import (
-    STRAIGHT_PX,
-    Line,
-    epipolar_line,
-    half_width_rad,
-    hidden_share,
-    line_findings,
-    line_table,
-    lines_drawing,
-    occlusion_findings,
-)
-from phibench.studies.isotropy.noise import (
+from phibench.studies.isotropy.azimuth_errors import (
     NORMAL_95,
     AzimuthNoise,
     BaselinePair,
@@ -76,6 +64,18 @@ from phibench.studies.isotropy.noise import (
     pairs_of,
     scatter_findings,
     sideways,
+)
+from phibench.studies.isotropy.binocular import Binocular, Laws, tried
+from phibench.studies.isotropy.lines import (
+    STRAIGHT_PX,
+    Line,
+    epipolar_line,
+    half_width_rad,
+    hidden_share,
+    line_findings,
+    line_table,
+    lines_drawing,
+    occlusion_findings,
 )
 from phibench.studies.misaligned_rigs import Places, errors
 

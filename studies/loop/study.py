@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 import polars as pl
@@ -21,6 +21,7 @@ from phibench.datasets.film.moving_camera import INFO, bake_rooms
 from phibench.estimator.geometry.rig_parameters import PRIOR_SIGMA, STROKE_PARAMETERS
 from phibench.robot.loop.arena import baked_arenas
 from phibench.robot.loop.episodes import Episode, run_episodes
+from phibench.robot.loop.policies import POLICIES
 from phibench.robot.loop.simulator import Setup, Task
 from phibench.scenes.frames import Array
 from phibench.scenes.misalignment import Misalignment
@@ -50,7 +51,10 @@ BASE, STREAM = "base", "study loop"
 _NO_EFFECT = ("rim_radius_m", "vertex_radius_m", "conic", "mirror_tilt_x_rad", "mirror_tilt_y_rad")  # of a sphere
 _FEWEST = 3  # episodes of an interval
 
-PolicyName = Literal["paper", "greedy", "drive-only", "random", "oracle"]
+if TYPE_CHECKING:
+    PolicyName = str
+else:
+    PolicyName = Literal[tuple(POLICIES)]
 
 
 class LoopSettings(Settings):

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import numpy as np
 from pydantic import Field
 
-from phibench.datasets.recipe.build import build_rig, idle_mirror_keys
 from phibench.datasets.recipe.mirror_tables import SHAPES, MirrorTable
+from phibench.datasets.recipe.recipe_scene import build_rig, idle_mirror_keys
 from phibench.datasets.recipe.tables import RigTable
 from phibench.scenes.frames import Array, BoolArray
 from phibench.scenes.rig import Rig

@@ -24,7 +24,7 @@ from phibench.datasets.frames.request import Exposure
 from phibench.datasets.frames.source import FrameSource
 from phibench.datasets.read import Dataset, Sample
 from phibench.estimator.geometry.least_squares_depth import depth_general
-from phibench.estimator.methods.draw_pairs import pairs_of
+from phibench.estimator.methods.simulated_pairs import pairs_of
 from phibench.scenes.frames import Array
 from phibench.scenes.laser import Beam
 from phibench.scenes.random_streams import generator
@@ -90,7 +90,7 @@ def _sources(
     """Each sample with what draws its frames."""
     by_id = {sample.row.sample_id: sample for sample in samples}
     for pair_draw in pairs_of(dataset, samples, preset).pair_draws:
-        sample = CachedSample(by_id[pair_draw.sample_id])
+        sample = CachedSample.of(by_id[pair_draw.sample_id])
         request = replace(pair_draw.request, exposure=exposure, laser_level=laser_level)
         yield sample, sample.source(replace(pair_draw, request=request))
 

@@ -26,7 +26,7 @@ import polars as pl
 
 from phibench.benchmark.scores.intervals import NORMAL_95
 from phibench.calibration.rig.bundle import Bundle
-from phibench.calibration.rig.spots import method_for
+from phibench.calibration.rig.known_spots import method_for
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.film.film_read import Film, Films
 from phibench.datasets.film.film_store import FilmInfo

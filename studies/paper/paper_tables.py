@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from phibench.calibration.rig.file import Calibration
+from phibench.calibration.rig.calibration_file import Calibration
 from phibench.datasets.common.shown_text import TextTable
 from phibench.datasets.read import Dataset, Sample
 from phibench.estimator.geometry.least_squares_depth import GeneralDepth, depth_general

@@ -7,20 +7,27 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import numpy as np
-import polars as pl
 from pydantic import Field
 
 from phibench.calibration.outline.limb_image import PoseMeasurement
 from phibench.calibration.rig.bundle import calibrate
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.frames.sensor_card import SensorCard, sensor_card
-from phibench.estimator.geometry.rig_parameters import PARAMETERS, prior_sigmas
+from phibench.estimator.geometry.rig_parameters import (
+    PARAMETERS,
+    prior_sigmas,
+)
 from phibench.estimator.limits.best_stroke import best_stroke, spot_bound
 from phibench.estimator.limits.processed_bound import SpotSigma
-from phibench.estimator.limits.stroke_curve import StrokeCurve, Surroundings, stroke_curve, stroke_grid
+from phibench.estimator.limits.stroke_curve import (
+    StrokeCurve,
+    Surroundings,
+    stroke_curve,
+    stroke_grid,
+)
 from phibench.estimator.spots.spot_prediction import Laser
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import Rig
@@ -32,16 +39,29 @@ from phibench.studies.framework import (
     Settings,
     Study,
     StudyDatasets,
+    StudyPreset,
     StudyResult,
     canvas,
     drawn,
     error_bars,
     line_style,
 )
-from phibench.studies.stroke import rendered_checks
+from phibench.studies.stroke.perturbed_rigs import RenderedCheck, RenderedOutcome, measured
+from phibench.studies.stroke.tables import (
+    Found,
+    best_findings,
+    best_frame,
+    best_table,
+    check_findings,
+    check_frame,
+    check_table,
+    curve_frame,
+    growth_findings,
+    limit_findings,
+    reason_findings,
+)
 
 AS_BUILT, CALIBRATED, EXACT = "as built", "calibrated by the outline", "pixels alone"
-_Preset = Literal["bayer-raw", "srgb8", "mjpeg"]
 _Range = Annotated[tuple[float, float], Field(strict=False)]
 _QUALITY = 85  # of the charts' JPEG, if their preset has one: that of the study's figures
 _FREE_STROKES_M = (0.1, 6.0)  # beyond every carriage: by geometry alone the best stroke is 1.2 to 2 D
@@ -50,7 +70,7 @@ _FREE_STROKES_M = (0.1, 6.0)  # beyond every carriage: by geometry alone the bes
 class CheckSettings(Settings):
     """Frames that are drawn and evaluated."""
 
-    preset: _Preset = Field(description="of the sensor")
+    preset: StudyPreset = Field(description="of the sensor")
     depths_m: Metres = Field(description="distances")
     factors: Annotated[tuple[float, ...], Field(strict=False, min_length=1)] = Field(description="of the best stroke")
     strokes_m: _Range = Field(description="between which the best stroke is sought")
@@ -61,7 +81,7 @@ class CheckSettings(Settings):
 class StrokeSettings(Settings):
     """Settings of the study."""
 
-    preset: _Preset = Field(description="sensor of the charts")
+    preset: StudyPreset = Field(description="sensor of the charts")
     depths_m: Metres = Field(description="distances of the chart")
     spot_height_m: float = Field(ge=0.0, le=3.0, description="above the floor")
     strokes_m: _Range = Field(description="of the carriage")
@@ -86,15 +106,15 @@ def run(settings: StrokeSettings, datasets: StudyDatasets) -> StudyResult:
             d, rig, covariance_rig=rigs[name], strokes_m=settings.strokes_m, around=around, card=card, spot=spot
         )
     todo = planned(settings, rig, {k: rigs[k] for k in (AS_BUILT, EXACT)})
-    checks = datasets.map(rendered_checks.measured, todo, "stroke, frames")
+    checks = datasets.map(measured, todo, "stroke, frames")
     names, top = tuple(rigs), settings.strokes_m[1]
-    findings = [row for name in names for row in rendered_checks.best_findings(best_by_case, name, tuple(longest))]
-    findings += [row for d in longest for row in rendered_checks.growth_findings(best_by_case, d, names, top)]
+    findings = [row for name in names for row in best_findings(best_by_case, name, tuple(longest))]
+    findings += [row for d in longest for row in growth_findings(best_by_case, d, names, top)]
     built = best_by_case[AS_BUILT, next(iter(longest))]
     if math.isfinite(built.stroke_m):
-        findings += rendered_checks.reason_findings(rig, built.depth_m, settings.spot_height_m, (built.stroke_m, top))
-    findings += rendered_checks.limit_findings(_free_curves(rig, settings.depths_m, spot, card, around))
-    findings += rendered_checks.check_findings(checks)
+        findings += reason_findings(rig, built.depth_m, settings.spot_height_m, (built.stroke_m, top))
+    findings += limit_findings(_free_curves(rig, settings.depths_m, spot, card, around))
+    findings += check_findings(checks)
     return StudyResult(
         {"table": best_frame(best_by_case), "curves": curve_frame(best_by_case), "checks": check_frame(checks)},
         tuple(findings),
@@ -104,8 +124,8 @@ def run(settings: StrokeSettings, datasets: StudyDatasets) -> StudyResult:
             check_drawing(checks),
         ),
         {
-            f"Best strokes, {settings.preset}": rendered_checks.best_table(best_by_case, names, depths),
-            f"Frames, {settings.check.preset}: rms error of D with 95 % interval": rendered_checks.check_table(checks),
+            f"Best strokes, {settings.preset}": best_table(best_by_case, names, depths),
+            f"Frames, {settings.check.preset}: rms error of D with 95 % interval": check_table(checks),
         },
         _notes(settings, checks),
     )
@@ -139,7 +159,7 @@ def tolerances(rig: Rig, outline_sigma_um: Sequence[float]) -> dict[str, Array]:
     }
 
 
-def planned(settings: StrokeSettings, rig: Rig, rigs: Mapping[str, Array]) -> list[rendered_checks.RenderedCheck]:
+def planned(settings: StrokeSettings, rig: Rig, rigs: Mapping[str, Array]) -> list[RenderedCheck]:
     """Cells of the check that lie within the limits."""
     wanted, card = settings.check, sensor_card(settings.check.preset)
     taken = (wanted.preset, wanted.power_mw, wanted.draws)
@@ -154,50 +174,11 @@ def planned(settings: StrokeSettings, rig: Rig, rigs: Mapping[str, Array]) -> li
             strokes = np.array([f * best.stroke_m for f in wanted.factors])
             curve = stroke_curve(rig, d, strokes, exposure_s=card.exposure_s, stroke_sigma_m=0.0, **options)
             checks += [
-                rendered_checks.RenderedCheck(name, d, float(h), f, float(s), rows, settings.spot_height_m, *taken)
+                RenderedCheck(name, d, float(h), f, float(s), rows, settings.spot_height_m, *taken)
                 for f, h, s in zip(wanted.factors, strokes, curve.allowed_sigma_m, strict=True)
                 if math.isfinite(s)
             ]
     return checks
-
-
-def best_frame(found: rendered_checks.Found) -> pl.DataFrame:
-    """A row per tolerance and distance."""
-    keys = ("depth_m", "stroke_m", "sigma_m", "sigma_spot_m", "sigma_calibration_m", "sigma_higher_order_m")
-    rows = [
-        {
-            "tolerance": name,
-            **{key: getattr(best, key) for key in keys},
-            "near_low_m": best.near()[0],
-            "near_high_m": best.near()[1],
-            "limits": ", ".join(best.limits),
-        }
-        for (name, _), best in found.items()
-    ]
-    return pl.DataFrame(rows)
-
-
-def curve_frame(found: rendered_checks.Found) -> pl.DataFrame:
-    """A row per tolerance, distance and stroke."""
-    names = ("sigma_m", "sigma_spot_m", "sigma_calibration_m", "sigma_higher_order_m")
-    frames = [
-        pl.DataFrame(
-            {"stroke_m": c.strokes_m, **{key: getattr(c, key) for key in names}, "cause": c.causes}
-        ).with_columns(tolerance=pl.lit(name), depth_m=pl.lit(depth))
-        for (name, depth), c in ((case, best.curve) for case, best in found.items())
-    ]
-    return pl.concat(frames)
-
-
-def check_frame(checks: Sequence[rendered_checks.RenderedOutcome]) -> pl.DataFrame:
-    """A row per cell of the check."""
-    keys = ("tolerance", "depth_m", "stroke_m", "factor", "predicted_m")
-    rows = [
-        {**{key: getattr(c.check, key) for key in keys}, "rms_m": c.rms_m.value, "pairs": len(c.errors_m)}
-        | {"rms_low_m": c.rms_m.low, "rms_high_m": c.rms_m.high}
-        for c in checks
-    ]
-    return pl.DataFrame(rows)
 
 
 def _free_curves(
@@ -209,7 +190,7 @@ def _free_curves(
     return {d: stroke_curve(rig, d, grid, spot, exact, around, card.exposure_s, 0.0) for d in ends}
 
 
-def _notes(settings: StrokeSettings, checks: Sequence[rendered_checks.RenderedOutcome]) -> tuple[str, ...]:
+def _notes(settings: StrokeSettings, checks: Sequence[RenderedOutcome]) -> tuple[str, ...]:
     notes = [
         "Predictions are for a round spot over a flat white wall at 1 mW and 1/60 s, rms over 8 "
         f"azimuths; frames of the check are {settings.check.preset} at {settings.check.power_mw:g} mW, before a "
@@ -229,7 +210,7 @@ def _notes(settings: StrokeSettings, checks: Sequence[rendered_checks.RenderedOu
 # -- drawings ----------------------------------------------------------------------------------------------------------
 
 
-def best_drawing(found: rendered_checks.Found, tolerances: Sequence[str], depths_m: Sequence[float]) -> Drawing:
+def best_drawing(found: Found, tolerances: Sequence[str], depths_m: Sequence[float]) -> Drawing:
     """Best stroke and its error against the distance."""
     with canvas(10.0, 4.0) as figure:
         left, right = figure.subplots(1, 2)
@@ -255,9 +236,7 @@ def best_drawing(found: rendered_checks.Found, tolerances: Sequence[str], depths
         return drawn("best", figure, alt + ".")
 
 
-def curves_drawing(
-    found: rendered_checks.Found, tolerances: Sequence[str], longest_m: Mapping[float, float]
-) -> Drawing:
+def curves_drawing(found: Found, tolerances: Sequence[str], longest_m: Mapping[float, float]) -> Drawing:
     """Predicted error against the stroke, a panel per distance of the paper."""
     with canvas(11.0, 3.8) as figure:
         axes = figure.subplots(1, len(longest_m), squeeze=False)[0]
@@ -281,7 +260,7 @@ def curves_drawing(
         return drawn("curves", figure, alt + ".")
 
 
-def check_drawing(checks: Sequence[rendered_checks.RenderedOutcome]) -> Drawing:
+def check_drawing(checks: Sequence[RenderedOutcome]) -> Drawing:
     """Measured rms beside the prediction."""
     names = tuple(dict.fromkeys(c.check.tolerance for c in checks))
     with canvas(10.0, 3.8) as figure:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from phibench.calibration.outline.outline_fit import rig_circle
+from phibench.calibration.outline.first_circle import rig_circle
 from phibench.calibration.rig.align import sharpness
 from phibench.datasets.build.bake_task import light_map
 from phibench.datasets.frames.sensor_card import sensor_card

@@ -12,8 +12,9 @@ from helpers.formed_mirrors import formed
 from helpers.lamp_views import LAMP_ROOM, electrons, lamp_image, moments, traced_lamp
 from helpers.misaligned_cases import Case, check, draw_case
 
-from phibench.render.optics.certificate import certify, trace_spot
+from phibench.render.optics.certificate import certify
 from phibench.render.optics.spot_layer import spot_layer
+from phibench.render.optics.traced_spot import trace_spot
 from phibench.render.optics.truth import spot_truth
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.mirror import HARMONICS, Form

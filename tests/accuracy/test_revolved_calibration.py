@@ -11,7 +11,7 @@ from scipy import optimize
 
 from phibench.calibration.outline.limb_image import PoseMeasurement
 from phibench.calibration.rig.bundle import KnownSpot, apparent_outline, calibrate
-from phibench.datasets.recipe.build import build_rig
+from phibench.datasets.recipe.recipe_scene import build_rig
 from phibench.datasets.recipe.tables import RigTable
 from phibench.estimator.geometry.least_squares_depth import depth_general
 from phibench.estimator.geometry.rig_parameters import PARAMETERS, changed, prior_sigmas

@@ -16,12 +16,12 @@ import pytest
 from helpers.bench_cases import cases, outcomes, truth_itself
 from helpers.valid_files import NASTY_TEXTS, compact, digest, nested, png, public_rows, read_sealed, write_sealed
 
-from phibench.benchmark.isolation.resolve import MethodError, Reference, resolve
+from phibench.benchmark.isolation.method_references import MethodError, Reference, resolve
 from phibench.benchmark.sealed.sealed_set import read_seal
 from phibench.benchmark.sealed.submission import SealedPairs, outcomes_of, read_submission, submission
 from phibench.calibration.captures.picture_files import read_picture
 from phibench.calibration.rig.bundle import Bundle
-from phibench.calibration.rig.file import read_calibration, write_calibration
+from phibench.calibration.rig.calibration_file import read_calibration, write_calibration
 from phibench.cli.main import main
 from phibench.datasets.build.journal import Entry, FolderHead, Journal
 from phibench.datasets.build.run_tasks import held_head, refuse_other

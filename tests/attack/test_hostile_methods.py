@@ -20,12 +20,12 @@ from helpers.hostile_methods import ALL, BAD, HEADER
 from helpers.processes import processes_under
 from helpers.sandbox_pairs import SmallPairs, method_file
 
-from phibench.benchmark.isolation.resolve import RunLimits
+from phibench.benchmark.isolation.method_references import RunLimits
 from phibench.benchmark.isolation.runner import run_method
 from phibench.benchmark.reports.report import write_report
 from phibench.benchmark.scores.answer_errors import Rules
-from phibench.benchmark.scores.document import MethodCard
 from phibench.benchmark.scores.score import Scored, saved, score_outcomes
+from phibench.benchmark.scores.score_document import MethodCard
 from phibench.benchmark.scores.score_tables import print_scores
 from phibench.estimator.interface import Outcome
 

@@ -15,7 +15,7 @@ from helpers.hostile_policies import DEEDS, HEADER, REACHES, deeds
 from helpers.listeners import accepting
 from helpers.processes import processes_under
 
-from phibench.benchmark.isolation.resolve import MethodError, RunLimits, resolve
+from phibench.benchmark.isolation.method_references import MethodError, RunLimits, resolve
 from phibench.robot.loop.episodes import LOST, Episode, run_foreign
 from phibench.robot.loop.foreign_policies import PolicyFile, _action
 from phibench.robot.loop.simulator import Action, Setup, Simulator, Task
@@ -138,7 +138,7 @@ def test_a_hostile_policy_loses_its_episode_and_leaves_nothing(
 
 UNPICKLED = {
     "datasets/build/workers.py": "workers of ours",
-    "benchmark/isolation/pairs_ahead.py": "processes of ours that draw pairs",
+    "benchmark/isolation/prefetched_pairs.py": "processes of ours that draw pairs",
     "benchmark/isolation/transport.py": "pairs of ours, in the process of a method",
     "robot/loop/foreign_policies.py": "what is known and observed, in the process of a policy",
 }

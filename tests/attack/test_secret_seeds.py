@@ -16,7 +16,7 @@ from phibench.benchmark.export.pair_rows import ExportRequest
 from phibench.benchmark.sealed.sealed_set import secret_seed
 from phibench.cli.main import main
 from phibench.datasets.common.errors import DatasetError
-from phibench.datasets.exposures.draw import draw_frames
+from phibench.datasets.exposures.draw_frames import draw_frames
 from phibench.datasets.frames.frame_files import read_index
 from phibench.datasets.frames.request import FrameOptions, sample_request
 from phibench.datasets.recipe.load import load_recipe, parse_recipe, with_numbers

@@ -5,8 +5,8 @@ from __future__ import annotations
 from helpers.bench_cases import cases, outcomes, sampler, shifted
 
 from phibench.benchmark.scores.answer_errors import Rules
-from phibench.benchmark.scores.document import MethodCard
 from phibench.benchmark.scores.score import score_outcomes
+from phibench.benchmark.scores.score_document import MethodCard
 
 
 def test_score_of_500_pairs_and_8_methods(benchmark):

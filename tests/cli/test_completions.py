@@ -27,8 +27,8 @@ def completed(words: list[str], capsys: pytest.CaptureFixture[str]) -> list[str]
 
 
 def test_values_that_are_completed_are_those_that_there_are(capsys: pytest.CaptureFixture[str]) -> None:
-    from phibench.benchmark.isolation.resolve import GROUP
-    from phibench.benchmark.release.benchmark import PARTS
+    from phibench.benchmark.isolation.method_references import GROUP
+    from phibench.benchmark.release.release_parts import PARTS
     from phibench.datasets.recipe.tables import Preset
     from phibench.estimator.methods.registry import KNOWN
     from phibench.robot.loop.policies import POLICIES

@@ -34,8 +34,8 @@ from phibench.datasets.store import checksums, schema
 from phibench.datasets.store.checksums import damaged, data_files, read_checksums
 from phibench.datasets.store.documents import read_manifest
 from phibench.datasets.store.layers import read_exr
-from phibench.datasets.store.leftovers import TEMPORARY_PREFIX
 from phibench.datasets.store.schema import ManifestRow
+from phibench.datasets.store.temporary_folders import TEMPORARY_PREFIX
 from phibench.render.optics.certificate import Certificate, certify
 from phibench.render.setup.variant import asked_variant
 from phibench.scenes.laser import LaserSpot

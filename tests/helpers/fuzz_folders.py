@@ -28,15 +28,15 @@ from phibench.benchmark.export import export_make
 from phibench.benchmark.export.pair_rows import ExportRequest
 from phibench.benchmark.pair_sets.frames_set import FramesSet
 from phibench.benchmark.release import release_make
-from phibench.benchmark.release.benchmark import PARTS
 from phibench.benchmark.release.release_make import ReleaseRequest
+from phibench.benchmark.release.release_parts import PARTS
 from phibench.benchmark.reports.bench import SHIPPED
-from phibench.benchmark.scores.document import EncodedPicture, ScoreDocument
+from phibench.benchmark.scores.score_document import EncodedPicture, ScoreDocument
 from phibench.benchmark.sealed import rebuilt_score, score_check
 from phibench.calibration.captures import imported_set
 from phibench.calibration.sensor_fit import fit
 from phibench.calibration.sensor_fit.capture_folder import read_header
-from phibench.datasets.build import finished_work, run_tasks
+from phibench.datasets.build import draws_file, run_tasks
 from phibench.datasets.build.journal import Journal
 from phibench.datasets.build.run_tasks import held_head
 from phibench.datasets.common.errors import DatasetError
@@ -98,14 +98,14 @@ def _draws() -> tuple[bytes, Callable[[Path], object], Callable[[random.Random],
     recipe = replace_samples(load_recipe("bench-dev"))
     spot = {"tries": 3, "surface": "wall", "position_world_m": [1.0, 0.0, 0.5], "normal_world": [-1.0, 0.0, 0.0]}
     spot |= {"diameter_m": 0.004, "beam_direction_world": None, "causes": ["none", "none"]}
-    document = [finished_work._key(recipe, RoomFiles()), {"0": spot, "1": "there is no place"}]
+    document = [draws_file._key(recipe, RoomFiles()), {"0": spot, "1": "there is no place"}]
 
     def signed(content: Any) -> bytes:
         text = compact(content)
         return hashlib.sha256(text).hexdigest().encode() + b"\n" + text
 
     def read(path: Path) -> object:
-        return finished_work.read_draws(path.parent, recipe, RoomFiles())
+        return draws_file.read_draws(path.parent, recipe, RoomFiles())
 
     return signed(document), read, lambda rng: signed(changed(document, rng))
 

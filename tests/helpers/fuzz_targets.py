@@ -23,9 +23,9 @@ from PIL import Image
 from phibench.benchmark.dense.dense_export import read_dense_index
 from phibench.benchmark.dense.dense_records import COLUMN_TYPES
 from phibench.benchmark.dense.dense_score import records_so_far
-from phibench.benchmark.isolation.resolve import MethodError, resolve
+from phibench.benchmark.isolation.method_references import MethodError, resolve
 from phibench.benchmark.release import fetch
-from phibench.benchmark.release.benchmark import read_manifest_file
+from phibench.benchmark.release.release_parts import read_manifest_file
 from phibench.benchmark.sealed.sealed_set import secret_seed
 from phibench.calibration.captures.pair_list import read_pair_list
 from phibench.calibration.captures.picture_files import read_photo
@@ -37,7 +37,7 @@ from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.film.film_store import FilmInfo, read_document, read_spots, read_table, write_spots
 from phibench.datasets.film.film_video import read_frames, write_frames
 from phibench.datasets.frames.request import jpeg_tables
-from phibench.datasets.frames.sensor_card import SensorFile, read_sensor_file
+from phibench.datasets.frames.sensor_file import SensorFile, read_sensor_file
 from phibench.datasets.rooms.panorama_files import is_linear
 from phibench.datasets.rooms.room_files import RoomFiles
 from phibench.datasets.store.checksums import read_checksums

@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 from scipy import ndimage
 
-from phibench.datasets.recipe.build import build_rig
+from phibench.datasets.recipe.recipe_scene import build_rig
 from phibench.datasets.recipe.tables import RigTable
 from phibench.render.optics.ray_tracer import trace_pixels
 from phibench.scenes.frames import Pose, as_matrix, as_vector, rotation_xyz

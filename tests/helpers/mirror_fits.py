@@ -14,7 +14,7 @@ from helpers.sensor_light import FILTERS
 
 from phibench.datasets.exposures.expected import expected_of_light
 from phibench.datasets.frames.sensor_card import card_of
-from phibench.datasets.recipe.build import build_rig
+from phibench.datasets.recipe.recipe_scene import build_rig
 from phibench.datasets.recipe.tables import RigTable
 from phibench.estimator.geometry.status import Status
 from phibench.estimator.limits.position_bound import spot_limit

@@ -8,8 +8,9 @@ from numpy.typing import NDArray
 from phibench.render.optics.spot_layer import SpotLayer, splat
 from phibench.render.optics.spot_samples import FilmCloud
 from phibench.render.sensor.light import Light
-from phibench.render.sensor.processing import colour_corrected, tone_decoded, white_balanced
+from phibench.render.sensor.processing import _ALPHA, _BETA, colour_corrected, white_balanced
 from phibench.render.sensor.settings import Sensor
+from phibench.render.sensor.srgb import srgb_decoded
 from phibench.scenes.frames import Array
 
 FILTERS = np.array([1.0, 0.10, 0.03])
@@ -24,6 +25,15 @@ def room(size: tuple[int, int], seed: int = 7) -> Light:
     """Textured room of (height, width) with a spot right of the middle; some pixels saturate at 1/60 s."""
     rates = np.random.default_rng(seed).uniform(0.0, 8e5, (3, *size)).astype(np.float32)
     return Light(rates, spot_at(0.6 * size[1] + 0.3, 0.5 * size[0] - 0.2))
+
+
+def tone_decoded(encoded: Array, sensor: Sensor) -> Array:
+    """Linear light of encoded values: the inverse of `processing.tone_encoded`."""
+    if sensor.transfer_function == "srgb":
+        return srgb_decoded(encoded)
+    if sensor.transfer_points is not None:
+        return np.interp(encoded, *np.transpose(sensor.transfer_points)[::-1])
+    return np.where(encoded < 4.5 * _BETA, encoded / 4.5, ((encoded + _ALPHA - 1.0) / _ALPHA) ** (1.0 / 0.45))
 
 
 def electrons_from_srgb(image: NDArray[np.uint8], sensor: Sensor) -> Array:

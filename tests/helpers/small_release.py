@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from phibench.benchmark.release.benchmark import ReleasePart, content_sha256
 from phibench.benchmark.release.release_make import Released, ReleaseRequest
+from phibench.benchmark.release.release_parts import ReleasePart, content_sha256
 
 ROOT = Path(__file__).parents[2]
 

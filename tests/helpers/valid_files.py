@@ -23,11 +23,11 @@ import polars as pl
 from helpers.bench_cases import cases, outcomes, truth_itself
 from PIL import Image
 
-from phibench.benchmark.isolation.resolve import Reference
+from phibench.benchmark.isolation.method_references import Reference
 from phibench.benchmark.pair_sets.frames_set import read_truth_file, truth_text
 from phibench.benchmark.scores.answer_errors import Rules
-from phibench.benchmark.scores.document import MethodCard
 from phibench.benchmark.scores.score import score_outcomes
+from phibench.benchmark.scores.score_document import MethodCard
 from phibench.benchmark.scores.score_files import read_records, read_score, write_score
 from phibench.benchmark.sealed.sealed_set import (
     FORMAT,
@@ -39,7 +39,7 @@ from phibench.benchmark.sealed.sealed_set import (
 from phibench.benchmark.sealed.submission import SealedPairs, outcomes_of, read_submission, submission
 from phibench.calibration.captures.picture_files import read_picture
 from phibench.calibration.rig.bundle import Bundle
-from phibench.calibration.rig.file import read_calibration, write_calibration
+from phibench.calibration.rig.calibration_file import read_calibration, write_calibration
 from phibench.datasets.build import bake_task
 from phibench.datasets.build.bake_task import read_light_map
 from phibench.datasets.build.journal import Entry, FolderHead, Journal

@@ -11,9 +11,9 @@ import pytest
 
 from phibench.render.sensor.settings import sensor
 from phibench.scenes.room import default_rig
+from phibench.studies.isotropy.azimuth_errors import circle
 from phibench.studies.isotropy.binocular import Binocular, Gain, binocular_findings, gain, power, standing
 from phibench.studies.isotropy.lines import hidden_share
-from phibench.studies.isotropy.noise import circle
 
 BOTH = Binocular(default_rig(), 0.425, 2.5, 0.5)
 LIGHT = np.array([3e4, 3e4, 2e4])

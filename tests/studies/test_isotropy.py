@@ -25,6 +25,15 @@ from phibench.scenes.random_streams import generator
 from phibench.scenes.room import default_rig
 from phibench.studies.framework import StudyDatasets, read_settings
 from phibench.studies.isotropy import binocular
+from phibench.studies.isotropy.azimuth_errors import (
+    AzimuthNoise,
+    bound_m,
+    circle,
+    flat_pair,
+    isotropy,
+    scatter_findings,
+    sideways,
+)
 from phibench.studies.isotropy.lines import (
     beside,
     beside_best,
@@ -34,15 +43,6 @@ from phibench.studies.isotropy.lines import (
     hidden_share,
     moved,
     occlusion_findings,
-)
-from phibench.studies.isotropy.noise import (
-    AzimuthNoise,
-    bound_m,
-    circle,
-    flat_pair,
-    isotropy,
-    scatter_findings,
-    sideways,
 )
 from phibench.studies.isotropy.study import STUDY, edge_findings, grid_findings
 

@@ -11,7 +11,7 @@ import pytest
 from rich.console import Console
 
 from phibench.datasets.common.errors import DatasetError
-from phibench.datasets.recipe.build import build_rig
+from phibench.datasets.recipe.recipe_scene import build_rig
 from phibench.datasets.recipe.tables import RigTable
 from phibench.estimator.geometry.reflection import image_of
 from phibench.estimator.geometry.sensitivities import PARAMETERS, sensitivity

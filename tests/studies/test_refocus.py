@@ -16,7 +16,7 @@ from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.rig import Rig
 from phibench.scenes.validation import SceneError
 from phibench.studies.misaligned_rigs import Places, errors
-from phibench.studies.misalignment.interactions import FAR_M, OLD, OUTLINE, refocus, refocus_findings, thin_lens
+from phibench.studies.misalignment.refocus import FAR_M, OLD, OUTLINE, refocus, refocus_findings, thin_lens
 
 PLACES = [(row.real_depth_m, row.baseline_m) for row in load_published()]
 

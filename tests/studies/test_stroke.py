@@ -17,19 +17,17 @@ from phibench.estimator.limits.stroke_curve import CEILING, FREE, StrokeCurve
 from phibench.scenes.random_streams import generator
 from phibench.scenes.rig import Rig
 from phibench.studies.framework import Finding, StudyDatasets, read_settings
-from phibench.studies.stroke.rendered_checks import (
-    RenderedCheck,
-    RenderedOutcome,
+from phibench.studies.stroke.perturbed_rigs import RenderedCheck, RenderedOutcome, deviations
+from phibench.studies.stroke.study import AS_BUILT, CALIBRATED, EXACT, STUDY, tolerances
+from phibench.studies.stroke.tables import (
     best_findings,
     check_findings,
-    deviations,
     growth,
     growth_findings,
     limit_findings,
     reason_findings,
     theta_rad,
 )
-from phibench.studies.stroke.study import AS_BUILT, CALIBRATED, EXACT, STUDY, tolerances
 
 TINY = """
 preset = "bayer-raw"

@@ -10,7 +10,7 @@ import pytest
 
 from phibench.benchmark.dense.dense_check import judged_dense, with_exchanged
 from phibench.benchmark.dense.dense_easy import EasyDensePairs, EasyTruth, points_of
-from phibench.benchmark.isolation.check import Check
+from phibench.benchmark.isolation.method_check import Check
 from phibench.estimator.dense.dense_interface import DenseAnswer
 from phibench.estimator.geometry.reflection import image_of
 from phibench.estimator.geometry.triangulate import depth_exact

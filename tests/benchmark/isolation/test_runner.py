@@ -19,9 +19,9 @@ import pytest
 from helpers.processes import processes_under, wait_until
 from helpers.sandbox_pairs import GOOD, HEADER, SHAPE, SmallPairs, method_file
 
+from phibench.benchmark.isolation.guest_process import MethodProcess, environment
+from phibench.benchmark.isolation.method_references import MethodError, RunLimits, resolve
 from phibench.benchmark.isolation.printed_output import stack_place
-from phibench.benchmark.isolation.process import MethodProcess, environment
-from phibench.benchmark.isolation.resolve import MethodError, RunLimits, resolve
 from phibench.benchmark.isolation.runner import Harness, outcomes, run_method
 from phibench.benchmark.isolation.transport import (
     LARGEST,

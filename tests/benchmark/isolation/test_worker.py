@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 from helpers.sandbox_pairs import GOOD, SmallPairs, method_file
 
-from phibench.benchmark.isolation import resolve as resolving
-from phibench.benchmark.isolation.resolve import MethodError, resolve
+from phibench.benchmark.isolation import method_references as resolving
+from phibench.benchmark.isolation.method_references import MethodError, resolve
 from phibench.benchmark.isolation.worker import load
 
 

@@ -70,7 +70,7 @@ def test_pairs_are_the_frames_of_their_takes(dataset: Dataset, pairs: DatasetPai
     assert len(pairs) == 9
     for pair_draw in pairs.pair_draws:
         pair = pairs.pair(pair_draw.number)
-        frames = CachedSample(dataset[pair_draw.sample_id]).source(pair_draw).frames(pair_draw.draw, laser_off=True)
+        frames = CachedSample.of(dataset[pair_draw.sample_id]).source(pair_draw).frames(pair_draw.draw, laser_off=True)
         assert set(pair.images) == {"down", "up", "down_off", "up_off"}
         for name, image in pair.images.items():
             assert np.array_equal(image, frames.by_name[name].image)
@@ -95,7 +95,7 @@ def test_several_frames_are_a_mean_with_their_number_and_have_their_own_bound(da
             with pytest.raises(ValueError, match="read-only"):
                 held[0, 0] = 0
     draw = several.pair_draws[0]
-    source = CachedSample(dataset[draw.sample_id]).source(draw)
+    source = CachedSample.of(dataset[draw.sample_id]).source(draw)
     sample, side = dataset[draw.sample_id], source.sides["down"]
     row, bound = sample.row.down, several.truth(0).down.bound_px2
     spot = SpotInImage((row.u_px, row.v_px), row.electrons_per_s, row.visible)
@@ -270,7 +270,7 @@ def test_snr_squared_is_twice_the_likelihood_ratio_of_the_spot(dataset: Dataset)
     plain = with_tables(dataset, distractors=[])
     found = dataset_pairs(plain, "bayer-raw")
     pair_draw = found.pair_draws[0]
-    full = CachedSample(plain[pair_draw.sample_id]).source(pair_draw).sides["down"]
+    full = CachedSample.of(plain[pair_draw.sample_id]).source(pair_draw).sides["down"]
     side = replace(full, light=replace(full.light, laser_level=0.02))
     sample, row = plain[pair_draw.sample_id], plain[pair_draw.sample_id].row.down
     card, region = card_of(side.chain.sensor), expected_of_light(side.light, side.chain.sensor, side.chain.camera)
@@ -295,7 +295,7 @@ def test_electrons_are_those_of_the_whole_spot(dataset: Dataset, pairs: DatasetP
     mono = dataset_pairs(dataset, "mono-raw")
     for found, planes in ((mono, (1.0, 1.0, 1.0)), (pairs, (1.0, 0.0, 0.0))):
         pair_draw = found.pair_draws[0]
-        source, truth = CachedSample(dataset[pair_draw.sample_id]).source(pair_draw), found.truth(0)
+        source, truth = CachedSample.of(dataset[pair_draw.sample_id]).source(pair_draw), found.truth(0)
         side = source.sides["down"]
         assert side.light.spot is not None
         rate = side.light.spot.electrons_per_s.sum(axis=(1, 2)) @ planes

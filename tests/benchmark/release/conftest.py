@@ -6,8 +6,8 @@ import pytest
 from helpers.inline_workers import InlineWorkerPool
 from helpers.small_release import FILMS, SMALL, STARTER, Made, ask
 
-from phibench.benchmark.release.benchmark import ReleasePart, content_sha256
 from phibench.benchmark.release.release_make import release
+from phibench.benchmark.release.release_parts import ReleasePart, content_sha256
 from phibench.benchmark.sealed.sealed_set import seal
 
 

@@ -21,8 +21,8 @@ from helpers.small_release import Made, flip, snapshot
 from helpers.strange_releases import member
 
 from phibench.benchmark.export.export_make import verify_export
-from phibench.benchmark.release.benchmark import STARTER_PAIRS, Archive
 from phibench.benchmark.release.fetch import Fetched, fetch, unpack
+from phibench.benchmark.release.release_parts import STARTER_PAIRS, Archive
 from phibench.benchmark.release.release_source import SOURCE
 from phibench.benchmark.scored_dataset import open_dataset
 from phibench.benchmark.scores.score_files import read_score

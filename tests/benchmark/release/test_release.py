@@ -17,8 +17,8 @@ from helpers.small_release import SMALL, STARTER, Made, ask, flip, snapshot
 
 from phibench.benchmark.export.export_make import export_frames_sets
 from phibench.benchmark.pair_sets.frames_set import FramesSet
-from phibench.benchmark.release.benchmark import PARTS, VERSION, ReleasePart, content_sha256
 from phibench.benchmark.release.release_make import ReleaseRequest, _card, _misfit, dry_run, release
+from phibench.benchmark.release.release_parts import PARTS, VERSION, ReleasePart, content_sha256
 from phibench.benchmark.release.release_source import SOURCE
 from phibench.benchmark.scored_dataset import open_dataset
 from phibench.benchmark.sealed.sealed_set import seal

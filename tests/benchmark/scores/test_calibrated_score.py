@@ -19,7 +19,7 @@ from phibench.benchmark.scores.metrics import measure, prepared
 from phibench.benchmark.scores.records import records
 from phibench.benchmark.sealed.score_check import check_score
 from phibench.calibration.rig.bundle import Bundle
-from phibench.calibration.rig.file import Calibration, CalibrationError, read_calibration, write_calibration
+from phibench.calibration.rig.calibration_file import Calibration, CalibrationError, read_calibration, write_calibration
 from phibench.cli.main import main
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.read import Dataset, open_finished
@@ -255,7 +255,7 @@ def check_submissions(scored: Path, without: Path, file: Path, dataset: Dataset)
 
 def rewritten(file: Path, change: Callable[[dict], None]) -> None:
     """Change a file and give it the hash that fits."""
-    from phibench.calibration.rig.file import _digest
+    from phibench.calibration.rig.calibration_file import _digest
 
     raw = json.loads(file.read_text())
     change(raw)

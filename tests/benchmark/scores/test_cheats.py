@@ -31,11 +31,7 @@ from helpers.sandbox_pairs import GOOD, SmallPairs, method_file
 from phibench.benchmark.isolation.runner import Harness
 from phibench.benchmark.pair_sets.dataset_pairs import dataset_pairs
 from phibench.benchmark.scores.answer_errors import Rules
-from phibench.benchmark.scores.metrics import measure, prepared
-from phibench.benchmark.scores.records import records
-from phibench.datasets.read import open_finished
-from phibench.estimator.interface import Answer, Spot
-from phibench.estimator.limits.beyond_images import (
+from phibench.benchmark.scores.beyond_images import (
     QUANTITIES,
     TESTS,
     TIMES,
@@ -47,6 +43,10 @@ from phibench.estimator.limits.beyond_images import (
     most_found,
     searched_px2,
 )
+from phibench.benchmark.scores.metrics import measure, prepared
+from phibench.benchmark.scores.records import records
+from phibench.datasets.read import open_finished
+from phibench.estimator.interface import Answer, Spot
 from phibench.estimator.pair_set import CachedPairs, PairTruth
 from phibench.scenes.random_streams import generator
 

@@ -17,10 +17,10 @@ from phibench.benchmark.scores.compare import (
     note_on_size,
     refuse_different,
 )
-from phibench.benchmark.scores.document import MethodCard
 from phibench.benchmark.scores.metrics import METRICS
 from phibench.benchmark.scores.records import records
 from phibench.benchmark.scores.score import score_outcomes
+from phibench.benchmark.scores.score_document import MethodCard
 from phibench.benchmark.scores.score_files import read_score, write_score
 from phibench.datasets.common.errors import DatasetError
 from phibench.estimator.interface import Outcome

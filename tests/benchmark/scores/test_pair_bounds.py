@@ -25,17 +25,17 @@ from helpers.bench_cases import (
 )
 from scipy.linalg import block_diag
 
-from phibench.benchmark.isolation.resolve import resolve
+from phibench.benchmark.isolation.method_references import resolve
 from phibench.benchmark.scores.answer_errors import Rules
-from phibench.benchmark.scores.document import Flag, MethodCard
+from phibench.benchmark.scores.beyond_images import MODEL_MARGIN, RAW_MARGIN, excesses
 from phibench.benchmark.scores.metrics import METRICS, PAIR_TWINS, applies, measure, prepared
 from phibench.benchmark.scores.records import records
 from phibench.benchmark.scores.score import score_outcomes
+from phibench.benchmark.scores.score_document import Flag, MethodCard
 from phibench.benchmark.scores.score_tables import leaderboard, scores_csv, scores_json
 from phibench.estimator.geometry.least_squares_depth import joint_bound
 from phibench.estimator.geometry.phi import estimate_phi
 from phibench.estimator.geometry.triangulate import depth_exact
-from phibench.estimator.limits.beyond_images import MODEL_MARGIN, RAW_MARGIN, excesses
 from phibench.estimator.methods.registry import KNOWN
 
 RULES = Rules(resamples=199)

@@ -23,12 +23,13 @@ from phibench.benchmark.reports.figures import (
     plain_number,
     pull_histogram,
 )
-from phibench.benchmark.reports.report import Section, report_html, time_section, verdict, write_report
+from phibench.benchmark.reports.report import report_html, verdict, write_report
+from phibench.benchmark.reports.report_sections import Section, time_section
 from phibench.benchmark.reports.results_page import read_parts
 from phibench.benchmark.scores.answer_errors import Rules
 from phibench.benchmark.scores.causes import CAUSES
-from phibench.benchmark.scores.document import Declared, Flag, MethodCard
 from phibench.benchmark.scores.score import score_outcomes
+from phibench.benchmark.scores.score_document import Declared, Flag, MethodCard
 from phibench.benchmark.scores.score_files import read_score, write_score
 from phibench.benchmark.scores.score_tables import division_and_rig, scores_csv
 from phibench.cli import main as cli

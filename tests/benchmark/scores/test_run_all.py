@@ -13,9 +13,9 @@ import pytest
 from helpers.processes import quiet
 from helpers.sandbox_pairs import HEADER, method_file
 
-from phibench.benchmark.isolation import resolve as resolving
-from phibench.benchmark.isolation.process import MethodProcess
-from phibench.benchmark.isolation.resolve import GROUP, MethodError, RunLimits, resolve
+from phibench.benchmark.isolation import method_references as resolving
+from phibench.benchmark.isolation.guest_process import MethodProcess
+from phibench.benchmark.isolation.method_references import GROUP, MethodError, RunLimits, resolve
 from phibench.benchmark.isolation.runner import Harness
 from phibench.benchmark.pair_sets.dataset_pairs import TRACKS, dataset_pairs, tracks_of
 from phibench.benchmark.reports import bench as benching

@@ -12,7 +12,7 @@ import phibench
 from phibench.benchmark.export.export_make import export
 from phibench.benchmark.export.pair_rows import ExportRequest, pair_key
 from phibench.datasets.common.errors import DatasetError
-from phibench.datasets.exposures.draw import draw_frames
+from phibench.datasets.exposures.draw_frames import draw_frames
 from phibench.datasets.frames.frame_files import read_index
 from phibench.datasets.frames.request import FrameOptions
 from phibench.datasets.recipe.load import parse_recipe, recipe_text

@@ -17,16 +17,16 @@ from PIL import Image
 
 import phibench
 from phibench.benchmark.scores.answer_errors import Rules
-from phibench.benchmark.scores.document import MethodCard, ScoreDocument, results_sha256
 from phibench.benchmark.scores.metrics import METRICS
 from phibench.benchmark.scores.score import saved_each, score_methods, score_outcomes
+from phibench.benchmark.scores.score_document import MethodCard, ScoreDocument, results_sha256
 from phibench.benchmark.scores.score_files import read_records, read_score, write_score
 from phibench.benchmark.scores.score_tables import leaderboard, number, ranked
 from phibench.benchmark.scores.strata import STRATA
 from phibench.benchmark.scores.worst_images import crop, worst
 from phibench.cli import main as cli
 from phibench.datasets.common.errors import DatasetError
-from phibench.datasets.frames.sensor_card import SensorFile, write_sensor_file
+from phibench.datasets.frames.sensor_file import SensorFile, write_sensor_file
 from phibench.estimator.interface import Outcome
 
 RULES = Rules(resamples=199)

@@ -15,9 +15,9 @@ from phibench.benchmark.scores.answer_errors import Rules
 from phibench.benchmark.scores.causes import KINDS
 from phibench.benchmark.scores.compare import compare_records
 from phibench.benchmark.scores.comparison_tables import print_comparison
-from phibench.benchmark.scores.document import MethodCard
 from phibench.benchmark.scores.metrics import METRICS
 from phibench.benchmark.scores.score import isolated, score_outcomes
+from phibench.benchmark.scores.score_document import MethodCard
 from phibench.benchmark.scores.score_tables import (
     HEADS,
     cause_table,

@@ -14,8 +14,8 @@ from helpers.processes import quiet
 
 from phibench.benchmark.pair_sets.dataset_pairs import Track, dataset_pairs
 from phibench.benchmark.scores.answer_errors import Rules
-from phibench.benchmark.scores.document import MethodCard, ScoreDocument
 from phibench.benchmark.scores.score import isolated, saved, score, score_outcomes
+from phibench.benchmark.scores.score_document import MethodCard, ScoreDocument
 from phibench.benchmark.scores.score_files import read_records, read_score, write_score
 from phibench.benchmark.sealed.score_check import check_score, schema_text
 from phibench.cli import main as cli

@@ -18,7 +18,7 @@ from phibench.calibration.captures.pair_list import read_pair_list
 from phibench.calibration.outline.limb_image import PoseMeasurement
 from phibench.calibration.outline.outline_result import Outline
 from phibench.calibration.rig.bundle import apparent_vertical
-from phibench.calibration.rig.file import read_calibration
+from phibench.calibration.rig.calibration_file import read_calibration
 from phibench.cli.main import main
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.read import Sample, open_dataset

@@ -8,7 +8,7 @@ import pytest
 
 from phibench.calibration.captures.rig_file import read_rig_file
 from phibench.datasets.common.errors import DatasetError
-from phibench.datasets.recipe.build import build_rig
+from phibench.datasets.recipe.recipe_scene import build_rig
 from phibench.datasets.recipe.tables import RigTable
 from phibench.scenes.laser import Beam
 from phibench.scenes.rig import Rig

@@ -9,17 +9,12 @@ import pytest
 import scipy
 from helpers.limb_frames import drawn_rig, limb_light
 
+from phibench.calibration.outline.first_circle import circles_by_size, grey, sphere_from_circle, sphere_from_rays
 from phibench.calibration.outline.limb_image import Plane, Tap, binned, planes_of
 from phibench.calibration.outline.limb_sectors import Sectors, _medians, scatter
 from phibench.calibration.outline.outline import _approach as approach
 from phibench.calibration.outline.outline import find_outline, fit_outline, outline_at
-from phibench.calibration.outline.outline_fit import (
-    circles_by_size,
-    grey,
-    sphere_from_circle,
-    sphere_from_rays,
-    step_from,
-)
+from phibench.calibration.outline.outline_fit import step_from
 from phibench.calibration.outline.outline_result import binned_rig
 from phibench.datasets.frames.sensor_card import sensor_card
 from phibench.estimator.spots.camera_codes import linear_to_srgb, srgb_to_linear

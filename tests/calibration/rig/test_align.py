@@ -16,7 +16,7 @@ from scipy import ndimage
 from phibench.calibration.captures.picture_files import read_linear, read_picture
 from phibench.calibration.captures.rig_file import read_rig_file
 from phibench.calibration.outline.contour import aside_by_tilt_m
-from phibench.calibration.outline.outline_fit import rig_circle
+from phibench.calibration.outline.first_circle import rig_circle
 from phibench.calibration.rig.align import alignment, circle_of, distance_of, nominal_centre, sharpness
 from phibench.cli import main as cli
 from phibench.datasets.frames.sensor_card import sensor_card

@@ -14,7 +14,7 @@ from helpers.oracles import true_pixel
 from phibench.calibration.outline.limb_image import PoseMeasurement
 from phibench.calibration.outline.outline_result import Outline, mean_outline
 from phibench.calibration.rig.bundle import Bundle, KnownSpot, calibrate, seen_at
-from phibench.calibration.rig.file import CalibrationError, read_calibration, write_calibration
+from phibench.calibration.rig.calibration_file import CalibrationError, read_calibration, write_calibration
 from phibench.cli import main as cli
 from phibench.datasets.common.errors import DatasetError
 from phibench.estimator.geometry.rig_parameters import PARAMETERS, changed, has_effect, prior_sigmas, stroke_of

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from helpers.oracles import true_pixel
 
-from phibench.calibration.outline.outline_fit import rig_circle
+from phibench.calibration.outline.first_circle import rig_circle
 from phibench.calibration.rig.bundle import apparent_outline
 from phibench.calibration.rig.edge_meeting import EdgeMeeting, edge_meeting, stated_tilt, with_vertical
 from phibench.calibration.rig.vertical_edges import edges_of, find_vertical, measured_vertical, vertical_of

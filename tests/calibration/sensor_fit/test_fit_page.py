@@ -8,7 +8,7 @@ import pytest
 from helpers.sensor_captures import write_processed_capture, write_raw_capture
 
 from phibench.cli.main import main
-from phibench.datasets.frames.sensor_card import read_sensor_file
+from phibench.datasets.frames.sensor_file import read_sensor_file
 from phibench.render.sensor.settings import sensor
 
 

@@ -13,8 +13,8 @@ from helpers.folders import contents
 from helpers.inline_workers import make_inline
 from helpers.processes import SMALLEST
 
-from phibench.datasets.build import finished_work, forecast
-from phibench.datasets.build.finished_work import draws_bytes, read_draws, seen_causes, write_draws
+from phibench.datasets.build import draws_file
+from phibench.datasets.build.draws_file import draws_bytes, read_draws, seen_causes, write_draws
 from phibench.datasets.plan import sampling
 from phibench.datasets.plan.plan import Plan, make_plan
 from phibench.datasets.plan.sampling import HIDDEN
@@ -53,7 +53,7 @@ def blind(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         raise AssertionError("a room was built")
 
     monkeypatch.setattr(sampling, "room_of", refused)
-    monkeypatch.setattr(forecast, "spot_truth", refused)
+    monkeypatch.setattr("phibench.datasets.plan.pair_forecasts.spot_truth", refused)
     return
 
 
@@ -121,7 +121,7 @@ def test_draws_of_something_else_are_not_taken(folder: Path, monkeypatch: pytest
     for old, new in (("lamp_rays = 16", "lamp_rays = 8"), ("jpeg_quality = { choice = [75, 85, 95] }", "")):
         assert old in TEXT
         assert len(read_draws(folder, parse_recipe(TEXT.replace(old, new)), files)) == 10
-    monkeypatch.setattr(finished_work, "code_behind", lambda _: "other code")
+    monkeypatch.setattr(draws_file, "code_behind", lambda _: "other code")
     assert read_draws(folder, recipe_of(), files) == {}
 
 

@@ -19,9 +19,9 @@ from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.make import make
 from phibench.datasets.read import open_finished
 from phibench.datasets.store import schema
-from phibench.datasets.store.files import only_run
-from phibench.datasets.store.leftovers import TEMPORARY_PREFIX
+from phibench.datasets.store.folder_lock import only_run
 from phibench.datasets.store.provenance import _tables, closure, code_behind
+from phibench.datasets.store.temporary_folders import TEMPORARY_PREFIX
 
 RUN = (
     "import sys\nfrom phibench.datasets.make import make\n"
@@ -211,7 +211,7 @@ def start(out: Path, workers: int = 2) -> "subprocess.Popen[str]":
 
 def test_a_second_run_is_refused_and_a_killed_one_holds_nothing(tmp_path: Path) -> None:
     code = (
-        "import sys, time\nfrom pathlib import Path\nfrom phibench.datasets.store.files import only_run\n"
+        "import sys, time\nfrom pathlib import Path\nfrom phibench.datasets.store.folder_lock import only_run\n"
         "with only_run(Path(sys.argv[1])):\n    print('held', flush=True)\n    time.sleep(60)"
     )
     with subprocess.Popen([sys.executable, "-c", code, str(tmp_path)], stdout=subprocess.PIPE, text=True) as holder:

@@ -11,8 +11,8 @@ from helpers.processes import SMALLEST
 
 from phibench.cli.main import main
 from phibench.datasets.build.room_export import bounds_m, export_mesh, export_panorama, export_room
-from phibench.datasets.recipe.build import build_rig
 from phibench.datasets.recipe.load import load_recipe
+from phibench.datasets.recipe.recipe_scene import build_rig
 from phibench.datasets.recipe.room_tables import MeshTable, PanoramaTable
 from phibench.datasets.rooms.mesh_room import mesh_room
 from phibench.datasets.rooms.panorama_room import panorama_room

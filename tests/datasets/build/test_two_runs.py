@@ -17,7 +17,7 @@ from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.plan.plan import make_plan
 from phibench.datasets.recipe.load import load_recipe
 from phibench.datasets.store import checksums, files, schema
-from phibench.datasets.store.files import only_run
+from phibench.datasets.store.folder_lock import only_run
 
 
 def test_of_two_runs_that_start_together_one_wins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

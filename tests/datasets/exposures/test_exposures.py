@@ -20,13 +20,13 @@ from phibench.datasets.build.run_tasks import plan_tasks
 from phibench.datasets.common.errors import DatasetError, RecipeError
 from phibench.datasets.exposures import pair_draws as module
 from phibench.datasets.exposures.pair_draws import BOX_MARGIN_PX, CachedSample, PairDraw, pair_draws
-from phibench.datasets.frames.sensor_card import SensorFile
+from phibench.datasets.frames.sensor_file import SensorFile
 from phibench.datasets.frames.source import noise_draw
 from phibench.datasets.make import make, make_from_plan
 from phibench.datasets.plan.plan import make_plan
 from phibench.datasets.read import Dataset, open_dataset, open_finished
-from phibench.datasets.recipe.build import build_rig
 from phibench.datasets.recipe.load import load_recipe, parse_recipe, recipe_text, with_numbers
+from phibench.datasets.recipe.recipe_scene import build_rig
 from phibench.datasets.recipe.tables import Recipe, RigTable
 from phibench.datasets.store.documents import recipe_sha256
 from phibench.render.sensor.camera_chain import auto_exposed
@@ -209,7 +209,7 @@ def test_automatic_exposure_is_the_down_images_and_kept(dataset: Dataset) -> Non
     dataset = with_tables(dataset, frames={"exposure_s": "auto"})
     [pair_draw, *_] = pair_draws(dataset, "srgb8")
     assert pair_draw.request.exposure == "auto"
-    kept = CachedSample(dataset[pair_draw.sample_id])
+    kept = CachedSample.of(dataset[pair_draw.sample_id])
     sensors = [kept.source(pair_draw).sides[position].chain.sensor for position in ("down", "up")]
     alone = dataset[pair_draw.sample_id].frame_source("srgb8", exposure="auto").sides
     assert sensors[0] == sensors[1] == alone["down"].chain.sensor == alone["up"].chain.sensor

@@ -219,9 +219,9 @@ def test_without_a_spot_there_is_nothing_to_be_compared_with(dataset: Dataset) -
 def test_frames_of_a_take_hold_them(dataset: Dataset) -> None:
     """Mean of the difference with and without, over the pixels of one distractor, laser on and off."""
     pair_draw = next(t for t in pair_draws(dataset, "mono-raw"))
-    kept = CachedSample(dataset[pair_draw.sample_id])
+    kept = CachedSample.of(dataset[pair_draw.sample_id])
     bare = with_tables(dataset, distractors=[])[pair_draw.sample_id]
-    source, plain = kept.source(pair_draw), CachedSample(bare).source(pair_draw)
+    source, plain = kept.source(pair_draw), CachedSample.of(bare).source(pair_draw)
     checked = 0
     for laser in (True, False):
         frames = [s.frame("down", 0, laser).image.astype(float) for s in (source, plain)]

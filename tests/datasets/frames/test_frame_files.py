@@ -15,7 +15,7 @@ from PIL import Image
 
 from phibench.cli import main as cli
 from phibench.datasets.common.errors import DatasetError
-from phibench.datasets.exposures.draw import Drawn, draw_frames
+from phibench.datasets.exposures.draw_frames import Drawn, draw_frames
 from phibench.datasets.frames.frame_files import (
     INDEX,
     INDEX_TABLE,
@@ -179,7 +179,7 @@ def test_the_default_folder_is_beside_the_data_set(tiny_dataset: Path, tmp_path:
 def test_samples_without_a_place_for_a_region_are_named(
     tiny_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("phibench.datasets.exposures.draw.has_place", lambda spot, size: spot.pose != "h1.400")
+    monkeypatch.setattr("phibench.datasets.exposures.draw_frames.has_place", lambda spot, size: spot.pose != "h1.400")
     assert run(tiny_dataset, "--region", 8, "--out", tmp_path / "f") == 0
     out = capsys.readouterr().out
     assert f"note: {HALF} is left out: no image of the spot" in out
@@ -285,7 +285,7 @@ def test_a_frame_that_goes_while_others_are_drawn_ends_the_run(
         return draw_frames(smallest_dataset, FrameOptions("mjpeg", {}), out=tmp_path, samples=[SEEN], workers=1)
 
     with monkeypatch.context() as patch:
-        patch.setattr("phibench.datasets.exposures.draw.write_index", removing)
+        patch.setattr("phibench.datasets.exposures.draw_frames.write_index", removing)
         with pytest.raises(
             DatasetError, match=r"1 of 2 files are gone from .*-down-on-0000\.jpg.*run the same"
         ) as caught:

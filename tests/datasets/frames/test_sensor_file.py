@@ -11,13 +11,13 @@ import pytest
 from phibench.cli.main import main
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.exposures.pair_draws import pair_draws
-from phibench.datasets.frames.sensor_card import (
+from phibench.datasets.frames.sensor_card import sensor_card
+from phibench.datasets.frames.sensor_file import (
     FitTables,
     MeasuredQuantity,
     SensorFile,
     allowed_numbers,
     read_sensor_file,
-    sensor_card,
     write_sensor_file,
 )
 from phibench.datasets.read import open_dataset

@@ -11,8 +11,8 @@ import scipy
 
 from phibench.datasets.common.errors import RecipeError
 from phibench.datasets.plan.plan import RECIPE_RIG, make_plan, shard_plan
-from phibench.datasets.recipe.build import build_misalignment
 from phibench.datasets.recipe.load import RECIPES, check_recipe, load_recipe
+from phibench.datasets.recipe.recipe_scene import build_misalignment
 from phibench.datasets.recipe.tables import Recipe
 from phibench.estimator.geometry.rig_parameters import PRIOR_SIGMA
 from phibench.scenes.mirror import OF_REVOLVED

@@ -8,9 +8,9 @@ from helpers.room_files import recipe
 
 from phibench.calibration.captures.rig_file import read_rig_file
 from phibench.datasets.common.errors import DatasetError, RecipeError
-from phibench.datasets.recipe.build import HOLDER_KINDS
 from phibench.datasets.recipe.load import check_recipe, load_recipe
 from phibench.datasets.recipe.mirror_tables import HolderTable
+from phibench.datasets.recipe.recipe_scene import HOLDER_KINDS
 
 
 def with_holder(fixed: dict[str, Any], drawn: dict[str, Any] | None = None) -> dict[str, Any]:

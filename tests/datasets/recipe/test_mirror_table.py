@@ -11,9 +11,9 @@ from helpers.room_files import recipe
 
 from phibench.datasets.common.errors import RecipeError
 from phibench.datasets.recipe import mirror_tables
-from phibench.datasets.recipe.build import build_rig, fixed_conic_faults
 from phibench.datasets.recipe.load import check_recipe
 from phibench.datasets.recipe.mirror_tables import OF_SHAPES, MirrorShape, MirrorTable
+from phibench.datasets.recipe.recipe_scene import build_rig, fixed_conic_faults
 from phibench.datasets.recipe.tables import RigTable
 from phibench.datasets.store.documents import from_json, to_json
 from phibench.scenes.revolved_mirror import RevolvedMirror

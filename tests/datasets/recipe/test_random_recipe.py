@@ -17,9 +17,9 @@ from phibench.datasets.plan.sampling import (
     first_points,
     rig_table,
 )
-from phibench.datasets.recipe.build import build_rig
 from phibench.datasets.recipe.load import check_recipe, load_recipe
 from phibench.datasets.recipe.mirror_tables import DRAWN_OF_MIRROR, HolderTable
+from phibench.datasets.recipe.recipe_scene import build_rig
 from phibench.datasets.recipe.tables import DRAWABLE, RandomRigTable, Recipe
 
 UNIFORM = {"uniform": [0.1, 1.4]}

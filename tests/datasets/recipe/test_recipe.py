@@ -7,9 +7,9 @@ import pytest
 from helpers.recipes import SOUND, changed, complaints, target
 
 from phibench.datasets.common.errors import RecipeError
-from phibench.datasets.recipe.build import build_rig, build_spot
 from phibench.datasets.recipe.checks import warnings
 from phibench.datasets.recipe.load import RECIPES, check_recipe, find_recipe, load_recipe, parse_recipe
+from phibench.datasets.recipe.recipe_scene import build_rig, build_spot
 from phibench.scenes.room import c310_rig, default_rig
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from phibench.datasets.recipe.build import build_rig
+from phibench.datasets.recipe.recipe_scene import build_rig
 from phibench.datasets.recipe.tables import RigTable
 from phibench.scenes.room import RIGS
 from tools import reference_page

@@ -15,19 +15,18 @@ import numpy as np
 import pytest
 
 from phibench.datasets.common.errors import DatasetError
-from phibench.datasets.store import files, schema
+from phibench.datasets.store import files, folder_lock, schema
 from phibench.datasets.store.files import (
-    only_run,
     remove_temporary,
     require_writable,
     sha256,
-    working,
     write_atomic,
     write_bytes,
     write_text,
 )
+from phibench.datasets.store.folder_lock import only_run, working
 from phibench.datasets.store.layers import write_exr
-from phibench.datasets.store.leftovers import TEMPORARY_PREFIX, folder_for_work
+from phibench.datasets.store.temporary_folders import TEMPORARY_PREFIX, folder_for_work
 
 
 def test_bytes_text_and_hash(tmp_path: Path) -> None:
@@ -170,7 +169,7 @@ def test_a_folder_that_is_a_file_is_a_write_error(tmp_path: Path) -> None:
 
 
 HOLD = (
-    "import sys, time\nfrom pathlib import Path\nfrom phibench.datasets.store.files import working\n"
+    "import sys, time\nfrom pathlib import Path\nfrom phibench.datasets.store.folder_lock import working\n"
     "with working(Path(sys.argv[1])):\n    print('works', flush=True)\n    time.sleep(60)"
 )
 
@@ -189,7 +188,7 @@ def test_locks_leave_nothing_behind(tmp_path: Path) -> None:
 
 
 def test_a_new_run_waits_for_the_workers_of_a_killed_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(files, "PATIENCE_S", 0.2)
+    monkeypatch.setattr(folder_lock, "PATIENCE_S", 0.2)
     with subprocess.Popen([sys.executable, "-c", HOLD, str(tmp_path)], stdout=subprocess.PIPE, text=True) as worker:
         assert worker.stdout is not None
         assert worker.stdout.readline() == "works\n"

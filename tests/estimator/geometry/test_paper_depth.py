@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from phibench.estimator.geometry.paper_depth import depth_approx, depth_paper, error_eq6, error_eq7
-from phibench.estimator.geometry.status import Status, covariance_of
+from phibench.estimator.geometry.status import Status
 
 R = 0.06
 
@@ -58,6 +58,11 @@ def test_eq4_equals_the_printed_form(phi1, ratio, h):
         assert estimate.depth_m == pytest.approx(printed, rel=1e-8)
     else:
         assert estimate.status in (Status.OK, Status.DIVERGING)
+
+
+def covariance_of(sigma_1: float, sigma_2: float, correlation: float = 0.0) -> np.ndarray:
+    cross = correlation * sigma_1 * sigma_2
+    return np.array([[sigma_1**2, cross], [cross, sigma_2**2]])
 
 
 def test_eq4_is_regular_where_the_tangent_is_infinite():

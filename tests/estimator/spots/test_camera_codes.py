@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 from helpers.chain_scenes import COLLECTED, FITS, MIDDLE, ROOM, SQUARE, UNITS, scene
+from helpers.sensor_light import tone_decoded
 from PIL import Image
 
 from phibench.calibration.captures.picture_files import read_picture, sensor_choice
@@ -17,7 +18,7 @@ from phibench.estimator.geometry.status import Status
 from phibench.estimator.limits.processed_bound import chain_limit
 from phibench.estimator.processed.chain_model import chain_model, codes
 from phibench.estimator.processed.fit_chain import unrounded
-from phibench.estimator.processed.fit_jpeg import grid_px
+from phibench.estimator.processed.fit_processed import grid_px
 from phibench.estimator.spots.camera_codes import (
     coefficients,
     light_of,
@@ -53,7 +54,7 @@ def test_tone_curves_are_the_simulators(changes: dict) -> None:
     card, x = card_of(s), np.concatenate([[-0.2, 0.0, 1.0, 1.3], np.linspace(0.0, 1.0, 997)])
     np.testing.assert_allclose(tone_of(x, card), processing.tone_encoded(x, s), rtol=0, atol=1e-12)
     y = np.linspace(0.0, 1.0, 1001)
-    np.testing.assert_allclose(light_of(y, card), processing.tone_decoded(y, s), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(light_of(y, card), tone_decoded(y, s), rtol=0, atol=1e-12)
     inside, h = np.linspace(0.0003, 0.9997, 777), 1e-7  # none is a point of the table or a knee
     slope = (tone_of(inside + h, card) - tone_of(inside - h, card)) / (2 * h)
     np.testing.assert_allclose(tone_slope(inside, card), slope, rtol=1e-5)

@@ -8,7 +8,7 @@ from fractions import Fraction
 import cv2
 import numpy as np
 import pytest
-from helpers.sensor_light import electrons_from_srgb, room
+from helpers.sensor_light import electrons_from_srgb, room, tone_decoded
 from PIL import Image
 from scipy.ndimage import convolve
 
@@ -16,7 +16,7 @@ from phibench.render.sensor import processing
 from phibench.render.sensor.camera_chain import Chain
 from phibench.render.sensor.electrons import NoiseStream
 from phibench.render.sensor.light import Light
-from phibench.render.sensor.processing import rgb_from_yuyv, tone_decoded, tone_encoded, yuyv
+from phibench.render.sensor.processing import rgb_from_yuyv, tone_encoded, yuyv
 from phibench.render.sensor.settings import Sensor, SensorError, sensor
 
 STREAM = NoiseStream(("formats", 0))

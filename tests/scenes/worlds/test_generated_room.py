@@ -11,7 +11,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from phibench.datasets.recipe.build import ceiling_m
+from phibench.datasets.recipe.recipe_scene import ceiling_m
 from phibench.render.optics.faces import FaceTable, face_table
 from phibench.scenes.room import Room, chassis
 from phibench.scenes.shapes import Bitmap, Cuboid, Mesh, Prism, Rectangle, cuboid

@@ -18,6 +18,7 @@ import polars as pl
 from pydantic import AfterValidator, Field, model_validator
 
 from phibench.benchmark.scores.answer_errors import Rules
+from phibench.benchmark.scores.beyond_images import excesses
 from phibench.benchmark.scores.causes import count, count_failures
 from phibench.benchmark.scores.intervals import Estimate
 from phibench.benchmark.scores.metrics import METRICS, MetricEstimate
@@ -26,7 +27,6 @@ from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import Name
 from phibench.datasets.store.provenance import code_behind, program_version, provenance
 from phibench.datasets.store.schema import Document
-from phibench.estimator.limits.beyond_images import excesses
 
 KIND: Literal["phibench score"] = "phibench score"
 VERSION = 6

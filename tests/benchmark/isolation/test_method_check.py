@@ -13,7 +13,8 @@ import pytest
 from helpers.sandbox_pairs import HEADER, method_file
 
 from phibench.benchmark.isolation.answers import AnswerError, answer_text, checked
-from phibench.benchmark.isolation.check import (
+from phibench.benchmark.isolation.easy_pairs import EasyPairs
+from phibench.benchmark.isolation.method_check import (
     PAIRS,
     Check,
     Views,
@@ -22,8 +23,7 @@ from phibench.benchmark.isolation.check import (
     judged,
     position_fault,
 )
-from phibench.benchmark.isolation.easy_pairs import EasyPairs
-from phibench.benchmark.isolation.resolve import MethodError, RunLimits
+from phibench.benchmark.isolation.method_references import MethodError, RunLimits
 from phibench.cli import main as cli
 from phibench.estimator.geometry.phi import phi_normal, phi_ray
 from phibench.estimator.geometry.triangulate import depth_exact

@@ -109,7 +109,7 @@ class DrawnPairs:
         pair_draw = self._pair_draws[number]
         kept = self._kept
         if kept is None or kept.row.sample_id != pair_draw.sample_id:
-            kept = self._kept = CachedSample(self._samples[pair_draw.sample_id])
+            kept = self._kept = CachedSample.of(self._samples[pair_draw.sample_id])
         if self._source is None or self._source[0] != number:
             self._source = number, kept.source(pair_draw)
         return pair_draw, kept, self._source[1]

@@ -28,9 +28,9 @@ from typing import Any
 from phibench.benchmark.isolation.answers import AnswerError, checked, checked_planes, most_bytes
 from phibench.benchmark.isolation.isolation import Access, Isolation
 from phibench.benchmark.isolation.method_provenance import MOST_NAMES, OpenedFiles
+from phibench.benchmark.isolation.method_references import MethodError, Reference, RunLimits
 from phibench.benchmark.isolation.printed_output import OutputTail, advised, last_lines, stack_place
 from phibench.benchmark.isolation.readable_files import access_of
-from phibench.benchmark.isolation.resolve import MethodError, Reference, RunLimits
 from phibench.benchmark.isolation.supervisor import HUNG_UP, KILL_SECONDS, processes_in
 from phibench.benchmark.isolation.transport import (
     LEAST_BYTES,
@@ -44,7 +44,7 @@ from phibench.benchmark.isolation.transport import (
 )
 from phibench.benchmark.isolation.worker import lacks_memory
 from phibench.datasets.common.parallel import ONE_THREAD
-from phibench.datasets.store.leftovers import OwnedFolder
+from phibench.datasets.store.temporary_folders import OwnedFolder
 from phibench.estimator.dense.dense_interface import DensePair
 from phibench.estimator.interface import FAILURES, Outcome
 from phibench.scenes.validation import printable_line

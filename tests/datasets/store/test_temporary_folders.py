@@ -10,14 +10,14 @@ from pathlib import Path
 import pytest
 
 from phibench.datasets.store.files import require_writable
-from phibench.datasets.store.leftovers import OwnedFolder, remove_leftovers, remove_tree
+from phibench.datasets.store.temporary_folders import OwnedFolder, remove_leftovers, remove_tree
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="needs flock")
 
 FOLDERS = """
 import sys, time
 from pathlib import Path
-from phibench.datasets.store.leftovers import OwnedFolder
+from phibench.datasets.store.temporary_folders import OwnedFolder
 beside = OwnedFolder("seal", Path(sys.argv[1]))
 with OwnedFolder("method") as folder:
     (folder / "deep").mkdir()

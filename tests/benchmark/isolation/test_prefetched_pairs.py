@@ -17,7 +17,7 @@ import pytest
 from helpers.processes import quiet
 
 from phibench.benchmark.isolation.easy_pairs import EasyPairs
-from phibench.benchmark.isolation.pairs_ahead import PairsAhead
+from phibench.benchmark.isolation.prefetched_pairs import PairsAhead
 from phibench.benchmark.pair_sets.dataset_pairs import dataset_pairs
 from phibench.benchmark.scores import score as scoring
 from phibench.datasets.common.errors import DatasetError
@@ -157,7 +157,7 @@ def test_nothing_is_left_of_the_processes(tmp_path: Path) -> None:
     assert not any(map(is_alive, pids))
     code = (
         "import time\nfrom phibench.benchmark.isolation.easy_pairs import EasyPairs\n"
-        "from phibench.benchmark.isolation.pairs_ahead import PairsAhead\n"
+        "from phibench.benchmark.isolation.prefetched_pairs import PairsAhead\n"
         "made = PairsAhead(EasyPairs(count=9), 2)\nmade.pair(0)\n"
         "print(*(maker._process.pid for maker in made._makers), flush=True)\ntime.sleep(600)\n"
     )

@@ -1,172 +1,78 @@
-"""Frames of the study `stroke`, drawn for rigs other than the nominal one, and the findings of the study.
-
-The spot's light is rendered for every rig; the wall behind it is flat light, as strong as the lab's. A check is one
-distance, stroke and tolerance; its measured error of D is held against the predicted one.
-"""
+"""Findings and tables of the study `stroke`: best strokes, their limits, measured errors beside predicted ones."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
+import polars as pl
 
-from phibench.benchmark.scores.answer_errors import Rules
-from phibench.benchmark.scores.intervals import Clusters, Estimate, estimates, rms_of
-from phibench.estimator.geometry.least_squares_depth import depth_general
 from phibench.estimator.geometry.reflection import image_of
 from phibench.estimator.geometry.rig_parameters import (
     PARAMETERS,
     PRIOR_SIGMA,
     RIG_PARAMETERS,
-    changed,
     rig_gradient,
-    stroke_of,
 )
-from phibench.estimator.limits.best_stroke import ROOM_E_PER_S, BestStroke
-from phibench.estimator.limits.stroke_curve import FREE, StrokeCurve, covariance_root
-from phibench.estimator.methods.registry import METHODS
-from phibench.render.optics.truth import spot_truth
-from phibench.render.sensor.settings import sensor
+from phibench.estimator.limits.best_stroke import BestStroke
+from phibench.estimator.limits.stroke_curve import (
+    FREE,
+    StrokeCurve,
+)
 from phibench.scenes.frames import Array
-from phibench.scenes.laser import LaserSpot, beam_diameter_m
-from phibench.scenes.random_streams import Name, generator
-from phibench.scenes.rig import POSITIONS, Rig, Stroke
-from phibench.scenes.room import Room
-from phibench.studies.framework import Finding, Row, ends_text, text_table
-from phibench.studies.image_cutout import Shot, SpotPair, cut_region, cut_rig, drawn_pair, without_off
-
-METHOD = {"bayer-raw": "raw_maximum_likelihood", "srgb8": "chain_fit", "mjpeg": "chain_fit"}
-_NAMES: tuple[Name, ...] = ("study", "stroke")
-_ROOM = Room("wall", ())  # the robot stands in it
-_BOX_PX = 48  # of the search: the fit starts as it does with a hint
-_MARGIN_PX = 32  # around it: what the chain's stages and JPEG's units look at
-_TURN = 0.618033988749895  # golden: azimuths, and with them sub-pixel phases, never repeat
-
-
-@dataclass(frozen=True)
-class RenderedCheck:
-    """One distance, stroke and tolerance.
-
-    Attributes
-    ----------
-    tolerance : str
-    depth_m, stroke_m, factor : float
-        The stroke is `factor` times the best.
-    predicted_m : float
-        Standard deviation of D.
-    covariance : shape (p, p), of the rig's parameters; rows
-    height_m : float
-    preset : str
-    power_mw : float
-    draws : int
-    """
-
-    tolerance: str
-    depth_m: float
-    stroke_m: float
-    factor: float
-    predicted_m: float
-    covariance: tuple[tuple[float, ...], ...]
-    height_m: float
-    preset: str
-    power_mw: float
-    draws: int
-
-
-@dataclass(frozen=True)
-class RenderedOutcome:
-    """A check with what was measured.
-
-    Attributes
-    ----------
-    check : Check
-    errors_m : tuple of float
-        D of the frames minus the true one, of the pairs in which both spots were found.
-    """
-
-    check: RenderedCheck
-    errors_m: tuple[float, ...]
-
-    @cached_property
-    def rms_m(self) -> Estimate:
-        """Root mean square error with its interval, by bootstrap: errors of rigs as built have long tails."""
-        n = len(self.errors_m)
-        rms = rms_of(Clusters(np.arange(n), n), np.square(self.errors_m))
-        # ends good to some per cent
-        return estimates([rms], n, Rules(resamples=999), generator(*_NAMES, "interval"))[0]
-
-    @property
-    def fits(self) -> bool:
-        """The predicted error lies in the interval of the measured one."""
-        return self.rms_m.low <= self.check.predicted_m <= self.rms_m.high
-
-
-def measured(check: RenderedCheck) -> RenderedOutcome:
-    """Draw and evaluate all frames of a check."""
-    nominal = Rig()
-    answers = [_answer(check, nominal, k) for k in range(check.draws)]
-    given = [a for a in answers if a is not None]
-    if not given:
-        return RenderedOutcome(check, ())
-    true, down, up, C_down, C_up = (np.array(column) for column in zip(*given, strict=True))
-    depth = depth_general(nominal, check.stroke_m, down, up, C_down, C_up, np.array(check.covariance)).depth_m
-    errors = depth - true
-    return RenderedOutcome(check, tuple(errors[np.isfinite(errors)].tolist()))
-
-
-def _answer(check: RenderedCheck, nominal: Rig, draw: int) -> tuple[float, Array, Array, Array, Array] | None:
-    """True D, positions in the whole image and claimed covariances of one draw; None if a spot is not found."""
-    names = (*_NAMES, check.tolerance, f"{check.depth_m:.6f}", f"{check.stroke_m:.6f}", draw)
-    # named without the stroke: all strokes of a distance are compared on the same random rigs
-    values = deviations(np.array(check.covariance), (*_NAMES, check.tolerance, f"{check.depth_m:.6f}", draw))
-    true, stroke_m = changed(nominal, values), float(stroke_of(np.array(check.stroke_m), values))
-    spot = _spot(check, nominal, 2.0 * math.pi * (draw * _TURN % 1.0))
-    uv = [_pixel(true, stroke_m, spot, p) for p in POSITIONS]
-    camera = nominal.camera
-    region = cut_region(uv, (camera.height_px, camera.width_px), _MARGIN_PX)
-    flat = np.broadcast_to(np.array(ROOM_E_PER_S)[:, None, None], (3, *region.shape))
-    pair = SpotPair.of(cut_rig(true, region), stroke_m, spot, _ROOM, dict.fromkeys(POSITIONS, flat), str(draw))
-    seen = drawn_pair(
-        draw, Shot(sensor(check.preset)), pair, (cut_rig(nominal, region), check.stroke_m), names, _BOX_PX
-    )
-    answer = METHODS[METHOD[check.preset]](without_off(seen))
-    spots = (answer.down, answer.up)
-    if any(one.uv_px is None or one.covariance_px2 is None for one in spots):
-        return None
-    # the method saw the cutout alone: back to pixels of the whole image, for the uncut nominal rig
-    corner = np.array([region.u0_px, region.v0_px], float)
-    down, up = (np.array(one.uv_px) + corner for one in spots)
-    C_down, C_up = (np.array(one.covariance_px2) for one in spots)
-    return pair.depth_m, down, up, C_down, C_up
-
-
-def deviations(covariance: Array, names: tuple[Name, ...]) -> Array:
-    """Errors of the rig's parameters, shape (p,), normal with a covariance that may be singular."""
-    return np.asarray(covariance_root(covariance) @ generator(*names, "rig").standard_normal(len(PARAMETERS)))
-
-
-def _spot(check: RenderedCheck, rig: Rig, azimuth_rad: float) -> LaserSpot:
-    axis = rig.at(0.0).sphere_centre_m
-    away = np.array([math.cos(azimuth_rad), math.sin(azimuth_rad)])
-    x, y = (axis[:2] + check.depth_m * away).tolist()
-    place, normal, power_w = (x, y, check.height_m), (-away[0], -away[1], 0.0), 1e-3 * check.power_mw
-    return LaserSpot(place, normal, beam_diameter_m(check.depth_m), power_w=power_w)
-
-
-def _pixel(rig: Rig, stroke_m: float, spot: LaserSpot, position: str) -> tuple[float, float]:
-    truth = spot_truth(rig.at(Stroke(stroke_m).offset_m(position)), spot, ())
-    return truth.u_px, truth.v_px
-
-
-# -- findings ------------------------------------------------------------------------------------------------------
+from phibench.scenes.rig import Rig
+from phibench.studies.framework import (
+    Finding,
+    Row,
+    ends_text,
+    text_table,
+)
+from phibench.studies.stroke.perturbed_rigs import RenderedOutcome
 
 GROWS = 1.05
 """An error grows again where that of the longest stroke is so many times the smallest."""
 NEAR = 0.05  # of the smallest error: strokes within it are as good
 Found = Mapping[tuple[str, float], BestStroke]
+
+
+def best_frame(found: Found) -> pl.DataFrame:
+    """A row per tolerance and distance."""
+    keys = ("depth_m", "stroke_m", "sigma_m", "sigma_spot_m", "sigma_calibration_m", "sigma_higher_order_m")
+    rows = [
+        {
+            "tolerance": name,
+            **{key: getattr(best, key) for key in keys},
+            "near_low_m": best.near()[0],
+            "near_high_m": best.near()[1],
+            "limits": ", ".join(best.limits),
+        }
+        for (name, _), best in found.items()
+    ]
+    return pl.DataFrame(rows)
+
+
+def curve_frame(found: Found) -> pl.DataFrame:
+    """A row per tolerance, distance and stroke."""
+    names = ("sigma_m", "sigma_spot_m", "sigma_calibration_m", "sigma_higher_order_m")
+    frames = [
+        pl.DataFrame(
+            {"stroke_m": c.strokes_m, **{key: getattr(c, key) for key in names}, "cause": c.causes}
+        ).with_columns(tolerance=pl.lit(name), depth_m=pl.lit(depth))
+        for (name, depth), c in ((case, best.curve) for case, best in found.items())
+    ]
+    return pl.concat(frames)
+
+
+def check_frame(checks: Sequence[RenderedOutcome]) -> pl.DataFrame:
+    """A row per cell of the check."""
+    keys = ("tolerance", "depth_m", "stroke_m", "factor", "predicted_m")
+    rows = [
+        {**{key: getattr(c.check, key) for key in keys}, "rms_m": c.rms_m.value, "pairs": len(c.errors_m)}
+        | {"rms_low_m": c.rms_m.low, "rms_high_m": c.rms_m.high}
+        for c in checks
+    ]
+    return pl.DataFrame(rows)
 
 
 def best_findings(found: Found, tolerance: str, depths_m: Sequence[float]) -> Iterator[Finding]:

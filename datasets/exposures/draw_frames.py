@@ -18,7 +18,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.common.errors import DatasetError, whole_number
 from phibench.datasets.common.parallel import parallel_map
 from phibench.datasets.common.progress import Steps, progress_console
 from phibench.datasets.frames.frame_files import (
@@ -34,12 +34,13 @@ from phibench.datasets.frames.frame_files import (
     write_index,
     write_preview,
 )
-from phibench.datasets.frames.request import FrameOptions, FrameRequest, whole_number
+from phibench.datasets.frames.request import FrameOptions, FrameRequest
 from phibench.datasets.frames.source import Frame, FrameSource, has_place
 from phibench.datasets.read import Dataset, Sample, open_dataset, open_finished
 from phibench.datasets.store import schema
 from phibench.datasets.store.checksums import filling, read_checksums, require_files
-from phibench.datasets.store.files import sha256, working
+from phibench.datasets.store.files import sha256
+from phibench.datasets.store.folder_lock import working
 from phibench.datasets.store.provenance import code_behind
 from phibench.datasets.store.schema import ManifestRow, row_line
 from phibench.scenes.rig import POSITIONS
