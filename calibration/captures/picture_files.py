@@ -245,7 +245,7 @@ def sensor_choice(photo: Photo, given: SensorFile | None = None) -> SensorChoice
     if photo.kind == "raw" and photo.pixels.max(initial=0) > card.top_dn:
         raise ImageError(
             f"{photo.path} has DN up to {photo.pixels.max()}: the sensor's end at {card.top_dn}; give the camera's "
-            "bits and black level with --sensor"
+            "bits and black level with --sensor, or a photograph with 8 bits"
         )
     text = "" if given is not None else "; the covariance is widened by the fit's misfit where that is above 1"
     if photo.subsampling is not None:

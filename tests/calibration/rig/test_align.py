@@ -188,6 +188,9 @@ def test_what_is_no_frame_is_refused_in_one_sentence(tmp_path, capsys) -> None:
     assert cli.main(["align", str(text)]) == 2
     assert cli.main(["align", str(tmp_path / "none.png")]) == 2
     assert capsys.readouterr().err.count("\n") == 2
+    Image.fromarray(np.full((32, 32), 60_000, np.uint16)).save(text)  # a photograph of 16 bits, or DN of a mosaic
+    assert cli.main(["align", str(text)]) == 2
+    assert "--sensor, or a photograph with 8 bits" in capsys.readouterr().err
 
 
 def test_a_photograph_of_an_unknown_camera_gives_the_circle(tmp_path, capsys) -> None:
