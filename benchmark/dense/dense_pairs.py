@@ -22,6 +22,7 @@ from phibench.datasets.exposures.pair_draws import PairDraw
 from phibench.datasets.frames.sensor_card import card_of
 from phibench.datasets.frames.source import Frame, FrameSource
 from phibench.datasets.read import Dataset
+from phibench.datasets.store.schema import ManifestRow
 from phibench.estimator.dense.dense_interface import DensePair
 from phibench.estimator.geometry.reflection import image_of, up_image
 from phibench.estimator.geometry.rig_parameters import stroke_of
@@ -106,12 +107,21 @@ class DensePairs:
         Frames of each image.
     calibration : Calibration, optional
         Whose rig and stroke the pairs have, in place of the nominal ones.
+    between : bool
+        Pairs have the up images of shorter strokes, too, from the same place, rig and room.
     """
 
     def __init__(
-        self, dataset: Dataset, pair_draws: tuple[PairDraw, ...], count: int = 1, calibration: Calibration | None = None
+        self,
+        dataset: Dataset,
+        pair_draws: tuple[PairDraw, ...],
+        count: int = 1,
+        calibration: Calibration | None = None,
+        between: bool = False,
     ) -> None:
         self._drawn, self._count, self._calibration = DrawnPairs(dataset, pair_draws), count, calibration
+        self._between = between
+        self._rows = {row.sample_id: row for row in dataset.rows}
 
     def __len__(self) -> int:
         return len(self._drawn)
@@ -124,7 +134,14 @@ class DensePairs:
         """Pickle without layers: another process opens the data set itself."""
         from phibench.datasets.read import open_dataset
 
-        return _reopened, (open_dataset, self.dataset.folder, self.pair_draws, self._count, self._calibration)
+        return _reopened, (
+            open_dataset,
+            self.dataset.folder,
+            self.pair_draws,
+            self._count,
+            self._calibration,
+            self._between,
+        )
 
     @property
     def dataset(self) -> Dataset:
@@ -151,7 +168,33 @@ class DensePairs:
             }
             rig, stroke_m = self._given(sample.nominal_rig, sample.row.nominal_stroke_m)
             card = card_of(source.sides["down"].chain.sensor)
-            return DensePair.of_frames(number, frames, rig=rig, stroke_m=stroke_m, card=card)
+            pair = DensePair.of_frames(number, frames, rig=rig, stroke_m=stroke_m, card=card)
+            return self._with_between(pair) if self._between else pair
+
+    def lower(self, number: int) -> dict[float, int]:
+        """Pairs of shorter strokes with the same down view, by nominal stroke, from low to high."""
+        own = self.pair_draws[number]
+        row = self._rows[own.sample_id]
+        found: dict[float, int] = {}
+        for other, draw in enumerate(self.pair_draws):
+            there = self._rows[draw.sample_id]
+            same = (draw.preset, draw.draw) == (own.preset, own.draw) and _place(there) == _place(row)
+            if same and there.nominal_stroke_m < row.nominal_stroke_m:
+                found.setdefault(there.nominal_stroke_m, other)
+        return dict(sorted(found.items()))
+
+    def _with_between(self, pair: DensePair) -> DensePair:
+        images, heights_m = [], []
+        for stroke_m, number in self.lower(pair.number).items():
+            pair_draw, sample, source = self._drawn.drawn_from(number)
+            if card_of(source.sides["up"].chain.sensor) == pair.card:  # the same exposure and processing
+                images.append(_frame(source, "up", pair_draw.draw, 0))
+                heights_m.append(self._given(sample.nominal_rig, stroke_m)[1])
+        if not images:
+            return pair
+        stack = np.stack(images)
+        stack.flags.writeable = False
+        return replace(pair, between=stack, between_m=tuple(heights_m))
 
     def frames(self, number: int) -> dict[str, Frame]:
         """First frame of each image of a pair, with the camera's JPEG file."""
@@ -198,7 +241,8 @@ class DensePairs:
         spots = DatasetPairs(self.dataset, self.pair_draws).document()
         kept = {name: value for name, value in spots.items() if name not in ("hinted", "boxes_px", "track")}
         calibrated = {} if self._calibration is None else {"calibration": self._calibration.sha256}
-        return {**kept, "task_version": DENSE_TASK_VERSION, "frames": self._count, **calibrated}
+        between = {"between": True} if self._between else {}
+        return {**kept, "task_version": DENSE_TASK_VERSION, "frames": self._count, **calibrated, **between}
 
 
 def dense_pairs(
@@ -208,6 +252,7 @@ def dense_pairs(
     pairs: int | None = None,
     frames: int = 1,
     calibration: Calibration | None = None,
+    between: bool = False,
 ) -> DensePairs:
     """Dense pairs of a data set, in the order of its spot pairs.
 
@@ -224,6 +269,8 @@ def dense_pairs(
         Frames of each image.
     calibration : Calibration, optional
         The pairs are those of its rig, and have its rig and stroke.
+    between : bool
+        As for `DensePairs`.
 
     Raises
     ------
@@ -245,7 +292,15 @@ def dense_pairs(
     numbered = [replace(draw, number=k) for k, draw in enumerate(_distinct(chosen, draws_of_spots))]
     if pairs is not None and pairs < 1:
         raise DatasetError(f"pairs = {pairs}: must be 1 or above")
-    return DensePairs(chosen, tuple(numbered[:pairs]), frames, calibration)
+    if between and frames > 1:
+        raise DatasetError("images between come one of each height: take frames = 1 with them")
+    result = DensePairs(chosen, tuple(numbered[:pairs]), frames, calibration, between)
+    if between and not any(map(result.lower, range(len(result)))):
+        raise DatasetError(
+            f"{chosen.folder}: no two pairs have the same rig, room and down view and another stroke, so that there "
+            "are no images between; make a data set with several strokes_m in one of its [[experiments]]"
+        )
+    return result
 
 
 _ASKED_M = 2.0  # a distance in every room
@@ -276,19 +331,17 @@ def _reopened(opened: Any, folder: Path, *others: Any) -> DensePairs:
     return DensePairs(opened(folder), *others)
 
 
+def _place(row: ManifestRow) -> tuple[str, ...]:
+    """Down view of a sample, by its rigs and room."""
+    return row.rig, row.nominal_rig, row.room, row.down.view_truth_file
+
+
 def _distinct(dataset: Dataset, draws: Sequence[PairDraw]) -> list[PairDraw]:
     """Draws without those whose two views another sample has, too: the first of the manifest stands for them."""
     first: dict[tuple[Any, ...], str] = {}
     owner = {}
     for row in dataset.rows:
-        views = (
-            row.rig,
-            row.nominal_rig,
-            row.room,
-            row.nominal_stroke_m,
-            row.down.view_truth_file,
-            row.up.view_truth_file,
-        )
+        views = (*_place(row), row.nominal_stroke_m, row.up.view_truth_file)
         owner[row.sample_id] = first.setdefault(views, row.sample_id)
     return [draw for draw in draws if owner[draw.sample_id] == draw.sample_id]
 

@@ -131,11 +131,12 @@ def chosen_pairs(
     pairs: int | None = None,
     frames: int = 1,
     calibration: str | Path | None = None,
+    between: bool = False,
 ) -> DensePairs:
     """Dense pairs of a folder or of an opened data set; parameters and errors as for `dense_pairs`."""
     opened: Any = dataset if isinstance(dataset, Dataset) else open_scored(dataset)
     read = None if calibration is None else read_calibration(calibration)
-    return dense_pairs(opened, preset, draws, pairs, frames, read)
+    return dense_pairs(opened, preset, draws, pairs, frames, read, between)
 
 
 def run_dense(

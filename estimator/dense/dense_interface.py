@@ -46,9 +46,13 @@ class DensePair(FramedImages):
         Numbers of the sensor and of its processing.
     frames : mapping of image name to array, or None
         Where images are of several frames: the single ones, as `Pair.frames`.
+    between : array, shape (n, H, W, ...), or None
+        Images at heights between both, if the pair has them, as `up`: methods of a whole stroke take them.
+    between_m : tuple of float
+        Their nominal heights above the down position, from low to high.
     """
 
-    IMAGE_NAMES = ("down", "up")
+    IMAGE_NAMES = ("down", "up", "between")
 
     number: int
     down: Image = field(repr=False)
@@ -57,6 +61,8 @@ class DensePair(FramedImages):
     stroke_m: float
     card: SensorCard
     frames: Mapping[str, Image] | None = field(default=None, repr=False)
+    between: Image | None = field(default=None, repr=False)
+    between_m: tuple[float, ...] = ()
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -14,7 +14,7 @@ from phibench.estimator.dense.panorama_matchers import (
     dense_sgbm_exact,
     dense_sift,
 )
-from phibench.estimator.dense.sweep import dense_sweep
+from phibench.estimator.dense.sweep import dense_stroke, dense_sweep
 from phibench.estimator.spots.image_planes import KINDS, kind_of
 
 
@@ -98,6 +98,12 @@ _ALL = (
         dense_sweep,
         "sweep over inverse distance by the rig's own rays, then planes fitted to both images",
         "R. T. Collins, CVPR (1996); B. D. Lucas and T. Kanade, IJCAI (1981)",
+    ),
+    DenseBuiltIn(
+        "dense_stroke",
+        dense_stroke,
+        "the same over all heights of a stroke, where a pair has them (dense score --between)",
+        "M. Okutomi and T. Kanade, IEEE Trans. PAMI 15, 353 (1993)",
     ),
 )
 

@@ -1,4 +1,4 @@
-"""Built-in method `dense_sweep`: sweep over inverse distance through the rig's exact geometry, and a fit of planes.
+"""Built-in methods `dense_sweep` and `dense_stroke`: sweep over 1 / D by the rig's exact geometry, and a fit of planes.
 
 1. Cost: for each 1 / D the up image is fetched at the place where each grid point of the down panorama would be seen.
    The map is exact, so that it holds for misaligned rigs and needs no epipolar lines (R. T. Collins, CVPR 1996).
@@ -6,6 +6,10 @@
 3. Fit: the pixels' differences a - b, and their slopes by 1 / D, are fitted by planes of the room. On a plane 1 / D is
    a combination of cos(azimuth), sin(azimuth) and tan(elevation). So windows may be large, and slanted surfaces have
    no stairs. A window grows while the larger one agrees with the smaller.
+
+`dense_stroke` takes all heights of a stroke, where a pair has them: costs of all images are averaged for each 1 / D,
+and one fit explains all differences (M. Okutomi and T. Kanade, IEEE Trans. PAMI 15, 353, 1993). Short baselines leave
+no second minimum, the long one is precise.
 
 The fit's own sigma, by the residuals in its window, knows noise alone: some 0.04 px. Errors in rooms are 0.15 px in the
 middle and 2 px at 95 % of the pixels; what makes the tail was not split. So the claim adds the way between the sweep's
@@ -34,6 +38,8 @@ from phibench.estimator.geometry.reflection import room_rays
 from phibench.scenes.frames import Array, BoolArray
 
 Costs = NDArray[np.int16]
+Heights = tuple[UnrolledPair, ...]
+Differences = list[tuple[Array, Array]]  # of the down image from another one, and the slope of that by 1 / D
 _LEVEL_PX = 1.0  # by which the up image's place moves between two levels, for nine pixels of ten
 _LEVELS = (16, 144)
 _COST_WINDOW = (5, 5)
@@ -58,10 +64,21 @@ _STILL = 0.5  # share of the fit's residual below which "the same pixel" is the 
 def dense_sweep(pair: DensePair, width_px: int = WIDTH_PX) -> DenseAnswer:
     """Sweep over inverse distance and fit of planes, by the rays of the rig."""
     opencv()
-    unrolled = UnrolledPair.of(pair, width_px)
+    return _swept((UnrolledPair.of(pair, width_px),))
+
+
+def dense_stroke(pair: DensePair, width_px: int = WIDTH_PX) -> DenseAnswer:
+    """Sweep and fit over all heights of a stroke; without images between, what `dense_sweep` answers."""
+    opencv()
+    return _swept(UnrolledPair.of(pair, width_px).at_heights())
+
+
+def _swept(heights: Heights) -> DenseAnswer:
+    """Answer from the whole stroke, which comes first, and from lower heights."""
+    unrolled = heights[0]
     levels = inverse_levels(unrolled.maps)
-    start = least(aggregated(costs(unrolled, levels)), levels)
-    fit = fitted(unrolled, start, float(levels[1] - levels[0]))
+    start = least(aggregated(mean_costs(heights, levels)), levels)
+    fit = fitted(heights, start, float(levels[1] - levels[0]))
     moved = np.abs(fit.inverse - start)
     good = unrolled.seen & (moved < _MOVED * (levels[1] - levels[0])) & (fit.sigma < _WORST_FIT * fit.inverse)
     good &= ~_stands_still(unrolled, fit) & ~hidden(unrolled.maps, fit.inverse)
@@ -97,6 +114,15 @@ def costs(unrolled: UnrolledPair, levels: Array) -> Costs:
         cost += cv2.min(cv2.absdiff(down_slope, slope(there)), _CUT_CODES)
         result[:, k] = cv2.boxFilter(cost, -1, _COST_WINDOW) * _SCALE
     return result
+
+
+def mean_costs(heights: Heights, levels: Array) -> Costs:
+    """Mean of the costs with the image at each height: a level is one D, whatever the baseline."""
+    total = costs(heights[0], levels)
+    for one in heights[1:]:
+        total += costs(one, levels)  # 16 bits hold the sums of 68 images
+    total //= np.int16(len(heights))
+    return total
 
 
 def aggregated(cost: Costs) -> Costs:
@@ -165,19 +191,22 @@ class PlaneFit:
         return PlaneFit(*(np.where(agrees, new, old) for new, old in pairs)), agrees
 
 
-def fitted(unrolled: UnrolledPair, start: Array, step: float) -> PlaneFit:
-    """Planes that explain the differences between both images best, from a start; `step` is a level of 1 / D."""
-    inverse, windows = start, windows_px(unrolled.maps)
+def fitted(heights: Heights, start: Array, step: float) -> PlaneFit:
+    """Planes that explain the differences between the images best, from a start; `step` is a level of 1 / D."""
+    inverse, maps = start, heights[0].maps
+    windows = windows_px(maps)
     for _ in range(_ROUNDS):
-        there, slope = seen_at(unrolled, inverse, step)
-        difference = unrolled.down.astype(float) - there
-        fit = _planes(unrolled.maps, inverse, difference, slope, windows[0], step)
+        differences = []
+        for one in heights:
+            there, slope = seen_at(one, inverse, step)
+            differences.append((heights[0].down.astype(float) - there, slope))
+        fit = _planes(maps, inverse, differences, windows[0], step)
         larger_may = np.ones(inverse.shape, bool)
         for window in windows[1:]:
-            larger = _planes(unrolled.maps, inverse, difference, slope, window, step)
+            larger = _planes(maps, inverse, differences, window, step)
             fit, larger_may = fit.or_larger(larger, larger_may)
         moved = inverse + np.clip(fit.inverse - inverse, -1.5 * step, 1.5 * step)
-        inverse = np.clip(moved, 1e-3, 1.0 / unrolled.maps.nearest_m)
+        inverse = np.clip(moved, 1e-3, 1.0 / maps.nearest_m)
     return PlaneFit(inverse, fit.sigma, fit.variance)
 
 
@@ -200,11 +229,11 @@ def seen_at(unrolled: UnrolledPair, inverse: Array, step: float) -> tuple[Array,
     return here, (after - before) * speed
 
 
-def _planes(maps: PanoramaMaps, inverse: Array, difference: Array, slope: Array, window: int, step: float) -> PlaneFit:
-    """Least squares of difference + slope (inverse - plane) over windows around each grid point.
+def _planes(maps: PanoramaMaps, inverse: Array, differences: Differences, window: int, step: float) -> PlaneFit:
+    """Least squares of difference + slope (inverse - plane) over windows around each grid point, of all images.
 
-    Each window has an offset of its own, known to `_OFFSET`, which elimination takes out. A weak pull to the start, as
-    of one measurement with the sigma of a level, keeps windows without texture in place.
+    Each window of each image has an offset of its own, known to `_OFFSET`, which elimination takes out. A weak pull to
+    the start, as of one measurement with the sigma of a level, keeps windows without texture in place.
     """
     cv2 = opencv()
     azimuth, elevation = maps.grid.azimuths_rad[None, :], maps.grid.elevations_rad[:, None]
@@ -214,18 +243,24 @@ def _planes(maps: PanoramaMaps, inverse: Array, difference: Array, slope: Array,
         return np.asarray(cv2.boxFilter(values, cv2.CV_64F, (window, window)))
 
     pull = (_LEAST_NOISE / window / step) ** 2
-    weight = slope**2 + pull
-    told = slope * (difference + slope * inverse) + pull * inverse
-    seen = difference + slope * inverse
     free = 1.0 / (1.0 + (_LEAST_NOISE / window / _OFFSET) ** 2)
-    beside = [mean(slope * each) for each in basis]
-    level = mean(seen)
-    product = [mean(weight * basis[i] * basis[j]) - free * beside[i] * beside[j] for i, j in _UPPER]
-    right = [mean(told * each) - free * with_offset * level for each, with_offset in zip(basis, beside, strict=True)]
+    weight, told, square = np.full(inverse.shape, pull), pull * inverse, pull * inverse**2
+    offsets = []
+    for difference, slope in differences:
+        seen = difference + slope * inverse
+        weight, told, square = weight + slope**2, told + slope * seen, square + seen**2
+        offsets.append((mean(seen), [mean(slope * each) for each in basis]))
+    product = [
+        mean(weight * basis[i] * basis[j]) - sum(free * beside[i] * beside[j] for _, beside in offsets)
+        for i, j in _UPPER
+    ]
+    right = [
+        mean(told * each) - sum(free * beside[i] * level for level, beside in offsets) for i, each in enumerate(basis)
+    ]
     inverted = _inverse3(*product)
     plane = [sum(map(np.multiply, row, right)) for row in inverted]
-    left = mean(seen**2 + pull * inverse**2) - free * level**2 - sum(map(np.multiply, plane, right))
-    variance = np.maximum(left, _LEAST_NOISE**2)
+    left = mean(square) - sum(free * level**2 for level, _ in offsets) - sum(map(np.multiply, plane, right))
+    variance = np.maximum(left / len(differences), _LEAST_NOISE**2)
     spread = sum(x * sum(map(np.multiply, row, basis)) for x, row in zip(basis, inverted, strict=True)) / window**2
     sigma = np.sqrt(np.maximum(spread, 0.0) * variance)
     return PlaneFit(np.asarray(sum(map(np.multiply, plane, basis))), sigma, variance)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -203,6 +203,18 @@ class UnrolledPair:
     def of(cls, pair: DensePair, width_px: int = WIDTH_PX) -> UnrolledPair:
         """Panoramas of a width."""
         return cls(pair, maps_of(pair.rig, pair.stroke_m, width_px))
+
+    def at_heights(self) -> tuple[UnrolledPair, ...]:
+        """Pair itself, and one of the down image with each image between, on the same grid."""
+        between = [] if self.pair.between is None else list(zip(self.pair.between_m, self.pair.between, strict=True))
+        lower = [
+            UnrolledPair(
+                replace(self.pair, up=image, stroke_m=height_m, between=None, between_m=()),
+                replace(self.maps, stroke_m=height_m),
+            )
+            for height_m, image in between
+        ]
+        return self, *lower
 
     @cached_property
     def up_image(self) -> Float32:

@@ -110,6 +110,7 @@ def score(
     draws: Whole | None = None,
     pairs: Whole | None = None,
     frames: Whole = 1,
+    between: Flag = False,
     calibration: Path | None = None,
     bootstrap_seed: BootstrapSeed = 0,
     workers: PairsAtOnce = 1,
@@ -132,6 +133,8 @@ def score(
         Only so many pairs.
     frames
         Frames of each image.
+    between
+        Also images at the heights between, from pairs of shorter strokes in the same place.
     calibration
         File of `phibench calibrate`: its rig's samples, with the calibrated rig and stroke.
     out
@@ -153,7 +156,7 @@ def score(
     files = score_files(out, [MethodCard.of(name, **resolve(name, DENSE).document()) for name in method])
     for target in filter(None, files):
         require_writable(target)
-    chosen = chosen_pairs(directory, preset, draws, pairs, frames, calibration)
+    chosen = chosen_pairs(directory, preset, draws, pairs, frames, calibration, between)
     scored = run_dense(method, chosen, workers, None, bootstrap_seed, limits.of_run, files)
     for one, file in zip(scored, files, strict=True):
         if file is not None:

@@ -5,7 +5,7 @@ Not a test file.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from helpers.dense_truths import smaller
@@ -35,11 +35,14 @@ class TexturedRoom:
     seed: int = 0
     contrast: float = 12.0
     shortest_m: float = 0.35
+    stripes_m: float | None = None  # period of stripes around the room, in place of the waves
 
     def codes(self, points_m: Array) -> Array:
         """Luma at points (..., 3)."""
         rng = np.random.default_rng(self.seed)
         result = np.full(points_m.shape[:-1], 110.0)
+        if self.stripes_m is not None:
+            return result + self.contrast * np.sin(2.0 * np.pi * points_m.sum(axis=-1) / self.stripes_m)
         for _ in range(24):
             direction = rng.normal(size=3)
             wave = direction / np.linalg.norm(direction) * 2.0 * np.pi / rng.uniform(self.shortest_m, 1.2)
@@ -61,14 +64,17 @@ class TexturedRoom:
         uv = np.stack(np.meshgrid(np.arange(camera.width_px), np.arange(camera.height_px)), axis=-1).astype(float)
         return np.nan_to_num(self.codes(self.points(view, uv)))
 
-    def pair(self, rig: Rig, stroke_m: float, noise: float = 1.0) -> tuple[DensePair, Array]:
+    def pair(
+        self, rig: Rig, stroke_m: float, noise: float = 1.0, between_m: tuple[float, ...] = ()
+    ) -> tuple[DensePair, Array]:
         """Pair as 8-bit pictures with white noise, codes, and D of the down image's pixels, shape (H, W)."""
         rng = np.random.default_rng(self.seed + 1)
-        images = [self.image(rig.at(h)) for h in (0.0, stroke_m)]
+        images = [self.image(rig.at(h)) for h in (0.0, stroke_m, *between_m)]
         coded = [np.clip(np.rint(x + noise * rng.normal(size=x.shape)), 0, 255).astype(np.uint8) for x in images]
-        down, up = (np.repeat(x[..., None], 3, axis=-1) for x in coded)
+        down, up, *between = (np.repeat(x[..., None], 3, axis=-1) for x in coded)
         camera = rig.camera
         uv = np.stack(np.meshgrid(np.arange(camera.width_px), np.arange(camera.height_px)), axis=-1).astype(float)
         view = rig.at(0.0)
         depth = np.linalg.norm((self.points(view, uv) - view.sphere_centre_m)[..., :2], axis=-1)
-        return DensePair(0, down, up, rig, stroke_m, sensor_card("srgb8")), depth
+        pair = DensePair(0, down, up, rig, stroke_m, sensor_card("srgb8"))
+        return replace(pair, between=np.stack(between), between_m=between_m) if between else pair, depth

@@ -63,6 +63,27 @@ def test_truth_has_its_certificate_and_a_moved_counterpart_has_none(pairs: Dense
     assert (truth.scored & ~shown).sum() == 0
 
 
+def test_images_between_are_those_of_shorter_strokes(dataset: ScoredDataset, pairs: DensePairs) -> None:
+    """Two experiments of one lab and rig: 0.5 and 1.4 m from the same down view."""
+    whole = dense_pairs(dataset, "mjpeg", between=True)
+    short, long = sorted(range(2), key=lambda number: pairs.pair(number).stroke_m)
+    assert whole.pair(short).between is None
+    pair = whole.pair(long)
+    assert pair.between is not None
+    assert pair.between_m == (pairs.pair(short).stroke_m,) == (0.5,)
+    assert np.array_equal(pair.between[0], pairs.pair(short).up)
+    assert np.array_equal(pair.up, pairs.pair(long).up)
+    assert whole.document()["between"] is True
+    assert not pair.between.flags.writeable
+
+
+def test_images_between_need_pairs_of_other_strokes(dataset: ScoredDataset) -> None:
+    with pytest.raises(DatasetError, match="no two pairs have the same rig, room and down view"):
+        dense_pairs(dataset[:1], "mjpeg", between=True)
+    with pytest.raises(DatasetError, match="one of each height"):
+        dense_pairs(dataset, "mjpeg", frames=2, between=True)
+
+
 def test_texture_is_that_of_the_image_without_its_noise() -> None:
     """A ramp of slope s under noise of deviation n has s^2 / n^2; a flat image has none.
 

@@ -34,6 +34,7 @@ from phibench.benchmark.isolation.transport import (
     pack,
     unpack,
 )
+from phibench.estimator.dense.dense_interface import DensePair
 from phibench.estimator.interface import FAILURES, Outcome, Pair
 from phibench.estimator.pair_set import ImageTruth, PairTruth
 
@@ -379,6 +380,17 @@ def test_images_arrive_as_they_were_and_cannot_be_written(sealed: bool, monkeypa
         with pytest.raises(ValueError, match="WRITEABLE"):
             parcel.pair.down.setflags(write=True)
         assert parcel.unchanged()
+    memory.close()
+
+
+def test_images_between_arrive_with_their_heights() -> None:
+    small, memory = SmallPairs().pair(0), MemoryFile()
+    down, up, *between = np.random.default_rng(2).integers(0, 255, (4, 6, 8, 3), np.uint8)
+    sent = DensePair(1, down, up, small.rig, 0.5, small.card, between=np.stack(between), between_m=(0.1, 0.3))
+    parcel = unpack(pack(sent, memory), SharedPages(memory.reader))
+    np.testing.assert_array_equal(parcel.pair.between, np.stack(between))
+    assert parcel.pair.between_m == (0.1, 0.3)
+    assert not parcel.pair.between.flags.writeable
     memory.close()
 
 

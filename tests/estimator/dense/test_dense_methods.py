@@ -19,7 +19,7 @@ from phibench.estimator.dense.panorama_matchers import (
     dense_sgbm_exact,
     dense_sift,
 )
-from phibench.estimator.dense.sweep import dense_sweep, hidden
+from phibench.estimator.dense.sweep import dense_stroke, dense_sweep, hidden
 from phibench.estimator.dense.unrolled_pair import luma_codes, maps_of
 from phibench.estimator.geometry.reflection import image_of, up_image
 from phibench.scenes.frames import Array
@@ -73,6 +73,25 @@ def test_the_sweep_finds_the_room(tilted: bool) -> None:
     assert np.median(np.abs(error)) < 0.007
     assert abs(np.median(error)) < 0.002
     assert answer.sigma_depth_m is not None
+
+
+def test_a_stroke_without_images_between_is_the_sweep() -> None:
+    pair, _ = room(True)
+    two, whole = dense_sweep(pair, WIDTH_PX), dense_stroke(pair, WIDTH_PX)
+    assert np.array_equal(two.depth_m, whole.depth_m, equal_nan=True)
+    assert np.array_equal(two.sigma_depth_m, whole.sigma_depth_m, equal_nan=True)
+
+
+def test_images_between_tell_one_stripe_from_the_next() -> None:
+    """Stripes of 0.4 m repeat along each wall: over 1 m of stroke several D fit two images, and one fits all four."""
+    pair, depth = TexturedRoom(stripes_m=0.4, contrast=25.0).pair(small_rig(), 1.0, between_m=(0.25, 0.5))
+    wrong = {}
+    for method in (dense_sweep, dense_stroke):
+        error = errors(method(pair, WIDTH_PX), depth)
+        assert len(error) > 0.2 * np.isfinite(depth).sum()
+        wrong[method.__name__] = float(np.mean(np.abs(error) > 0.2))
+    print(wrong)
+    assert wrong["dense_stroke"] < 0.5 * wrong["dense_sweep"]
 
 
 def test_flow_and_features_use_the_rays_of_a_tilted_rig() -> None:

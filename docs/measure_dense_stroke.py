@@ -1,0 +1,164 @@
+"""Two frames against a film of the whole stroke: `dense_sweep` and `dense_stroke` in the rooms of a data set.
+
+Usage: python docs/measure_dense_stroke.py DATASET FRAMES [EVERY] [WIDTH]
+
+Every third sample, or every EVERYth, gets three more MJPEG frames at a quarter, a half and three quarters of its
+stroke: laser off, by the sample's own rig, room, light map, sensor and exposure. They are rendered into the folder
+FRAMES, where a further run finds them. Other lights (`[[distractors]]`) are left out of them. WIDTH is that of the
+panoramas, 960 by default.
+
+Prints a row per sample, then medians and gains with intervals over samples.
+"""
+
+from __future__ import annotations
+
+import io
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from phibench.datasets.build.bake_task import bake_settings, read_light_map
+from phibench.datasets.frames.sensor_card import card_of
+from phibench.datasets.frames.source import noise_draw
+from phibench.datasets.read import Sample, open_dataset
+from phibench.datasets.store.files import write_bytes
+from phibench.estimator.dense.dense_interface import DenseAnswer, DensePair
+from phibench.estimator.dense.sweep import dense_stroke, dense_sweep
+from phibench.estimator.dense.unrolled_pair import WIDTH_PX
+from phibench.render.optics.correspondence import Correspondence
+from phibench.scenes.frames import Array
+
+PARTS = (0.25, 0.5, 0.75)
+FILMS = {"three between": PARTS}
+RECALLED = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2)
+
+
+def film(sample: Sample, folder: Path, number: int) -> dict[float, Array]:
+    """Frames between, by part of the stroke; rendered where they are not there."""
+    files = {part: folder / f"{sample.row.sample_id}-{part}.jpg" for part in PARTS}
+    for part, file in files.items():
+        if not file.is_file():
+            write_bytes(file, rendered(sample, part, number))
+    return {part: np.asarray(Image.open(io.BytesIO(file.read_bytes())).convert("RGB")) for part, file in files.items()}
+
+
+def rendered(sample: Sample, part: float, number: int) -> bytes:
+    """JPEG file of the camera at a part of the stroke."""
+    from phibench.render.room.ambient import render_ambient
+    from phibench.render.room.noise_budget import BUDGETS
+    from phibench.render.sensor.electrons import frame_stream
+    from phibench.render.sensor.light import Light
+    from phibench.render.setup.variant import activate
+
+    activate()
+    ambient, source = sample.dataset.recipe.ambient, sample.frame_source("mjpeg")
+    light_map, side = read_light_map(sample.dataset.folder, sample.row.room), source.sides["down"]
+    layer = render_ambient(
+        sample.rig.at(part * sample.row.stroke_m),
+        sample.room,
+        light_map,
+        bake_settings(ambient),
+        ambient.cells_per_pixel,
+        1000 + number,
+        budget=BUDGETS[ambient.quality],
+    )
+    planes = np.asarray(layer.electrons_per_s, np.float32)
+    light = Light(planes, lamp_level=side.light.lamp_level, laser_level=0.0, f_number=side.light.f_number)
+    return side.chain.jpeg_bytes(light, frame_stream(*source.names, f"step {part}", False, noise_draw("mjpeg", 0)))
+
+
+def with_between(pair: DensePair, frames: dict[float, Array], parts: tuple[float, ...]) -> DensePair:
+    """The pair with frames between."""
+    heights_m = tuple(part * pair.stroke_m for part in parts)
+    return replace(pair, between=np.stack([frames[part] for part in parts]), between_m=heights_m)
+
+
+def pair_of(sample: Sample) -> DensePair:
+    """Dense pair of a sample, as `dense_pairs` makes it."""
+    source = sample.frame_source("mjpeg")
+    down, up = (source.frame(position, laser=False).image for position in ("down", "up"))
+    card = card_of(source.sides["down"].chain.sensor)
+    return DensePair(0, down, up, sample.nominal_rig, sample.row.nominal_stroke_m, card)
+
+
+def relative(answer: DenseAnswer, found: Correspondence) -> Array:
+    """Relative errors, NaN where there is no answer or the point is not in both images."""
+    assert answer.depth_m is not None
+    return np.where(found.seen, answer.depth_m / found.depth_m - 1.0, np.nan)
+
+
+def numbers(error: Array, pixels: int) -> dict[str, float]:
+    """Metrics of one answer, per cent."""
+    size = np.abs(error[np.isfinite(error)])
+    found = {"answered": len(size) / pixels, "median": np.median(size), "above 10 %": np.mean(size > 0.1)}
+    found["recall"] = np.mean([np.count_nonzero(size <= limit) for limit in RECALLED]) / pixels
+    return {name: 100.0 * float(value) for name, value in found.items()}
+
+
+def claims(answer: DenseAnswer) -> Array:
+    """Relative sigma."""
+    assert answer.depth_m is not None
+    assert answer.sigma_depth_m is not None
+    return answer.sigma_depth_m / answer.depth_m
+
+
+def surest(error: Array, claim: Array, count: int) -> float:
+    """Median size of the so many errors with the least claims."""
+    known = np.flatnonzero(np.isfinite(error))
+    order = np.argsort(claim.reshape(-1)[known], kind="stable")[:count]
+    return float(np.median(np.abs(error.reshape(-1)[known[order]])))
+
+
+def told(name: str, values: list[float]) -> str:
+    """Median and mean with intervals over samples."""
+    draws = np.random.default_rng(1).choice(values, (4000, len(values)))
+    parts = []
+    for word, of in (("median", np.median), ("mean", np.mean)):
+        low, high = np.percentile(of(draws, axis=1), [2.5, 97.5])
+        parts.append(f"{word} {of(values):.3f} ({low:.3f} to {high:.3f})")
+    return f"{name}: {', '.join(parts)}, of {len(values)}"
+
+
+def main() -> None:
+    """Print the figures."""
+    dataset, folder = open_dataset(sys.argv[1]), Path(sys.argv[2])
+    every = int(sys.argv[3]) if len(sys.argv) > 3 else 3
+    width_px = int(sys.argv[4]) if len(sys.argv) > 4 else WIDTH_PX
+    kept: dict[str, list[float]] = {}
+    for number in range(0, len(dataset), every):
+        sample = dataset[number]
+        pair, truth = pair_of(sample), sample.correspondence()
+        frames = film(sample, folder, number)
+        asked = {"two": pair, **{name: with_between(pair, frames, parts) for name, parts in FILMS.items()}}
+        found, claimed = {}, {}
+        for name, one in asked.items():
+            begin = time.process_time()
+            answer = (dense_stroke if one.between_m else dense_sweep)(one, width_px)
+            seconds = time.process_time() - begin
+            found[name], claimed[name] = relative(answer, truth), claims(answer)
+            row = {**numbers(found[name], int(truth.seen.sum())), "CPU s": seconds}
+            for key, value in row.items():
+                kept.setdefault(f"{name}: {key}", []).append(value)
+        for name in FILMS:
+            both = np.isfinite(found["two"]) & np.isfinite(found[name])
+            ratio = np.median(np.abs(found[name][both])) / np.median(np.abs(found["two"][both]))
+            kept.setdefault(f"{name} over two, median at the same pixels", []).append(float(ratio))
+            count = min(int(np.isfinite(found[one]).sum()) for one in ("two", name))
+            same = surest(found[name], claimed[name], count) / surest(found["two"], claimed["two"], count)
+            kept.setdefault(f"{name} over two, median at the same share", []).append(same)
+            gain = kept[f"{name}: recall"][-1] - kept["two: recall"][-1]
+            kept.setdefault(f"{name} less two, recall, points", []).append(gain)
+            less = kept[f"{name}: above 10 %"][-1] - kept["two: above 10 %"][-1]
+            kept.setdefault(f"{name} less two, above 10 %, points", []).append(less)
+        shown = "; ".join(f"{key} {values[-1]:.3g}" for key, values in kept.items() if "CPU" not in key)
+        print(f"{sample.row.sample_id}, h = {pair.stroke_m:.2f} m: {shown}", flush=True)
+    for name, values in kept.items():
+        print(told(name, values))
+
+
+if __name__ == "__main__":
+    main()
