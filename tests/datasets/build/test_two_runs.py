@@ -16,7 +16,7 @@ from phibench.datasets.build.journal import FolderHead, Journal
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.plan.plan import make_plan
 from phibench.datasets.recipe.load import load_recipe
-from phibench.datasets.store import checksums, files, schema
+from phibench.datasets.store import checksums, folder_lock, schema
 from phibench.datasets.store.folder_lock import only_run
 
 
@@ -24,7 +24,7 @@ def test_of_two_runs_that_start_together_one_wins(tmp_path: Path, monkeypatch: p
     """A short form of `tests/attack/test_starts.py`, by threads: who is refused must not disturb who is not."""
     plan, rounds, outcomes = make_plan(load_recipe(SMALLEST)), 15, [[""] * 15, [""] * 15]
     start = threading.Barrier(2)
-    monkeypatch.setattr(files, "_AT_ONCE_S", 0.02)
+    monkeypatch.setattr(folder_lock, "_AT_ONCE_S", 0.02)
 
     def one(me: int) -> None:
         for number in range(rounds):
@@ -67,7 +67,7 @@ def test_of_two_runs_that_start_together_one_wins(tmp_path: Path, monkeypatch: p
 def test_a_lock_that_does_not_tell_its_holder_is_no_wrong_process(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str, told: str
 ) -> None:
-    monkeypatch.setattr(files, "_NAMED_S", 0.06)
+    monkeypatch.setattr(folder_lock, "_NAMED_S", 0.06)
     with only_run(tmp_path):
         (tmp_path / schema.LOCK).write_text(text)
         with pytest.raises(DatasetError, match="another run") as caught, only_run(tmp_path):
