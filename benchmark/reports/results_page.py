@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import textwrap
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -293,10 +293,19 @@ def results_html(parts: Sequence[ScoreGroup], by: str = "phi") -> str:
 def _source_rows(parts: Sequence[ScoreGroup]) -> Iterator[tuple[str, ...]]:
     for part in parts:
         first = part.scores[0]
-        programs = sorted({score.program or "not told" for score in part.scores})
+        programs = told_programs({score.program or "not told" for score in part.scores})
         digest = str(first.pair_set.get("dataset_sha256"))[:12]
         cells = (part.title, first.pair_set.get("name"), first.pairs, first.samples, first.pair_set.get("task_version"))
-        yield (*map(str, cells), digest, ", ".join(programs))
+        yield (*map(str, cells), digest, programs)
+
+
+def told_programs(programs: Iterable[str]) -> str:
+    """Programs of scores, the commits of one version together."""
+    commits: dict[str, list[str]] = {}
+    for program in sorted(programs):
+        version, _, commit = program.partition(" (commit ")
+        commits.setdefault(version, []).extend(filter(None, [commit.removesuffix(")")]))
+    return ", ".join(f"{version} (commit {', '.join(some)})" if some else version for version, some in commits.items())
 
 
 def results_document(parts: Sequence[ScoreGroup]) -> dict[str, Any]:

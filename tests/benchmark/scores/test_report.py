@@ -25,7 +25,7 @@ from phibench.benchmark.reports.figures import (
 )
 from phibench.benchmark.reports.report import report_html, verdict, write_report
 from phibench.benchmark.reports.report_sections import Section, time_section
-from phibench.benchmark.reports.results_page import read_parts
+from phibench.benchmark.reports.results_page import read_parts, told_programs
 from phibench.benchmark.scores.answer_errors import Rules
 from phibench.benchmark.scores.causes import CAUSES
 from phibench.benchmark.scores.score import score_outcomes
@@ -477,3 +477,9 @@ def test_scores_in_the_formats_of_others(tmp_path, capsys):
     assert "give ORGANIZATION/NAME" in capsys.readouterr().err
     assert cli.main([*words[:-2]]) == 2
     assert "--records needs --dataset-id and --organization" in capsys.readouterr().err
+
+
+def test_commits_of_one_version_are_told_together() -> None:
+    programs = ["phibench 0.6.0 (commit bb)", "phibench 0.5.0 (commit cc)", "phibench 0.6.0 (commit aa)", "not told"]
+    told = "not told, phibench 0.5.0 (commit cc), phibench 0.6.0 (commit aa, bb)"
+    assert told_programs(set(programs)) == told
