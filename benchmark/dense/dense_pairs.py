@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -93,6 +93,25 @@ class DenseTruth:
         """Elevation of the room points above the sphere centre at the down position, shape (H, W)."""
         down = self.true_rig.at(0.0).sphere_centre_m
         return np.asarray(np.arctan2(self.found.point_world_m[..., 2] - down[2], self.depth_m))
+
+
+class DensePairSet(Protocol):
+    """Dense pairs that can be scored, whatever they lie in."""
+
+    @property
+    def folders(self) -> tuple[Path, ...]:
+        """Folders with the truth, which methods must not read."""
+
+    def __len__(self) -> int: ...
+
+    def pair(self, number: int) -> DensePair:
+        """Images as a method sees them."""
+
+    def truth(self, number: int) -> DenseTruth:
+        """Exact answer for every pixel."""
+
+    def document(self) -> dict[str, Any]:
+        """Provenance of the set."""
 
 
 class DensePairs:

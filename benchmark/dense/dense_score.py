@@ -29,7 +29,7 @@ from phibench.benchmark.dense.dense_document import (
     dense_document,
     statistic_of_dense,
 )
-from phibench.benchmark.dense.dense_pairs import DensePairs, DenseTruth, dense_pairs
+from phibench.benchmark.dense.dense_pairs import DensePairs, DensePairSet, DenseTruth, dense_pairs
 from phibench.benchmark.dense.dense_records import COLUMN_TYPES, TruthErrors, pair_records
 from phibench.benchmark.isolation.method_references import DENSE, MethodError, RunLimits, code_of_function, resolve
 from phibench.benchmark.isolation.runner import Harness, Ran, asked_here, function_name, ran_here
@@ -141,7 +141,7 @@ def chosen_pairs(
 
 def run_dense(
     references: Sequence[str],
-    pairs: DensePairs,
+    pairs: DensePairSet,
     workers: int = 1,
     console: Console | None = None,
     seed: int = 0,
@@ -192,7 +192,7 @@ def _asked(harness: Harness, shown: _Shown, workers: int, done: int) -> Iterator
 class _Shown:
     """Pairs and truths of a set for several threads: one is made at a time."""
 
-    def __init__(self, pairs: DensePairs) -> None:
+    def __init__(self, pairs: DensePairSet) -> None:
         self._pairs, self._lock = pairs, threading.Lock()
 
     def __len__(self) -> int:
@@ -226,7 +226,7 @@ class _SoFar:
 
     @classmethod
     def of(
-        cls, files: Sequence[Path | None], cards: Sequence[MethodCard], pairs: DensePairs, limits: RunLimits
+        cls, files: Sequence[Path | None], cards: Sequence[MethodCard], pairs: DensePairSet, limits: RunLimits
     ) -> _SoFar:
         """Files of methods, in their order."""
         known = [_so_far(file) for file in files if file is not None]
@@ -270,7 +270,7 @@ def _so_far(file: Path) -> Path:
 
 
 def _records(
-    pairs: DensePairs | _Shown,
+    pairs: DensePairSet | _Shown,
     asked: Iterable[tuple[Outcome, ...]],
     rows: list[list[pl.DataFrame]],
     told: Callable[[int], None],
@@ -297,7 +297,7 @@ def _on_raw(preset: str) -> str:
 
 def _scored(
     card: MethodCard,
-    pairs: DensePairs,
+    pairs: DensePairSet,
     table: pl.DataFrame,
     seed: int,
     limits: Mapping[str, Any],

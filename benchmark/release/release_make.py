@@ -23,8 +23,17 @@ from typing import IO
 
 from rich.console import Console
 
+from phibench.benchmark.export.dense_set import (
+    DENSE_SEAL,
+    DENSE_SET,
+    first_pairs,
+    pairs_of_sealed,
+    seal_dense_set,
+    write_dense_set,
+)
 from phibench.benchmark.export.export_make import export_frames_sets
 from phibench.benchmark.release.release_parts import (
+    DENSE_PAIRS,
     FORMAT,
     MANIFEST,
     STARTER_PAIRS,
@@ -50,6 +59,7 @@ from phibench.datasets.film.film_make import make_films
 from phibench.datasets.film.film_plan import film_plans
 from phibench.datasets.film.film_store import INFO as FILM_INFO
 from phibench.datasets.make import cost, make
+from phibench.datasets.read import open_finished
 from phibench.datasets.recipe.load import parse_recipe, recipe_files, with_numbers
 from phibench.datasets.store import schema
 from phibench.datasets.store.checksums import differing_files, filling, read_checksums, signed, write_documents
@@ -68,6 +78,8 @@ _SEAL = "seal.json"
 _IMAGE_BYTES, _IMAGES = 730_000, 4  # of a sealed pair at 1280 x 720; the mean of 40 pairs in three presets
 _PAIR_BYTES = {"mjpeg": 450_000, "srgb8": 4_230_000, "bayer-raw": 4_570_000}  # of dev's first pairs, four images each
 _SET_BYTES = 500_000  # of the documents of a frames set, about
+_DENSE_BYTES = {"dense": 4_000_000, "sealed-dense": 250_000}  # of a pair, with and without planes of truth
+_FIRST_SAMPLES = ("frames", "dense")  # kinds that show a part of another data set, whatever more it has
 
 
 @dataclass(frozen=True)
@@ -99,7 +111,7 @@ class ReleaseRequest:
         own = part.samples
         if own is None or self.samples is None:
             return own
-        return min(own, self.samples) if part.kind == "frames" else self.samples
+        return min(own, self.samples) if part.kind in _FIRST_SAMPLES else self.samples
 
     def source_of(self, part: ReleasePart) -> ReleasePart | None:
         """Part of this release whose frames a part shows, if it is asked for, too."""
@@ -158,7 +170,7 @@ def dry_run(request: ReleaseRequest) -> Iterator[str]:
         done = used.get(part.title, request.work / part.title)
         samples = request.samples_of(part)
         count = "" if samples is None else f"{samples} samples, "
-        if part.kind == "frames":
+        if part.kind == "frames" or part.kind in _DENSE_BYTES:
             yield f"{part.title}: {count}{_frames_cost(request, part, part.title in used)}"
         elif (done / schema.CHECKSUMS).is_file() and part.kind != "sealed":
             size = sum((done / name).stat().st_size for name in _members(part, done) if (done / name).is_file())
@@ -181,7 +193,10 @@ def _film_cost(part: ReleasePart) -> str:
 
 
 def _frames_cost(request: ReleaseRequest, part: ReleasePart, is_there: bool) -> str:
-    size = sum(_SET_BYTES + _PAIR_BYTES[preset] * count for preset, count in request.frames_of(part).items())
+    if part.kind in _DENSE_BYTES:
+        size = _DENSE_BYTES[part.kind] * min(DENSE_PAIRS, request.samples_of(part) or DENSE_PAIRS)
+    else:
+        size = sum(_SET_BYTES + _PAIR_BYTES[preset] * count for preset, count in request.frames_of(part).items())
     told = f"about {megabytes(size)}, frames of {part.rendered}"
     if is_there or request.source_of(part) is not None:
         return told
@@ -203,7 +218,7 @@ def _check_folders(request: ReleaseRequest) -> None:
             parse_recipe(
                 with_numbers(part.text(), str(part.recipe), samples, None), str(part.recipe), recipe_files(part.recipe)
             )
-    sealed = [part.name for part in request.parts if part.kind == "sealed"]
+    sealed = [part.name for part in request.parts if part.is_sealed]
     if request.secret_seed is None and sealed:
         raise DatasetError(f"part {sealed[0]} is sealed: give --secret-seed FILE, which is made if it is not there")
     if request.secret_seed is not None and (seed := request.secret_seed.resolve()).is_relative_to(out):
@@ -230,7 +245,7 @@ def _claimed(out: Path) -> Manifest:
 
 def _seed(request: ReleaseRequest, part: ReleasePart, make_it: bool = True) -> int | None:
     """Seed of a part: the recipe's, or the secret one. None if that is still to be drawn."""
-    if part.kind != "sealed":
+    if not part.is_sealed:
         return drawn_numbers(part.text())[0]
     assert request.secret_seed is not None  # `_check_folders`
     return secret_seed(request.secret_seed, make_it)
@@ -271,10 +286,10 @@ def _misfit(request: ReleaseRequest, part: ReleasePart, folder: Path) -> str:
         return f"{refused}, and a release has all samples of its recipe"
     seed, samples = drawn_numbers(text)
     wanted = request.samples_of(part)
-    if samples != wanted and not (part.kind == "frames" and (samples or 0) > (wanted or 0)):
+    if samples != wanted and not (part.kind in _FIRST_SAMPLES and (samples or 0) > (wanted or 0)):
         return f"it has {samples} samples, and {part.title} is to have {wanted} (--samples)"
     if seed != (meant := _seed(request, part, make_it=False)):
-        secret = f"the one in {request.secret_seed}" if part.kind == "sealed" else str(meant)
+        secret = f"the one in {request.secret_seed}" if part.is_sealed else str(meant)
         return f"its seed is not {secret}, which {part.title} needs"
     return ""
 
@@ -282,8 +297,8 @@ def _misfit(request: ReleaseRequest, part: ReleasePart, folder: Path) -> str:
 def _dataset(request: ReleaseRequest, part: ReleasePart, used: Mapping[str, Path], seal: Seal) -> Path:
     """Folder whose files are to be packed: made, if need be, or used."""
     folder = used.get(part.title, request.work / part.rendered)
-    has_frames = part.kind == "frames" and not _misfit(request, part, folder)
-    if part.title not in used and not has_frames:
+    shows_another = (part.kind == "frames" or part.kind in _DENSE_BYTES) and not _misfit(request, part, folder)
+    if part.title not in used and not shows_another:
         part.text()  # the frozen one, or an error
         if part.kind == "films":
             make_films(part.recipe, folder, request.workers, request.console)
@@ -292,6 +307,8 @@ def _dataset(request: ReleaseRequest, part: ReleasePart, used: Mapping[str, Path
             make(part.recipe, folder, request.workers, request.console, samples=samples, seed=seed)
     if part.kind == "frames":
         return _frames(request, part, folder)
+    if part.kind in _DENSE_BYTES:
+        return _dense(request, part, folder)
     if part.kind != "sealed":
         return folder
     public = request.work / f"{part.title}-public"
@@ -317,6 +334,21 @@ def _frames(request: ReleaseRequest, part: ReleasePart, folder: Path) -> Path:
     if not (out / schema.CHECKSUMS).is_file() and (faults := differing_files(folder, read_checksums(folder))):
         raise DatasetError(f"{folder}: {faults[0]}; run `phibench dataset repair {folder}`")
     return export_frames_sets(folder, pairs, out, workers=request.workers, console=request.console)
+
+
+def _dense(request: ReleaseRequest, part: ReleasePart, folder: Path) -> Path:
+    """Dense set of the first samples; of a sealed part its public form."""
+    most = min(DENSE_PAIRS, request.samples_of(part) or DENSE_PAIRS)
+    digest = _digest([sha256(folder / schema.CHECKSUMS), most])[:12]
+    dataset, out = open_finished(folder), request.work / f"{part.title}-{digest}"
+    if not (out / schema.CHECKSUMS).is_file() and (faults := differing_files(folder, read_checksums(folder))):
+        raise DatasetError(f"{folder}: {faults[0]}; run `phibench dataset repair {folder}`")
+    if part.kind == "dense":
+        return write_dense_set(first_pairs(dataset, most), out)
+    public = request.work / f"{part.title}-{digest}-public"
+    if (public / schema.CHECKSUMS).is_file():
+        return public
+    return seal_dense_set(write_dense_set(pairs_of_sealed(dataset, most), out), public)
 
 
 # Archives.
@@ -351,7 +383,7 @@ def _packed(request: ReleaseRequest, part: ReleasePart, folder: Path, manifest: 
         kind=part.kind,
         recipe_sha256=part.sha256,
         samples=count,
-        recipe_samples=part.samples,
+        recipe_samples=part.whole,
         files=len(members),
         size=sum((folder / name).stat().st_size for name in members),
         sums_sha256=sha256(folder / schema.CHECKSUMS),
@@ -438,6 +470,8 @@ def _sample_count(part: ReleasePart, folder: Path) -> int:
         "sealed": (_SEAL, "pairs"),
         "films": (FILM_INFO, "films"),
         "frames": (frames, "samples"),
+        "dense": (DENSE_SET, "pairs"),
+        "sealed-dense": (DENSE_SEAL, "pairs"),
     }[part.kind]
     file = InputFile(folder / name, "run `phibench dataset repair`")
     value = file.json().get(key)
@@ -473,6 +507,7 @@ def _card(title: str, manifest: Manifest) -> str:
     lines += ["    phibench fetch NAME --from PLACE-OF-THIS-FOLDER --out FOLDER", ""]
     kinds = {"pairs": "pairs with truth", "sealed": "pairs, truth sealed", "films": "films with truth"}
     kinds["frames"] = f"frames with truth: {', '.join(STARTER_PAIRS)}"
+    kinds |= {"dense": "dense pairs with truth", "sealed-dense": "dense pairs, truth sealed"}
     rows = [
         (f"`{name}`", kinds[one.kind], one.count_text, f"{one.files}", megabytes(one.size), f"{len(one.archives)}")
         for name, one in sorted(manifest.parts.items())

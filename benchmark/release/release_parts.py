@@ -27,7 +27,7 @@ VERSION = "4.0"
 MANIFEST = "MANIFEST.json"
 FORMAT = "phibench release 1"
 _BLOCK = tarfile.BLOCKSIZE
-Kind = Literal["pairs", "sealed", "films", "frames"]
+Kind = Literal["pairs", "sealed", "films", "frames", "dense", "sealed-dense"]
 Digest = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
 
 
@@ -41,11 +41,11 @@ class ReleasePart:
         Last word of its archives' name.
     recipe : str or Path
         Name of a shipped recipe, or a file.
-    kind : "pairs", "sealed", "films" or "frames"
+    kind : "pairs", "sealed", "films", "frames", "dense" or "sealed-dense"
     sha256 : str
         Hash of the recipe's values (`content_sha256`).
     source : str
-        Of frames: name of the part whose first samples they show.
+        Of frames and dense pairs: name of the part whose samples they show.
     """
 
     name: str
@@ -68,7 +68,19 @@ class ReleasePart:
     def samples(self) -> int | None:
         """Number of samples of the whole part; None if its recipe draws none."""
         own = drawn_numbers(self.text())[1]
-        return own if own is None or self.kind != "frames" else min(own, max(STARTER_PAIRS.values()))
+        most = {"frames": max(STARTER_PAIRS.values()), "dense": DENSE_PAIRS}.get(self.kind)
+        return own if own is None or most is None else min(own, most)
+
+    @property
+    def whole(self) -> int | None:
+        """Number of samples that the whole part shows; None if its recipe draws none."""
+        own = self.samples
+        return own if own is None or self.kind != "sealed-dense" else min(own, DENSE_PAIRS)
+
+    @property
+    def is_sealed(self) -> bool:
+        """True if its samples are drawn with the secret seed."""
+        return self.kind in ("sealed", "sealed-dense")
 
     def text(self) -> str:
         """Text of the recipe.
@@ -91,16 +103,21 @@ def _title(name: str) -> str:
 
 STARTER_PAIRS = {"mjpeg": 60, "srgb8": 3, "bayer-raw": 3}
 """Pairs of each frames set of the starter part. PNG files keep the noise: 60 pairs in each would have 0.54 GB."""
+DENSE_PAIRS = 100
+"""Most pairs of a dense part."""
 _DEV = "a274640eda114303c9fa7a51185574048483b7e529d3f9916bdac10f89f7ac6b"
+_TEST = "32818cd99112fcf5f0125898b2ab538ab9d53cf02fd90089ec9d14457af67aaa"
 PARTS = (
     ReleasePart("dev", "bench-dev", "pairs", _DEV),
-    ReleasePart("test", "bench-test", "sealed", "32818cd99112fcf5f0125898b2ab538ab9d53cf02fd90089ec9d14457af67aaa"),
+    ReleasePart("test", "bench-test", "sealed", _TEST),
     ReleasePart("paper", "paper", "pairs", "2487ca0015be181c7164faaccdac0829078d996d81dc8719f9992951b34faa44"),
     ReleasePart(
         "mirrors", "bench-mirrors", "pairs", "45f352f98d2c12a779a89b805240481f519a09e92401dff9ae76ad529bce68fb"
     ),
     ReleasePart("films", "bench-films", "films", "d7e243e791f85a1e0c0e761c5f1ca5377cc839d1a7e1221b5d0a87424c91b9c9"),
     ReleasePart("drives", "bench-drives", "films", "825473dc49345b0f331de47ab49b735d453fcdfafa669aa45dbbb39c4a3926f3"),
+    ReleasePart("dense-dev", "bench-dev", "dense", _DEV, source="dev"),
+    ReleasePart("dense-test", "bench-test", "sealed-dense", _TEST, source="test"),
     ReleasePart("starter", "bench-dev", "frames", _DEV, source="dev"),
 )
 

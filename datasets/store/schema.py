@@ -342,6 +342,7 @@ class TruthFolder(StrEnum):
     BAKED_ROOMS = "rooms.json"
     IMPORTED = "imported.json"
     DENSE_EXPORT = "dense.jsonl"
+    DENSE_SET = "dense_set.json"
     UNFINISHED = ".phibench-working"
     LOCKED = ".phibench-lock"
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import App, Parameter
 
@@ -22,6 +22,9 @@ from phibench.cli.options import (
     Preset,
     Whole,
 )
+
+if TYPE_CHECKING:
+    from phibench.benchmark.dense.dense_pairs import DensePairSet
 
 dense = App(
     name="dense",
@@ -142,7 +145,7 @@ def score(
     wide
         With intervals below the values.
     """
-    from phibench.benchmark.dense.dense_score import chosen_pairs, run_dense, saved_dense
+    from phibench.benchmark.dense.dense_score import run_dense, saved_dense
     from phibench.benchmark.dense.dense_tables import dense_board, dense_failures
     from phibench.benchmark.isolation.method_references import DENSE, resolve
     from phibench.benchmark.scores.score_document import MethodCard
@@ -156,7 +159,7 @@ def score(
     files = score_files(out, [MethodCard.of(name, **resolve(name, DENSE).document()) for name in method])
     for target in filter(None, files):
         require_writable(target)
-    chosen = chosen_pairs(directory, preset, draws, pairs, frames, calibration, between)
+    chosen = _scored_pairs(directory, preset, draws, pairs, frames, calibration, between)
     scored = run_dense(method, chosen, workers, None, bootstrap_seed, limits.of_run, files)
     for one, file in zip(scored, files, strict=True):
         if file is not None:
@@ -169,6 +172,29 @@ def score(
     for file in filter(None, files):
         print(f"written: {file}")
     return int(any(sum(one.document.failures.values()) == one.document.pairs for one in scored))
+
+
+def _scored_pairs(
+    directory: Path,
+    preset: str | None,
+    draws: int | None,
+    pairs: int | None,
+    frames: int,
+    calibration: Path | None,
+    between: bool,
+) -> DensePairSet:
+    """Pairs of a data set, or of a dense set, whose frames are drawn."""
+    from phibench.benchmark.dense.dense_score import chosen_pairs
+    from phibench.benchmark.export.dense_set import DENSE_SEAL, DENSE_SET, DenseSet
+    from phibench.datasets.common.errors import DatasetError
+
+    if not any((directory / name).is_file() for name in (DENSE_SET, DENSE_SEAL)):
+        return chosen_pairs(directory, preset, draws, pairs, frames, calibration, between)
+    if between or any(option is not None for option in (preset, draws, calibration)) or frames != 1:
+        raise DatasetError(
+            f"{directory} holds frames that are drawn: leave --preset, --draws, --frames, --between, --calibration out"
+        )
+    return DenseSet(directory, pairs)
 
 
 @dense.command

@@ -27,6 +27,7 @@ OF_FOLDERS = (
     *("dataset.json", "recipe.toml", "seal.json", ".phibench-draws", "export.json", "request.json", "rooms.json"),
     *("room000.npz", "imported.json", "pairs.jsonl", "imported.png", "header.jpg", "encoded.txt", "drawing.svg"),
     *("manifest-of-a-release.json", "frames_set.json", "lines-of-frames.jsonl"),
+    *("dense_set.json", "lines-of-dense.jsonl"),
 )
 BUILDS_A_ROOM = ("rooms.json", "room000.npz")  # 1 s of a processor for each case
 OF_WRITERS = {

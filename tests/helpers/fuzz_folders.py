@@ -25,6 +25,7 @@ from PIL import Image
 from rich.console import Console
 
 from phibench.benchmark.export import export_make
+from phibench.benchmark.export.dense_set import DENSE_SET, DenseSet
 from phibench.benchmark.export.pair_rows import ExportRequest
 from phibench.benchmark.pair_sets.frames_set import FramesSet
 from phibench.benchmark.release import release_make
@@ -225,6 +226,29 @@ def _one_line() -> bytes:
     return compact(json.loads(first) | {"number": 0}) + b"\n"
 
 
+def _dense_set(name: str, path: Path) -> object:
+    """A dense set whose file of this name was damaged, with hashes that fit; its planes are missing."""
+    folder = path.parent / "dense-set"
+    folder.mkdir(exist_ok=True)
+    files = {DENSE_SET: _DENSE_INFO, LINES: _dense_line(), name: path.read_bytes()}
+    for file, content in files.items():
+        (folder / file).write_bytes(content)
+    hashes = {file: hashlib.sha256(content).hexdigest() for file, content in files.items()}
+    (folder / schema.CHECKSUMS).write_text(checksums_text(hashes))
+    opened = DenseSet(folder)
+    return len(opened), opened.document()
+
+
+_DENSE_INFO = compact({"format": "phibench dense set 1", "task_version": 1, "pairs": 1, "source": {"name": "a"}})
+
+
+def _dense_line() -> bytes:
+    first = json.loads(_one_line())
+    truth = {name: first["truth"][name] for name in ("sample_id", "draw", "preset", "stroke_m", "true_rig")}
+    truth |= {"room": "lab", "object_names": ["floor"], "planes": "truth/0.exr"}
+    return compact(first | {"truth": truth}) + b"\n"
+
+
 def folder_kinds(folder: Path, dataset: Path) -> dict[str, Kind]:
     """Targets by the name of their file."""
     opened = open_finished(dataset)
@@ -259,6 +283,8 @@ def folder_kinds(folder: Path, dataset: Path) -> dict[str, Kind]:
             compact,
         ),
         Kind("lines-of-frames.jsonl", _one_line(), partial(_frames_set, LINES), compact),
+        Kind(DENSE_SET, _DENSE_INFO, partial(_dense_set, DENSE_SET), compact),
+        Kind("lines-of-dense.jsonl", _dense_line(), partial(_dense_set, LINES), compact),
         Kind(imported_set.INFO, info, partial(_imported, info, rows, png()), compact),
         Kind(imported_set.ROWS, rows, partial(_imported, info, rows, png()), compact),
         Kind("imported.png", png(), partial(_imported, info, rows, png())),

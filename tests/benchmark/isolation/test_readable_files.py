@@ -193,6 +193,7 @@ OPEN = {
     "log.jsonl": "time and causes of tasks",
     "request.json": "how frames were drawn",
     "seal.json": "public half of a sealed set",
+    "dense_seal.json": "public half of a sealed dense set",
     "pairs.jsonl": "public pairs of a sealed set; an imported set and a frames set are hidden whole",
     "done.json": "key and hashes of a film",
     "light{:02d}.npz": "light of a film, which is hidden whole",
