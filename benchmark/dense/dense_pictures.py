@@ -33,7 +33,8 @@ ERROR = 0.1
 """Relative error at the ends of the colours."""
 NEAR_M, FAR_M = 0.4, 10.0
 """D at the ends of the colours."""
-_OBSTACLE_M = (0.05, 1.0)  # heights between which a thing is in a robot's way
+OBSTACLE_M = (0.05, 1.0)
+"""Heights between which a thing is in a robot's way."""
 _SECTORS = 180  # of two degrees
 _SECTOR_PART = 0.02  # of a sector's points that may be nearer than its free space: lone errors
 _SECTOR_POINTS = 5  # fewer say nothing
@@ -167,7 +168,7 @@ class DensePicture:
             points.set_rasterized(True)
             figure.colorbar(points, ax=axes, label="error of D, %, blue is too far", extend="both")
             axes.plot(0.0, 0.0, marker="o", color="#0072b2", markersize=7, linestyle="none", label="robot")
-            low, high = _OBSTACLE_M
+            low, high = OBSTACLE_M
             axes.set_title(f"what stands {low:g} to {high:g} m above the floor")
             axes.set(
                 xlim=(-_RANGE_M, _RANGE_M), ylim=(-_RANGE_M, _RANGE_M), xlabel="x, m", ylabel="y, m", aspect="equal"
@@ -191,7 +192,7 @@ class DensePicture:
         """Pixels of the room whose point, at a D, stands in a robot's way."""
         with np.errstate(invalid="ignore"):
             z = self.points_m(depth_m)[..., 2]
-            return np.asarray((z > _OBSTACLE_M[0]) & (z < _OBSTACLE_M[1]) & self.truth.found.of_room)
+            return np.asarray((z > OBSTACLE_M[0]) & (z < OBSTACLE_M[1]) & self.truth.found.of_room)
 
     def _obstacles(self, depth_m: Array) -> Array:
         """Their x and y from the axis, shape (n, 2)."""

@@ -110,6 +110,10 @@ def dense_bound(
         True D.
     window_px : int
     """
-    told = matching_information(planes_e, card, epipolar_motion(rig, stroke_m, depth_m), window_px)
+    return sigma_of(matching_information(planes_e, card, epipolar_motion(rig, stroke_m, depth_m), window_px), depth_m)
+
+
+def sigma_of(told: Array, depth_m: Array) -> Array:
+    """Least sigma of D, metres, from the information on 1 / D: infinite where that is none, NaN without depth."""
     with np.errstate(divide="ignore"):
         return np.asarray(depth_m**2 / np.sqrt(np.where(told > _FLAT_PER_M2, told, 0.0)))
