@@ -1,7 +1,7 @@
-"""Does a small network on top of `dense_sweep` gain anything? Features of its costs and fit, then training and a test.
+"""Train the network of `dense_learned`, and test what it gains over `dense_sweep` in other rooms.
 
 Usage: python docs/train_dense.py features DATASET FILE.npz [EVERY WIDTH]
-       python docs/train_dense.py fit FILE.npz              (needs PyTorch)
+       python docs/train_dense.py fit FILE.npz [WEIGHTS.npz]     (needs PyTorch)
 
 Features of 6000 random pixels of each room that both images show: cost curves around the sweep's answer before and
 after aggregation, the fit's sigma and way, its neighbours, place and stroke. The network answers a correction of 1 / D
@@ -18,21 +18,22 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
+from measure_dense_stroke import pair_of
+
+from phibench.datasets.read import open_dataset
+from phibench.estimator.dense.learned_sweep import LARGEST, LEARNED_WIDTH_PX, SweepNetwork, features_of
+from phibench.estimator.dense.sweep import SweepParts, dense_sweep
+from phibench.estimator.dense.unrolled_pair import UnrolledPair
 
 PIXELS = 6000  # of a room
-AROUND = 8  # levels of a cost curve on each side
-NEIGHBOURS = (3, 9)  # grid points
 RECALLED = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2)
 FOLDS, EPOCHS, BATCH, RATE, WIDTH = 5, 12, 2048, 3e-3, 64
-LARGEST = 0.3  # correction, relative
+WORST = 0.1  # scale of answers, as of the method
+NAMES = ("matrix", "offset")
 
 
 def features(folder: str, file: str, every: int, width_px: int) -> None:
     """Write features, relative target and the sweep's own answer of all rooms."""
-    from measure_dense_stroke import pair_of
-
-    from phibench.datasets.read import open_dataset
-
     dataset = open_dataset(folder)
     parts: dict[str, list[Any]] = {}
     for room, number in enumerate(range(0, len(dataset), every)):
@@ -46,104 +47,78 @@ def features(folder: str, file: str, every: int, width_px: int) -> None:
         np.savez(file, **{name: np.concatenate(values) for name, values in parts.items()})
 
 
-def of_room(pair: Any, truth: Any, rng: np.random.Generator, width_px: int, answer: Any = None) -> dict[str, Any]:
-    """Features (n, F), true and answered 1 / D, claimed sigma of 1 / D, and whether the sweep answers."""
-    from phibench.estimator.dense import sweep
-    from phibench.estimator.dense.unrolled_pair import UnrolledPair
-
+def of_room(pair: Any, truth: Any, rng: np.random.Generator, width_px: int) -> dict[str, Any]:
+    """Features (n, 53), true and answered 1 / D, and the sweep's claim, relative, NaN where it gives no answer."""
     unrolled = UnrolledPair.of(pair, width_px)
-    levels = sweep.inverse_levels(unrolled.maps)
-    step = float(levels[1] - levels[0])
-    raw = sweep.costs(unrolled, levels)
-    total = sweep.aggregated(raw)
-    start = sweep.least(total, levels)
-    fit = sweep.fitted((unrolled,), start, step)
-    answer = answer or sweep.dense_sweep(pair, width_px)
+    parts, answer = SweepParts.of((unrolled,)), dense_sweep(pair, width_px)
     index, _, place = unrolled._places
-    usable = truth.seen.reshape(-1)[index] & unrolled.seen[_near(place, unrolled)]
+    height, width = unrolled.down.shape
+    row = np.clip(np.rint(place[:, 1]).astype(int), 0, height - 1)
+    column = np.rint(place[:, 0]).astype(int) % width
+    usable = truth.seen.reshape(-1)[index] & unrolled.seen[row, column]
     pick = rng.permutation(np.flatnonzero(usable))[:PIXELS]
-    row, column = (part[pick] for part in _near(place, unrolled))
-    base = unrolled.at_pixels(fit.inverse)[pick]
-    middle = np.clip(np.rint((base - levels[0]) / step).astype(int), 0, len(levels) - 1)
-    window = np.clip(middle[:, None] + np.arange(-AROUND, AROUND + 1), 0, len(levels) - 1)
-    curves = [cost[row[:, None], window, column[:, None]].astype(float) for cost in (raw, total)]
-    away = np.abs(np.arange(len(levels)) - middle[:, None]) > AROUND
-    second = np.where(away, total[row, :, column], 32767).min(axis=1) - curves[1].min(axis=1)
-    height, width = fit.inverse.shape
-    near = [
-        np.clip((fit.inverse[np.clip(row + dv * k, 0, height - 1), (column + du * k) % width] - base) / step, -5.0, 5.0)
-        for k in NEIGHBOURS
-        for dv, du in ((0, 1), (0, -1), (1, 0), (-1, 0))
-    ]
-    point = (row, column)
-    rest = [
-        second / 4000.0,
-        np.log(fit.sigma[point] / step),
-        (start[point] - fit.inverse[point]) / step,
-        np.log(fit.variance[point]),
-        base,
-        np.log(np.maximum(base, 0.02)),
-        np.full(len(row), np.log(step)),
-        unrolled.maps.grid.elevations_rad[row],
-        np.full(len(row), pair.stroke_m),
-        unrolled.down[point] / 128.0,
-        sweep.hidden(unrolled.maps, fit.inverse)[point].astype(float),
-        *near,
-    ]
-    shapes = [curve - curve.min(axis=1, keepdims=True) for curve in curves]
-    table = np.concatenate([shapes[0] / 240.0, shapes[1] / 2000.0, np.stack(rest, axis=1)], axis=1)
-    pixels = index[pick]
-    sigma = answer.sigma_depth_m.reshape(-1)[pixels] / answer.depth_m.reshape(-1)[pixels]
+    base, pixels = unrolled.at_pixels(parts.fit.inverse)[pick], index[pick]
+    assert answer.depth_m is not None
+    assert answer.sigma_depth_m is not None
     return {
-        "features": table.astype(np.float32),
+        "features": features_of(parts, row[pick], column[pick], base),
         "true": 1.0 / truth.depth_m.reshape(-1)[pixels],
         "base": base,
-        "claim": sigma,  # relative; NaN where the sweep gives no answer
+        "claim": answer.sigma_depth_m.reshape(-1)[pixels] / answer.depth_m.reshape(-1)[pixels],
     }
 
 
-def _near(place: Any, unrolled: Any) -> tuple[Any, Any]:
-    """Row and column of the nearest grid point."""
-    height, width = unrolled.down.shape
-    return np.clip(np.rint(place[:, 1]).astype(int), 0, height - 1), np.rint(place[:, 0]).astype(int) % width
+def fit(file: str, weights: str | None) -> None:
+    """Train on four fifths of the rooms and try the others, five times; print the figures of all rooms.
 
-
-def fit(file: str) -> None:
-    """Train on four fifths of the rooms and try the others, five times; print the figures of all rooms."""
+    With a file for weights, train on all rooms, too.
+    """
     data = np.load(file)
     begin, rows = time.process_time(), {}
     base = np.maximum(data["base"], 0.02)
+    target = data["true"] / base - 1.0
     correction, scale = np.zeros(len(base)), np.ones(len(base))
     for fold in range(FOLDS):
         test = data["room"] % FOLDS == fold
-        correction[test], scale[test] = trained(data["features"], data["true"] / base - 1.0, test)
-    print(
-        f"{len(set(data['room']))} rooms, {len(base)} pixels, {time.process_time() - begin:.0f} CPU-s for {FOLDS} nets"
-    )
-    for room in np.unique(data["room"]):
+        correction[test], scale[test] = trained(data["features"][~test], target[~test])(data["features"][test])
+    rooms = np.unique(data["room"])
+    print(f"{len(rooms)} rooms, {len(base)} pixels, {time.process_time() - begin:.0f} CPU-s for {FOLDS} networks")
+    for room in rooms:
         here = data["room"] == room
         for name, values in of_ways(data["true"][here], base[here], data["claim"][here], correction[here], scale[here]):
             rows.setdefault(name, []).append(values)
     told(rows)
+    ratio = np.abs(data["true"] / (base * (1.0 + correction)) - 1.0) / scale
+    sure = scale < WORST
+    print(
+        f"scale below {WORST}: {100 * sure.mean():.1f} %; of their errors 95 % are below "
+        f"{np.quantile(ratio[sure], 0.95):.2f} scales"
+    )
+    if weights is not None:
+        network = trained(data["features"], target)
+        pairs = {
+            f"{name}{k}": part
+            for k, layer in enumerate(network.layers)
+            for name, part in zip(NAMES, layer, strict=True)
+        }
+        np.savez_compressed(weights, mean=network.mean, spread=network.spread, **pairs)
 
 
-def trained(features: Any, target: Any, test: Any) -> tuple[Any, Any]:
-    """Relative correction of 1 / D and scale of its error, for the pixels of the test."""
+def trained(features: Any, target: Any) -> SweepNetwork:
+    """Network of some pixels."""
     import torch
 
     torch.manual_seed(0)
     torch.set_num_threads(1)
-    mean, spread = features[~test].mean(axis=0), features[~test].std(axis=0) + 1e-6
+    mean, spread = features.mean(axis=0), features.std(axis=0) + 1e-6
     inputs = torch.tensor(np.clip((features - mean) / spread, -6.0, 6.0), dtype=torch.float32)
     wanted = torch.tensor(np.clip(target, -0.5, 1.0), dtype=torch.float32)
-    sizes = (features.shape[1], WIDTH, WIDTH)
-    layers = [part for a, b in pairwise(sizes) for part in (torch.nn.Linear(a, b), torch.nn.SiLU())]
-    net = torch.nn.Sequential(*layers, torch.nn.Linear(WIDTH, 2))
-    known = torch.tensor(np.flatnonzero(~test))
+    linear = [torch.nn.Linear(a, b) for a, b in pairwise((features.shape[1], WIDTH, WIDTH, 2))]
+    net = torch.nn.Sequential(linear[0], torch.nn.SiLU(), linear[1], torch.nn.SiLU(), linear[2])
     optimiser = torch.optim.AdamW(net.parameters(), lr=RATE, weight_decay=1e-4)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, RATE, total_steps=EPOCHS * (len(known) // BATCH + 1))
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, RATE, total_steps=EPOCHS * (len(inputs) // BATCH + 1))
     for _ in range(EPOCHS):
-        for batch in torch.split(known[torch.randperm(len(known))], BATCH):
+        for batch in torch.split(torch.randperm(len(inputs)), BATCH):
             optimiser.zero_grad()
             shift, log_scale = net(inputs[batch]).unbind(dim=1)
             # density of Laplace: few errors are large, as in the sweep
@@ -151,9 +126,8 @@ def trained(features: Any, target: Any, test: Any) -> tuple[Any, Any]:
             loss.backward()
             optimiser.step()
             schedule.step()
-    with torch.no_grad():
-        shift, log_scale = net(inputs[torch.tensor(test)]).unbind(dim=1)
-    return LARGEST * np.tanh(shift.numpy()), np.exp(log_scale.numpy())
+    layers = tuple((layer.weight.detach().numpy(), layer.bias.detach().numpy()) for layer in linear)
+    return SweepNetwork(mean.astype(np.float32), spread.astype(np.float32), layers)
 
 
 def of_ways(true: Any, base: Any, claim: Any, correction: Any, scale: Any) -> Iterator[tuple[str, list[float]]]:
@@ -209,6 +183,6 @@ def ause(error: Any, sigma: Any) -> float:
 
 if __name__ == "__main__":
     if sys.argv[1] == "features":
-        features(sys.argv[2], sys.argv[3], *(int(x) for x in sys.argv[4:6] or (3, 640)))
+        features(sys.argv[2], sys.argv[3], *(int(x) for x in sys.argv[4:6] or (3, LEARNED_WIDTH_PX)))
     else:
-        fit(sys.argv[2])
+        fit(sys.argv[2], sys.argv[3] if len(sys.argv) > 3 else None)

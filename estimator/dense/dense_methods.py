@@ -7,6 +7,7 @@ from importlib.util import find_spec
 
 from phibench.datasets.common.errors import DatasetError
 from phibench.estimator.dense.dense_interface import DenseAnswer, DenseMethod, DensePair
+from phibench.estimator.dense.learned_sweep import dense_learned
 from phibench.estimator.dense.panorama_matchers import (
     NEEDS_OPENCV,
     dense_flow,
@@ -104,6 +105,12 @@ _ALL = (
         dense_stroke,
         "the same over all heights of a stroke, where a pair has them (dense score --between)",
         "M. Okutomi and T. Kanade, IEEE Trans. PAMI 15, 353 (1993)",
+    ),
+    DenseBuiltIn(
+        "dense_learned",
+        dense_learned,
+        "dense_sweep, corrected by a small network of its costs; trained on 30 rooms of bench-dev",
+        "docs/train_dense.py",
     ),
 )
 

@@ -19,6 +19,7 @@ minimum and the fit, and both have factors from rooms of `bench-dev` (docs/measu
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -73,15 +74,56 @@ def dense_stroke(pair: DensePair, width_px: int = WIDTH_PX) -> DenseAnswer:
     return _swept(UnrolledPair.of(pair, width_px).at_heights())
 
 
+@dataclass(frozen=True)
+class SweepParts:
+    """Sweep and fit of a pair, on the grid.
+
+    Attributes
+    ----------
+    heights : the pair, then those of lower heights
+    levels : array, shape (L,)
+        1 / D.
+    raw, total : arrays, shape (H, L, W)
+        Costs, and their sums along paths.
+    start : array, shape (H, W)
+        1 / D of the least sum.
+    fit : PlaneFit
+    """
+
+    heights: Heights
+    levels: Array
+    raw: Costs
+    total: Costs
+    start: Array
+    fit: PlaneFit
+
+    @classmethod
+    def of(cls, heights: Heights) -> SweepParts:
+        """Sweep over the levels, then fit."""
+        levels = inverse_levels(heights[0].maps)
+        raw = mean_costs(heights, levels)
+        total = aggregated(raw)
+        start = least(total, levels)
+        return cls(heights, levels, raw, total, start, fitted(heights, start, float(levels[1] - levels[0])))
+
+    @property
+    def step(self) -> float:
+        """Between two levels, 1 / m."""
+        return float(self.levels[1] - self.levels[0])
+
+    @cached_property
+    def both_show(self) -> BoolArray:
+        """Mask of the directions whose point both images may show, by the fit: neither hidden nor robot nor holder."""
+        unrolled = self.heights[0]
+        return unrolled.seen & ~_stands_still(unrolled, self.fit) & ~hidden(unrolled.maps, self.fit.inverse)
+
+
 def _swept(heights: Heights) -> DenseAnswer:
     """Answer from the whole stroke, which comes first, and from lower heights."""
-    unrolled = heights[0]
-    levels = inverse_levels(unrolled.maps)
-    start = least(aggregated(mean_costs(heights, levels)), levels)
-    fit = fitted(heights, start, float(levels[1] - levels[0]))
-    moved = np.abs(fit.inverse - start)
-    good = unrolled.seen & (moved < _MOVED * (levels[1] - levels[0])) & (fit.sigma < _WORST_FIT * fit.inverse)
-    good &= ~_stands_still(unrolled, fit) & ~hidden(unrolled.maps, fit.inverse)
+    parts = SweepParts.of(heights)
+    unrolled, fit = heights[0], parts.fit
+    moved = np.abs(fit.inverse - parts.start)
+    good = parts.both_show & (moved < _MOVED * parts.step) & (fit.sigma < _WORST_FIT * fit.inverse)
     claim = np.hypot(_CLAIM_FIT * fit.sigma, _CLAIM_MOVED * moved)
     return unrolled.answer(np.where(good, fit.inverse, np.nan), np.where(good, claim, np.nan))
 
