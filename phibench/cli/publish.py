@@ -121,7 +121,8 @@ def release(
         File with the seed of the sealed part, outside --out; one is drawn if there is no such file. Other parts need
         none.
     part
-        "dev", "test", "paper", "mirrors", "films", "drives" or "starter". May be given several times; all by default.
+        "dev", "test", "paper", "mirrors", "films", "drives", "dense-dev", "dense-test" or "starter".
+        May be given several times; all by default.
     samples
         Samples of each part that draws its samples, instead of the recipe's number.
     use
