@@ -202,6 +202,7 @@ OPEN = {
     "direct_url.json": "an installer's",
     "published.csv": "table of the paper, shipped with this package",
     "{preset}-{name}.json": "a score: told by its content",
+    "learned_sweep.npz": "weights of a built-in method, shipped with this package",
     "my_phi.json": "a score of the demo: told by its content",
 }
 """Names that a method may read, and why."""
