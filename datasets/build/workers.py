@@ -8,6 +8,7 @@ this process. `python -m phibench.datasets.build.workers` prints what this Pytho
 from __future__ import annotations
 
 import contextlib
+import gc
 import json
 import logging
 import signal
@@ -301,8 +302,11 @@ def _connect(distributed: Any, scheduler: str) -> Any:
     try:
         return distributed.Client(**where, timeout=CONNECT_S, set_as_default=False)
     except Exception as error:  # nonsense in an address or a file ends in many kinds
-        text = f"no dask scheduler answers at {scheduler} within {CONNECT_S:g} s"
-        raise DatasetError(f"{text} ({str(error).splitlines()[0] if str(error) else type(error).__name__})") from None
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+    # the failed client lies in a cycle, and takes dask's lock of loops when it is deleted: where that happens while the
+    # next client has this lock, both wait for ever
+    gc.collect()
+    raise DatasetError(f"no dask scheduler answers at {scheduler} within {CONNECT_S:g} s ({reason})")
 
 
 def _wants_key(file: Path | None, address: str) -> bool:

@@ -2,6 +2,7 @@
 
 import concurrent.futures
 import contextlib
+import gc
 import json
 import os
 import re
@@ -10,10 +11,13 @@ import signal
 import subprocess
 import sys
 import time
+import weakref
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import distributed
 import pytest
 from helpers.folders import contents
 from helpers.listeners import listeners
@@ -287,6 +291,27 @@ def test_a_wait_for_a_scheduler_that_starts_late(tmp_path: Path) -> None:
             assert not waiting.done()
             with running(worker):
                 assert waiting.result(timeout=100) is None
+
+
+def test_a_client_that_failed_is_gone_before_the_next_begins(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Deleted while the next one starts, it would wait for dask's lock of loops, which that one has, for ever."""
+    made: list[weakref.ref[distributed.Client]] = []
+
+    class Client(distributed.Client):  # type: ignore[misc]
+        def __new__(cls, *_: Any, **__: Any) -> "Client":
+            client: Client = super().__new__(cls)
+            made.append(weakref.ref(client))
+            return client
+
+    monkeypatch.setattr(workers, "CONNECT_S", 0.3)
+    gc.disable()  # nothing but the code itself deletes it
+    try:
+        with pytest.raises(DatasetError, match="no dask scheduler answers") as caught:
+            workers._connect(SimpleNamespace(Client=Client), "tcp://127.0.0.1:9")
+    finally:
+        gc.enable()
+    assert caught.value.__context__ is None  # an error's frames keep the client
+    assert [client() for client in made] == [None]
 
 
 def test_slurm_jobs_are_ordered_and_ended() -> None:
