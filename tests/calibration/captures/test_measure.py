@@ -377,4 +377,4 @@ def test_a_calibration_says_that_the_lens_was_turned(depth_m: float, words: str)
 
     made = {"sphere_in_camera_m": [[0.0, 0.0, 0.26]], "sigma_m": [[4e-6, 4e-6, 2e-5]]}
     held = SimpleNamespace(made_from=made)
-    assert words in _calibration_note(held, Rig(), [outline(depth_m)])
+    assert words in _calibration_note(held, [outline(depth_m)])
