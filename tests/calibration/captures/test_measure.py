@@ -20,7 +20,6 @@ from phibench.cli.main import main
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.read import Sample, open_dataset
 from phibench.estimator.spots.image_planes import ImageError
-from phibench.scenes.rig import Rig
 
 Files = dict[str, list[Path]]
 
