@@ -366,7 +366,6 @@ def _changed(folder: Path, old: str, new: str) -> Path:
 
 
 @pytest.mark.usefixtures("inline")
-@pytest.mark.slow
 def test_without_mitsuba_frames_may_change_and_nothing_may_be_rendered(smallest_dataset: Path, tmp_path: Path) -> None:
     copy, blocked = Path(shutil.copytree(smallest_dataset, tmp_path / "copy")), tmp_path / "blocked"
     for name in ("mitsuba", "drjit"):

@@ -124,7 +124,6 @@ def test_the_cheat_gains_where_the_room_is_the_same() -> None:
     assert chance <= FALSE_ALARM
 
 
-@pytest.mark.slow
 def test_no_room_of_one_set_is_in_the_other_and_the_cheat_gains_nothing() -> None:
     """Three rooms of each, one a kind; all 240 by their sources."""
     sources = [set(draw_rooms(load_recipe(name)).values()) for name in ("bench-dev", "bench-test")]

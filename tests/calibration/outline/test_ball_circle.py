@@ -118,7 +118,6 @@ def test_edges_of_a_disc_have_their_place() -> None:
     assert np.abs(place[:, 0]).max() < 0.2
 
 
-@pytest.mark.slow
 def test_a_grey_picture_is_enough() -> None:
     photo = photograph(1)
     circle = find_circle(photo.light.mean(axis=-1))

@@ -321,7 +321,6 @@ def test_what_cannot_be_seen_has_no_stroke() -> None:
     assert cut.limits == (IMAGE_EDGE,)
 
 
-@pytest.mark.slow
 def test_strokes_whose_error_is_unknown_have_a_cause() -> None:
     """At 0.2 m and 1 mW a spot has more electrons than the bound's table; a free stroke has a finite error."""
     preset_spot = spot_bound(RIG, sensor_card("mjpeg"))
