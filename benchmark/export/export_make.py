@@ -17,6 +17,7 @@ from rich.console import Console
 
 from phibench.benchmark.export.containers import NEEDS_PYARROW, image_name, shard_name, write_shard
 from phibench.benchmark.export.dataset_card import card, croissant
+from phibench.benchmark.export.dense_set import DENSE_SEAL, DENSE_TRUTH
 from phibench.benchmark.export.pair_rows import (
     INDEX,
     SPLITS,
@@ -29,6 +30,7 @@ from phibench.benchmark.export.pair_rows import (
 )
 from phibench.benchmark.pair_sets.dataset_pairs import DatasetPairs, dataset_pairs
 from phibench.benchmark.pair_sets.frames_set import frames_row, frames_set_documents
+from phibench.benchmark.sealed.sealed_set import SEAL
 from phibench.datasets.build.parts import Brought, bring_all
 from phibench.datasets.build.tasks import BuildTask, Made
 from phibench.datasets.common.errors import DatasetError, whole_number
@@ -51,13 +53,14 @@ from phibench.datasets.store.checksums import (
 from phibench.datasets.store.croissant import LICENSE_TEXT
 from phibench.datasets.store.documents import parquet_bytes
 from phibench.datasets.store.files import sha256, write_text
-from phibench.datasets.store.pair_files import is_frames_set
 from phibench.datasets.store.provenance import code_behind
 from phibench.scenes.rig import POSITIONS
 
 INFO = schema.TruthFolder.EXPORT.value
 _COPIED = (schema.RIGS, schema.ROOMS, schema.RECIPE)
 _AGAIN = "run the same `phibench export` again"
+_KINDS = schema.TruthFolder
+_INDICES = (INFO, _KINDS.FRAMES_SET, _KINDS.DENSE_EXPORT, _KINDS.DENSE_SET, SEAL, DENSE_SEAL)  # one in each export
 
 
 @dataclass(frozen=True)
@@ -201,10 +204,10 @@ def scored_pairs(dataset: Dataset, request: ExportRequest) -> DatasetPairs:
 
 
 def is_export(folder: Path) -> bool:
-    """True of an export, of a frames set, and of a folder of exports as `export_frames_sets` writes it."""
+    """True of an export, of a set of frames, dense or sealed ones, too, and of a folder of several exports."""
     is_data_set = (folder / schema.INFO).is_file()
     signs_exports = (folder / schema.CHECKSUMS).is_file() and any(folder.glob(f"*/{INFO}"))
-    return (folder / INFO).is_file() or is_frames_set(folder) or (signs_exports and not is_data_set)
+    return any((folder / name).is_file() for name in _INDICES) or (signs_exports and not is_data_set)
 
 
 def verify_export(folder: str | Path) -> list[str]:
@@ -223,7 +226,7 @@ def verify_export(folder: str | Path) -> list[str]:
     listed = read_checksums(folder)
     paths = (path for path in folder.rglob("*") if path.is_symlink() or not path.is_dir())  # pipes and sockets, too
     there = {path.relative_to(folder).as_posix() for path in paths}
-    state = {schema.CHECKSUMS, schema.JOURNAL, schema.LOCK, schema.TruthFile.SHARDS.value}
+    state = {schema.CHECKSUMS, schema.JOURNAL, schema.LOCK, schema.TruthFile.SHARDS.value, DENSE_TRUTH}
     strange = sorted(there - set(listed) - state)
     return differing_files(folder, listed) + [f"{name} is not of the export" for name in strange]
 

@@ -191,7 +191,7 @@ def verify(
     Parameters
     ----------
     directory
-        Folder of a data set, of an export, or of several exports that one list signs.
+        Folder of a data set, of an export, of a frames set, dense or sealed ones, too, or of several exports.
     mitsuba
         Also compare so many samples with Mitsuba's path tracer: light, outline, and the spot's flux and centroid.
     """

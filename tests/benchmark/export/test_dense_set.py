@@ -88,6 +88,26 @@ def test_a_set_is_kept_whole_and_damage_is_told(written: Path, kinds_dataset: Pa
         write_dense_set(first_pairs(open_finished(kinds_dataset), 2), copy)
 
 
+def test_verify_takes_dense_sets_and_their_sealed_form(
+    written: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Every file but that of the secret is listed; a flipped bit and a stray file are faults."""
+    folder = tmp_path / "set"
+    shutil.copytree(written, folder)
+    public = seal_dense_set(folder, tmp_path / "public")
+    for whole in (folder, public):
+        assert main(["dataset", "verify", str(whole)]) == 0
+    damaged = public / "frames" / "000001-up.jpg"
+    damaged.write_bytes(damaged.read_bytes()[:-1] + b"x")
+    (public / "mine.txt").write_text("mine")
+    capsys.readouterr()
+    assert main(["dataset", "verify", str(public)]) == 1
+    told = capsys.readouterr().out
+    assert "frames/000001-up.jpg" in told
+    assert "mine.txt is not of the export" in told
+    assert "2 faults" in told
+
+
 def test_a_data_set_in_one_room_is_refused(tiny_dataset: Path) -> None:
     for choose in (first_pairs, pairs_of_sealed):
         with pytest.raises(DatasetError, match="has no rooms of its own: a dense set needs a recipe with"):
