@@ -38,13 +38,19 @@ def _cell(name: str, value: Value, wide: bool = False) -> str:
     return f"{shown}\n{interval}" if wide and interval else shown
 
 
+def _head(text: str) -> str:
+    """Head of two lines, the unit in the second; narrow, so that names of methods do not break."""
+    word, _, limit = text.partition(" ")
+    return f"{word}\n{limit} %".replace("\n %", "\n%")
+
+
 def dense_board(scores: Sequence[DenseScore], wide: bool = False) -> TextTable:
     """One row per method, the best recall first."""
     first = scores[0]
     ordered = sorted(scores, key=lambda score: -(score.metrics["recall"].value or 0.0))
     rows = [(score.method.name, *(_cell(name, score.metrics[name], wide) for name in _SHOWN)) for score in ordered]
     title = f"{first.pairs} dense pairs of '{first.pair_set.get('name')}', {first.pixels} pixels that both images show"
-    heads = ("method", *(f"{text}\n%" for text in _SHOWN.values()))
+    heads = ("method", *map(_head, _SHOWN.values()))
     return TextTable(title, heads, tuple(rows), "L" + "r" * len(_SHOWN), _NOTE)
 
 
@@ -55,8 +61,7 @@ def dense_strata_table(score: DenseScore) -> TextTable:
         name = f"{part.by}, {part.label}".removesuffix(" of D").removesuffix(" of the noise")
         cells = (_cell(name, part.metrics[name]) for name in _OF_STRATA)
         rows.append((name, f"{part.pixels / 1000.0:.0f}", *cells))
-    names = (_SHOWN[name].replace(" 10", "\n10") for name in _OF_STRATA)
-    heads = ("part", "pixels\n1000", *(f"{name} %" if "\n" in name else f"{name}\n%" for name in names))
+    heads = ("part", "pixels\n1000", *(_head(_SHOWN[name]) for name in _OF_STRATA))
     return TextTable(f"{score.method.name}, by part", heads, tuple(rows), "l" + "r" * (1 + len(_OF_STRATA)))
 
 
@@ -75,12 +80,15 @@ def dense_differences(differences: Sequence[Difference], first: str, second: str
     """Paired differences of two scores."""
     rows = []
     for item in differences:
-        factor = 100.0 if DENSE_METRICS[item.name].unit == "1" else 1.0
+        metric = DENSE_METRICS[item.name]
+        factor = 100.0 if metric.unit == "1" else 1.0
         shown, interval = cell_parts(item.difference, factor, 2, significant=True)
-        unit = "%" if factor > 1.0 else DENSE_METRICS[item.name].unit
+        unit = "%" if factor > 1.0 else metric.unit
         name = f"{item.name.removesuffix('_m')}, {unit}"
         values = (f"{factor * value:.3g}" for value in (item.first, item.second))
         verdict = {"first": first, "second": second}.get(item.better, item.better)
+        if metric.better not in ("lower", "higher"):
+            verdict = "-"  # more answers are no better ones
         rows.append((name, *values, shown, interval, verdict))
     heads = ("metric", "first", "second", "difference", "95 %", "better")
     return TextTable(f"second, {second}, minus first, {first}", heads, tuple(rows), "lrrrrL")

@@ -293,7 +293,9 @@ def compare(first: Path, second: Path, *, bootstrap_seed: BootstrapSeed = 0) -> 
     from phibench.datasets.common.shown_text import show_grid, table_console
 
     differences = compare_dense(first, second, bootstrap_seed)
-    names = (f"{read_dense(path).method.name} ({path.name})" for path in (first, second))
+    names = [read_dense(path).method.name for path in (first, second)]
+    if names[0] == names[1]:
+        names = [f"{name} ({path.name})" for name, path in zip(names, (first, second), strict=True)]
     show_grid(table_console(False), dense_differences(differences, *names))
     if all(item.better == "too few samples" for item in differences):
         print("Too few samples for a verdict: 30 are the least (docs/scoring.md, Paired comparison).")
