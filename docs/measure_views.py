@@ -31,8 +31,7 @@ import numpy as np
 
 from phibench.datasets.build.bake_task import bake_room, bake_settings
 from phibench.datasets.build.view_task import render_view
-from phibench.datasets.build.workers import MEMORY
-from phibench.datasets.common.parallel import ONE_THREAD, return_memory
+from phibench.datasets.common.parallel import ONE_THREAD, keep_memory, return_memory
 from phibench.datasets.film.film_plan import film_plans
 from phibench.datasets.film.film_room import renderer
 from phibench.datasets.film.film_task import make_film
@@ -177,9 +176,9 @@ def _memory_mb() -> float:
 
 def main() -> None:
     """Read the options and measure."""
-    wanted = {**ONE_THREAD, **MEMORY}
-    if any(os.environ.get(name) != value for name, value in wanted.items()):
-        os.execve(sys.executable, [sys.executable, *sys.argv], {**os.environ, **wanted})
+    if any(os.environ.get(name) != value for name, value in ONE_THREAD.items()):
+        os.execve(sys.executable, [sys.executable, *sys.argv], {**os.environ, **ONE_THREAD})
+    keep_memory()
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("which", choices=("bake", "view", "film"))
     parser.add_argument("what", help="a recipe; bakes also of `lab` at its own noise")

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.common.parallel import keep_memory
 from phibench.datasets.rooms.room_files import RoomError
 from phibench.datasets.store.files import sha256
 from phibench.datasets.store.folder_lock import working
@@ -124,6 +125,7 @@ def perform(task: BuildTask, out: Path, code: str | None = None) -> Done | Faile
     """
     if code is not None and code != code_sha256():
         return Failed(f"worker {worker_name()} runs other code than the sender: install the same version on both")
+    keep_memory()  # a worker of dask begins without us
     began, began_cpu = time.perf_counter(), time.process_time()
     try:
         with working(out):

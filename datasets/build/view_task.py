@@ -10,6 +10,7 @@ from typing import Any
 
 from phibench.datasets.build.bake_task import bake_settings, read_light_map
 from phibench.datasets.build.tasks import Made
+from phibench.datasets.common.parallel import keep_memory
 from phibench.datasets.plan.plan import PosePlan
 from phibench.datasets.recipe.tables import AmbientTable
 from phibench.datasets.rooms.room_files import RoomError
@@ -24,6 +25,7 @@ def start_renderer() -> dict[str, Any]:
     """Switch Mitsuba on in this process; return what it runs on."""
     from phibench.render.setup.variant import THREADS, activate, renders_with
 
+    keep_memory()
     activate()
     return {**renders_with(), "threads_per_process": THREADS}
 

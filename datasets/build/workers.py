@@ -28,7 +28,7 @@ from typing import Any
 from phibench.datasets.build.tasks import BuildTask, Done, Executor, Failed, Outcome, fault_text, perform, worker_name
 from phibench.datasets.build.view_task import start_renderer
 from phibench.datasets.common.errors import DatasetError, whole_number
-from phibench.datasets.common.parallel import ONE_THREAD, end_with_the_parent, environment_of_children
+from phibench.datasets.common.parallel import ONE_THREAD, begin_worker, environment_of_children
 from phibench.datasets.store.files import write_text
 from phibench.datasets.store.provenance import code_sha256, provenance
 
@@ -40,8 +40,6 @@ DEATH_S = 10.0  # a worker whose pipe has ended is on its way out
 _POLL_S = 0.005  # between looks for a task that has ended: short beside any task
 _LEAST_S = 0.5  # between two looks for a scheduler that is still to start
 _CENSUS_S = 2.0  # counting the workers is a call to the scheduler: not before every task
-# glibc returns large arrays at once; a view's arrays of 45 MB would then fault every page anew, 1 s a view
-MEMORY = {"MALLOC_TRIM_THRESHOLD_": f"{2**31}", "MALLOC_MMAP_THRESHOLD_": f"{2**30}", "MALLOC_TOP_PAD_": f"{2**26}"}
 _STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _MISSING = "dask.distributed is not installed: run `pip install 'phibench[cluster]'`"
 
@@ -173,7 +171,7 @@ class _Worker:
     def begin(self, task: BuildTask) -> None:
         """Send a task, the first one to a new process; if the worker has just died, `outcome` tells."""
         if self._process.pid is None:
-            with _signals_kept_from_children(), environment_of_children({**MEMORY, **ONE_THREAD}):
+            with _signals_kept_from_children(), environment_of_children(ONE_THREAD):
                 self._process.start()
                 self._far.close()  # ours: the pipe then ends with the worker
         with contextlib.suppress(OSError):  # a worker that died at once: `result` tells
@@ -208,7 +206,7 @@ class _Worker:
 
 def _serve(line: Connection, do: Do, out: Path, code: str) -> None:
     """Do tasks until the pipe ends."""
-    end_with_the_parent()
+    begin_worker()
     signal.pthread_sigmask(signal.SIG_UNBLOCK, _STOPS)
     with contextlib.suppress(EOFError):  # the run has hung up: nothing is left to do
         while True:
