@@ -289,5 +289,5 @@ def _signs(pattern: str) -> str:
 
 
 def _shown(given: object) -> str:
-    text = repr(given)
+    text = str(given).lower() if isinstance(given, bool) else repr(given)  # as TOML and JSON write it
     return text if len(text) <= 60 else text[:57] + "..."

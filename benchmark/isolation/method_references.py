@@ -181,9 +181,10 @@ def _of_file(reference: str, seat: Seat) -> Reference:
         raise MethodError(f"method '{reference}': say which function is meant, such as {file}:{seat.function}")
     path = Path(text).absolute()
     if not path.is_file():
+        if path.is_dir():
+            raise MethodError(f"method '{reference}': {path} is a folder; name the file with the function in it")
         advice = f"`{seat.command} new {text}` writes an example"
-        what = "is a folder" if path.is_dir() else "is not there"
-        raise MethodError(f"method '{reference}': the file {path} {what}; {advice}")
+        raise MethodError(f"method '{reference}': the file {path} is not there; {advice}")
     if path.name != printable_line(path.name):
         raise MethodError(f"method '{printable_line(path.name)}': give the file a name of at most 200 printable signs")
     parsed(path)

@@ -232,7 +232,11 @@ def _ranking(
         pulls=pull_histogram(tables),
         frames=frames,
         frame_of=frame_of,
-        false_lines={name: line for name, table in tables.items() if (line := false_line(table))},
+        false_lines={
+            name: line
+            for name, table in tables.items()
+            if (line := false_line(table, "localise" in tracks_of(scores[name].pair_set)))
+        },
         apart=apart,
     )
 

@@ -311,21 +311,21 @@ CAUSES: dict[str, str] = {
 TAKEN_FOR: dict[str, tuple[str, str]] = {
     "lamp": (
         "a lamp or its reflection in the mirror",
-        "subtract a laser-off image, mask lamps (lamp_mask in docs/method.md), or use --track localise",
+        "subtract a laser-off image, or mask lamps (lamp_mask in docs/method.md)",
     ),
     "lamp_noise": (
         "noise of a lamp or its reflection in on - off",
-        "divide by the noise, mask lamps (lamp_mask in docs/method.md), or use --track localise",
+        "divide by the noise, or mask lamps (lamp_mask in docs/method.md)",
     ),
-    "light": ("another light of the scene", "tell it by the laser-off image and its size, or use --track localise"),
-    "region": ("a region that is brighter than the spot", "subtract a laser-off image, or use --track localise"),
+    "light": ("another light of the scene", "tell it by the laser-off image and its size"),
+    "region": ("a region that is brighter than the spot", "subtract a laser-off image"),
     "region_noise": (
         "noise of a bright region in on - off",
-        "divide by the noise, mask bright regions (lamp_mask in docs/method.md), or use --track localise",
+        "divide by the noise, or mask bright regions (lamp_mask in docs/method.md)",
     ),
     "nothing": (
-        "false, on nothing brighter than the spot",
-        "phibench method check tells mistakes of convention, --track localise narrows the search",
+        "false, where the image is no brighter than at the spot",
+        "look at the worst images of `phibench report`; `phibench method check` finds mistakes of convention",
     ),
 }
 """Kinds of places that false detections lie on, in words, with advice."""

@@ -242,12 +242,13 @@ def _median_and_most(spread: PairRange) -> str:
 # -- lines beside the tables ---------------------------------------------------------------------------------------
 
 
-def false_line(records: pl.DataFrame) -> str:
+def false_line(records: pl.DataFrame, boxed: bool = False) -> str:
     """Sentence on what the false answers are, with advice; "" unless a fifth of the answers are false.
 
     Parameters
     ----------
     records : with causes
+    boxed : every spot has a box around it, so that the search cannot be narrowed
     """
     answers = records.filter(pl.col("u_px").is_not_null())
     false = answers.filter("false_detection")
@@ -259,7 +260,8 @@ def false_line(records: pl.DataFrame) -> str:
     bright = ("lamp", "region")
     subtracts = sum(kinds[cause + NOISE] for cause in bright) > sum(kinds[cause] for cause in bright)
     what, advice = TAKEN_FOR[kind + NOISE if kind in bright and subtracts else kind]
-    return f"{100 * number / len(answers):.0f} % of the answers are {what}: {advice}"
+    narrower = "" if boxed else "; --track localise narrows the search"
+    return f"{100 * number / len(answers):.0f} % of the answers are {what}: {advice}{narrower}"
 
 
 def failure_line(records: pl.DataFrame) -> str:
@@ -380,8 +382,12 @@ def method_lines(one: HasScore) -> list[str]:
     """Sentences on a method: it failed or refused every pair, it knows too much, what its false answers are."""
     why = refused(one.records)
     failure = f"not compared: it {why}" if why else failure_line(one.records)
-    told = filter(None, (failure, *(flag.text for flag in one.document.flags), false_line(one.records)))
+    told = filter(None, (failure, *(flag.text for flag in one.document.flags), _false_line(one)))
     return [f"{one.document.method.name}: {line}" for line in told]
+
+
+def _false_line(one: HasScore) -> str:
+    return false_line(one.records, "localise" in tracks_of(one.document.pair_set))
 
 
 def _line(console: Console, text: str) -> None:
@@ -451,6 +457,9 @@ def one_line(estimate: Estimate, factor: float = 1.0, digits: int = 3) -> str:
     return " ".join(word for word in cell_parts(estimate, factor, digits) if word)
 
 
+_NOTHING = 1e-9  # of an interval's upper end: quantiles of few samples come as 1e-50 for 0
+
+
 def cell_parts(estimate: Estimate, factor: float, digits: int, significant: bool = False) -> tuple[str, str]:
     """Value and interval, or value and why there is none; "-" alone where there is no value."""
     if not math.isfinite(estimate.value):
@@ -458,7 +467,8 @@ def cell_parts(estimate: Estimate, factor: float, digits: int, significant: bool
     value = number(factor * estimate.value, digits, significant)
     if not math.isfinite(estimate.low):
         return value, f"({estimate.note})" if estimate.note else ""
-    low, high = (number(factor * x, digits, significant) for x in (estimate.low, estimate.high))
+    least = estimate.low if abs(estimate.low) > _NOTHING * abs(estimate.high) else 0.0
+    low, high = (number(factor * x, digits, significant) for x in (least, estimate.high))
     return value, f"[{low}, {high}]"
 
 

@@ -345,7 +345,7 @@ def frames(
     preset
         Where the chain ends: "ideal" (EXR, expected electrons), "mono-raw", "bayer-raw" (PNG of 16 bits that holds
         10-bit DN, not scaled), "srgb8" (PNG), "yuyv" (PNG of Y' and chroma) or "mjpeg" (JPEG; PNG with
-        --region). By default that of --sensor, or "mjpeg".
+        --region). By default that of --sensor, the first that the data set's recipe names, or "mjpeg".
     sensor
         Sensor file of `phibench sensor fit`: its numbers stand for the preset's.
     out
@@ -357,14 +357,24 @@ def frames(
     from phibench.datasets.frames.sensor_file import read_sensor_file
 
     file = None if sensor is None else read_sensor_file(sensor)
-    preset = preset or (DEFAULT_PRESET if file is None else file.preset)
+    named = () if preset or file else _presets_named(directory)
+    preset = preset or (file.preset if file else (*named, DEFAULT_PRESET)[0])
     options = drawing.options(preset, {} if file is None else file.numbers)
     given: Any = {"samples": drawing.sample or None, "laser_off": laser_off, "workers": drawing.workers}
     done = draw_frames(directory, options, drawing.draws, out=out, **given)
-    for note in done.notes:
+    others = [f"one that the recipe also names has a folder of its own: --preset {name}" for name in named[1:]]
+    for note in (*done.notes, *others):
         print(f"note: {note}")
     print(f"{done.folder}: {done.made} files written, {done.kept} kept, index frames.jsonl and frames.parquet")
     return 0
+
+
+def _presets_named(directory: Path) -> tuple[str, ...]:
+    """Presets of the recipe's `[frames]`."""
+    from phibench.datasets.read import open_finished
+
+    frames = open_finished(directory).recipe.frames
+    return () if frames is None else tuple(frames.presets)
 
 
 @Parameter(name="*")

@@ -230,6 +230,7 @@ def test_the_line_on_false_answers_takes_a_methods_places_together():
     kinds = ["lamp", *["lamp_noise"] * 4, *["region_noise"] * 3]
     table = pl.DataFrame({"u_px": [1.0] * 8, "false_detection": [True] * 8, "taken_for": kinds})
     assert false_line(table).startswith("62 % of the answers are noise of a lamp")
+    assert "localise" not in false_line(table, boxed=True)  # every spot has its box already
     plain = table.with_columns(taken_for=pl.Series([kind.removesuffix("_noise") for kind in kinds]))
     assert false_line(plain).startswith("62 % of the answers are a lamp or its reflection in the mirror: subtract")
 

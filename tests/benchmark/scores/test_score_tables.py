@@ -15,12 +15,14 @@ from phibench.benchmark.scores.answer_errors import Rules
 from phibench.benchmark.scores.causes import KINDS
 from phibench.benchmark.scores.compare import compare_records
 from phibench.benchmark.scores.comparison_tables import print_comparison
+from phibench.benchmark.scores.intervals import Estimate
 from phibench.benchmark.scores.metrics import METRICS
 from phibench.benchmark.scores.score import isolated, score_outcomes
 from phibench.benchmark.scores.score_document import MethodCard
 from phibench.benchmark.scores.score_tables import (
     HEADS,
     cause_table,
+    cell_parts,
     failure_line,
     leaderboard,
     nothing_answered,
@@ -189,6 +191,12 @@ def test_one_unit_per_quantity():
 )
 def test_three_digits(value, text):
     assert number(value, 3, significant=True) == text
+
+
+def test_an_interval_from_nothing_begins_at_nothing():
+    """Quantiles of the share of 1 of 2 samples come as 8e-52; a small number that is one stays."""
+    shown = [cell_parts(Estimate(0.5, low, 1.0), 100.0, 3, significant=True)[1] for low in (8e-52, 1e-5)]
+    assert shown == ["[0, 100]", "[0.001, 100]"]
 
 
 def test_a_method_that_takes_none_of_the_pairs_is_not_ranked_and_not_blamed(scored, capsys, monkeypatch):

@@ -47,6 +47,19 @@ def image_in(path: Path) -> np.ndarray:
         return np.asarray(picture)
 
 
+def test_the_first_preset_of_the_recipe_is_drawn_and_the_others_are_told(
+    bench_dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The recipe's first is not the default of the command."""
+    first, *others = open_dataset(bench_dataset).recipe.frames.presets
+    assert first != "mjpeg"
+    out = tmp_path / "frames"
+    assert run(bench_dataset, "--out", out, "--workers", 1, "--region", 32) == 0
+    assert {row.preset for row in read_index(out).values()} == {first}
+    told = capsys.readouterr().out
+    assert all(f"--preset {name}" in told for name in others)
+
+
 @pytest.mark.parametrize(
     ("preset", "end", "mode"),
     [
