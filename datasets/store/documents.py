@@ -212,7 +212,7 @@ def read_info(folder: Path) -> DatasetInfo:
     path = folder / schema.INFO
     if not folder.is_dir():
         raise DatasetError(
-            f"there is no folder {folder}; `phibench dataset make` makes a data set, and `phibench demo` writes five pairs"
+            f"there is no folder {folder}; `phibench dataset make` makes a data set, `phibench demo` writes five pairs"
         )
     if not path.is_file():
         if (folder / schema.TruthFolder.FRAMES_SET).is_file():

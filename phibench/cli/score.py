@@ -94,8 +94,8 @@ class ChoiceOptions:
     frames
         Frames of each position with the laser on and with it off, such as 6 6; one of each by default.
     track
-        localise: every pair in boxes of 64 pixels; find or depth: whole frames (docs/scoring.md). `phibench bench` takes
-        several.
+        localise: every pair in boxes of 64 pixels; find or depth: whole frames (docs/scoring.md). `phibench bench`
+        takes several.
     """
 
     preset: OwnOrPreset = None
