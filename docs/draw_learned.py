@@ -23,8 +23,9 @@ from phibench.datasets.exposures.pair_draws import CachedSample, PairDraw, pair_
 from phibench.datasets.frames.sensor_card import card_of
 from phibench.datasets.frames.source import frame_stream, noise_draw
 from phibench.datasets.read import open_finished
+from phibench.estimator.learned.network_graphs import CROP
 from phibench.estimator.learned.network_input import crop_input, crop_origin, cut
-from phibench.estimator.learned.networks import CROP, Network
+from phibench.estimator.learned.networks import Network
 from phibench.render.sensor.light import Region
 from phibench.scenes.frames import Array
 from phibench.scenes.random_streams import generator

@@ -34,22 +34,24 @@ from phibench.datasets.frames.request import FrameOptions
 from phibench.datasets.read import open_finished
 from phibench.datasets.training import Crop, CropSettings, SpotCrops
 from phibench.estimator.learned.network_file import read_model
-from phibench.estimator.learned.network_input import PLANES, SCALARS, SIDE_PX, VIEWS, WINDOW_PX, CropView, crop_input
-from phibench.estimator.learned.networks import (
+from phibench.estimator.learned.network_graphs import (
     CONVOLUTIONS,
     CORRECTION_PX,
     CROP,
     DENSE,
-    INSTALL_TRAINING,
-    MIDDLE_PX,
     PLANES_OUT,
     REDUCED,
-    Network,
-    NetworkError,
     Weights,
     cell_places,
-    covariances,
     weight_shapes,
+)
+from phibench.estimator.learned.network_input import PLANES, SCALARS, SIDE_PX, VIEWS, WINDOW_PX, CropView, crop_input
+from phibench.estimator.learned.networks import (
+    INSTALL_TRAINING,
+    MIDDLE_PX,
+    Network,
+    NetworkError,
+    covariances,
     write_network,
 )
 from phibench.scenes.frames import Array

@@ -32,19 +32,9 @@ from phibench.datasets.read import Dataset, open_finished
 from phibench.datasets.training import CropSettings, SpotCrops
 from phibench.estimator.interface import Box
 from phibench.estimator.learned.network_file import read_model
+from phibench.estimator.learned.network_graphs import CROP, DETECT, DETECTOR, Weights
 from phibench.estimator.learned.network_input import frame_input
-from phibench.estimator.learned.networks import (
-    CROP,
-    DETECT,
-    DETECTOR,
-    Network,
-    NetworkError,
-    Weights,
-    heat_peaks,
-    refined,
-    shipped,
-    write_network,
-)
+from phibench.estimator.learned.networks import Network, NetworkError, heat_peaks, refined, shipped, write_network
 from phibench.estimator.spots.detect import mirror_box, outline_mask
 from phibench.estimator.spots.image_planes import kind_of
 from phibench.scenes.frames import Array

@@ -2,24 +2,16 @@
 
 Two folders are kept apart. `out` is public: archives, `MANIFEST.json`, `SHA256SUMS`, card, licence and Croissant.
 `work` is not: it holds the data sets as they are rendered, that of the sealed part with its truth.
-
-The same data sets give the same bytes: members of an archive are sorted, and have one time, one owner and one mode.
 """
 
 from __future__ import annotations
 
-import hashlib
-import io
-import json
-import os
 import re
 import stat
-import tarfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
-from typing import IO
 
 from rich.console import Console
 
@@ -32,6 +24,7 @@ from phibench.benchmark.export.dense_set import (
     write_dense_set,
 )
 from phibench.benchmark.export.export_make import export_frames_sets
+from phibench.benchmark.release.release_archives import archive_tasks, digest_of, packed_files
 from phibench.benchmark.release.release_parts import (
     DENSE_PAIRS,
     FORMAT,
@@ -49,7 +42,6 @@ from phibench.benchmark.release.release_parts import (
 from phibench.benchmark.sealed.sealed_set import secret_seed
 from phibench.datasets.build.forecast import megabytes
 from phibench.datasets.build.parts import bring_all
-from phibench.datasets.build.tasks import BuildTask, Made
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import InputFile
 from phibench.datasets.common.progress import progress_console
@@ -65,7 +57,7 @@ from phibench.datasets.store import schema
 from phibench.datasets.store.checksums import differing_files, filling, read_checksums, signed, write_documents
 from phibench.datasets.store.croissant import LICENSE_TEXT, LICENSE_URL, croissant_text, file_object
 from phibench.datasets.store.documents import read_info
-from phibench.datasets.store.files import sha256, write_atomic, write_text
+from phibench.datasets.store.files import sha256, write_text
 from phibench.datasets.store.pair_files import FRAMES_SET
 from phibench.datasets.store.temporary_folders import folder_for_work
 
@@ -73,7 +65,6 @@ Seal = Callable[[Path, Path], object]
 """Sealing of a data set: (folder, public folder); `benchmark.sealed.sealed_set.seal`."""
 ARCHIVE_BYTES = 500_000_000  # that a fetch that breaks off repeats at most
 README = "README.md"
-_TIME_S = 315532800  # 1980-01-01, as all files of a sealed set have
 _SEAL = "seal.json"
 _IMAGE_BYTES, _IMAGES = 730_000, 4  # of a sealed pair at 1280 x 720; the mean of 40 pairs in three presets
 _PAIR_BYTES = {"mjpeg": 450_000, "srgb8": 4_230_000, "bayer-raw": 4_570_000}  # of dev's first pairs, four images each
@@ -173,7 +164,8 @@ def dry_run(request: ReleaseRequest) -> Iterator[str]:
         if part.kind == "frames" or part.kind in _DENSE_BYTES:
             yield f"{part.title}: {count}{_frames_cost(request, part, part.title in used)}"
         elif (done / schema.CHECKSUMS).is_file() and part.kind != "sealed":
-            size = sum((done / name).stat().st_size for name in _members(part, done) if (done / name).is_file())
+            paths = [done / name for name in packed_files(done, part.kind == "pairs")]
+            size = sum(path.stat().st_size for path in paths if path.is_file())
             yield f"{part.title}: {count}{megabytes(size)}, from {done}"
         elif part.kind == "films":
             yield f"{part.title}: {_film_cost(part)}"
@@ -329,7 +321,7 @@ def _dataset(request: ReleaseRequest, part: ReleasePart, used: Mapping[str, Path
 def _frames(request: ReleaseRequest, part: ReleasePart, folder: Path) -> Path:
     """Frames sets of the first samples; another data set, or another number of samples, has a folder of its own."""
     pairs = request.frames_of(part)
-    digest = _digest([sha256(folder / schema.CHECKSUMS), pairs])[:12]
+    digest = digest_of([sha256(folder / schema.CHECKSUMS), pairs])[:12]
     out = request.work / f"{part.title}-{digest}"
     if not (out / schema.CHECKSUMS).is_file() and (faults := differing_files(folder, read_checksums(folder))):
         raise DatasetError(f"{folder}: {faults[0]}; run `phibench dataset repair {folder}`")
@@ -339,7 +331,7 @@ def _frames(request: ReleaseRequest, part: ReleasePart, folder: Path) -> Path:
 def _dense(request: ReleaseRequest, part: ReleasePart, folder: Path) -> Path:
     """Dense set of the first samples; of a sealed part its public form."""
     most = min(DENSE_PAIRS, request.samples_of(part) or DENSE_PAIRS)
-    digest = _digest([sha256(folder / schema.CHECKSUMS), most])[:12]
+    digest = digest_of([sha256(folder / schema.CHECKSUMS), most])[:12]
     dataset, out = open_finished(folder), request.work / f"{part.title}-{digest}"
     if not (out / schema.CHECKSUMS).is_file() and (faults := differing_files(folder, read_checksums(folder))):
         raise DatasetError(f"{folder}: {faults[0]}; run `phibench dataset repair {folder}`")
@@ -357,26 +349,20 @@ def _dense(request: ReleaseRequest, part: ReleasePart, folder: Path) -> Path:
 def _packed(request: ReleaseRequest, part: ReleasePart, folder: Path, manifest: Manifest) -> tuple[Manifest, int, int]:
     """Archives of one part, and the manifest with it; numbers of archives written and kept."""
     out = request.out
-    members, title = _members(part, folder), part.title
-    shares = {
-        f"{title}-{number:03d}.tar": {name: members[name] for name in names}
-        for number, names in enumerate(_shares(folder, members, request.archive_bytes))
-    }
+    title = part.title
+    members = packed_files(folder, part.kind == "pairs")
+    tasks = archive_tasks(title, folder, members, request.archive_bytes)
     parts = dict(manifest.parts)
     if parts.pop(title, None) is not None:
         write_text(out / MANIFEST, manifest.model_copy(update={"parts": parts}).text())
     (out / schema.CHECKSUMS).unlink(missing_ok=True)  # until all is there the release is not finished
-    tasks = [
-        BuildTask(f"archive {name}", _digest([title, list(share.items())]), write_archive, (name, title, folder, share))
-        for name, share in shares.items()
-    ]
     state = request.work / f"{title}-archives"
-    brought = bring_all({task.name: task for task in tasks}, out, 1, request.console, title, state=state)
+    brought = bring_all({task.name: task for task in tasks.values()}, out, 1, request.console, title, state=state)
     archives = [
         Archive(name=name, size=(out / name).stat().st_size, sha256=digest) for name, digest in brought.hashes.items()
     ]
     for path in out.glob(f"{title}-[0-9][0-9][0-9].tar"):
-        if path.name not in shares:
+        if path.name not in tasks:
             path.unlink()  # of an earlier release with more files
     count = _sample_count(part, folder)
     parts[title] = ReleasedPart(
@@ -391,75 +377,7 @@ def _packed(request: ReleaseRequest, part: ReleasePart, folder: Path, manifest: 
     )
     manifest = manifest.model_copy(update={"parts": parts})
     write_text(out / MANIFEST, manifest.text())
-    return manifest, len(brought.made), len(shares) - len(brought.made)
-
-
-def _digest(document: object) -> str:
-    return hashlib.sha256(json.dumps(document).encode()).hexdigest()
-
-
-def _members(part: ReleasePart, folder: Path) -> dict[str, str]:
-    """Files to be packed with their SHA-256, sorted by name: what SHA256SUMS lists, itself, and the journal."""
-    listed = read_checksums(folder)
-    extra = [schema.CHECKSUMS, *([schema.JOURNAL] if part.kind == "pairs" else [])]
-    hashes = listed | {name: sha256(folder / name) for name in extra if (folder / name).is_file()}
-    return dict(sorted(hashes.items()))
-
-
-def _shares(folder: Path, members: Mapping[str, str], most: int) -> Iterator[list[str]]:
-    """Members of each archive, in their order."""
-    share: list[str] = []
-    size = 0
-    for name in members:
-        path = folder / name
-        if not path.is_file():
-            raise DatasetError(f"{folder}: {name} is missing; run `phibench dataset verify` to see all faults")
-        bytes_here = path.stat().st_size
-        if share and size + bytes_here > most:
-            yield share
-            share, size = [], 0
-        share.append(name)
-        size += bytes_here
-    if share:
-        yield share
-
-
-def write_archive(out: Path, archive: str, title: str, folder: Path, members: Mapping[str, str]) -> Made:
-    """Task: write an archive of a folder's files, each with its SHA-256.
-
-    Raises
-    ------
-    DatasetError
-        If one has another hash.
-    """
-    write_atomic(out / archive, lambda path: _write_tar(path, title, folder, members))
-    return Made((archive,))
-
-
-def _write_tar(path: Path, title: str, folder: Path, members: Mapping[str, str]) -> None:
-    """Tar whose bytes depend on names and contents alone; every file is checked on its way."""
-    with path.open("wb") as file, tarfile.open(fileobj=file, mode="w", format=tarfile.USTAR_FORMAT) as tar:
-        for name in members:
-            with (folder / name).open("rb") as source:
-                entry = tarfile.TarInfo(f"{title}/{name}")
-                entry.size, entry.mtime, entry.mode = os.fstat(source.fileno()).st_size, _TIME_S, 0o644
-                reader = _Hashing(source)
-                tar.addfile(entry, reader)
-            if reader.digest.hexdigest() != members[name]:
-                what = f"{folder}: {name} is damaged: its SHA-256 is not the one in {schema.CHECKSUMS}"
-                raise DatasetError(f"{what}; run `phibench dataset repair {folder}`")
-
-
-class _Hashing(io.RawIOBase):
-    """File that is hashed while it is read."""
-
-    def __init__(self, file: IO[bytes]) -> None:
-        self._file, self.digest = file, hashlib.sha256()
-
-    def read(self, size: int = -1) -> bytes:
-        data = self._file.read(size)
-        self.digest.update(data)
-        return data
+    return manifest, len(brought.made), len(tasks) - len(brought.made)
 
 
 def _sample_count(part: ReleasePart, folder: Path) -> int:

@@ -1,4 +1,4 @@
-"""Networks in ONNX files: their layers, writing and reading them, and running them by onnxruntime.
+"""Networks in ONNX files: read, checked, run by onnxruntime, written; and the spot of a pair by the network of crops.
 
 One thread: the same bytes every time.
 
@@ -14,7 +14,7 @@ import hashlib
 import json
 import math
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -30,28 +30,15 @@ from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.datasets.store.files import write_bytes
 from phibench.estimator.interface import Image, Spot
 from phibench.estimator.learned.network_file import NetworkFileError, Node, read_model, require_layers
-from phibench.estimator.learned.network_input import (
-    FRAME_PLANES,
-    PLANES,
-    SCALARS,
-    SIDE_PX,
-    WINDOW_PX,
-    CropInput,
-    crop_input,
-    crop_origin,
-    cut,
-)
+from phibench.estimator.learned.network_graphs import CROP, DETECT, GRAPHS, Weights, weight_shapes
+from phibench.estimator.learned.network_input import SIDE_PX, WINDOW_PX, CropInput, crop_input, crop_origin, cut
 from phibench.scenes.frames import Array, BoolArray
 from phibench.scenes.validation import printable_line
 
-CROP, DETECT = "learned_crop", "learned_detect"
 VERSIONS = {CROP: "3", DETECT: "1"}
 """Versions of what a network gets, of its layers and of what it answers; a change of any raises it."""
 INSTALL = "pip install 'phibench[learned]'"
 INSTALL_TRAINING = "pip install 'phibench[learned-training]' (the CPU's wheel of PyTorch is enough: docs/learned.md)"
-
-Weights = dict[str, NDArray[Any]]
-"""Arrays by name, "<layer>.w" and "<layer>.b"."""
 
 _REMEDY = "install phibench anew, or train it: docs/learned.md"
 _MOST_BYTES = MIB
@@ -215,7 +202,7 @@ def _checked(model: bytes, name: str) -> dict[str, str]:
     if network.metadata.get("version") != VERSIONS[name]:
         stated = printable_line(str(network.metadata.get("version")), 20)
         raise NetworkFileError(f"is of version {stated}, this phibench needs version {VERSIONS[name]}")
-    graph = _GRAPHS[name](_Recorder())
+    graph = GRAPHS[name](_Recorder())
     for kind, given, right in (("inputs", network.inputs, graph.inputs), ("outputs", network.outputs, graph.outputs)):
         if given != list(right):
             raise NetworkFileError(
@@ -264,45 +251,6 @@ def _session(model: bytes, file: InputFile) -> Any:
         raise file.fault("is no network that onnxruntime can run") from error
 
 
-# -- layers ----------------------------------------------------------------------------------------------------------
-
-PLANES_OUT = 32
-CONVOLUTIONS = (("c1", PLANES, 6, 2), *((name, PLANES_OUT, 3, 1) for name in ("c2", "c3", "c4")))
-"""Of the network of crops: name, planes in, side of the kernel, step. No border: 8 x 8 cells in the middle are left."""
-CELLS, FIRST_CELL_PX = 8, 8
-REDUCED = 8
-"""Planes of the cells that the dense layers get one by one."""
-DENSE = (
-    ("f1", SCALARS, 32),
-    ("f2", 32, 2 * PLANES_OUT),
-    ("d1", CELLS**2 * REDUCED + PLANES_OUT + SCALARS, 96),
-    ("d2", 96, 5),
-)
-"""Matrices and their widths: gains and offsets of the first planes by the scalars, then the answer."""
-CORRECTION_PX = 0.1
-"""Of the place, per unit of the last layer."""
-DETECTOR = (("e1", FRAME_PLANES, 12), ("e2", 12, 16), ("e3", 16, 16), ("e4", 16, 16))
-"""Of the network of frames: name, planes in, planes out; 3 x 3 cells each, cut at 0; then one plane of 1 x 1."""
-
-
-def weight_shapes(name: str) -> dict[str, tuple[int, ...]]:
-    """Shapes of a network's weights by name."""
-    if name == DETECT:
-        sizes: list[tuple[str, tuple[int, ...], int]] = [(key, (to, of, 3, 3), to) for key, of, to in DETECTOR]
-        sizes.append(("heat", (1, DETECTOR[-1][2], 1, 1), 1))
-    else:
-        sizes = [(key, (PLANES_OUT, of, side, side), PLANES_OUT) for key, of, side, _ in CONVOLUTIONS]
-        sizes += [(key, (to, PLANES_OUT, 1, 1), to) for key, to in (("cells", 3), ("less", REDUCED))]
-        sizes += [(key, (of, to), to) for key, of, to in DENSE]
-    return {f"{key}{end}": shape for key, w, b in sizes for end, shape in ((".w", w), (".b", (b,)))}
-
-
-def cell_places() -> NDArray[np.float32]:
-    """Places (u, v) of the first pixels of all cells, shape (1, 2, cells)."""
-    v, u = np.mgrid[:CELLS, :CELLS] * 2.0 + FIRST_CELL_PX
-    return np.stack([u.ravel(), v.ravel()])[None].astype(np.float32)
-
-
 # -- writing ----------------------------------------------------------------------------------------------------------
 
 _OPSET, _IR = 17, 8  # of 2022: what every onnxruntime of these years reads
@@ -330,7 +278,7 @@ def write_network(path: Path, name: str, weights: Weights, metadata: Mapping[str
         import onnx.numpy_helper
     except ImportError as error:
         raise NetworkError(f"writing networks needs onnx: {INSTALL_TRAINING}") from error
-    graph = _GRAPHS[name](onnx.helper)
+    graph = GRAPHS[name](onnx.helper)
     tensors = [onnx.numpy_helper.from_array(value, key) for key, value in (weights | graph.constants).items()]
     float_of = onnx.TensorProto.FLOAT
     ends = [
@@ -346,90 +294,6 @@ def write_network(path: Path, name: str, weights: Weights, metadata: Mapping[str
     write_bytes(path, sealed(model.SerializeToString(deterministic=True)))
     Network(path, name)
     return path
-
-
-@dataclass(frozen=True)
-class Graph:
-    """Nodes of a network, constants besides its weights, and shapes of its inputs and outputs."""
-
-    nodes: list[Any]
-    constants: Weights
-    inputs: dict[str, list[str | int]]
-    outputs: dict[str, list[str | int]]
-
-
-def _crop_graph(helper: Any) -> Graph:
-    """`crop_forward` in ONNX's operators."""
-    node = helper.make_node
-    nodes = [
-        node("Gemm", ["scalars", "f1.w", "f1.b"], ["f1.x"]),
-        node("Relu", ["f1.x"], ["f1.y"]),
-        node("Gemm", ["f1.y", "f2.w", "f2.b"], ["f2.x"]),
-        node("Reshape", ["f2.x", "film"], ["f2.y"]),
-        node("Split", ["f2.y", "halves"], ["gain", "shift"], axis=1),
-    ]
-    x = "planes"
-    for name, _, side, stride in CONVOLUTIONS:
-        nodes.append(_convolved(helper, x, name, side, stride))
-        x = f"{name}.x"
-        if name == "c1":
-            nodes += [node("Mul", [x, "gain"], ["gained"]), node("Add", ["gained", "shift"], ["moved_planes"])]
-            x = "moved_planes"
-        nodes.append(node("Relu", [x], [f"{name}.y"]))
-        x = f"{name}.y"
-    nodes += [
-        _convolved(helper, x, "cells", 1),
-        node("Reshape", ["cells.x", "three"], ["flat"]),
-        node("Split", ["flat", "parts"], ["logit", "offset"], axis=1),
-        node("Softmax", ["logit"], ["weight"], axis=2),
-        node("Add", ["offset", "places"], ["placed"]),
-        node("Mul", ["weight", "placed"], ["weighted"]),
-        node("ReduceSum", ["weighted", "last"], ["middle"], keepdims=0),
-        node("Reshape", [x, "many"], ["features"]),
-        node("Mul", ["weight", "features"], ["attended"]),
-        node("ReduceSum", ["attended", "last"], ["at_spot"], keepdims=0),
-        _convolved(helper, x, "less", 1),
-        node("Relu", ["less.x"], ["less.y"]),
-        node("Flatten", ["less.y"], ["everywhere"], axis=1),
-        node("Concat", ["at_spot", "everywhere", "scalars"], ["pooled"], axis=1),
-        node("Gemm", ["pooled", "d1.w", "d1.b"], ["h"]),
-        node("Relu", ["h"], ["h.y"]),
-        node("Gemm", ["h.y", "d2.w", "d2.b"], ["y"]),
-        node("Split", ["y", "ends"], ["moved", "factor"], axis=1),
-        node("Mul", ["moved", "share"], ["correction"]),
-        node("Add", ["middle", "correction"], ["uv_px"]),
-    ]
-    n = PLANES_OUT
-    whole = {"three": [0, 3, -1], "many": [0, n, -1], "parts": [1, 2], "last": [2], "ends": [2, 3]}
-    whole |= {"film": [0, 2 * n, 1, 1], "halves": [n, n]}
-    constants: Weights = {key: np.array(value, np.int64) for key, value in whole.items()}
-    constants |= {"places": cell_places(), "share": np.array(CORRECTION_PX, np.float32)}
-    inputs: dict[str, list[str | int]] = {"planes": ["n", PLANES, SIDE_PX, SIDE_PX], "scalars": ["n", SCALARS]}
-    return Graph(nodes, constants, inputs, {"uv_px": ["n", 2], "factor": ["n", 3]})
-
-
-def _detect_graph(helper: Any) -> Graph:
-    """`detector_forward` in ONNX's operators."""
-    nodes, x = [], "planes"
-    for name, _, _ in DETECTOR:
-        nodes += [
-            helper.make_node(
-                "Conv", [x, f"{name}.w", f"{name}.b"], [f"{name}.x"], kernel_shape=[3, 3], pads=[1] * 4, strides=[1] * 2
-            ),
-            helper.make_node("Relu", [f"{name}.x"], [f"{name}.y"]),
-        ]
-        x = f"{name}.y"
-    nodes.append(helper.make_node("Conv", [x, "heat.w", "heat.b"], ["heat"], kernel_shape=[1, 1]))
-    return Graph(nodes, {}, {"planes": ["n", FRAME_PLANES, "h", "w"]}, {"heat": ["n", 1, "h", "w"]})
-
-
-def _convolved(helper: Any, x: str, name: str, side: int, stride: int = 1) -> Any:
-    """Node of a layer without a border; its result is "<name>.x"."""
-    numbers = {"kernel_shape": [side] * 2, "strides": [stride] * 2}
-    return helper.make_node("Conv", [x, f"{name}.w", f"{name}.b"], [f"{name}.x"], **numbers)
-
-
-_GRAPHS: Mapping[str, Callable[[Any], Graph]] = {CROP: _crop_graph, DETECT: _detect_graph}
 
 
 # -- spots of a pair -------------------------------------------------------------------------------------------------

@@ -15,8 +15,9 @@ from pathlib import Path
 import numpy as np
 
 from phibench.estimator.interface import Answer, Box, Method, Pair, Spot
+from phibench.estimator.learned.network_graphs import CROP, DETECT
 from phibench.estimator.learned.network_input import ACCEPTED, frame_input
-from phibench.estimator.learned.networks import CROP, DETECT, Network, heat_peaks, network, refined, shipped
+from phibench.estimator.learned.networks import Network, heat_peaks, network, refined, shipped
 from phibench.estimator.methods.chain_fit import chain_fit
 from phibench.estimator.methods.locate import SearchRegion, at_detection, detected, each_spot, red_peak, spot_of
 from phibench.estimator.methods.raw_likelihood import joint_fit, raw_likelihood

@@ -27,7 +27,8 @@ from phibench.cli.calibration import align, calibrate
 from phibench.cli.captures import import_, measure, sensor
 from phibench.cli.dataset import dataset
 from phibench.cli.dense import dense
-from phibench.cli.film import film, loop
+from phibench.cli.film import film
+from phibench.cli.loop import loop
 from phibench.cli.options import DATA, INSTALLATION, KEEPERS, METHODS, SENSOR, START, answer_to_old_spelling
 from phibench.cli.publish import export, fetch, release, seal, submission
 from phibench.cli.room import room, scene

@@ -42,7 +42,8 @@ from phibench.datasets.rooms.panorama_files import is_linear
 from phibench.datasets.rooms.room_files import RoomFiles
 from phibench.datasets.store.checksums import read_checksums
 from phibench.datasets.store.documents import parquet_bytes
-from phibench.estimator.learned.networks import CROP, Network
+from phibench.estimator.learned.network_graphs import CROP
+from phibench.estimator.learned.networks import Network
 from phibench.render.film.moving_rows import RowsImage
 from phibench.scenes.rig import Rig
 

@@ -11,7 +11,8 @@ import pytest
 
 from phibench.estimator.learned import networks
 from phibench.estimator.learned.network_file import _fields, read_model
-from phibench.estimator.learned.networks import CROP, DETECT, Network, NetworkError, covariances, sealed, shipped
+from phibench.estimator.learned.network_graphs import CROP, DETECT
+from phibench.estimator.learned.networks import Network, NetworkError, covariances, sealed, shipped
 from phibench.scenes.random_streams import generator
 
 FOLDER = Path(networks.__file__).parent

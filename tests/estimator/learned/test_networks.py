@@ -14,6 +14,7 @@ from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.frames.sensor_card import sensor_card
 from phibench.estimator.learned import networks
 from phibench.estimator.learned.network_file import read_model
+from phibench.estimator.learned.network_graphs import CROP, DETECT
 from phibench.estimator.learned.network_input import (
     SCALARS,
     SIDE_PX,
@@ -26,16 +27,7 @@ from phibench.estimator.learned.network_input import (
     filter_planes,
     frame_input,
 )
-from phibench.estimator.learned.networks import (
-    CROP,
-    DETECT,
-    Network,
-    NetworkError,
-    covariances,
-    heat_peaks,
-    sealed,
-    shipped,
-)
+from phibench.estimator.learned.networks import Network, NetworkError, covariances, heat_peaks, sealed, shipped
 from phibench.estimator.methods.registry import METHODS, learned_crop, learned_detect
 from phibench.scenes.random_streams import generator
 from tools import crop_training, frame_training

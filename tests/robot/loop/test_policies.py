@@ -13,7 +13,7 @@ import scipy
 from helpers.target_approach import rig_covariance
 
 from phibench.benchmark.isolation.method_references import RunLimits
-from phibench.cli import film
+from phibench.cli import loop
 from phibench.cli import main as cli
 from phibench.robot.loop.arena import generated_arena
 from phibench.robot.loop.episodes import (
@@ -182,7 +182,7 @@ def test_a_policy_without_its_package_is_no_policy_that_failed(monkeypatch: pyte
 
 def test_a_table_of_episodes_has_a_dash_where_nothing_was_stated(capsys: pytest.CaptureFixture[str]) -> None:
     [episode] = run_episodes(Setup(), "random", 1, "x")
-    film._print([replace(episode, stated_m=math.nan, cause="ran into something")])
+    loop._print([replace(episode, stated_m=math.nan, cause="ran into something")])
     row = capsys.readouterr().out.splitlines()[1]
     assert "nan" not in row
     assert row.endswith(" -  ran into something")
