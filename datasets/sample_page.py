@@ -2,8 +2,8 @@
 
 One HTML file with one script of its own. It opens from disk and fetches nothing. Truth planes travel as 16-bit numbers
 with a stated step, the same number of pixels as the image: what the page shows at a pixel is the truth plane's value
-there, rounded to that step. `sample_page.js` draws images, `sample_room.js` the room; `sample_page.html` frames them.
-Style and tools are shared with the page of a dense answer.
+there, rounded to that step. `sample_page.js` draws images, `sample_room.js` the room.
+Frame (`page_frame.html`), style and tools are shared with the page of a dense answer.
 """
 
 from __future__ import annotations
@@ -79,19 +79,34 @@ def write_sample_page(sample: Sample, path: str | Path) -> Path:
 
 def sample_page(sample: Sample) -> str:
     """HTML text of the page of a sample."""
-    return filled_page(Path(__file__).with_suffix(".html"), page_data(sample))
+    return filled_page(Path(__file__).with_suffix(".html"), "phibench sample", page_data(sample))
 
 
-def filled_page(template: Path, data: dict[str, Any]) -> str:
-    """Page of a template: shared style and scripts, the script that lies beside it, and the data."""
+def filled_page(body: Path, title: str, data: dict[str, Any]) -> str:
+    """Page with a body from a file, in the frame, style and scripts of all pages; its own style and script lie beside.
+
+    Parameters
+    ----------
+    body : HTML; the script has the same name with .js, the style, if there is one, with .css
+    title : str
+    data : what the script finds as JSON
+    """
     here = Path(__file__)
-    # "<" would end the script where a name holds "</script>"
-    text = json.dumps(data, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
-    files = [*(here.with_name(name) for name in _SHARED), template.with_suffix(".js")]
-    script = "\n".join(file.read_text(encoding="utf-8") for file in files)
-    style = here.with_name("page_style.css").read_text(encoding="utf-8")
-    page = template.read_text(encoding="utf-8").replace("@STYLE@\n", style)
-    return page.replace("@DATA@", text).replace("@SCRIPT@\n", script)
+    own_style = body.with_suffix(".css")
+    styles = [here.with_name("page_style.css"), *([own_style] if own_style.is_file() else [])]
+    scripts = [*(here.with_name(name) for name in _SHARED), body.with_suffix(".js")]
+    parts = {
+        "@TITLE@": title,
+        "@STYLE@\n": "".join(file.read_text(encoding="utf-8") for file in styles),
+        "@BODY@\n": body.read_text(encoding="utf-8"),
+        # "<" would end the script where a name holds "</script>"
+        "@DATA@": json.dumps(data, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c"),
+        "@SCRIPT@\n": "\n".join(file.read_text(encoding="utf-8") for file in scripts),
+    }
+    page = here.with_name("page_frame.html").read_text(encoding="utf-8")
+    for mark, text in parts.items():
+        page = page.replace(mark, text)
+    return page
 
 
 def page_data(sample: Sample) -> dict[str, Any]:

@@ -1,7 +1,7 @@
 """Interactive page of a dense answer: panoramas, D true and answered, counterparts, causes, the bound, and the room.
 
-One HTML file that fetches nothing, with style and tools of the page of a sample. Values travel as 16-bit numbers with
-a stated step, one for each pixel of the down image: what the page shows is the value there, rounded to that step.
+One HTML file that fetches nothing, with frame, style and tools of the page of a sample. Values travel as 16-bit numbers
+with a stated step, one for each pixel of the down image: what the page shows is the value there, rounded to that step.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ class DensePage:
 
     def html(self) -> str:
         """Text of the page."""
-        return filled_page(Path(__file__).with_suffix(".html"), self.data())
+        return filled_page(Path(__file__).with_suffix(".html"), "phibench dense depth", self.data())
 
     def write(self, path: str | Path) -> Path:
         """Write the page; return the file's path.
