@@ -16,7 +16,7 @@ from typing import TypedDict, Unpack
 from rich.console import Console
 
 from phibench.datasets.build.draws_file import draws_bytes, read_draws, seen_causes, write_draws
-from phibench.datasets.build.finished_work import (
+from phibench.datasets.build.earlier_runs import (
     OR_REPLACE,
     LostWorkError,
     finished_without,
@@ -63,8 +63,8 @@ from phibench.datasets.recipe.load import find_recipe, parse_recipe, recipe_file
 from phibench.datasets.recipe.tables import Recipe
 from phibench.datasets.rooms.room_files import RoomFiles
 from phibench.datasets.store import schema
-from phibench.datasets.store.documents import dataset_info, parse_info, read_manifest
 from phibench.datasets.store.files import write_text
+from phibench.datasets.store.metadata import dataset_info, parse_info, read_manifest
 from phibench.datasets.store.provenance import code_sha256, provenance
 from phibench.render.optics.truth import VISIBLE
 from phibench.render.setup.variant import ENVIRONMENT

@@ -15,7 +15,7 @@ from typing import Any
 
 from rich.console import Console
 
-from phibench.datasets.build.finished_work import lost_work
+from phibench.datasets.build.earlier_runs import lost_work
 from phibench.datasets.build.journal import Entry, FolderHead, Journal, Refusal, is_intact
 from phibench.datasets.build.run_tasks import claimed, copy_room_files, finish, held_head, task_names
 from phibench.datasets.common.errors import DatasetError
@@ -26,7 +26,10 @@ from phibench.datasets.recipe.load import parse_recipe, recipe_text
 from phibench.datasets.recipe.tables import Recipe
 from phibench.datasets.store import schema
 from phibench.datasets.store.checksums import held_room_files
-from phibench.datasets.store.documents import (
+from phibench.datasets.store.files import sha256, write_atomic
+from phibench.datasets.store.folder_lock import only_run
+from phibench.datasets.store.layers import read_exr
+from phibench.datasets.store.metadata import (
     dataset_info,
     info_text,
     parse_info,
@@ -34,9 +37,6 @@ from phibench.datasets.store.documents import (
     recipe_sha256,
     same_content,
 )
-from phibench.datasets.store.files import sha256, write_atomic
-from phibench.datasets.store.folder_lock import only_run
-from phibench.datasets.store.layers import read_exr
 from phibench.datasets.store.provenance import provenance
 from phibench.datasets.store.schema import CHECKSUMS, DatasetInfo
 from phibench.scenes.rig import POSITIONS

@@ -26,7 +26,7 @@ from phibench.datasets.frames.sensor_card import SensorCard, card_of
 from phibench.datasets.frames.source import FrameSource
 from phibench.datasets.read import Dataset, Sample, open_finished
 from phibench.datasets.recipe.tables import FramesTable
-from phibench.datasets.store.documents import from_json
+from phibench.datasets.store.json_forms import from_json
 from phibench.datasets.store.layers import SpotWindow
 from phibench.datasets.store.pair_files import IMAGES_OFF, FramesRow, PairFiles, is_frames_set
 from phibench.render.sensor.camera_chain import Chain, auto_exposed

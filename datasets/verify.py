@@ -38,7 +38,7 @@ from phibench.datasets.store.checksums import (
     read_checksums,
     strays,
 )
-from phibench.datasets.store.documents import alike, differences, parse_info, same_number, to_json
+from phibench.datasets.store.json_forms import alike, same_number, to_json
 from phibench.datasets.store.layers import (
     SPOT_STACKS,
     read_ambient_pair,
@@ -46,6 +46,7 @@ from phibench.datasets.store.layers import (
     read_spot,
     read_truth,
 )
+from phibench.datasets.store.metadata import differences, parse_info
 from phibench.datasets.store.schema import LightRow, ManifestRow, PoseInfo, RoomInfo, SpotRow
 from phibench.datasets.store.sensitivity_file import sensitivity_fault
 from phibench.render.optics.ray_tracer import trace_pixels

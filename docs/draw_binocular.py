@@ -20,7 +20,7 @@ from phibench.estimator.geometry.reflection import image_of
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.render.optics.room_tracer import room_geometry
 from phibench.render.optics.spot_layer import spot_layer
-from phibench.render.room.ambient import render_ambient
+from phibench.render.room.ambient_layer import render_ambient
 from phibench.render.room.light_map import BakeSettings
 from phibench.render.sensor.settings import sensor
 from phibench.scenes.frames import Array

@@ -10,7 +10,7 @@ from PIL import Image
 
 from phibench.datasets.build.bake_task import light_map
 from phibench.datasets.store.pictures import display_exposure_s, to_srgb
-from phibench.render.room.ambient import render_ambient
+from phibench.render.room.ambient_layer import render_ambient
 from phibench.render.room.light_map import BakeSettings
 from phibench.scenes.holder import fitted
 from phibench.scenes.room import default_rig, lab

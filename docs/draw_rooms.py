@@ -15,13 +15,13 @@ import numpy as np
 from PIL import Image
 
 from phibench.datasets.store.pictures import display_exposure_s, to_srgb
-from phibench.render.room.ambient import render_ambient
+from phibench.render.room.ambient_layer import render_ambient
 from phibench.render.room.light_map import BakeSettings, bake
 from phibench.scenes.camera import Camera
 from phibench.scenes.rig import Rig
 from phibench.scenes.room import default_rig
 from phibench.scenes.worlds.generated_room import generate_room
-from phibench.scenes.worlds.properties import drawn_properties
+from phibench.scenes.worlds.room_properties import drawn_properties
 
 FINE = BakeSettings(texel_m=0.1, indirect_texel_m=0.2, lamp_rays=32, bounces=6, bounce_rays=32, final_rays=64)
 COARSE = BakeSettings(texel_m=0.2, indirect_texel_m=0.4, lamp_rays=16, bounces=5, bounce_rays=16, final_rays=24)

@@ -48,7 +48,7 @@ def film(sample: Sample, folder: Path, number: int) -> dict[float, Array]:
 
 def rendered(sample: Sample, part: float, number: int) -> bytes:
     """JPEG file of the camera at a part of the stroke."""
-    from phibench.render.room.ambient import render_ambient
+    from phibench.render.room.ambient_layer import render_ambient
     from phibench.render.room.noise_budget import BUDGETS
     from phibench.render.sensor.electrons import frame_stream
     from phibench.render.sensor.light import Light

@@ -30,7 +30,7 @@ from phibench.datasets.recipe.load import load_recipe
 from phibench.render.optics.faces import FaceTable, IntArray, TexelGrid, face_table
 from phibench.render.optics.room_tracer import room_geometry
 from phibench.render.optics.truth import truth_layer
-from phibench.render.room.ambient import view_surfaces
+from phibench.render.room.ambient_layer import view_surfaces
 from phibench.render.room.bounced_light import gathered
 from phibench.render.room.camera_plugin import MM_PER_M
 from phibench.render.room.lamp_light import direct_light

@@ -30,7 +30,7 @@ from phibench.datasets.build.bake_task import bake_settings
 from phibench.datasets.plan.draws import draw_rooms
 from phibench.datasets.recipe.load import load_recipe
 from phibench.datasets.rooms.panorama_room import PanoramaSettings
-from phibench.render.room.ambient import render_ambient
+from phibench.render.room.ambient_layer import render_ambient
 from phibench.render.room.light_map import BakeSettings, bake
 from phibench.scenes.room import Room
 from phibench.scenes.shapes import Rectangle

@@ -55,7 +55,7 @@ SHORT = {  # lines of a recipe of drives
 }
 TASK = "phibench.datasets.build.view_task"
 PARTS = {
-    "light": ("phibench.render.room.ambient", ("view_surfaces", "render_ambient")),
+    "light": ("phibench.render.room.ambient_layer", ("view_surfaces", "render_ambient")),
     "truth": ("phibench.render.optics.truth", ("truth_layer",)),
     "layers' files": (TASK, ("write_ambient", "write_truth")),
     "preview": (TASK, ("display_exposure_s", "to_srgb", "save_png")),

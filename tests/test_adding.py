@@ -237,7 +237,7 @@ USE_ROOMS = """
 from phibench.datasets.plan.plan import make_plan
 from phibench.datasets.recipe.load import load_recipe
 from phibench.datasets.rooms.room_sources import SOURCES
-from phibench.datasets.store.documents import from_json, to_json
+from phibench.datasets.store.json_forms import from_json, to_json
 plan = make_plan(load_recipe("bare.toml"))
 again = from_json(SOURCES["bare"], to_json(plan.rooms["bare0"]))
 print(list(plan.rooms), {pair.room for pair in plan.pairs}, plan.room("bare0").digest == again.build().digest)

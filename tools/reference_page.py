@@ -47,7 +47,7 @@ from phibench.datasets.recipe.tables import (
 from phibench.scenes.rig import Rig
 from phibench.scenes.room import RIGS
 from phibench.scenes.validation import allowed, schema_node
-from phibench.scenes.worlds.properties import PROPERTIES
+from phibench.scenes.worlds.room_properties import PROPERTIES
 
 TABLES: dict[str, type[BaseModel]] = {
     "[dataset]": DatasetTable,

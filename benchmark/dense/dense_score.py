@@ -43,8 +43,8 @@ from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import InputFile
 from phibench.datasets.common.progress import Steps, progress_console
 from phibench.datasets.read import Dataset
-from phibench.datasets.store.documents import parquet_bytes
 from phibench.datasets.store.files import require_writable, write_bytes
+from phibench.datasets.store.metadata import parquet_bytes
 from phibench.datasets.store.provenance import code_behind
 from phibench.datasets.store.schema import RECORDS_SO_FAR
 from phibench.estimator.dense.dense_interface import DenseMethod, DensePair

@@ -34,8 +34,8 @@ from phibench.datasets.exposures.pair_draws import PairDraw
 from phibench.datasets.frames.frame_files import png_bytes
 from phibench.datasets.read import Dataset
 from phibench.datasets.store.checksums import checksums_text, filling, signed, write_documents
-from phibench.datasets.store.documents import from_json, to_json
 from phibench.datasets.store.files import sha256, write_bytes, write_secret
+from phibench.datasets.store.json_forms import from_json, to_json
 from phibench.datasets.store.layers import read_exr, write_exr
 from phibench.datasets.store.pair_files import FRAMES, MOST_PAIRS, PAIRS, PairFiles, PublicPair
 from phibench.datasets.store.schema import CHECKSUMS, SEALED_TRUTH, Document, TruthFolder

@@ -29,10 +29,8 @@ from phibench.benchmark.isolation.answers import AnswerError, checked, checked_p
 from phibench.benchmark.isolation.isolation import Access, Isolation
 from phibench.benchmark.isolation.method_provenance import MOST_NAMES, OpenedFiles
 from phibench.benchmark.isolation.method_references import MethodError, Reference, RunLimits
-from phibench.benchmark.isolation.printed_output import OutputTail, advised, last_lines, stack_place
-from phibench.benchmark.isolation.readable_files import access_of
-from phibench.benchmark.isolation.supervisor import HUNG_UP, KILL_SECONDS, processes_in
-from phibench.benchmark.isolation.transport import (
+from phibench.benchmark.isolation.method_worker import lacks_memory
+from phibench.benchmark.isolation.pair_transport import (
     LEAST_BYTES,
     AnyPair,
     Connection,
@@ -42,7 +40,9 @@ from phibench.benchmark.isolation.transport import (
     needed_bytes,
     pack,
 )
-from phibench.benchmark.isolation.worker import lacks_memory
+from phibench.benchmark.isolation.printed_output import OutputTail, advised, last_lines, stack_place
+from phibench.benchmark.isolation.readable_files import access_of
+from phibench.benchmark.isolation.supervisor import HUNG_UP, KILL_SECONDS, processes_in
 from phibench.datasets.common.parallel import ONE_THREAD
 from phibench.datasets.store.temporary_folders import OwnedFolder
 from phibench.estimator.dense.dense_interface import DensePair
@@ -416,7 +416,7 @@ def _names(reply: dict[str, Any]) -> frozenset[str]:
 
 
 def outcome_of(pair: AnyPair, reply: dict[str, Any], seconds: float) -> Outcome:
-    """Outcome of a pair from the reply of `worker.reply_of`; what is no answer is the failure "invalid"."""
+    """Outcome of a pair from the reply of `method_worker.reply_of`; what is no answer is the failure "invalid"."""
     failure, message = reply.get("failure"), reply.get("message", "")
     if failure in FAILURES and isinstance(message, str):
         return Outcome(pair.number, None, seconds, failure, printable_line(message, _MESSAGE_LENGTH))

@@ -1,6 +1,6 @@
 """Pairs of a set made ahead by other processes, so that making them keeps no method waiting.
 
-Images come through shared memory, the rest over a socket, as pairs go to a method's process: `isolation.transport`. The
+Images come through shared memory, the rest over a socket, as pairs go to a method's process (`pair_transport`). The
 processes belong to the runner: they know the truth, and no method can reach them.
 """
 
@@ -19,7 +19,7 @@ from collections import deque
 from types import TracebackType
 from typing import Any
 
-from phibench.benchmark.isolation.transport import (
+from phibench.benchmark.isolation.pair_transport import (
     LEAST_BYTES,
     Connection,
     MemoryFile,

@@ -58,7 +58,9 @@ def _be_worker(supervisor: int, line: int, reader: int) -> None:
     from phibench.benchmark.isolation.isolation import isolated_by  # after the fork: the supervisor stays small
 
     isolation = isolated_by(sys.stdin)
-    from phibench.benchmark.isolation.worker import main as work  # its libraries may start threads: after the isolation
+    from phibench.benchmark.isolation.method_worker import (
+        main as work,  # its libraries may start threads: after the isolation
+    )
 
     work(line, reader, isolation)
 

@@ -28,8 +28,8 @@ from phibench.datasets.common.input_files import SETTINGS_BYTES, InputFile, Name
 from phibench.datasets.common.shown_text import ShortForm
 from phibench.datasets.exposures.pair_draws import search_box
 from phibench.datasets.frames.sensor_card import SensorCard
-from phibench.datasets.store.documents import from_json, to_json
 from phibench.datasets.store.files import sha256
+from phibench.datasets.store.json_forms import from_json, to_json
 from phibench.datasets.store.pair_files import (
     FRAMES_SET,
     MOST_PAIRS,

@@ -56,8 +56,8 @@ from phibench.datasets.recipe.load import parse_recipe, recipe_files, with_numbe
 from phibench.datasets.store import schema
 from phibench.datasets.store.checksums import differing_files, filling, read_checksums, signed, write_documents
 from phibench.datasets.store.croissant import LICENSE_TEXT, LICENSE_URL, croissant_text, file_object
-from phibench.datasets.store.documents import read_info
 from phibench.datasets.store.files import sha256, write_text
+from phibench.datasets.store.metadata import read_info
 from phibench.datasets.store.pair_files import FRAMES_SET
 from phibench.datasets.store.temporary_folders import folder_for_work
 

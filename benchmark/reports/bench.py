@@ -23,7 +23,7 @@ from phibench.benchmark.isolation.method_references import RunLimits, installed,
 from phibench.benchmark.pair_sets.dataset_pairs import TRACKS, Track, tracks_of
 from phibench.benchmark.pair_sets.frames_set import FramesSet
 from phibench.benchmark.pair_sets.wanted_pairs import PairChoice, open_scored, wanted_pairs
-from phibench.benchmark.reports.report import write_report
+from phibench.benchmark.reports.report_page import write_report
 from phibench.benchmark.reports.report_sections import time_section
 from phibench.benchmark.scores.score import Scored, run_and_score, saved_each
 from phibench.benchmark.scores.score_files import records_kept

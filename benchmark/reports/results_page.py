@@ -16,7 +16,7 @@ from typing import Any
 
 import polars as pl
 
-from phibench.benchmark.reports.report import report_html
+from phibench.benchmark.reports.report_page import report_html
 from phibench.benchmark.reports.report_sections import Section, tracks_section
 from phibench.benchmark.reports.track_tables import track_tables
 from phibench.benchmark.scores.answer_errors import Rules

@@ -34,8 +34,8 @@ from phibench.datasets.common.input_files import SETTINGS_BYTES, FileName, Input
 from phibench.datasets.frames.frame_files import png_bytes
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.datasets.store.checksums import checksums_text, read_checksums, writing_to
-from phibench.datasets.store.documents import from_json, to_json
 from phibench.datasets.store.files import read_rows, sha256, write_bytes, write_text
+from phibench.datasets.store.json_forms import from_json, to_json
 from phibench.datasets.store.provenance import provenance
 from phibench.datasets.store.schema import CHECKSUMS, Document, TruthFolder
 from phibench.datasets.store.temporary_folders import OwnedFolder, folder_for_work

@@ -20,7 +20,7 @@ from functools import lru_cache
 import numpy as np
 import scipy
 
-from phibench.calibration.outline.outline_fit import OutlinePixels, Place
+from phibench.calibration.outline.outline_least_squares import OutlinePixels, Place
 from phibench.scenes.frames import Array, BoolArray, as_vector
 from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.revolved_profile import rim_points

@@ -34,8 +34,8 @@ from phibench.calibration.outline.first_circle import (
     sphere_from_rays,
 )
 from phibench.calibration.outline.limb_image import Plane, binned, full_pixels, limb_angle_rad, planes_of
-from phibench.calibration.outline.outline_fit import OutlinePixels, Step, band, step_from
 from phibench.calibration.outline.outline_jpeg import without_jpeg
+from phibench.calibration.outline.outline_least_squares import OutlinePixels, Step, band, step_from
 from phibench.calibration.outline.outline_result import (
     MIN_ARC,
     SECTORS,

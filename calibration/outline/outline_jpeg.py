@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phibench.calibration.outline.limb_image import JPEG_LUMA
-from phibench.calibration.outline.outline_fit import OutlinePixels, Step
+from phibench.calibration.outline.outline_least_squares import OutlinePixels, Step
 from phibench.calibration.outline.outline_result import JPEG_DRAWS
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.estimator.spots.camera_codes import light_of, mcu_px, tone_of

@@ -27,7 +27,7 @@ from phibench.calibration.outline.edge_ring import CURVES, TURN_RAD, TURNS
 from phibench.calibration.outline.first_circle import circles_by_size, grey
 from phibench.calibration.outline.limb_image import STEP_PX, Plane, blurred, distances_px, line_spread
 from phibench.calibration.outline.limb_sectors import Sectors
-from phibench.calibration.outline.outline_fit import OutlinePixels, Place, Step, pixels_near, solution_of
+from phibench.calibration.outline.outline_least_squares import OutlinePixels, Place, Step, pixels_near, solution_of
 from phibench.calibration.outline.outline_result import (
     MIN_ARC,
     SECTORS,

@@ -18,8 +18,8 @@ from pydantic import BaseModel, ConfigDict
 from phibench.calibration.rig.bundle import Bundle
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import MIB, InputFile
-from phibench.datasets.store.documents import alike, from_json, to_json
 from phibench.datasets.store.files import write_text
+from phibench.datasets.store.json_forms import alike, from_json, to_json
 from phibench.estimator.geometry.rig_parameters import PARAMETERS, RENAMED, changed
 from phibench.scenes.frames import IDENTITY, Array
 from phibench.scenes.mirror import OF_REVOLVED

@@ -22,8 +22,8 @@ from phibench.datasets.common.parallel import return_memory
 from phibench.datasets.recipe.tables import AmbientTable
 from phibench.datasets.rooms.room_sources import RoomSource, room_of
 from phibench.datasets.store import schema
-from phibench.datasets.store.documents import to_json
 from phibench.datasets.store.files import write_bytes, write_text
+from phibench.datasets.store.json_forms import to_json
 from phibench.datasets.store.provenance import code_behind
 from phibench.datasets.store.schema import RoomInfo
 from phibench.datasets.store.temporary_folders import remove_leftovers

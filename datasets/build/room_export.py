@@ -39,7 +39,7 @@ from phibench.scenes.frames import Vector
 from phibench.scenes.room import Room, default_rig
 from phibench.scenes.validation import finite_vector, printable_line, within
 from phibench.scenes.worlds.generated_room import generate_room
-from phibench.scenes.worlds.properties import PROPERTIES, drawn_properties
+from phibench.scenes.worlds.room_properties import PROPERTIES, drawn_properties
 
 SETTINGS = BakeSettings(texel_m=0.05, indirect_texel_m=0.1, lamp_rays=32, bounces=8, bounce_rays=32, final_rays=128)
 _LEAST_ROWS, _MOST_ROWS = 16, 4096  # of a panorama; those that a recipe takes

@@ -37,7 +37,9 @@ from phibench.datasets.rooms.room_sources import ONLY_ROOM
 from phibench.datasets.store import schema
 from phibench.datasets.store.checksums import differing, filling, signed, write_documents
 from phibench.datasets.store.croissant import dataset_croissant
-from phibench.datasets.store.documents import (
+from phibench.datasets.store.files import sha256, write_bytes
+from phibench.datasets.store.json_forms import to_json
+from phibench.datasets.store.metadata import (
     dataset_info,
     info_text,
     manifest_documents,
@@ -45,10 +47,8 @@ from phibench.datasets.store.documents import (
     read_info,
     rigs_text,
     same_content,
-    to_json,
     to_table,
 )
-from phibench.datasets.store.files import sha256, write_bytes
 from phibench.datasets.store.provenance import code_behind
 from phibench.datasets.store.schema import DatasetInfo, ManifestRow, RoomInfo
 from phibench.scenes.rig import POSITIONS

@@ -34,7 +34,7 @@ def render_view(out: Path, dataset: str, rig: Rig, source: RoomSource, pose: Pos
     """Task: render one pose and write its three files below `out`."""
     from phibench.render.optics.room_tracer import room_geometry
     from phibench.render.optics.truth import truth_layer
-    from phibench.render.room.ambient import dark_layer, render_ambient, view_surfaces
+    from phibench.render.room.ambient_layer import dark_layer, render_ambient, view_surfaces
     from phibench.render.room.noise_budget import BUDGETS
     from phibench.render.setup.variant import activate
 

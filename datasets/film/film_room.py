@@ -46,7 +46,7 @@ def renderer(plan: Plan, film: FilmPlan, room: Room) -> Render:
         return lambda view, pose, seed: np.zeros((3, *film.region.shape), np.float32)
     from phibench.datasets.build.bake_task import bake_settings
     from phibench.datasets.build.view_task import start_renderer
-    from phibench.render.room.ambient import render_ambient
+    from phibench.render.room.ambient_layer import render_ambient
     from phibench.render.room.light_map import between
     from phibench.render.room.noise_budget import BUDGETS
 

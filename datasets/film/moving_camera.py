@@ -25,8 +25,8 @@ from phibench.datasets.common.progress import progress_console
 from phibench.datasets.frames.request import in_one_sentence
 from phibench.datasets.rooms.room_sources import GeneratedRoom
 from phibench.datasets.store.checksums import filling
-from phibench.datasets.store.documents import from_json, to_json
 from phibench.datasets.store.files import write_bytes, write_text
+from phibench.datasets.store.json_forms import from_json, to_json
 from phibench.datasets.store.provenance import code_behind, provenance
 from phibench.datasets.store.schema import Document, TruthFolder, described
 from phibench.render.film.room_image import LitRoom, Placement, quick_spot, room_image
@@ -43,7 +43,7 @@ from phibench.scenes.random_streams import Name
 from phibench.scenes.rig import Rig
 from phibench.scenes.room import Room
 from phibench.scenes.validation import SceneError
-from phibench.scenes.worlds.properties import drawn_properties
+from phibench.scenes.worlds.room_properties import drawn_properties
 
 INFO = TruthFolder.BAKED_ROOMS.value
 _AGAIN = "run `phibench loop bake` again"

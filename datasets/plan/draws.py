@@ -60,7 +60,7 @@ from phibench.scenes.rig import Rig
 from phibench.scenes.room import Room
 from phibench.scenes.validation import SceneError
 from phibench.scenes.worlds.floor_plan import floor_plan
-from phibench.scenes.worlds.properties import drawn_properties
+from phibench.scenes.worlds.room_properties import drawn_properties
 
 # Rooms of a recipe: the one of `[room]`, or those of `[rooms]`, of several kinds in turn.
 #

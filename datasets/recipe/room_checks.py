@@ -12,7 +12,7 @@ from phibench.datasets.recipe.tables import Recipe
 from phibench.datasets.rooms.room_files import RoomError, RoomFiles
 from phibench.scenes.rig import Rig
 from phibench.scenes.validation import Fault, SceneError
-from phibench.scenes.worlds.properties import PROPERTIES
+from phibench.scenes.worlds.room_properties import PROPERTIES
 
 
 def tables_of_rooms(raw: dict[str, Any]) -> Iterator[Fault]:

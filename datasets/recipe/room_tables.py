@@ -14,7 +14,7 @@ from phibench.datasets.recipe.distributions import Distribution, Name, Table, na
 from phibench.datasets.rooms.mesh_placement import MeshLamp, MeshSettings
 from phibench.datasets.rooms.panorama_room import PanoramaSettings
 from phibench.scenes.validation import SHA256, SceneError
-from phibench.scenes.worlds.properties import PROPERTIES, Property
+from phibench.scenes.worlds.room_properties import PROPERTIES, Property
 
 MESH_SUFFIXES = (".glb", ".ply")
 

@@ -20,7 +20,7 @@ from phibench.datasets.rooms.panorama_room import PanoramaSettings
 from phibench.datasets.rooms.room_files import RoomError, checked_file
 from phibench.scenes.room import ROOMS, Room, TargetBoard
 from phibench.scenes.validation import SceneError, nearest, printable_line
-from phibench.scenes.worlds.properties import RoomProperties
+from phibench.scenes.worlds.room_properties import RoomProperties
 
 EXPORTED = "exported"
 """Folder, among the files of rooms, of those that a data set makes itself."""

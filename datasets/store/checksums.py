@@ -19,9 +19,9 @@ from phibench.datasets.recipe.room_tables import RoomsTable
 from phibench.datasets.rooms.room_files import RoomFiles
 from phibench.datasets.rooms.room_sources import EXPORTED
 from phibench.datasets.store import schema
-from phibench.datasets.store.documents import read_info, read_manifest
 from phibench.datasets.store.files import WriteError, remove_temporary, require_file, sha256, write_bytes
 from phibench.datasets.store.folder_lock import only_run
+from phibench.datasets.store.metadata import read_info, read_manifest
 from phibench.datasets.store.schema import DatasetInfo
 from phibench.datasets.store.stored_rooms import read_rooms
 from phibench.datasets.store.temporary_folders import TEMPORARY_PREFIX, folder_for_work

@@ -20,8 +20,8 @@ from pydantic import AfterValidator, Field, field_validator, model_validator
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import FileName, InputFile, Name
 from phibench.datasets.store.checksums import read_checksums
-from phibench.datasets.store.documents import to_json
 from phibench.datasets.store.files import read_rows
+from phibench.datasets.store.json_forms import to_json
 from phibench.datasets.store.schema import CHECKSUMS, Document, Number, TruthFolder
 from phibench.scenes.camera import LARGEST_SIDE_PX, Camera
 

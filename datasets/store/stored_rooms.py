@@ -9,8 +9,8 @@ from pathlib import Path
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.rooms.room_sources import ONLY_ROOM, SOURCES, NamedRoom, PanoramaRoom, RoomSource, room_of
 from phibench.datasets.store import schema
-from phibench.datasets.store.documents import from_json
 from phibench.datasets.store.files import read_rows
+from phibench.datasets.store.json_forms import from_json
 from phibench.datasets.store.schema import DatasetInfo, RoomInfo
 from phibench.scenes.room import Room
 from phibench.scenes.validation import SceneError, nearest

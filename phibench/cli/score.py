@@ -228,7 +228,7 @@ def report(
     study
         Folders that `phibench study` wrote.
     """
-    from phibench.benchmark.reports.report import write_report
+    from phibench.benchmark.reports.report_page import write_report
     from phibench.studies.run import section
 
     print(write_report(files, out, [section(folder) for folder in study], rank))

@@ -22,7 +22,7 @@ from phibench.scenes.room import Room
 from phibench.scenes.shapes import Cuboid, Mesh, Prism, Rectangle, Shape
 from phibench.scenes.validation import SceneError
 from phibench.scenes.worlds.generated_room import generate_room
-from phibench.scenes.worlds.properties import drawn_properties
+from phibench.scenes.worlds.room_properties import drawn_properties
 
 _THIN_M = 1e-3  # a rectangle as a box
 _END_M = 3e-3  # of a line of sight: the spot lies on a box

@@ -16,7 +16,7 @@ from phibench.scenes.frames import Pose, Vector, rotation_xyz
 from phibench.scenes.shapes import Rectangle, rectangle
 from phibench.scenes.worlds.assembly import Assembly, AssemblyShape, Footprint, footprint_of, moved, part_bounds_m
 from phibench.scenes.worlds.materials import Surface
-from phibench.scenes.worlds.properties import RoomProperties
+from phibench.scenes.worlds.room_properties import RoomProperties
 
 FREE_RADIUS_M = 0.20  # of the upright cylinder about the stroke axis that stays free up to the ceiling
 FREE_DISC_M = 0.55  # of the disc on the floor that the robot takes; its half diagonal is 0.522 m

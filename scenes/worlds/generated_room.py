@@ -30,7 +30,7 @@ from phibench.scenes.worlds.floor_plan import (
 )
 from phibench.scenes.worlds.lamps import EFFICACY_LM_W, band_radiance, hang_lamps
 from phibench.scenes.worlds.materials import MaterialSet, Surface, radiance_bitmap
-from phibench.scenes.worlds.properties import RoomProperties
+from phibench.scenes.worlds.room_properties import RoomProperties
 from phibench.scenes.worlds.tabletop import Piece
 
 MOST_LIGHTS = 12  # emitting rectangles: each is sampled by itself

@@ -29,7 +29,7 @@ from phibench.scenes.random_streams import Name, generator
 from phibench.scenes.shapes import Bitmap, Texture, Uniform
 from phibench.scenes.worlds import patterns
 from phibench.scenes.worlds.patterns import Draw, Shape2
-from phibench.scenes.worlds.properties import RoomProperties
+from phibench.scenes.worlds.room_properties import RoomProperties
 
 _DARKEST, _BRIGHTEST = 0.015, 0.92  # nothing ordinary is beyond
 

@@ -29,7 +29,7 @@ from phibench.scenes.random_streams import generator
 from phibench.scenes.rig import Rig
 from phibench.scenes.room import Room
 from phibench.scenes.worlds.generated_room import generate_room
-from phibench.scenes.worlds.properties import drawn_properties
+from phibench.scenes.worlds.room_properties import drawn_properties
 
 STREAM = "study dense"
 SPHERE, PARABOLOID, OFF_AXIS, IN_FOCUS = "sphere", "paraboloid", "hyperboloid off its axis", "hyperboloid in its focus"

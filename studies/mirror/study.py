@@ -27,7 +27,7 @@ from phibench.studies.framework import (
     canvas,
     drawn,
 )
-from phibench.studies.mirror import measured_places, tables
+from phibench.studies.mirror import place_bounds, tables
 from phibench.studies.mirror.field import disc_shares, meridian, outline_radius_px
 
 if TYPE_CHECKING:
@@ -98,14 +98,14 @@ def _rigs(settings: tables.MirrorSettings) -> dict[str, Rig]:
     return rigs
 
 
-def _bounds_of_spots(settings: tables.MirrorSettings, preset: str, rig: Rig) -> measured_places.BlurBounds:
+def _bounds_of_spots(settings: tables.MirrorSettings, preset: str, rig: Rig) -> place_bounds.BlurBounds:
     card = sensor_card(preset, exposure_s=settings.exposure_s)
     r, g, b = rig.camera.detector.laser_filter_response
-    return measured_places.blur_bounds(card, (r, g, b), settings.blurs_px)
+    return place_bounds.blur_bounds(card, (r, g, b), settings.blurs_px)
 
 
 def compare(
-    settings: tables.MirrorSettings, rig: Rig, by_preset: Mapping[str, measured_places.BlurBounds]
+    settings: tables.MirrorSettings, rig: Rig, by_preset: Mapping[str, place_bounds.BlurBounds]
 ) -> tables.Compared:
     """All that the study says of one mirror."""
     rays = meridian(rig)
@@ -114,22 +114,19 @@ def compare(
     depths = sorted({*settings.depths_m, *settings.misaligned_m, *(settings.curve_depths_m.tolist())})
     seen = _seen(settings, rig, [(d, h) for h in heights for d in depths])
     bounds = {
-        (preset, h, d): measured_places.place_bound(rig, table, d, h, settings.stroke_m)
+        (preset, h, d): place_bounds.place_bound(rig, table, d, h, settings.stroke_m)
         if seen[d, h]
-        else measured_places.NOTHING
+        else place_bounds.NOTHING
         for preset, table in by_preset.items()
         for h in heights
         for d in (depths if h == settings.spot_height_m else settings.depths_m)
     }
-    nothing = dict.fromkeys(measured_places.DIRECTIONS, math.nan)
+    nothing = dict.fromkeys(place_bounds.DIRECTIONS, math.nan)
     at, h = settings.spot_height_m, settings.stroke_m
     wrong = [d for d in settings.misaligned_m if seen[d, at]]
     spots = np.array([(d, 0.0, at) for d in wrong])
     costs = (
-        {
-            kind: measured_places.errors(rig, kind, measured_places.usual(kind), spots, h)
-            for kind in measured_places.DIRECTIONS
-        }
+        {kind: place_bounds.errors(rig, kind, place_bounds.usual(kind), spots, h) for kind in place_bounds.DIRECTIONS}
         if wrong
         else {}
     )
@@ -144,12 +141,12 @@ def compare(
         up=disc_shares(rig, rays, settings.stroke_m, settings.azimuths_rad),
         places=places,
         bounds=bounds,
-        floor_m=tuple(measured_places.floor_from_m(rig, h, settings.edge_px, a, settings.curve_m[1]) for a in sides),
+        floor_m=tuple(place_bounds.floor_from_m(rig, h, settings.edge_px, a, settings.curve_m[1]) for a in sides),
         costs=dict.fromkeys(settings.misaligned_m, nothing)
         | {d: {kind: float(column[i]) for kind, column in costs.items()} for i, d in enumerate(wrong)},
         tolerances={
-            k: measured_places.tolerance(rig, k, spots, h, settings.cost) if wrong else math.nan
-            for k in measured_places.DIRECTIONS
+            k: place_bounds.tolerance(rig, k, spots, h, settings.cost) if wrong else math.nan
+            for k in place_bounds.DIRECTIONS
         },
     )
 
@@ -159,7 +156,7 @@ def _seen(
 ) -> dict[tuple[float, float], bool]:
     """Distances and heights that a pair measures, from all azimuths."""
     points = np.array([(d, 0.0, h) for d, h in places])
-    fine = measured_places.measured(rig, points, settings.stroke_m, settings.edge_px, settings.azimuths_rad)
+    fine = place_bounds.measured(rig, points, settings.stroke_m, settings.edge_px, settings.azimuths_rad)
     return dict(zip(places, fine.tolist(), strict=True))
 
 
@@ -169,7 +166,7 @@ def place_map(settings: tables.MirrorSettings, rig: Rig) -> tables.PlaceMap:
     heights = np.arange(0.0, settings.map_height_m + 0.5 * settings.map_step_m, settings.map_step_m)
     D, Z = np.meshgrid(depths, heights)
     points = np.stack([D.ravel(), np.zeros(D.size), Z.ravel()], axis=-1)
-    fine = measured_places.measured(rig, points, settings.stroke_m, settings.edge_px, settings.azimuths_rad)
+    fine = place_bounds.measured(rig, points, settings.stroke_m, settings.edge_px, settings.azimuths_rad)
     return tables.PlaceMap(depths, heights, fine.reshape(D.shape))
 
 
@@ -220,8 +217,8 @@ def cost_frame(found: Mapping[str, tables.Compared]) -> pl.DataFrame:
             "mirror": name,
             "depth_m": d,
             "deviation": kind,
-            "parameters": ", ".join(measured_places.DIRECTIONS[kind]),
-            "usual": measured_places.usual(kind),
+            "parameters": ", ".join(place_bounds.DIRECTIONS[kind]),
+            "usual": place_bounds.usual(kind),
             "error_relative": error,
             "tolerance": compared.tolerances[kind],
         }
@@ -321,7 +318,7 @@ def _places(ax: Axes, found: Mapping[str, tables.Compared]) -> None:
 
 def _costs(ax: Axes, found: Mapping[str, tables.Compared], settings: tables.MirrorSettings) -> None:
     middle = settings.misaligned_m[len(settings.misaligned_m) // 2]
-    kinds = list(measured_places.DIRECTIONS)
+    kinds = list(place_bounds.DIRECTIONS)
     for i, c in enumerate(found.values()):
         cost = np.array([100.0 * c.costs[middle][kind] for kind in kinds])
         cost = np.where((cost >= _LEAST) & np.isfinite(cost), cost, np.nan)

@@ -54,8 +54,8 @@ from phibench.studies.misaligned_rigs import (
     true_depth_m,
 )
 from phibench.studies.misalignment import tables
-from phibench.studies.misalignment.interactions import Interactions, interaction_findings, interactions, rows
 from phibench.studies.misalignment.refocus import FOCUS_M, LENS_M, refocus, refocus_findings, thin_lens
+from phibench.studies.misalignment.sobol_indices import Interactions, interaction_findings, interactions, rows
 
 Distance = Annotated[float, Field(gt=0.1, le=20.0)]
 Positive = Annotated[float, Field(gt=0.0, le=1.0)]

@@ -11,7 +11,7 @@ from phibench.calibration.outline.first_circle import rig_circle
 from phibench.calibration.rig.align import sharpness
 from phibench.datasets.build.bake_task import light_map
 from phibench.datasets.frames.sensor_card import sensor_card
-from phibench.render.room.ambient import render_ambient
+from phibench.render.room.ambient_layer import render_ambient
 from phibench.render.room.light_map import BakeSettings
 from phibench.render.sensor.camera_chain import Chain
 from phibench.render.sensor.electrons import NoiseStream

@@ -18,7 +18,7 @@ from helpers.path_spots import compare
 from phibench.render.optics.spot_layer import spot_layer
 from phibench.render.optics.truth import spot_truth, truth_layer
 from phibench.render.plugins.room_plugins import to_scene_mm
-from phibench.render.room.ambient import render_ambient
+from phibench.render.room.ambient_layer import render_ambient
 from phibench.render.room.camera_plugin import sensor_dict
 from phibench.render.room.light_map import BakeSettings, bake
 from phibench.render.setup.variant import activate
@@ -229,7 +229,7 @@ def test_path_tracing_is_bit_identical_and_seeds_matter(mi: ModuleType) -> None:
 
 BAKE_AND_RENDER = """
 import hashlib, sys
-from phibench.render.room.ambient import render_ambient
+from phibench.render.room.ambient_layer import render_ambient
 from phibench.render.room.light_map import BakeSettings, bake
 from phibench.scenes.room import default_rig, lab
 room, rig = lab(), default_rig()

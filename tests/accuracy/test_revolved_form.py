@@ -14,7 +14,7 @@ from helpers.lamp_views import LAMP_ROOM, lamp_image, lamp_window, moments, trac
 from helpers.revolved_rigs import PROFILES, revolved
 from scipy.special import eval_jacobi
 
-from phibench.datasets.store.documents import from_json, to_json
+from phibench.datasets.store.json_forms import from_json, to_json
 from phibench.estimator.geometry.reflection import image_of
 from phibench.estimator.geometry.reflection import reflect as estimated
 from phibench.estimator.geometry.sensitivities import PARAMETERS, pixel_gradient

@@ -14,7 +14,7 @@ from helpers.path_ambient import path_runs
 from helpers.path_windows import independent_bake
 
 from phibench.render.optics.truth import spot_truth
-from phibench.render.room.ambient import render_ambient
+from phibench.render.room.ambient_layer import render_ambient
 from phibench.render.room.light_map import BakeSettings, LightMap
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.room import lab

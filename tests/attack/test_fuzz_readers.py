@@ -37,7 +37,7 @@ from phibench.cli.main import main
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.read import open_finished
 from phibench.datasets.store.checksums import checksums_text, read_checksums
-from phibench.datasets.store.documents import differences
+from phibench.datasets.store.metadata import differences
 
 PATIENCE_S = 60  # far above the slowest case, on a machine with other work
 CPU_S = 10.0  # of one case

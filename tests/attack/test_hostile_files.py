@@ -30,8 +30,9 @@ from phibench.datasets.common.input_files import DEPTH, InputFile
 from phibench.datasets.plan.plan import parse_shard
 from phibench.datasets.recipe.load import load_recipe
 from phibench.datasets.store.checksums import read_checksums
-from phibench.datasets.store.documents import from_json, read_rigs, to_json
+from phibench.datasets.store.json_forms import from_json, to_json
 from phibench.datasets.store.layers import read_exr, write_exr
+from phibench.datasets.store.metadata import read_rigs
 from phibench.estimator.geometry.rig_parameters import PARAMETERS
 from phibench.estimator.interface import Outcome
 from phibench.scenes.rig import Rig

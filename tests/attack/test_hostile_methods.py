@@ -22,7 +22,7 @@ from helpers.sandbox_pairs import SmallPairs, method_file
 
 from phibench.benchmark.isolation.method_references import RunLimits
 from phibench.benchmark.isolation.runner import run_method
-from phibench.benchmark.reports.report import write_report
+from phibench.benchmark.reports.report_page import write_report
 from phibench.benchmark.scores.answer_errors import Rules
 from phibench.benchmark.scores.score import Scored, saved, score_outcomes
 from phibench.benchmark.scores.score_document import MethodCard

@@ -139,7 +139,7 @@ def test_a_hostile_policy_loses_its_episode_and_leaves_nothing(
 UNPICKLED = {
     "datasets/build/workers.py": "workers of ours",
     "benchmark/isolation/prefetched_pairs.py": "processes of ours that draw pairs",
-    "benchmark/isolation/transport.py": "pairs of ours, in the process of a method",
+    "benchmark/isolation/pair_transport.py": "pairs of ours, in the process of a method",
     "robot/loop/foreign_policies.py": "what is known and observed, in the process of a policy",
 }
 """Modules that open pickles, and whose: none is of a method or a policy."""

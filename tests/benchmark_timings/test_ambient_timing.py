@@ -11,7 +11,7 @@ import pytest
 from helpers.oracles import TARGETS
 from helpers.path_ambient import traced_scene
 
-from phibench.render.room.ambient import render_ambient
+from phibench.render.room.ambient_layer import render_ambient
 from phibench.render.room.light_map import BakeSettings, LightMap, bake
 from phibench.render.setup.variant import activate
 from phibench.scenes.room import c310_rig, lab

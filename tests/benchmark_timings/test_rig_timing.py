@@ -16,7 +16,7 @@ from phibench.estimator.geometry.panorama import PanoramaGrid, pixels_by_model, 
 from phibench.estimator.limits.best_stroke import best_stroke, spot_bound
 from phibench.estimator.spots.spot_prediction import spot_blur
 from phibench.render.optics.spot_layer import spot_layer
-from phibench.render.room.ambient import render_ambient
+from phibench.render.room.ambient_layer import render_ambient
 from phibench.render.room.light_map import BakeSettings, bake
 from phibench.render.sensor.settings import sensor
 from phibench.scenes.laser import Beam, LaserSpot, beam_diameter_m

@@ -16,7 +16,7 @@ from helpers.sandbox_pairs import GOOD, SmallPairs, method_file
 
 from phibench.benchmark.isolation.guest_process import MethodProcess
 from phibench.benchmark.isolation.method_references import RunLimits, resolve
-from phibench.benchmark.isolation.transport import Connection, MemoryFile, SharedPages, pack, unpack
+from phibench.benchmark.isolation.pair_transport import Connection, MemoryFile, SharedPages, pack, unpack
 from phibench.estimator.interface import Pair
 
 

@@ -15,7 +15,7 @@ from phibench.datasets.store.layers import TRUTH_PLANES, write_ambient, write_tr
 from phibench.datasets.store.pictures import display_exposure_s, save_png, to_srgb
 from phibench.render.optics.room_tracer import room_geometry
 from phibench.render.optics.truth import truth_layer
-from phibench.render.room.ambient import render_ambient, view_film, view_surfaces
+from phibench.render.room.ambient_layer import render_ambient, view_film, view_surfaces
 from phibench.render.room.light_map import BakeSettings, LightMap, bake
 from phibench.render.room.subpixel_grid import CellSampler
 from phibench.scenes.room import default_rig, lab

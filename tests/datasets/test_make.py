@@ -32,8 +32,8 @@ from phibench.datasets.recipe.load import load_recipe
 from phibench.datasets.rooms.room_sources import room_of
 from phibench.datasets.store import checksums, schema
 from phibench.datasets.store.checksums import damaged, data_files, read_checksums
-from phibench.datasets.store.documents import read_manifest
 from phibench.datasets.store.layers import read_exr
+from phibench.datasets.store.metadata import read_manifest
 from phibench.datasets.store.schema import ManifestRow
 from phibench.datasets.store.temporary_folders import TEMPORARY_PREFIX
 from phibench.render.optics.certificate import Certificate, certify

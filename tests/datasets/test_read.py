@@ -15,8 +15,9 @@ from phibench.datasets.read import Dataset, open_dataset, open_finished
 from phibench.datasets.recipe.load import load_recipe
 from phibench.datasets.rooms.room_sources import room_of
 from phibench.datasets.store import schema
-from phibench.datasets.store.documents import parquet_bytes, to_json
+from phibench.datasets.store.json_forms import to_json
 from phibench.datasets.store.layers import SpotWindow
+from phibench.datasets.store.metadata import parquet_bytes
 from phibench.datasets.verify import plan_faults, verify
 from phibench.render.optics.spot_layer import spot_layer
 from phibench.render.optics.truth import TRUTH_PLANES, truth_layer

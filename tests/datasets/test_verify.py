@@ -38,7 +38,6 @@ from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.read import open_dataset
 from phibench.datasets.show import show
 from phibench.datasets.store import checksums, pictures, schema
-from phibench.datasets.store.documents import read_manifest
 from phibench.datasets.store.layers import (
     read_ambient,
     read_ambient_variance,
@@ -47,6 +46,7 @@ from phibench.datasets.store.layers import (
     write_ambient,
     write_truth,
 )
+from phibench.datasets.store.metadata import read_manifest
 from phibench.datasets.store.pictures import Picture
 from phibench.datasets.verify import Report, file_faults, verify
 from phibench.studies.paper.sensitivity_table import keep_sensitivities

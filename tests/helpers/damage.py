@@ -9,8 +9,8 @@ import numpy as np
 from phibench.datasets.build.journal import FolderHead, Journal
 from phibench.datasets.store import schema
 from phibench.datasets.store.checksums import checksums_text, data_files, read_checksums
-from phibench.datasets.store.documents import manifest_documents
 from phibench.datasets.store.files import sha256, write_bytes, write_text
+from phibench.datasets.store.metadata import manifest_documents
 from phibench.datasets.store.schema import ManifestRow
 from phibench.datasets.verify import file_faults
 

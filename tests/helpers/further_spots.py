@@ -15,7 +15,7 @@ from phibench.datasets.read import Dataset, Sample
 from phibench.datasets.recipe.distributions import quantile
 from phibench.datasets.recipe.spot_placement import by_ray, shown_as
 from phibench.datasets.rooms.room_sources import SOURCES, RoomSource
-from phibench.datasets.store.documents import from_json
+from phibench.datasets.store.json_forms import from_json
 from phibench.datasets.store.schema import ManifestRow
 from phibench.scenes.random_streams import generator
 from phibench.scenes.rig import Rig

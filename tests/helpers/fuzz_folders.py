@@ -49,7 +49,8 @@ from phibench.datasets.recipe.load import load_recipe, recipe_text
 from phibench.datasets.rooms.room_files import RoomFiles
 from phibench.datasets.store import schema
 from phibench.datasets.store.checksums import checksums_text
-from phibench.datasets.store.documents import parse_info, to_json
+from phibench.datasets.store.json_forms import to_json
+from phibench.datasets.store.metadata import parse_info
 from phibench.datasets.store.pair_files import FRAMES_SET
 from phibench.datasets.store.pair_files import PAIRS as LINES
 from phibench.render.room.light_map import LightMap, encoded

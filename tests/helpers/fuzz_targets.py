@@ -41,7 +41,7 @@ from phibench.datasets.frames.sensor_file import SensorFile, read_sensor_file
 from phibench.datasets.rooms.panorama_files import is_linear
 from phibench.datasets.rooms.room_files import RoomFiles
 from phibench.datasets.store.checksums import read_checksums
-from phibench.datasets.store.documents import parquet_bytes
+from phibench.datasets.store.metadata import parquet_bytes
 from phibench.estimator.learned.network_graphs import CROP
 from phibench.estimator.learned.networks import Network
 from phibench.render.film.moving_rows import RowsImage

@@ -44,7 +44,7 @@ def lamp_window(view: View) -> tuple[int, int, int, int]:
 
 def lamp_image(view: View, room: Room, crop: tuple[int, int, int, int]) -> np.ndarray:
     """Ambient layer, plane R, of a room with nothing in it but a lamp: its light map is dark."""
-    from phibench.render.room.ambient import render_ambient
+    from phibench.render.room.ambient_layer import render_ambient
     from phibench.render.room.light_map import BakeSettings, LightMap, texel_count
 
     settings = BakeSettings(lamp_rays=4, bounce_rays=4, final_rays=4)

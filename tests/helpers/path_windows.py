@@ -14,7 +14,7 @@ from helpers.path_ambient import path_runs
 from phibench.render.optics.room_tracer import room_geometry
 from phibench.render.optics.truth import truth_layer
 from phibench.render.room import light_map
-from phibench.render.room.ambient import Crop, render_ambient, view_surfaces
+from phibench.render.room.ambient_layer import Crop, render_ambient, view_surfaces
 from phibench.render.room.light_map import BakeSettings, LightMap, bake
 from phibench.scenes.frames import Array
 from phibench.scenes.room import Room, default_rig

@@ -15,7 +15,7 @@ from phibench.datasets.rooms.mesh_room import mesh_room
 from phibench.datasets.rooms.panorama_room import PanoramaSettings, panorama_room
 from phibench.datasets.rooms.room_sources import GeneratedRoom
 from phibench.scenes.room import Room
-from phibench.scenes.worlds.properties import drawn_properties
+from phibench.scenes.worlds.room_properties import drawn_properties
 
 MESHES = ("curved", "vault", "colours")
 PANORAMAS = ("box", "flat box", "mesh")

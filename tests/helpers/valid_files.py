@@ -49,7 +49,7 @@ from phibench.datasets.frames.sensor_card import sensor_card
 from phibench.datasets.recipe.load import load_recipe
 from phibench.datasets.store import schema, sensitivity_file
 from phibench.datasets.store.checksums import checksums_text
-from phibench.datasets.store.documents import to_json
+from phibench.datasets.store.json_forms import to_json
 from phibench.datasets.store.layers import read_layer, write_exr
 from phibench.datasets.store.sensitivity_file import read_sensitivities
 from phibench.estimator.geometry.rig_parameters import PARAMETERS

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from helpers.snell import through
 
-from phibench.datasets.store.documents import from_json, to_json
+from phibench.datasets.store.json_forms import from_json, to_json
 from phibench.estimator.geometry.least_squares_depth import depth_general
 from phibench.estimator.geometry.reflection import image_of
 from phibench.estimator.geometry.triangulate import depth_exact, exact_gradient

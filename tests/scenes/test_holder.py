@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from helpers.revolved_rigs import PROFILES, revolved
 
-from phibench.datasets.store.documents import from_json, to_json
+from phibench.datasets.store.json_forms import from_json, to_json
 from phibench.render.optics.certificate import certify
 from phibench.render.optics.ray_tracer import trace_pixels
 from phibench.render.optics.room_tracer import first_hit, room_geometry

@@ -12,7 +12,7 @@ from helpers.form_oracles import radius_at
 from helpers.formed_mirrors import formed
 from scipy.special import sph_harm_y
 
-from phibench.datasets.store.documents import from_json, to_json
+from phibench.datasets.store.json_forms import from_json, to_json
 from phibench.estimator.geometry.reflection import reflect as estimated
 from phibench.render.optics.ray_tracer import lens_rays, meet, reflect, trace_pixels
 from phibench.render.optics.reflection_point import bundle_spread, fermat_points, mirror_points

@@ -22,7 +22,7 @@ from phibench.datasets.plan.plan import make_plan, shard_plan
 from phibench.datasets.read import open_finished
 from phibench.datasets.recipe import tables
 from phibench.datasets.recipe.load import check_recipe
-from phibench.datasets.store.documents import from_json, to_json
+from phibench.datasets.store.json_forms import from_json, to_json
 from phibench.datasets.store.layers import read_ambient, read_truth
 from phibench.datasets.verify import verify
 from phibench.estimator.geometry.triangulate import depth_exact
@@ -370,7 +370,7 @@ def test_a_moved_view_is_the_view_of_a_rig_that_was_built_there(misaligned_datas
     """
     from phibench.datasets.build.bake_task import bake_settings, read_light_map
     from phibench.render.optics.truth import truth_layer
-    from phibench.render.room.ambient import render_ambient
+    from phibench.render.room.ambient_layer import render_ambient
     from phibench.render.room.noise_budget import BUDGETS
     from phibench.render.setup.variant import activate
 

@@ -13,7 +13,7 @@ from pydantic import Field
 from rich.console import Console
 
 import phibench.studies
-from phibench.benchmark.reports.report import write_report
+from phibench.benchmark.reports.report_page import write_report
 from phibench.cli.main import main
 from phibench.datasets.common.errors import DatasetError
 from phibench.studies import run

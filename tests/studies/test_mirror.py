@@ -30,7 +30,7 @@ from phibench.scenes.rig import Rig
 from phibench.scenes.room import escalade360
 from phibench.studies.framework import StudyDatasets, StudyResult, read_settings
 from phibench.studies.mirror.field import disc_shares, meridian, outline_radius_px
-from phibench.studies.mirror.measured_places import (
+from phibench.studies.mirror.place_bounds import (
     DIRECTIONS,
     UNCALIBRATED,
     BlurBounds,

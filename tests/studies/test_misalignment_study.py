@@ -37,7 +37,7 @@ from phibench.studies.misaligned_rigs import (
     seen_px,
     slopes,
 )
-from phibench.studies.misalignment.interactions import (
+from phibench.studies.misalignment.sobol_indices import (
     Interactions,
     evaluated,
     interaction_findings,

@@ -21,9 +21,7 @@ from helpers.sandbox_pairs import GOOD, HEADER, SHAPE, SmallPairs, method_file
 
 from phibench.benchmark.isolation.guest_process import MethodProcess, environment
 from phibench.benchmark.isolation.method_references import MethodError, RunLimits, resolve
-from phibench.benchmark.isolation.printed_output import stack_place
-from phibench.benchmark.isolation.runner import Harness, outcomes, run_method
-from phibench.benchmark.isolation.transport import (
+from phibench.benchmark.isolation.pair_transport import (
     LARGEST,
     LEAST_BYTES,
     Connection,
@@ -34,6 +32,8 @@ from phibench.benchmark.isolation.transport import (
     pack,
     unpack,
 )
+from phibench.benchmark.isolation.printed_output import stack_place
+from phibench.benchmark.isolation.runner import Harness, outcomes, run_method
 from phibench.estimator.dense.dense_interface import DensePair
 from phibench.estimator.interface import FAILURES, Outcome, Pair
 from phibench.estimator.pair_set import ImageTruth, PairTruth

@@ -12,7 +12,7 @@ from helpers.sandbox_pairs import GOOD, SmallPairs, method_file
 
 from phibench.benchmark.isolation import method_references as resolving
 from phibench.benchmark.isolation.method_references import MethodError, resolve
-from phibench.benchmark.isolation.worker import load
+from phibench.benchmark.isolation.method_worker import load
 
 
 @pytest.fixture(autouse=True)

@@ -27,7 +27,7 @@ from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.plan.plan import make_plan
 from phibench.datasets.recipe.load import parse_recipe, recipe_text, with_numbers
 from phibench.datasets.store.checksums import damaged, differing_files, read_checksums
-from phibench.datasets.store.documents import read_manifest
+from phibench.datasets.store.metadata import read_manifest
 
 ROOT = Path(__file__).parents[3]
 SECRET = 2**128 + 12345

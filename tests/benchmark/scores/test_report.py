@@ -23,7 +23,7 @@ from phibench.benchmark.reports.figures import (
     plain_number,
     pull_histogram,
 )
-from phibench.benchmark.reports.report import report_html, verdict, write_report
+from phibench.benchmark.reports.report_page import report_html, verdict, write_report
 from phibench.benchmark.reports.report_sections import Section, time_section
 from phibench.benchmark.reports.results_page import read_parts, told_programs
 from phibench.benchmark.scores.answer_errors import Rules

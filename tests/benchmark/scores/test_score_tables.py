@@ -10,7 +10,7 @@ import pytest
 from helpers.bench_cases import cases, constant, outcomes, sampler, shifted, silent
 
 from phibench.benchmark.reports import figures
-from phibench.benchmark.reports.report import report_html, verdict
+from phibench.benchmark.reports.report_page import report_html, verdict
 from phibench.benchmark.scores.answer_errors import Rules
 from phibench.benchmark.scores.causes import KINDS
 from phibench.benchmark.scores.compare import compare_records

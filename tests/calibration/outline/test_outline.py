@@ -14,7 +14,7 @@ from phibench.calibration.outline.limb_image import Plane, Tap, binned, planes_o
 from phibench.calibration.outline.limb_sectors import Sectors, _medians, scatter
 from phibench.calibration.outline.outline import _approach as approach
 from phibench.calibration.outline.outline import find_outline, fit_outline, outline_at
-from phibench.calibration.outline.outline_fit import step_from
+from phibench.calibration.outline.outline_least_squares import step_from
 from phibench.calibration.outline.outline_result import binned_rig
 from phibench.datasets.frames.sensor_card import sensor_card
 from phibench.estimator.spots.camera_codes import linear_to_srgb, srgb_to_linear

@@ -22,7 +22,7 @@ from phibench.calibration.outline.contour import (
 )
 from phibench.calibration.outline.limb_image import planes_of
 from phibench.calibration.outline.outline import find_outline, fit_outline, outline_at
-from phibench.calibration.outline.outline_fit import OutlinePixels
+from phibench.calibration.outline.outline_least_squares import OutlinePixels
 from phibench.calibration.outline.outline_result import Outline, mean_outline
 from phibench.datasets.frames.sensor_card import sensor_card
 from phibench.estimator.spots.image_planes import ImageError

@@ -7,7 +7,7 @@ import pytest
 from helpers.folders import contents
 from helpers.processes import SMALLEST, quiet
 
-from phibench.datasets.build.finished_work import lost_work
+from phibench.datasets.build.earlier_runs import lost_work
 from phibench.datasets.build.journal import Journal
 from phibench.datasets.build.run_tasks import plan_tasks
 from phibench.datasets.build.workers import versions
@@ -18,7 +18,7 @@ from phibench.datasets.plan.plan import make_plan
 from phibench.datasets.recipe.load import parse_recipe
 from phibench.datasets.store import schema
 from phibench.datasets.store.checksums import read_checksums
-from phibench.datasets.store.documents import dataset_info, read_info
+from phibench.datasets.store.metadata import dataset_info, read_info
 
 
 @pytest.fixture

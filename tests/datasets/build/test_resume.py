@@ -189,9 +189,9 @@ def test_a_line_with_another_number_is_damaged(tmp_path: Path) -> None:
 
 def test_a_key_covers_the_code_behind_a_task_and_no_other() -> None:
     view, spot = closure("phibench.datasets.build.view_task"), closure("phibench.datasets.build.spot_task")
-    assert {"phibench.render.room.ambient", "phibench.scenes.camera", "phibench.datasets.store.layers"} <= view
+    assert {"phibench.render.room.ambient_layer", "phibench.scenes.camera", "phibench.datasets.store.layers"} <= view
     assert "phibench.render.optics.certificate" in spot - view
-    assert "phibench.render.room.ambient" in view - spot
+    assert "phibench.render.room.ambient_layer" in view - spot
     assert not {"phibench.datasets.make", "phibench.datasets.common.progress", "phibench.datasets.build.workers"} & (
         view | spot
     )

@@ -17,7 +17,7 @@ from phibench.datasets.recipe.room_tables import MeshTable, PanoramaTable
 from phibench.datasets.rooms.mesh_room import mesh_room
 from phibench.datasets.rooms.panorama_room import panorama_room
 from phibench.render.optics.room_tracer import own_geometry
-from phibench.render.room.ambient import render_ambient
+from phibench.render.room.ambient_layer import render_ambient
 from phibench.render.room.light_map import BakeSettings, bake
 from phibench.scenes.room import Room
 from phibench.scenes.shapes import Bitmap, Checker, Uniform, rectangle

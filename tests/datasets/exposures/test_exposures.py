@@ -28,7 +28,7 @@ from phibench.datasets.read import Dataset, open_dataset, open_finished
 from phibench.datasets.recipe.load import load_recipe, parse_recipe, recipe_text, with_numbers
 from phibench.datasets.recipe.recipe_scene import build_rig
 from phibench.datasets.recipe.tables import Recipe, RigTable
-from phibench.datasets.store.documents import recipe_sha256
+from phibench.datasets.store.metadata import recipe_sha256
 from phibench.render.sensor.camera_chain import auto_exposed
 from phibench.render.sensor.light import Light, Region
 

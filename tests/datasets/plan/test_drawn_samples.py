@@ -27,8 +27,8 @@ from phibench.datasets.recipe.load import load_recipe
 from phibench.datasets.rooms.room_sources import room_of
 from phibench.datasets.show import contact_sheet
 from phibench.datasets.store import schema
-from phibench.datasets.store.documents import read_manifest
 from phibench.datasets.store.layers import read_exr
+from phibench.datasets.store.metadata import read_manifest
 from phibench.datasets.verify import verify
 from phibench.render.optics.truth import spot_truth
 from phibench.scenes.rig import POSITIONS

@@ -12,8 +12,8 @@ from phibench.datasets.plan.draws import draw_rooms
 from phibench.datasets.plan.plan import make_plan
 from phibench.datasets.recipe.load import check_recipe, load_recipe
 from phibench.datasets.rooms.room_sources import GeneratedRoom
-from phibench.datasets.store.documents import from_json, to_json
-from phibench.scenes.worlds.properties import PROPERTIES
+from phibench.datasets.store.json_forms import from_json, to_json
+from phibench.scenes.worlds.room_properties import PROPERTIES
 
 RAY = {"azimuth_deg": {"uniform": [0.0, 360.0]}, "height_m": 0.45}
 

@@ -15,7 +15,7 @@ from phibench.datasets.recipe.load import check_recipe
 from phibench.datasets.recipe.mirror_tables import OF_SHAPES, MirrorShape, MirrorTable
 from phibench.datasets.recipe.recipe_scene import build_rig, fixed_conic_faults
 from phibench.datasets.recipe.tables import RigTable
-from phibench.datasets.store.documents import from_json, to_json
+from phibench.datasets.store.json_forms import from_json, to_json
 from phibench.scenes.revolved_mirror import RevolvedMirror
 from phibench.scenes.rig import Rig
 from phibench.scenes.validation import SceneError

@@ -11,7 +11,7 @@ from phibench.datasets.rooms.mesh_placement import MeshLamp, MeshSettings, read_
 from phibench.datasets.rooms.panorama_room import PanoramaSettings
 from phibench.datasets.rooms.room_files import RoomError, RoomFiles
 from phibench.datasets.rooms.room_sources import SOURCES, MeshRoom, PanoramaRoom, room_of
-from phibench.datasets.store.documents import from_json, to_json
+from phibench.datasets.store.json_forms import from_json, to_json
 
 LAMP = MeshLamp((0.0, 0.6, 2.55), (0.0, 0.0, -1.0), (1.2, 0.6))
 HALL = MeshSettings(Path("meshes/hall.glb"), 1.0, "y", (0.0, 0.0, 0.0), lamps=(LAMP,))

@@ -21,7 +21,7 @@ from phibench.datasets.recipe.load import load_recipe
 from phibench.datasets.rooms.room_sources import NamedRoom, room_of
 from phibench.datasets.store import schema
 from phibench.datasets.store.checksums import data_files, read_checksums
-from phibench.datasets.store.documents import from_json, to_json
+from phibench.datasets.store.json_forms import from_json, to_json
 from phibench.datasets.verify import verify
 
 IDS = ("lit-0", "dark-1")

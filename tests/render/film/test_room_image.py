@@ -167,7 +167,7 @@ def test_quick_spots_are_those_of_many_pairs(point: tuple[float, float, float]) 
 def test_accuracy_of_rooms_without_mitsuba(capsys) -> None:
     """Half of all pixels within a tenth of the sensor's noise of the rendered view; edges and glints differ more."""
     from phibench.datasets.build.view_task import start_renderer
-    from phibench.render.room.ambient import render_ambient
+    from phibench.render.room.ambient_layer import render_ambient
     from phibench.render.room.light_map import BakeSettings, bake
 
     start_renderer()

@@ -18,7 +18,7 @@ from helpers.snell import through
 from phibench.render.optics.faces import FaceTable
 from phibench.render.optics.room_tracer import room_geometry
 from phibench.render.optics.truth import truth_layer
-from phibench.render.room.ambient import view_surfaces
+from phibench.render.room.ambient_layer import view_surfaces
 from phibench.scenes.frames import Pose, rotation_xyz
 from phibench.scenes.glass_tube import GlassTube
 from phibench.scenes.holder import Holder, fitted

@@ -11,7 +11,7 @@ from helpers.oracles import TARGETS
 from helpers.path_ambient import path_trace
 
 from phibench.render.optics.faces import TexelGrid, face_table
-from phibench.render.room.ambient import AmbientLayer, render_ambient
+from phibench.render.room.ambient_layer import AmbientLayer, render_ambient
 from phibench.render.room.light_map import BakeSettings, LightMap, bake
 from phibench.scenes.frames import Pose, rotation_xyz
 from phibench.scenes.rig import Rig

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from helpers.oracles import TARGETS
 
-from phibench.render.room.ambient import render_ambient, view_film, view_surfaces
+from phibench.render.room.ambient_layer import render_ambient, view_film, view_surfaces
 from phibench.render.room.bounced_light import BrightTexels
 from phibench.render.room.equirectangular import equirectangular
 from phibench.render.room.light_map import BakeSettings, LightMap, bake

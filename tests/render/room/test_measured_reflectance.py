@@ -12,7 +12,7 @@ from phibench.datasets.common.errors import RecipeError
 from phibench.datasets.recipe.load import check_recipe
 from phibench.datasets.recipe.recipe_scene import build_rig
 from phibench.datasets.recipe.tables import RigTable
-from phibench.datasets.store.documents import from_json, to_json
+from phibench.datasets.store.json_forms import from_json, to_json
 from phibench.estimator.spots.spot_prediction import Laser, spot_electrons_per_s
 from phibench.render.optics.certificate import certify
 from phibench.render.optics.spot_layer import spot_layer

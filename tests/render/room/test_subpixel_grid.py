@@ -16,7 +16,7 @@ from phibench.render.optics.room_tracer import room_geometry
 from phibench.render.optics.spot_layer import spot_layer
 from phibench.render.optics.truth import spot_truth, truth_layer
 from phibench.render.room import refinement
-from phibench.render.room.ambient import render_ambient, view_film, view_surfaces
+from phibench.render.room.ambient_layer import render_ambient, view_film, view_surfaces
 from phibench.render.room.light_map import BakeSettings, LightMap, bake
 from phibench.render.room.noise_budget import (
     BUDGET,

@@ -15,7 +15,7 @@ from scipy import optimize
 
 from phibench.render.optics.faces import TexelGrid, face_table
 from phibench.render.optics.spot_layer import spot_layer
-from phibench.render.room.ambient import render_ambient
+from phibench.render.room.ambient_layer import render_ambient
 from phibench.render.room.light_map import BakeSettings, LightMap, bake
 from phibench.render.sensor.camera_chain import Chain
 from phibench.render.sensor.electrons import NoiseStream

@@ -17,7 +17,7 @@ from phibench.scenes.room import Room, chassis
 from phibench.scenes.shapes import Bitmap, Cuboid, Mesh, Prism, Rectangle, cuboid
 from phibench.scenes.worlds.floor_plan import FREE_DISC_HEIGHT_M, FREE_DISC_M, FREE_RADIUS_M, floor_plan
 from phibench.scenes.worlds.generated_room import MOST_LIGHTS, MOST_PATCHES, generate_room
-from phibench.scenes.worlds.properties import PROPERTIES, RoomProperties, drawn_properties
+from phibench.scenes.worlds.room_properties import PROPERTIES, RoomProperties, drawn_properties
 
 SEED = "rooms-of-a-test"
 FLAT_LAMP_M = 0.11  # the flattest lamps may be above the robot

@@ -10,7 +10,7 @@ import scipy
 
 from phibench.scenes.validation import SceneError
 from phibench.scenes.worlds.lamps import BANDS_NM, EFFICACY_LM_W, band_radiance, black_body_bands
-from phibench.scenes.worlds.properties import PROPERTIES, drawn_properties
+from phibench.scenes.worlds.room_properties import PROPERTIES, drawn_properties
 
 # CIE 1924 V(lambda), 410 to 680 nm in steps of 10 nm.
 V = (

@@ -10,7 +10,7 @@ import pytest
 from phibench.scenes.shapes import Bitmap
 from phibench.scenes.worlds import graphics, patterns
 from phibench.scenes.worlds.materials import MATERIALS, MaterialSet
-from phibench.scenes.worlds.properties import drawn_properties
+from phibench.scenes.worlds.room_properties import drawn_properties
 
 COLOURS = np.array([[0.45, 0.32, 0.2, 0.5], [0.25, 0.2, 0.15, 0.3], [0.6, 0.6, 0.55, 0.6]])
 HELPERS = {"fractal", "mixed", "shaded", "lattice", "band", "joints", "motif"}

@@ -31,7 +31,7 @@ from phibench.datasets.recipe.load import parse_recipe
 from phibench.datasets.recipe.tables import Recipe
 from phibench.datasets.store import schema
 from phibench.datasets.store.checksums import held_room_files, read_checksums
-from phibench.datasets.store.documents import parse_info
+from phibench.datasets.store.metadata import parse_info
 from phibench.datasets.store.provenance import code_sha256
 from phibench.datasets.store.schema import DatasetInfo
 
