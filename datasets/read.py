@@ -23,8 +23,8 @@ from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import first_fault
 from phibench.datasets.common.shown_text import ShortForm
 from phibench.datasets.frames.distractors import Distractor, distractors
-from phibench.datasets.frames.request import FrameOptions, FrameRequest, sample_request
-from phibench.datasets.frames.source import Frames, FrameSource
+from phibench.datasets.frames.frame_request import FrameOptions, FrameRequest, sample_request
+from phibench.datasets.frames.frame_source import Frames, FrameSource
 from phibench.datasets.recipe.recipe_scene import spot_albedo
 from phibench.datasets.recipe.tables import Recipe
 from phibench.datasets.store.checksums import check_documents

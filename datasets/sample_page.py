@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phibench.datasets.common.errors import DatasetError
-from phibench.datasets.frames.source import Frame
+from phibench.datasets.frames.frame_source import Frame
 from phibench.datasets.read import Dataset, Sample
 from phibench.datasets.store.files import write_text
 from phibench.render.optics.faces import IntArray

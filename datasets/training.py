@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 
 from phibench.datasets.common.errors import DatasetError, whole_number
 from phibench.datasets.common.shown_text import ShortForm
-from phibench.datasets.frames.request import FrameOptions, FrameRequest, in_one_sentence, sample_request
+from phibench.datasets.frames.frame_request import FrameOptions, FrameRequest, in_one_sentence, sample_request
+from phibench.datasets.frames.frame_source import FrameSource
 from phibench.datasets.frames.sensor_card import SensorCard, card_of
-from phibench.datasets.frames.source import FrameSource
 from phibench.datasets.read import Dataset, Sample, open_finished
 from phibench.datasets.recipe.tables import FramesTable
 from phibench.datasets.store.json_forms import from_json

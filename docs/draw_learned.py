@@ -20,8 +20,8 @@ import polars as pl
 
 from phibench.benchmark.scores.intervals import clopper_pearson
 from phibench.datasets.exposures.pair_draws import CachedSample, PairDraw, pair_draws
+from phibench.datasets.frames.frame_source import frame_stream, noise_draw
 from phibench.datasets.frames.sensor_card import card_of
-from phibench.datasets.frames.source import frame_stream, noise_draw
 from phibench.datasets.read import open_finished
 from phibench.estimator.learned.network_graphs import CROP
 from phibench.estimator.learned.network_input import crop_input, crop_origin, cut

@@ -30,7 +30,7 @@ from scipy.optimize import least_squares
 from scipy.special import ndtr
 
 from phibench.calibration.sensor_fit.edge_spread import Edge, edges_of, measure
-from phibench.calibration.sensor_fit.fit import LensFit, fit_sensor
+from phibench.calibration.sensor_fit.fit_sensor import LensFit, fit_sensor
 from phibench.calibration.sensor_fit.noise_levels import decoded_by
 from phibench.render.sensor.camera_chain import Chain
 from phibench.render.sensor.electrons import NoiseStream

@@ -19,7 +19,7 @@ from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
-from phibench.datasets.frames.source import FrameSource
+from phibench.datasets.frames.frame_source import FrameSource
 from phibench.datasets.read import Sample, open_dataset
 from phibench.datasets.store.files import write_bytes
 from phibench.render.sensor import processing

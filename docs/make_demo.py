@@ -18,7 +18,7 @@ from pathlib import Path
 from phibench.benchmark.export.export_make import export
 from phibench.benchmark.export.pair_rows import ExportRequest
 from phibench.benchmark.pair_sets.dataset_pairs import dataset_pairs
-from phibench.datasets.frames.request import FrameOptions
+from phibench.datasets.frames.frame_request import FrameOptions
 from phibench.datasets.read import open_finished
 from phibench.datasets.store.checksums import checksums_text
 from phibench.datasets.store.files import sha256, write_text

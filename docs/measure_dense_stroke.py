@@ -22,8 +22,8 @@ import numpy as np
 from PIL import Image
 
 from phibench.datasets.build.bake_task import bake_settings, read_light_map
+from phibench.datasets.frames.frame_source import noise_draw
 from phibench.datasets.frames.sensor_card import card_of
-from phibench.datasets.frames.source import noise_draw
 from phibench.datasets.read import Sample, open_dataset
 from phibench.datasets.store.files import write_bytes
 from phibench.estimator.dense.dense_interface import DenseAnswer, DensePair

@@ -17,13 +17,13 @@ from pathlib import Path
 import numpy as np
 
 from phibench.datasets.exposures.pair_draws import CachedSample, PairDraw, search_boxes
-from phibench.datasets.frames.request import FrameRequest
-from phibench.datasets.frames.source import FrameSource
+from phibench.datasets.frames.frame_request import FrameRequest
+from phibench.datasets.frames.frame_source import FrameSource
 from phibench.datasets.read import Dataset, Sample, open_dataset
 from phibench.estimator.interface import Answer, Box, Pair
-from phibench.estimator.methods.locate import SharedPair, detected
 from phibench.estimator.methods.registry import METHODS
 from phibench.estimator.methods.simulated_pairs import DrawnPairs
+from phibench.estimator.methods.spot_search import SharedPair, detected
 from phibench.scenes.rig import POSITIONS
 
 BOX_PX = 40

@@ -26,7 +26,7 @@ from scipy.stats import spearmanr
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 from helpers.chain_scenes import COLLECTED, MIDDLE, ROOM, UNITS, scene
 
-from phibench.datasets.exposures.expected import expected_of_light
+from phibench.datasets.exposures.expected_electrons import expected_of_light
 from phibench.datasets.frames.sensor_card import card_of
 from phibench.estimator.limits.position_bound import processed_snr, raw_snr
 from phibench.estimator.limits.processed_bound import chain_limit

@@ -54,8 +54,8 @@ REFERENCE = {
     "Sensor and frames": (
         "phibench.render.sensor.settings",
         "phibench.render.sensor.camera_chain",
-        "phibench.datasets.frames.request",
-        "phibench.datasets.frames.source",
+        "phibench.datasets.frames.frame_request",
+        "phibench.datasets.frames.frame_source",
     ),
     "Geometry and limits": (
         "phibench.estimator.geometry.triangulate",

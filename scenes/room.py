@@ -315,4 +315,4 @@ def c310_rig() -> Rig:
 
 
 ROOMS: dict[str, Callable[[Sequence[TargetBoard]], Room]] = {"lab": lab, "dark": dark}
-RIGS: dict[str, Callable[[], Rig]] = {"default": default_rig, "c310": c310_rig}
+RIGS: dict[str, Callable[[], Rig]] = {"default": Rig, "c310": c310_rig}

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from phibench.benchmark.pair_sets.dataset_pairs import SpotBounds, SpotInImage, spot_bounds
+from phibench.datasets.frames.frame_source import PositionLight
 from phibench.datasets.frames.sensor_card import card_of
-from phibench.datasets.frames.source import PositionLight
 from phibench.estimator.interface import Box, Pair
 from phibench.estimator.pair_set import ImageTruth as Answer
 from phibench.estimator.pair_set import PairTruth

@@ -88,7 +88,7 @@ def add_preset(copy: Copy) -> None:
 USE_PRESET = """
 from phibench.cli.main import main
 from phibench.benchmark.isolation.easy_pairs import EasyPairs
-from phibench.datasets.frames.source import noise_draw
+from phibench.datasets.frames.frame_source import noise_draw
 from phibench.datasets.recipe.tables import FramesTable
 from tools.reference_page import recipe_page
 print(EasyPairs("night-raw8").pair(0).down.max(), EasyPairs("bayer-raw").pair(0).down.max() > 255)

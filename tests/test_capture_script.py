@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from phibench.calibration.sensor_fit.capture_folder import open_capture
-from phibench.calibration.sensor_fit.fit import fit_sensor
+from phibench.calibration.sensor_fit.fit_sensor import fit_sensor
 
 SIZE = (64, 48)
 NAMES = (

@@ -20,7 +20,7 @@ import json
 import math
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import MIB, InputFile
-from phibench.datasets.frames.request import FrameOptions
+from phibench.datasets.frames.frame_request import FrameOptions
 from phibench.datasets.read import open_finished
 from phibench.datasets.training import Crop, CropSettings, SpotCrops
 from phibench.estimator.learned.network_file import read_model
@@ -473,6 +473,16 @@ def add_passes(parser: argparse.ArgumentParser, default: int, text: str) -> None
     parser.add_argument("--passes", type=one_or_more, default=default, help=f"{text}; {default} by default")
 
 
+def told(made: Callable[[], Path]) -> int:
+    """Make a file and print its name, or what is wrong; exit code."""
+    try:
+        print(made())
+    except DatasetError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Train a network from the command line."""
     parser = argparse.ArgumentParser("python -m tools.crop_training", description=__doc__.split("\n")[0])
@@ -485,15 +495,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--rescale", type=Path, metavar="FILE", help="a network that only gets a new covariance scale")
     given = parser.parse_args(arguments)
     settings = TrainingSettings(given.seed, tuple(given.preset or REQUESTS), given.crops, given.passes)
-    try:
-        if given.rescale is None:
-            print(train(given.folder, given.out, settings))
-        else:
-            print(rescaled(given.folder, given.rescale, given.out, settings))
-    except DatasetError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    return 0
+    if given.rescale is None:
+        return told(lambda: train(given.folder, given.out, settings))
+    return told(lambda: rescaled(given.folder, given.rescale, given.out, settings))
 
 
 if __name__ == "__main__":

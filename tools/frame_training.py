@@ -24,7 +24,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import MIB, InputFile
 from phibench.datasets.exposures.pair_draws import CachedSample, PairDraw, pair_draws
 from phibench.datasets.frames.sensor_card import card_of
@@ -50,6 +49,7 @@ from tools.crop_training import (
     first_layer,
     rooms_of,
     scale_of,
+    told,
     torch_on_one_thread,
 )
 
@@ -361,15 +361,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--rescale", type=Path, metavar="FILE", help="a detector that only gets a new covariance scale")
     given = parser.parse_args(arguments)
     settings = FrameSettings(given.seed, given.spots, passes=given.passes)
-    try:
-        if given.rescale is None:
-            print(train(given.folder, given.out, settings))
-        else:
-            print(rescaled(given.folder, given.rescale, given.out, settings))
-    except DatasetError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    return 0
+    if given.rescale is None:
+        return told(lambda: train(given.folder, given.out, settings))
+    return told(lambda: rescaled(given.folder, given.rescale, given.out, settings))
 
 
 if __name__ == "__main__":

@@ -13,17 +13,14 @@ from typing import Any
 
 import numpy as np
 
-from phibench.benchmark.isolation.easy_pairs import EasyCamera
-from phibench.benchmark.isolation.method_references import MethodError
+from phibench.benchmark.isolation.easy_pairs import EasyCamera, require_easy
 from phibench.datasets.frames.sensor_card import SensorCard, sensor_card
 from phibench.estimator.dense.dense_interface import DensePair
 from phibench.estimator.geometry.reflection import image_of, room_rays
-from phibench.estimator.spots.image_planes import KINDS, kind_of
 from phibench.estimator.spots.raw_pixels import bayer_filters
 from phibench.scenes.frames import Array
 from phibench.scenes.random_streams import generator
 from phibench.scenes.rig import Rig, View
-from phibench.scenes.validation import nearest
 
 _LEVEL_E = np.array([3600.0, 4000.0, 2600.0])  # behind R, G, B on a white wall
 _WAVES, _LONG_M, _SHORT_M = 48, 0.9, 0.12  # of the pattern: a pixel sees some 20 mm at 2.5 m
@@ -134,12 +131,7 @@ class EasyDensePairs:
     folders: tuple[Path, ...] = ()
 
     def __post_init__(self) -> None:
-        try:
-            kind = kind_of(sensor_card(self.preset))
-        except ValueError:
-            kind = ""  # no such preset
-        if kind not in KINDS:
-            raise MethodError(f"no easy pairs for preset '{self.preset}': {nearest(self.preset, KINDS)}")
+        require_easy(self.preset)
 
     def __len__(self) -> int:
         return self.count

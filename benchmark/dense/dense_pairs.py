@@ -19,8 +19,8 @@ from phibench.benchmark.pair_sets.wanted_pairs import of_calibration
 from phibench.calibration.rig.calibration_file import Calibration
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.exposures.pair_draws import PairDraw
+from phibench.datasets.frames.frame_source import Frame, FrameSource
 from phibench.datasets.frames.sensor_card import card_of
-from phibench.datasets.frames.source import Frame, FrameSource
 from phibench.datasets.read import Dataset
 from phibench.datasets.store.schema import ManifestRow
 from phibench.estimator.dense.dense_interface import DensePair

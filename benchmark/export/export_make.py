@@ -37,8 +37,8 @@ from phibench.datasets.common.errors import DatasetError, whole_number
 from phibench.datasets.common.input_files import InputFile
 from phibench.datasets.common.progress import progress_console
 from phibench.datasets.exposures.draw_frames import require_outside, sample_key
-from phibench.datasets.frames.request import FrameOptions
-from phibench.datasets.frames.source import FrameSource, has_place
+from phibench.datasets.frames.frame_request import FrameOptions
+from phibench.datasets.frames.frame_source import FrameSource, has_place
 from phibench.datasets.read import Dataset, open_dataset, open_finished
 from phibench.datasets.recipe.tables import FramesTable
 from phibench.datasets.store import schema

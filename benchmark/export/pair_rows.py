@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from phibench.datasets.common.errors import DatasetError, whole_number
 from phibench.datasets.frames.frame_files import png_bytes, suffix
-from phibench.datasets.frames.request import FrameOptions
-from phibench.datasets.frames.source import Frames, FrameSource
+from phibench.datasets.frames.frame_request import FrameOptions
+from phibench.datasets.frames.frame_source import Frames, FrameSource
 from phibench.datasets.read import Dataset
 from phibench.datasets.store.metadata import to_table
 from phibench.datasets.store.schema import ManifestRow, TruthFile

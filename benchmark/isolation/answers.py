@@ -1,4 +1,4 @@
-"""Answers of a method as JSON: encoded in the method's process, checked in its parent.
+"""Answers of a method as JSON: encoded in the method's process; checked in its parent, as the outcome of a pair.
 
 A method may return anything. Encoding keeps what JSON can hold; the check gives one plain sentence if it is no answer.
 """
@@ -13,11 +13,12 @@ from typing import Any
 
 import numpy as np
 
-from phibench.estimator.dense.dense_interface import DenseAnswer, require_shape
+from phibench.estimator.dense.dense_interface import DenseAnswer, DensePair, require_shape
 from phibench.estimator.geometry.phi import CONVENTIONS
-from phibench.estimator.interface import OK, Answer, Matrix2, Spot
+from phibench.estimator.interface import FAILURES, OK, Answer, Matrix2, Outcome, Pair, Spot
 from phibench.scenes.validation import nearest, printable_line
 
+MESSAGE_LENGTH = 400  # of a fault: some lines of a terminal
 _MOST = 64  # numbers or letters of a value that is none of ours
 _DEEPEST = 4  # lists in each other: a covariance has two
 _LARGEST_INTEGER = 10**300  # a float holds it; a longer one does not fit into any number of an answer
@@ -311,3 +312,17 @@ def _decoded(name: str, field: dict[str, Any]) -> Any:
         raise AnswerError(f"{name} has {len(data)} bytes, which is not its shape {shape}")
     # in native order, as `DenseAnswer` asks for it
     return np.frombuffer(data, kind).reshape(shape).astype(np.dtype(kind).newbyteorder("="), copy=False)
+
+
+def outcome_of(pair: Pair | DensePair, reply: dict[str, Any], seconds: float) -> Outcome:
+    """Outcome of a pair from the reply of `method_worker.reply_of`; what is no answer is the failure "invalid"."""
+    failure, message = reply.get("failure"), reply.get("message", "")
+    if failure in FAILURES and isinstance(message, str):
+        return Outcome(pair.number, None, seconds, failure, printable_line(message, MESSAGE_LENGTH))
+    try:
+        if isinstance(pair, DensePair):
+            return Outcome(pair.number, None, seconds, dense=checked_planes(reply["answer"], pair.shape))
+        return Outcome(pair.number, checked(reply["answer"]), seconds)
+    except (AnswerError, KeyError) as error:
+        text = str(error) if isinstance(error, AnswerError) else "the reply holds neither answer nor failure"
+        return Outcome(pair.number, None, seconds, "invalid", text)

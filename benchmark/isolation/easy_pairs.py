@@ -20,13 +20,13 @@ from numpy.typing import NDArray
 
 from phibench.benchmark.isolation.method_references import MethodError
 from phibench.datasets.common.shown_text import ShortForm
-from phibench.datasets.exposures.expected import ExpectedRegion
+from phibench.datasets.exposures.expected_electrons import ExpectedRegion
 from phibench.datasets.frames.sensor_card import SensorCard, sensor_card
 from phibench.estimator.geometry.phi import phi_incidence, phi_normal, phi_ray
 from phibench.estimator.geometry.reflection import image_of
 from phibench.estimator.interface import Box, Pair
 from phibench.estimator.limits.position_bound import raw_snr, spot_limit
-from phibench.estimator.methods.locate import around, clipped
+from phibench.estimator.methods.spot_search import around, clipped
 from phibench.estimator.pair_set import ImageTruth, PairTruth
 from phibench.estimator.spots.camera_codes import tone_of, yuyv_image
 from phibench.estimator.spots.gaussian_spot import outer, profile
@@ -208,6 +208,16 @@ _SPAN_PX = 20  # by which a box may be off the spot
 _BLUE_SHARE = 0.4  # of the red spot's light: half of it after the white balance, less in luma and in the sum of colours
 
 
+def require_easy(preset: str) -> None:
+    """Raise `MethodError` for a preset that no easy pairs are made for."""
+    try:
+        kind = kind_of(sensor_card(preset))
+    except ValueError:
+        kind = ""  # no such preset
+    if kind not in KINDS:
+        raise MethodError(f"no easy pairs for preset '{preset}': {nearest(preset, KINDS)}")
+
+
 @dataclass(frozen=True, repr=False)
 class EasyPairs(ShortForm):
     """Easy pairs by number; a `PairSet`.
@@ -238,12 +248,7 @@ class EasyPairs(ShortForm):
     whole: int = 0
 
     def __post_init__(self) -> None:
-        try:
-            kind = kind_of(sensor_card(self.preset))
-        except ValueError:
-            kind = ""  # no such preset
-        if kind not in KINDS:
-            raise MethodError(f"no easy pairs for preset '{self.preset}': {nearest(self.preset, KINDS)}")
+        require_easy(self.preset)
 
     def _shown(self) -> dict[str, Any]:
         return {

@@ -25,7 +25,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from phibench.benchmark.isolation.answers import AnswerError, checked, checked_planes, most_bytes
+from phibench.benchmark.isolation.answers import MESSAGE_LENGTH, most_bytes, outcome_of
 from phibench.benchmark.isolation.isolation import Access, Isolation
 from phibench.benchmark.isolation.method_provenance import MOST_NAMES, OpenedFiles
 from phibench.benchmark.isolation.method_references import MethodError, Reference, RunLimits
@@ -46,7 +46,7 @@ from phibench.benchmark.isolation.supervisor import HUNG_UP, KILL_SECONDS, proce
 from phibench.datasets.common.parallel import ONE_THREAD
 from phibench.datasets.store.temporary_folders import OwnedFolder
 from phibench.estimator.dense.dense_interface import DensePair
-from phibench.estimator.interface import FAILURES, Outcome
+from phibench.estimator.interface import Outcome
 from phibench.scenes.validation import printable_line
 
 _NO_PAIR: AnyPair | None = None
@@ -82,7 +82,6 @@ _SUPERVISOR = "phibench.benchmark.isolation.supervisor"
 _REPLY_BYTES = 1 << 20  # an answer has some hundreds
 _MOST_STALE = 64  # replies to other questions that are dropped before the process is given up
 _END_SECONDS = KILL_SECONDS + 1.0  # the supervisor needs the first part
-_MESSAGE_LENGTH = 400  # of a fault: some lines of a terminal
 _STACK_SECONDS = 0.3  # for a stack to be printed, and for the pipe to end
 _NOT_RESTARTED = ("", "invalid")  # the process is as sound as before
 
@@ -173,7 +172,7 @@ class MethodProcess:
             outcome = Outcome(pair.number, None, math.nan, "crash", f"the method's process cannot be used: {text}")
         if self._limits.fresh or outcome.failure not in _NOT_RESTARTED:
             self.end()
-        message = printable_line(outcome.message, _MESSAGE_LENGTH)
+        message = printable_line(outcome.message, MESSAGE_LENGTH)
         if outcome.failure == "error":
             message = advised(message, self._isolation, outcome.output, self._access.hidden)
         return replace(outcome, message=message)
@@ -300,7 +299,7 @@ class GuestProcess:
             why = f"{self.death(reference.place)}{self._last_line()}"
             raise MethodError(f"{self._kind} '{reference.name}' cannot be imported: {why}") from None
         if fault != "":
-            raise MethodError(advised(printable_line(str(fault), _MESSAGE_LENGTH), isolation))
+            raise MethodError(advised(printable_line(str(fault), MESSAGE_LENGTH), isolation))
         self.loaded = _names(reply)
         return isolation
 
@@ -413,20 +412,6 @@ def _names(reply: dict[str, Any]) -> frozenset[str]:
     told = reply.get("loaded")
     names = told[:MOST_NAMES] if isinstance(told, list) else []
     return frozenset(name for name in names if isinstance(name, str) and name == printable_line(name))
-
-
-def outcome_of(pair: AnyPair, reply: dict[str, Any], seconds: float) -> Outcome:
-    """Outcome of a pair from the reply of `method_worker.reply_of`; what is no answer is the failure "invalid"."""
-    failure, message = reply.get("failure"), reply.get("message", "")
-    if failure in FAILURES and isinstance(message, str):
-        return Outcome(pair.number, None, seconds, failure, printable_line(message, _MESSAGE_LENGTH))
-    try:
-        if isinstance(pair, DensePair):
-            return Outcome(pair.number, None, seconds, dense=checked_planes(reply["answer"], pair.shape))
-        return Outcome(pair.number, checked(reply["answer"]), seconds)
-    except (AnswerError, KeyError) as error:
-        text = str(error) if isinstance(error, AnswerError) else "the reply holds neither answer nor failure"
-        return Outcome(pair.number, None, seconds, "invalid", text)
 
 
 def _signal_name(number: int) -> str:

@@ -39,7 +39,7 @@ from phibench.estimator.interface import Method
 from phibench.scenes.validation import close_names
 
 if TYPE_CHECKING:
-    from phibench.estimator.methods.locate import SharedWork
+    from phibench.estimator.methods.spot_search import SharedWork
 
 _STATM = Path("/proc/self/statm")
 
@@ -264,7 +264,7 @@ def main(line: int, reader: int, isolation: dict[str, Any]) -> None:
 
 def _shared(received: ReceivedPair) -> ReceivedPair:
     """The pair with the work that built-in methods share."""
-    from phibench.estimator.methods.locate import SharedPair
+    from phibench.estimator.methods.spot_search import SharedPair
 
     pair = received.pair
     return received if isinstance(pair, SharedPair | DensePair) else replace(received, pair=SharedPair.of(pair))

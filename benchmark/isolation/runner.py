@@ -18,7 +18,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Protocol, TypeVar
 
-from phibench.benchmark.isolation.guest_process import MethodProcess, outcome_of
+from phibench.benchmark.isolation.answers import outcome_of
+from phibench.benchmark.isolation.guest_process import MethodProcess
 from phibench.benchmark.isolation.isolation import Isolation
 from phibench.benchmark.isolation.method_provenance import loaded_names, packages_of
 from phibench.benchmark.isolation.method_references import MethodError, Reference, RunLimits, resolve

@@ -18,11 +18,11 @@ import numpy as np
 
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.shown_text import ShortForm
-from phibench.datasets.exposures.expected import ExpectedRegion, expected_of_light
+from phibench.datasets.exposures.expected_electrons import ExpectedRegion, expected_of_light
 from phibench.datasets.exposures.pair_draws import CachedSample, FrameCounts, PairDraw, pair_draws, search_boxes
+from phibench.datasets.frames.frame_source import FrameSource, PositionLight
 from phibench.datasets.frames.sensor_card import SensorCard, card_of
 from phibench.datasets.frames.sensor_file import SensorFile
-from phibench.datasets.frames.source import FrameSource, PositionLight
 from phibench.datasets.read import Dataset, open_dataset
 from phibench.datasets.store import schema
 from phibench.datasets.store.files import sha256

@@ -27,8 +27,8 @@ from phibench.benchmark.reports.figures import (
     radius_panels,
 )
 from phibench.benchmark.reports.report_sections import Section, tracks_section
-from phibench.benchmark.scores.causes import CAUSES, KINDS
 from phibench.benchmark.scores.compare import note_on_others, same_pairs
+from phibench.benchmark.scores.failure_causes import CAUSES, KINDS
 from phibench.benchmark.scores.metrics import METRICS, RANKS, applies
 from phibench.benchmark.scores.score_document import EncodedPicture, ScoreDocument
 from phibench.benchmark.scores.score_files import read_records, read_score

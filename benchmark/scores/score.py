@@ -28,7 +28,7 @@ from phibench.benchmark.pair_sets.wanted_pairs import (
     wanted_pairs,
 )
 from phibench.benchmark.scores.answer_errors import Rules
-from phibench.benchmark.scores.causes import KeptFits, with_causes
+from phibench.benchmark.scores.failure_causes import KeptFits, with_causes
 from phibench.benchmark.scores.records import in_order, missed_relative, record_table, with_missed
 from phibench.benchmark.scores.score_document import Declared, Division, MethodCard, ScoreDocument, Worst, document_of
 from phibench.benchmark.scores.score_files import UnfinishedError, records_kept, write_score

@@ -19,7 +19,7 @@ from pydantic import AfterValidator, Field, model_validator
 
 from phibench.benchmark.scores.answer_errors import Rules
 from phibench.benchmark.scores.beyond_images import excesses
-from phibench.benchmark.scores.causes import count, count_failures
+from phibench.benchmark.scores.failure_causes import count, count_failures
 from phibench.benchmark.scores.intervals import Estimate
 from phibench.benchmark.scores.metrics import METRICS, MetricEstimate
 from phibench.benchmark.scores.strata import Stratum, count_pairs, light_shift, measured, strata

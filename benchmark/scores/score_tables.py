@@ -17,7 +17,7 @@ import polars as pl
 from rich.console import Console
 
 from phibench.benchmark.pair_sets.dataset_pairs import Track, tracks_of
-from phibench.benchmark.scores.causes import CAUSES, KINDS, NOISE, TAKEN_FOR
+from phibench.benchmark.scores.failure_causes import CAUSES, KINDS, NOISE, TAKEN_FOR
 from phibench.benchmark.scores.intervals import Estimate
 from phibench.benchmark.scores.metrics import CHOSEN, METRICS, RANKS, applies
 from phibench.benchmark.scores.score_document import PairRange, ScoreDocument, Value

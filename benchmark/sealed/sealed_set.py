@@ -34,7 +34,7 @@ from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import SETTINGS_BYTES, InputFile, Name
 from phibench.datasets.common.progress import Steps, progress_console
 from phibench.datasets.frames.frame_files import png_bytes
-from phibench.datasets.frames.source import Frames
+from phibench.datasets.frames.frame_source import Frames
 from phibench.datasets.read import open_finished
 from phibench.datasets.recipe.load import RECIPES, load_recipe
 from phibench.datasets.recipe.tables import Recipe

@@ -31,7 +31,6 @@ from phibench.calibration.rig.from_dataset import (
     Photograph,
     write_bundle,
 )
-from phibench.calibration.rig.known_spots import method_for
 from phibench.calibration.rig.vertical_edges import find_vertical
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.read import place_of
@@ -40,8 +39,9 @@ from phibench.estimator.geometry.least_squares_depth import depth_general
 from phibench.estimator.geometry.rig_parameters import stroke_of
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.estimator.interface import Pair
-from phibench.estimator.methods.locate import SharedPair, kept
 from phibench.estimator.methods.raw_likelihood import with_posteriors
+from phibench.estimator.methods.registry import method_for
+from phibench.estimator.methods.spot_search import SharedPair, kept
 from phibench.estimator.spots.image_planes import ImageError
 from phibench.scenes.rig import POSITIONS, Rig
 

@@ -52,7 +52,6 @@ from phibench.calibration.outline.outline import find_outline
 from phibench.calibration.outline.outline_result import Outline, mean_outline
 from phibench.calibration.rig.bundle import calibrate
 from phibench.calibration.rig.calibration_file import Calibration, read_calibration
-from phibench.calibration.rig.known_spots import method_for
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.datasets.frames.sensor_file import SensorFile, read_sensor_file
@@ -60,8 +59,9 @@ from phibench.estimator.geometry.least_squares_depth import GeneralDepth, depth_
 from phibench.estimator.geometry.rig_parameters import PARAMETERS, prior_sigmas, stroke_of
 from phibench.estimator.geometry.status import Status, describe
 from phibench.estimator.interface import Answer, Image, Pair, Spot
-from phibench.estimator.methods.locate import SharedPair, kept
 from phibench.estimator.methods.raw_likelihood import with_posteriors
+from phibench.estimator.methods.registry import method_for
+from phibench.estimator.methods.spot_search import SharedPair, kept
 from phibench.estimator.spots.detect import detect
 from phibench.estimator.spots.image_planes import ImageError
 from phibench.scenes.frames import Array

@@ -27,8 +27,8 @@ from phibench.datasets.common.errors import DatasetError
 from phibench.estimator.geometry.status import Status
 from phibench.estimator.interface import Answer, Pair, Spot
 from phibench.estimator.methods.chain_fit import spot_outputs
-from phibench.estimator.methods.locate import pair_blur, seen_depth_m
 from phibench.estimator.methods.raw_likelihood import raw_spot_data
+from phibench.estimator.methods.spot_search import pair_blur, seen_depth_m
 from phibench.estimator.processed.quasi_score import CoefficientWindow, fit_window
 from phibench.estimator.spots.fit_raw import SpotData, fit_law
 from phibench.estimator.spots.gaussian_spot import SpotModel, SpotPixels, limited

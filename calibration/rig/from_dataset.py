@@ -20,7 +20,7 @@ from phibench.calibration.outline.outline import find_outline
 from phibench.calibration.outline.outline_result import Outline, mean_measured, mean_outline
 from phibench.calibration.rig.bundle import Bundle, KnownSpot, calibrate
 from phibench.calibration.rig.calibration_file import write_calibration
-from phibench.calibration.rig.known_spots import Ruler, known_spot, measured_spot, method_for, one_per_pose
+from phibench.calibration.rig.known_spots import Ruler, known_spot, measured_spot, one_per_pose
 from phibench.calibration.rig.outline_picture import write_overlay
 from phibench.calibration.rig.vertical_edges import find_vertical
 from phibench.datasets.common.errors import DatasetError
@@ -29,6 +29,7 @@ from phibench.datasets.read import Dataset, Sample, open_dataset
 from phibench.datasets.store.files import require_writable
 from phibench.estimator.geometry.rig_parameters import PARAMETERS, prior_sigmas
 from phibench.estimator.geometry.status import Status, describe
+from phibench.estimator.methods.registry import method_for
 from phibench.estimator.methods.simulated_pairs import pairs_of
 from phibench.estimator.spots.simple_spots import find_spot
 from phibench.scenes.frames import Array

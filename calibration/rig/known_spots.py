@@ -1,4 +1,4 @@
-"""Laser spots at known places, for calibration: the method that finds them, and simulated measurements of places.
+"""Laser spots at known places, for calibration: as found in both images, and simulated measurements of their places.
 
 Pixels are found by a built-in method; distance, height and azimuth are as if a person had measured them.
 A "measured" place is the truth plus an error drawn from the sample's own stream. The stated sigma is the real one.
@@ -14,11 +14,8 @@ import numpy as np
 
 from phibench.calibration.rig.bundle import KnownSpot
 from phibench.datasets.common.errors import DatasetError
-from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.datasets.read import Sample
 from phibench.estimator.interface import Answer, Pair, Spot
-from phibench.estimator.methods.registry import METHODS, BuiltIn
-from phibench.estimator.spots.image_planes import RAW, kind_of
 from phibench.scenes.frames import Array
 from phibench.scenes.random_streams import generator
 from phibench.scenes.rig import POSITIONS
@@ -56,11 +53,6 @@ class Ruler:
                 raise DatasetError(
                     f"sigma of a calibration spot's {what} = {sigma:g} {unit}: must be above 0, at most {MAX_SIGMA:g}"
                 )
-
-
-def method_for(card: SensorCard) -> BuiltIn:
-    """The built-in method that comes closest to the bound of this kind of image and claims a covariance."""
-    return METHODS["raw_maximum_likelihood" if kind_of(card) in RAW else "chain_fit"]
 
 
 def require_positions(answer: Answer, sample_id: str) -> None:

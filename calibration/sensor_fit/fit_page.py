@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from phibench.calibration.sensor_fit.capture_folder import CaptureError
-from phibench.calibration.sensor_fit.fit import SensorFit
+from phibench.calibration.sensor_fit.fit_sensor import SensorFit
 from phibench.calibration.sensor_fit.noise_levels import encoded_by
 from phibench.datasets.common.shown_text import html_text, markdown_cell, markdown_text, table_lines
 from phibench.datasets.store.files import write_bytes, write_text

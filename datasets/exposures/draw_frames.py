@@ -34,8 +34,8 @@ from phibench.datasets.frames.frame_files import (
     write_index,
     write_preview,
 )
-from phibench.datasets.frames.request import FrameOptions, FrameRequest
-from phibench.datasets.frames.source import Frame, FrameSource, has_place
+from phibench.datasets.frames.frame_request import FrameOptions, FrameRequest
+from phibench.datasets.frames.frame_source import Frame, FrameSource, has_place
 from phibench.datasets.read import Dataset, Sample, open_dataset, open_finished
 from phibench.datasets.store import schema
 from phibench.datasets.store.checksums import filling, read_checksums, require_files

@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 
 from phibench.datasets.common.errors import DatasetError, whole_number
 from phibench.datasets.frames.distractors import Distractor, distractors, present
-from phibench.datasets.frames.request import FrameOptions, FrameRequest, sample_stream
+from phibench.datasets.frames.frame_request import FrameOptions, FrameRequest, sample_stream
+from phibench.datasets.frames.frame_source import FrameSource, has_place
 from phibench.datasets.frames.sensor_file import SensorFile
-from phibench.datasets.frames.source import FrameSource, has_place
 from phibench.datasets.read import Dataset, Sample
 from phibench.datasets.recipe.tables import FramesTable
 from phibench.datasets.store.layers import SpotWindow

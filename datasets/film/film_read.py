@@ -24,7 +24,7 @@ import polars
 from numpy.typing import NDArray
 
 from phibench.datasets.common.errors import DatasetError
-from phibench.datasets.exposures.expected import ExpectedRegion, expected_of_light
+from phibench.datasets.exposures.expected_electrons import ExpectedRegion, expected_of_light
 from phibench.datasets.film.film_plan import FilmPlan, film_plans
 from phibench.datasets.film.film_store import (
     CHECKSUMS,
@@ -43,7 +43,7 @@ from phibench.datasets.film.film_store import (
     read_table,
     read_view,
 )
-from phibench.datasets.frames.request import in_one_sentence
+from phibench.datasets.frames.frame_request import in_one_sentence
 from phibench.datasets.plan.plan import Plan
 from phibench.datasets.recipe.load import parse_recipe, recipe_files, recipe_text
 from phibench.datasets.store.layers import SpotWindow
@@ -67,7 +67,7 @@ class FilmFrame:
     Attributes
     ----------
     image : array
-        As `phibench.datasets.frames.source.Frame.image`, on `region`.
+        As `phibench.datasets.frames.frame_source.Frame.image`, on `region`.
     jpeg : bytes or None
         The file that the camera sends; None for a window and for other outputs than "mjpeg".
     frame, draw : int
@@ -249,7 +249,7 @@ class Film:
             return FilmFrame(chain.frame(light, stream, region), jpeg, number, draw, chosen, region)
 
     def expected(self, number: int, preset: str = "bayer-raw", margin_px: int = 4, **changes: Any) -> ExpectedRegion:
-        """Means and derivatives around the spot of a frame, as `datasets.exposures.expected`."""
+        """Means and derivatives around the spot of a frame, as `datasets.exposures.expected_electrons`."""
         return expected_of_light(
             self.light(number), self.sensor(preset, **changes), self.plan.scene.rig.camera, margin_px
         )

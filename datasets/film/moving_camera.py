@@ -22,7 +22,7 @@ from phibench.datasets.build.tasks import BuildTask, Made, task_key
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import FileName, InputFile
 from phibench.datasets.common.progress import progress_console
-from phibench.datasets.frames.request import in_one_sentence
+from phibench.datasets.frames.frame_request import in_one_sentence
 from phibench.datasets.rooms.room_sources import GeneratedRoom
 from phibench.datasets.store.checksums import filling
 from phibench.datasets.store.files import write_bytes, write_text

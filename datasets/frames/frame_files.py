@@ -19,7 +19,7 @@ from PIL import Image
 
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import FileName, InputFile
-from phibench.datasets.frames.source import Frame
+from phibench.datasets.frames.frame_source import Frame
 from phibench.datasets.store.files import read_rows, write_bytes, write_text
 from phibench.datasets.store.layers import write_exr
 from phibench.datasets.store.metadata import model_table, parquet_bytes

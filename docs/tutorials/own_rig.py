@@ -32,7 +32,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import phibench
-from phibench.datasets.exposures.expected import expected_region
+from phibench.datasets.exposures.expected_electrons import expected_region
 from phibench.datasets.frames.sensor_card import card_of
 from phibench.estimator.geometry.rig_parameters import rig_covariance
 from phibench.estimator.limits.position_bound import depth_limit, spot_limit

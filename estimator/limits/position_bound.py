@@ -36,7 +36,7 @@ from numpy.polynomial.legendre import leggauss
 from numpy.typing import ArrayLike
 from scipy.special import log_ndtr, ndtr
 
-from phibench.datasets.exposures.expected import ExpectedRegion
+from phibench.datasets.exposures.expected_electrons import ExpectedRegion
 from phibench.datasets.exposures.pair_draws import FrameCounts
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.estimator.geometry.phi import PhiEstimate, estimate_phi

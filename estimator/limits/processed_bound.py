@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import cho_factor, cho_solve
 
-from phibench.datasets.exposures.expected import ExpectedRegion
+from phibench.datasets.exposures.expected_electrons import ExpectedRegion
 from phibench.datasets.exposures.pair_draws import FrameCounts
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.estimator.limits.position_bound import (

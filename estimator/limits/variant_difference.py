@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from phibench.datasets.common.errors import DatasetError
-from phibench.datasets.exposures.expected import ExpectedRegion, expected_of_light
+from phibench.datasets.exposures.expected_electrons import ExpectedRegion, expected_of_light
 from phibench.datasets.frames.sensor_card import SensorCard, card_of
 from phibench.datasets.read import Dataset, Sample, open_finished
 from phibench.datasets.store import schema

@@ -14,8 +14,8 @@ from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.estimator.geometry.status import Status, describe
 from phibench.estimator.interface import Answer, Box, Pair, Spot
 from phibench.estimator.methods.likelihood_maps import SpotLikelihood, claimed_px2, of_pixels, of_window
-from phibench.estimator.methods.locate import around as box_at
-from phibench.estimator.methods.locate import (
+from phibench.estimator.methods.spot_search import around as box_at
+from phibench.estimator.methods.spot_search import (
     at_detection,
     box_around,
     detected,

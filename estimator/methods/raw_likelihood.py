@@ -38,7 +38,7 @@ from phibench.estimator.methods.likelihood_maps import (
     of_pixels,
     place_covariance,
 )
-from phibench.estimator.methods.locate import (
+from phibench.estimator.methods.spot_search import (
     SearchRegion,
     SharedPair,
     at_detection,

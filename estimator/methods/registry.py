@@ -14,13 +14,14 @@ from pathlib import Path
 
 import numpy as np
 
+from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.estimator.interface import Answer, Box, Method, Pair, Spot
 from phibench.estimator.learned.network_graphs import CROP, DETECT
 from phibench.estimator.learned.network_input import ACCEPTED, frame_input
 from phibench.estimator.learned.networks import Network, heat_peaks, network, refined, shipped
 from phibench.estimator.methods.chain_fit import chain_fit
-from phibench.estimator.methods.locate import SearchRegion, at_detection, detected, each_spot, red_peak, spot_of
 from phibench.estimator.methods.raw_likelihood import joint_fit, raw_likelihood
+from phibench.estimator.methods.spot_search import SearchRegion, at_detection, detected, each_spot, red_peak, spot_of
 from phibench.estimator.spots.candidates import Candidates
 from phibench.estimator.spots.detect import Detection, Thresholds, choose, mirror_box, outline_mask
 from phibench.estimator.spots.image_planes import KINDS, PROCESSED, RAW, kind_of, linear_planes, redness
@@ -416,3 +417,8 @@ KNOWN: dict[str, BuiltIn] = {method.name: method for method in _ALL}
 
 METHODS: dict[str, BuiltIn] = {name: method for name, method in KNOWN.items() if method.installed}
 """Those that can run here."""
+
+
+def method_for(card: SensorCard) -> BuiltIn:
+    """The built-in method that comes closest to the bound of this kind of image and claims a covariance."""
+    return METHODS["raw_maximum_likelihood" if kind_of(card) in RAW else "chain_fit"]

@@ -15,8 +15,8 @@ import numpy as np
 
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.exposures.pair_draws import CachedSample, FrameCounts, PairDraw, pair_draws
+from phibench.datasets.frames.frame_source import Frame, Frames, FrameSource
 from phibench.datasets.frames.sensor_card import SensorCard, card_of
-from phibench.datasets.frames.source import Frame, Frames, FrameSource
 from phibench.datasets.read import Dataset, Sample
 from phibench.estimator.interface import Box, Image, Pair
 

@@ -171,8 +171,8 @@ def fit(frames: Path, *, out: Path, page: Path | None = None) -> int:
     page
         Page to write, .html or .md: the numbers, and plots of what they were fitted to.
     """
-    from phibench.calibration.sensor_fit.fit import fit_sensor
     from phibench.calibration.sensor_fit.fit_page import numbers_of, remarks_of, require_page, write_page
+    from phibench.calibration.sensor_fit.fit_sensor import fit_sensor
     from phibench.datasets.frames.sensor_file import write_sensor_file
     from phibench.datasets.store.files import require_writable
 

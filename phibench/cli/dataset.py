@@ -29,7 +29,7 @@ from phibench.cli.options import (
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from phibench.datasets.frames.request import FrameOptions
+    from phibench.datasets.frames.frame_request import FrameOptions
     from phibench.datasets.read import Sample
 
 dataset = App(name="dataset", group=START, help="Make, check and show data sets; draw frames and panoramas.")
@@ -316,7 +316,7 @@ class DrawOptions:
 
     def options(self, preset: str, numbers: Mapping[str, Any]) -> FrameOptions:
         """Options of frames; what is not given is the recipe's."""
-        from phibench.datasets.frames.request import FrameOptions, exposure_of
+        from phibench.datasets.frames.frame_request import FrameOptions, exposure_of
 
         asked: dict[str, Any] = {"region": self.region, "camera_seed": self.camera_seed}
         given = {key: value for key, value in asked.items() if value is not None}

@@ -16,7 +16,7 @@ import scipy
 
 from phibench.benchmark.scores.answer_errors import Rules
 from phibench.benchmark.scores.intervals import Clusters, Estimate, deviation_of, estimates
-from phibench.datasets.exposures.expected import expected_of_light
+from phibench.datasets.exposures.expected_electrons import expected_of_light
 from phibench.datasets.frames.sensor_card import card_of
 from phibench.datasets.read import Dataset, Sample
 from phibench.estimator.geometry.reflection import image_of

@@ -20,8 +20,8 @@ from phibench.benchmark.scores.score_tables import cell_parts
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.shown_text import TextTable
 from phibench.datasets.exposures.pair_draws import CachedSample, FrameCounts
-from phibench.datasets.frames.request import Exposure
-from phibench.datasets.frames.source import FrameSource
+from phibench.datasets.frames.frame_request import Exposure
+from phibench.datasets.frames.frame_source import FrameSource
 from phibench.datasets.read import Dataset, Sample
 from phibench.estimator.geometry.least_squares_depth import depth_general
 from phibench.estimator.methods.simulated_pairs import pairs_of

@@ -26,7 +26,7 @@ from phibench.benchmark.scores.intervals import NORMAL_95
 from phibench.calibration.outline.outline_result import mean_outline
 from phibench.calibration.rig.bundle import Bundle, calibrate
 from phibench.calibration.rig.from_dataset import frame_outline, frame_spots
-from phibench.calibration.rig.known_spots import Ruler, method_for, one_per_pose
+from phibench.calibration.rig.known_spots import Ruler, one_per_pose
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.exposures.pair_draws import FrameCounts
 from phibench.datasets.read import Dataset, Sample
@@ -34,6 +34,7 @@ from phibench.estimator.geometry.least_squares_depth import GeneralDepth, depth_
 from phibench.estimator.geometry.status import describe
 from phibench.estimator.interface import OK, Answer, Pair
 from phibench.estimator.methods.raw_likelihood import joint_of
+from phibench.estimator.methods.registry import method_for
 from phibench.estimator.methods.simulated_pairs import pairs_of
 from phibench.estimator.pair_set import PairTruth
 from phibench.scenes.rig import POSITIONS

@@ -26,7 +26,6 @@ import polars as pl
 
 from phibench.benchmark.scores.intervals import NORMAL_95
 from phibench.calibration.rig.bundle import Bundle
-from phibench.calibration.rig.known_spots import method_for
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.film.film_read import Film, Films
 from phibench.datasets.film.film_store import FilmInfo
@@ -34,6 +33,7 @@ from phibench.datasets.frames.sensor_card import card_of
 from phibench.datasets.read import Dataset
 from phibench.estimator.geometry.status import depth_pull
 from phibench.estimator.interface import Image, Pair
+from phibench.estimator.methods.registry import method_for
 from phibench.robot.film.film_bundle import FilmDepth, film_depth
 from phibench.robot.film.film_estimates import EqualLight, bundle_depth, equal_light, seen_film
 from phibench.robot.film.film_frames import film_frames, lit_frames

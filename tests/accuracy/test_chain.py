@@ -142,7 +142,7 @@ def test_accuracy_of_the_srgb_limit_lies_above_the_raw_one() -> None:
     """8 bits cost at most some per cent, and never gain: the raw signal is a finer reading of the same pixels."""
     flux_e = 5000.0 / COLLECTED
     raw = card_of(sensor("bayer-raw", prnu=0.0, dsnu_e=0.0, gain_dn_per_e=1.3, adc_bits=14))
-    from phibench.datasets.exposures.expected import expected_of_light
+    from phibench.datasets.exposures.expected_electrons import expected_of_light
     from phibench.estimator.limits.position_bound import derivative_images, exact_information
 
     s = sensor("srgb8", prnu=0.0, dsnu_e=0.0)

@@ -18,7 +18,7 @@ from phibench.cli.main import main
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.exposures.draw_frames import draw_frames
 from phibench.datasets.frames.frame_files import read_index
-from phibench.datasets.frames.request import FrameOptions, sample_request
+from phibench.datasets.frames.frame_request import FrameOptions, sample_request
 from phibench.datasets.recipe.load import load_recipe, parse_recipe, with_numbers
 from phibench.datasets.store.files import write_secret
 from phibench.render.sensor.electrons import fixed_pattern

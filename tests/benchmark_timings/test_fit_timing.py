@@ -7,7 +7,7 @@ import pytest
 from helpers.chain_scenes import COLLECTED, MIDDLE, SQUARE, UNITS, scene
 from helpers.sensor_light import spot_at
 
-from phibench.datasets.exposures.expected import expected_of_light
+from phibench.datasets.exposures.expected_electrons import expected_of_light
 from phibench.datasets.frames.sensor_card import card_of
 from phibench.estimator.geometry.status import Status
 from phibench.estimator.limits.position_bound import NOISE_MODELS, spot_limit

@@ -8,8 +8,8 @@ from dataclasses import replace
 import pytest
 from helpers.sensor_light import room
 
-from phibench.datasets.frames.request import FrameRequest
-from phibench.datasets.frames.source import FrameSource, PositionLight
+from phibench.datasets.frames.frame_request import FrameRequest
+from phibench.datasets.frames.frame_source import FrameSource, PositionLight
 from phibench.datasets.store.layers import SpotWindow
 from phibench.render.sensor.camera_chain import Chain
 from phibench.render.sensor.electrons import NoiseStream, _pattern

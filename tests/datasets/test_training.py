@@ -12,7 +12,7 @@ import scipy
 from numpy.typing import NDArray
 
 from phibench.datasets.common.errors import DatasetError
-from phibench.datasets.frames.request import FrameOptions
+from phibench.datasets.frames.frame_request import FrameOptions
 from phibench.datasets.read import open_dataset
 from phibench.datasets.store.layers import SpotWindow
 from phibench.datasets.training import PERIOD_PX, CropSettings, PairDataset, SpotCrops, shifted_spot

@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from phibench.datasets.frames.frame_files import png_bytes
-from phibench.datasets.frames.request import Exposure
+from phibench.datasets.frames.frame_request import Exposure
 from phibench.datasets.read import Dataset, Sample
 from phibench.estimator.methods.simulated_pairs import DrawnPairs, pairs_of
 from phibench.scenes.rig import Rig

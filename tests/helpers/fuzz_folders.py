@@ -35,7 +35,7 @@ from phibench.benchmark.reports.bench import SHIPPED
 from phibench.benchmark.scores.score_document import EncodedPicture, ScoreDocument
 from phibench.benchmark.sealed import rebuilt_score, score_check
 from phibench.calibration.captures import imported_set
-from phibench.calibration.sensor_fit import fit
+from phibench.calibration.sensor_fit import fit_sensor
 from phibench.calibration.sensor_fit.capture_folder import read_header
 from phibench.datasets.build import draws_file, run_tasks
 from phibench.datasets.build.journal import Journal
@@ -43,7 +43,7 @@ from phibench.datasets.build.run_tasks import held_head
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.film import moving_camera
 from phibench.datasets.frames import frame_files
-from phibench.datasets.frames.request import FrameOptions
+from phibench.datasets.frames.frame_request import FrameOptions
 from phibench.datasets.read import open_finished
 from phibench.datasets.recipe.load import load_recipe, recipe_text
 from phibench.datasets.rooms.room_files import RoomFiles
@@ -179,7 +179,7 @@ def _header(path: Path) -> object:
     capture = SimpleNamespace(kind="mjpeg", dark=SimpleNamespace(files=[path]), edges=None, chessboards=None)
     for name in ("flats", "exposures", "dark_exposures"):
         setattr(capture, name, ())
-    fit._take_jpeg(cast(Any, SimpleNamespace(take=lambda *_: None)), cast(Any, capture))
+    fit_sensor._take_jpeg(cast(Any, SimpleNamespace(take=lambda *_: None)), cast(Any, capture))
     return read_header(path.read_bytes(), path.name)
 
 

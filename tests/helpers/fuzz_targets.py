@@ -36,7 +36,7 @@ from phibench.datasets.build.bake_task import cache_limit_mb
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.film.film_store import FilmInfo, read_document, read_spots, read_table, write_spots
 from phibench.datasets.film.film_video import read_frames, write_frames
-from phibench.datasets.frames.request import jpeg_tables
+from phibench.datasets.frames.frame_request import jpeg_tables
 from phibench.datasets.frames.sensor_file import SensorFile, read_sensor_file
 from phibench.datasets.rooms.panorama_files import is_linear
 from phibench.datasets.rooms.room_files import RoomFiles

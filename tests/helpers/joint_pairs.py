@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from helpers.sensor_light import FILTERS, spot_at
 
-from phibench.datasets.exposures.expected import expected_of_light
+from phibench.datasets.exposures.expected_electrons import expected_of_light
 from phibench.datasets.frames.sensor_card import card_of
 from phibench.estimator.geometry.reflection import image_of
 from phibench.estimator.limits.position_bound import spot_limit

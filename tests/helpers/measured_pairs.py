@@ -32,7 +32,7 @@ from phibench.calibration.captures.imported_set import import_pairs
 from phibench.calibration.captures.measure import KnownNumbers, measure, read_setting
 from phibench.calibration.captures.pair_list import photos_of, read_pair_list
 from phibench.calibration.rig.from_dataset import CalibrationSources
-from phibench.calibration.sensor_fit.fit import fit_sensor
+from phibench.calibration.sensor_fit.fit_sensor import fit_sensor
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.exposures.pair_draws import FrameCounts
 from phibench.datasets.frames.frame_files import png_bytes

@@ -12,7 +12,7 @@ from functools import cache
 import numpy as np
 from helpers.sensor_light import FILTERS
 
-from phibench.datasets.exposures.expected import expected_of_light
+from phibench.datasets.exposures.expected_electrons import expected_of_light
 from phibench.datasets.frames.sensor_card import card_of
 from phibench.datasets.recipe.recipe_scene import build_rig
 from phibench.datasets.recipe.tables import RigTable

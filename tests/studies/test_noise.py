@@ -15,7 +15,7 @@ from rich.console import Console
 from phibench.benchmark.scores.answer_errors import Rules
 from phibench.benchmark.scores.intervals import Estimate
 from phibench.datasets.common.errors import DatasetError
-from phibench.datasets.exposures.expected import expected_region
+from phibench.datasets.exposures.expected_electrons import expected_region
 from phibench.datasets.frames.sensor_card import card_of
 from phibench.datasets.read import Sample, open_dataset
 from phibench.estimator.limits.position_bound import spot_limit

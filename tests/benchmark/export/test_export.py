@@ -21,7 +21,7 @@ from phibench.benchmark.export.export_make import ExportOutcome, export, verify_
 from phibench.benchmark.export.pair_rows import ExportRequest, Form, pair_key, splits
 from phibench.cli.main import main
 from phibench.datasets.common.errors import DatasetError
-from phibench.datasets.frames.request import FrameOptions
+from phibench.datasets.frames.frame_request import FrameOptions
 from phibench.datasets.read import open_dataset
 
 

@@ -28,9 +28,9 @@ from phibench.cli import main as cli
 from phibench.estimator.geometry.phi import phi_normal, phi_ray
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.estimator.interface import Answer, Method, Outcome, Pair, Spot
-from phibench.estimator.methods.locate import SharedPair
 from phibench.estimator.methods.pair_light import mirror_mask
 from phibench.estimator.methods.registry import METHODS
+from phibench.estimator.methods.spot_search import SharedPair
 from phibench.scenes.random_streams import generator
 
 Change = Callable[[Pair, Spot, str], Spot]

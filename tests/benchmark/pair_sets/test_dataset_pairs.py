@@ -30,7 +30,7 @@ from phibench.benchmark.pair_sets.wanted_pairs import PairChoice
 from phibench.benchmark.scored_dataset import open_dataset as scored_dataset
 from phibench.benchmark.scores.worst_images import worst
 from phibench.datasets.common.errors import DatasetError
-from phibench.datasets.exposures.expected import expected_of_light, expected_region
+from phibench.datasets.exposures.expected_electrons import expected_of_light, expected_region
 from phibench.datasets.exposures.pair_draws import CachedSample, FrameCounts
 from phibench.datasets.frames.sensor_card import card_of
 from phibench.datasets.read import Dataset, open_dataset

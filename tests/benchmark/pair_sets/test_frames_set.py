@@ -19,7 +19,7 @@ from phibench.benchmark.scored_dataset import ScoredDataset
 from phibench.benchmark.scores.score import score
 from phibench.cli.main import main
 from phibench.datasets.common.errors import DatasetError
-from phibench.datasets.frames.request import FrameOptions
+from phibench.datasets.frames.frame_request import FrameOptions
 from phibench.datasets.store.checksums import checksums_text
 from phibench.datasets.store.files import sha256
 from phibench.datasets.training import PairDataset

@@ -11,7 +11,7 @@ from helpers.bench_cases import RIG, Cases, cases, change, constant, image_of, o
 from scipy.ndimage import maximum_filter, uniform_filter
 
 from phibench.benchmark.scores.answer_errors import MATCH_PX, Rules
-from phibench.benchmark.scores.causes import (
+from phibench.benchmark.scores.failure_causes import (
     _RULES,
     CAUSES,
     KINDS,

@@ -27,7 +27,7 @@ from phibench.benchmark.reports.report_page import report_html, verdict, write_r
 from phibench.benchmark.reports.report_sections import Section, time_section
 from phibench.benchmark.reports.results_page import read_parts, told_programs
 from phibench.benchmark.scores.answer_errors import Rules
-from phibench.benchmark.scores.causes import CAUSES
+from phibench.benchmark.scores.failure_causes import CAUSES
 from phibench.benchmark.scores.score import score_outcomes
 from phibench.benchmark.scores.score_document import Declared, Flag, MethodCard
 from phibench.benchmark.scores.score_files import read_score, write_score

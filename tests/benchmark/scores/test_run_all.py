@@ -26,9 +26,9 @@ from phibench.benchmark.scores.score_files import read_score
 from phibench.cli import main as cli
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.read import open_finished
-from phibench.estimator.methods import locate
-from phibench.estimator.methods.locate import SharedPair
+from phibench.estimator.methods import spot_search
 from phibench.estimator.methods.registry import METHODS
+from phibench.estimator.methods.spot_search import SharedPair
 from phibench.estimator.spots.detect import detect
 
 
@@ -101,7 +101,7 @@ def test_shared_work_is_done_once_and_changes_no_answer(
     asked = [method for method in METHODS.values() if not method.refusal(pair)]
     alone = [repr(method(pair)) for method in asked]  # repr of a float tells every bit
     searches: list[int] = []
-    monkeypatch.setattr(locate, "detect", lambda one: searches.append(one.number) or detect(one))
+    monkeypatch.setattr(spot_search, "detect", lambda one: searches.append(one.number) or detect(one))
     for order in (1, -1):
         shared = SharedPair.of(pair)
         assert [repr(method(shared)) for method in asked[::order]] == alone[::order]
@@ -116,9 +116,9 @@ def test_a_method_of_others_neither_profits_from_shared_work_nor_changes_it(
     bench_dataset: Path, tmp_path: Path
 ) -> None:
     body = """
-    from phibench.estimator.methods import locate
+    from phibench.estimator.methods import spot_search
     from phibench.estimator.spots import detect
-    locate.detect = detect.detect = lambda pair: 1 / 0
+    spot_search.detect = detect.detect = lambda pair: 1 / 0
     return Answer(Spot((float(hasattr(pair, "work")), float(os.getpid()))), Spot.missing(type(pair).__name__))
     """
     foreign = method_file(tmp_path, textwrap.dedent(body), header=f"import os\n{HEADER}")

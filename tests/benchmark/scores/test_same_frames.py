@@ -14,7 +14,7 @@ from phibench.benchmark.export.pair_rows import ExportRequest, pair_key
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.exposures.draw_frames import draw_frames
 from phibench.datasets.frames.frame_files import read_index
-from phibench.datasets.frames.request import FrameOptions
+from phibench.datasets.frames.frame_request import FrameOptions
 from phibench.datasets.recipe.load import parse_recipe, recipe_text
 from phibench.datasets.training import CropSettings, PairDataset, SpotCrops
 from phibench.render.sensor import settings

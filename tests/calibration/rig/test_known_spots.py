@@ -13,12 +13,13 @@ import scipy
 from phibench.calibration.rig.bundle import vertical_by_principal_point
 from phibench.calibration.rig.calibration_file import read_calibration
 from phibench.calibration.rig.from_dataset import CalibrationSources, calibrate_dataset, frame_spots
-from phibench.calibration.rig.known_spots import Ruler, known_spot, method_for, one_per_pose
+from phibench.calibration.rig.known_spots import Ruler, known_spot, one_per_pose
 from phibench.cli.main import main
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.read import Dataset, open_finished
 from phibench.estimator.geometry.rig_parameters import PARAMETERS, prior_sigmas
 from phibench.estimator.interface import Answer, Spot
+from phibench.estimator.methods.registry import method_for
 from phibench.estimator.methods.simulated_pairs import pairs_of
 from phibench.studies.paper.experiment_tables import Procedure, run_experiments
 

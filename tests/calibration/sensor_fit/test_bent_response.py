@@ -11,7 +11,7 @@ from PIL import Image
 
 from phibench.calibration.sensor_fit.block_sums import before_rounding, block_sums
 from phibench.calibration.sensor_fit.capture_folder import CaptureError
-from phibench.calibration.sensor_fit.fit import fit_sensor
+from phibench.calibration.sensor_fit.fit_sensor import fit_sensor
 from phibench.calibration.sensor_fit.response_fit import LightLevel, NoiseOfLevel, fit_linearity, fit_response
 
 SHARES = (0.1, 0.25, 0.4, 0.54, 0.7, 0.84)

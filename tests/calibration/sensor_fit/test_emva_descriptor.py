@@ -10,7 +10,7 @@ from helpers.transfer_frames import BentCamera, write_stack
 
 from phibench.calibration.sensor_fit.capture_folder import CaptureError
 from phibench.calibration.sensor_fit.emva_descriptor import open_descriptor
-from phibench.calibration.sensor_fit.fit import fit_sensor
+from phibench.calibration.sensor_fit.fit_sensor import fit_sensor
 from phibench.cli.main import main
 
 CAMERA = BentCamera(0.1, 30.0, 29.4, bend=0.02)

@@ -12,7 +12,7 @@ from PIL import Image
 
 from phibench.calibration.sensor_fit.block_sums import rounded_moments
 from phibench.calibration.sensor_fit.capture_folder import CaptureError
-from phibench.calibration.sensor_fit.fit import SensorFit, fit_sensor
+from phibench.calibration.sensor_fit.fit_sensor import SensorFit, fit_sensor
 from phibench.render.sensor.settings import Sensor, sensor
 
 LEVELS = (0.1, 0.3, 0.5, 0.7, 0.85)

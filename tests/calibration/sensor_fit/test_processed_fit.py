@@ -17,7 +17,7 @@ from helpers.sensor_captures import (
 )
 
 from phibench.calibration.sensor_fit.capture_folder import CaptureError
-from phibench.calibration.sensor_fit.fit import SensorFit, fit_sensor
+from phibench.calibration.sensor_fit.fit_sensor import SensorFit, fit_sensor
 from phibench.calibration.sensor_fit.noise_levels import PlaneNoise, decoded_by, encoded_by
 from phibench.calibration.sensor_fit.plane_model import _rounded
 from phibench.datasets.store.files import write_bytes

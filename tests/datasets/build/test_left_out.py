@@ -24,7 +24,7 @@ from phibench.datasets.build import sample_task, spot_task, tasks, workers
 from phibench.datasets.build.journal import Journal
 from phibench.datasets.build.tasks import BuildTask, Done, Failed
 from phibench.datasets.common.errors import DatasetError, IncompleteError
-from phibench.datasets.frames.request import FrameOptions
+from phibench.datasets.frames.frame_request import FrameOptions
 from phibench.datasets.make import dry_run, make
 from phibench.datasets.merge_repair import merge, repair
 from phibench.datasets.plan import sampling

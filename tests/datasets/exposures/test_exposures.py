@@ -20,8 +20,8 @@ from phibench.datasets.build.run_tasks import plan_tasks
 from phibench.datasets.common.errors import DatasetError, RecipeError
 from phibench.datasets.exposures import pair_draws as module
 from phibench.datasets.exposures.pair_draws import BOX_MARGIN_PX, CachedSample, PairDraw, pair_draws
+from phibench.datasets.frames.frame_source import noise_draw
 from phibench.datasets.frames.sensor_file import SensorFile
-from phibench.datasets.frames.source import noise_draw
 from phibench.datasets.make import make, make_from_plan
 from phibench.datasets.plan.plan import make_plan
 from phibench.datasets.read import Dataset, open_dataset, open_finished

@@ -12,7 +12,7 @@ from helpers.bench_samples import hidden, many, with_tables
 from helpers.oracles import true_pixel
 from helpers.sensor_light import room, spot_at
 
-from phibench.datasets.exposures.expected import expected_of_light
+from phibench.datasets.exposures.expected_electrons import expected_of_light
 from phibench.datasets.exposures.pair_draws import CachedSample, pair_draws
 from phibench.datasets.frames.distractors import MIN_APART_PX, Distractor, distractors, present
 from phibench.datasets.read import Dataset, Sample, open_dataset

@@ -26,8 +26,8 @@ from phibench.datasets.frames.frame_files import (
     read_index,
     write_index,
 )
-from phibench.datasets.frames.request import FrameOptions
-from phibench.datasets.frames.source import Frame
+from phibench.datasets.frames.frame_request import FrameOptions
+from phibench.datasets.frames.frame_source import Frame
 from phibench.datasets.read import open_dataset
 from phibench.datasets.store.checksums import damaged, strays
 from phibench.datasets.store.layers import read_exr

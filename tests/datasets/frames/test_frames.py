@@ -18,8 +18,8 @@ from helpers.sensor_moments import raw_moments
 from PIL import Image
 
 from phibench.datasets.common.errors import DatasetError
-from phibench.datasets.frames.request import FrameOptions, jpeg_tables
-from phibench.datasets.frames.source import FrameSource
+from phibench.datasets.frames.frame_request import FrameOptions, jpeg_tables
+from phibench.datasets.frames.frame_source import FrameSource
 from phibench.datasets.read import Dataset, Sample, open_dataset
 from phibench.render.sensor.electrons import NoiseStream
 from phibench.render.sensor.light import Region
@@ -231,7 +231,7 @@ def test_a_shared_stream_is_noticed(dataset: Dataset, monkeypatch: pytest.Monkey
         names = {"data": data, "seed": seed, "sample": sample, "position": position, "laser": str(laser), "draw": draw}
         return NoiseStream(tuple(value for name, value in names.items() if name != forgotten))
 
-    monkeypatch.setattr("phibench.datasets.frames.source.frame_stream", stream)
+    monkeypatch.setattr("phibench.datasets.frames.frame_source.frame_stream", stream)
     sources = [sample.frame_source("bayer-raw", analogue_gain=4.0, exposure=4e-3) for sample in dataset]
     found = _dependent([_residual(source, *frame) for source in sources for frame in FRAMES])
     assert sum(found) == 8  # every frame has exactly one twin

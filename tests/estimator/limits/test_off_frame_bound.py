@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from helpers.sensor_light import spot_at
 
-from phibench.datasets.exposures.expected import ExpectedRegion, expected_of_light
+from phibench.datasets.exposures.expected_electrons import ExpectedRegion, expected_of_light
 from phibench.datasets.frames.sensor_card import card_of, sensor_card
 from phibench.estimator.limits.position_bound import spot_limit
 from phibench.estimator.limits.processed_bound import (

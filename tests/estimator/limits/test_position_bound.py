@@ -13,7 +13,7 @@ from helpers.sensor_light import spot_at
 from helpers.sensor_moments import drawn_moments, linear_operator, raw_moments
 
 from phibench.datasets.common.errors import DatasetError
-from phibench.datasets.exposures.expected import ExpectedRegion, expected_of_light, expected_region
+from phibench.datasets.exposures.expected_electrons import ExpectedRegion, expected_of_light, expected_region
 from phibench.datasets.frames.sensor_card import card_of, sensor_card
 from phibench.estimator.geometry.status import Status
 from phibench.estimator.limits.position_bound import (

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.special import ndtr
 
-from phibench.datasets.exposures.expected import ExpectedRegion
+from phibench.datasets.exposures.expected_electrons import ExpectedRegion
 from phibench.datasets.frames.sensor_card import SensorCard, sensor_card
 from phibench.estimator.limits.position_bound import processed_snr, raw_snr
 from phibench.estimator.limits.processed_bound import chain_limit

@@ -12,7 +12,7 @@ from helpers.damage import sign
 
 from phibench.cli.main import main
 from phibench.datasets.common.errors import DatasetError
-from phibench.datasets.exposures.expected import ExpectedRegion, expected_region
+from phibench.datasets.exposures.expected_electrons import ExpectedRegion, expected_region
 from phibench.datasets.frames.sensor_card import card_of
 from phibench.datasets.read import open_finished
 from phibench.datasets.store import schema

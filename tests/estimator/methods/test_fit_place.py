@@ -7,8 +7,8 @@ import pytest
 
 from phibench.benchmark.isolation.easy_pairs import EasyPairs
 from phibench.estimator.interface import Answer, Pair, Spot
-from phibench.estimator.methods.locate import SharedPair, at_detection, detected, left_px, red_peak
 from phibench.estimator.methods.registry import METHODS
+from phibench.estimator.methods.spot_search import SharedPair, at_detection, detected, left_px, red_peak
 from phibench.estimator.spots.detect import Detection
 from phibench.estimator.spots.fit_raw import fit_law
 from phibench.estimator.spots.gaussian_spot import SpotBlur, SpotModel

@@ -15,9 +15,9 @@ import pytest
 from phibench.benchmark.isolation.easy_pairs import EasyPairs
 from phibench.datasets.frames.sensor_card import SensorCard, sensor_card
 from phibench.estimator.interface import Answer, Box, Pair, Spot
-from phibench.estimator.methods.locate import SharedPair, around, clipped, each_spot, locate, red_peak
 from phibench.estimator.methods.pair_light import laser_light, mirror_mask
 from phibench.estimator.methods.registry import KNOWN, METHODS, BuiltIn, at_the_red_peak
+from phibench.estimator.methods.spot_search import SharedPair, around, clipped, each_spot, locate, red_peak
 from phibench.estimator.spots.camera_codes import linear_to_srgb, srgb_to_linear
 from phibench.estimator.spots.image_planes import (
     KINDS,

@@ -13,8 +13,8 @@ from phibench.benchmark.isolation.example_method import extract
 from phibench.datasets.frames.sensor_card import card_of
 from phibench.estimator.interface import Box, Pair, Spot
 from phibench.estimator.methods.chain_fit import chain_fit
-from phibench.estimator.methods.locate import each_spot_twice
 from phibench.estimator.methods.raw_likelihood import raw_maximum_likelihood
+from phibench.estimator.methods.spot_search import each_spot_twice
 from phibench.estimator.processed.quasi_score import shared_covariance
 from phibench.estimator.spots.detect import detect
 from phibench.estimator.spots.raw_pixels import GaussLaw, PixelNoise

@@ -16,15 +16,15 @@ import pytest
 from helpers.sensor_light import FILTERS, spot_at
 from scipy.ndimage import gaussian_filter
 
-from phibench.datasets.exposures.expected import expected_of_light
+from phibench.datasets.exposures.expected_electrons import expected_of_light
 from phibench.datasets.frames.sensor_card import card_of
 from phibench.datasets.read import open_dataset
 from phibench.estimator.geometry.reflection import image_of
 from phibench.estimator.interface import Box, Pair
 from phibench.estimator.limits.position_bound import spot_limit
-from phibench.estimator.methods.locate import box_around, locate
 from phibench.estimator.methods.raw_likelihood import joint_fit
 from phibench.estimator.methods.registry import detected_spots
+from phibench.estimator.methods.spot_search import box_around, locate
 from phibench.estimator.spots.candidates import Candidates, candidates_at, lattice
 from phibench.estimator.spots.detect import (
     PROCESSED,

@@ -13,7 +13,7 @@ import pytest
 import scipy
 from helpers.sensor_light import FILTERS, spot_at
 
-from phibench.datasets.exposures.expected import expected_of_light
+from phibench.datasets.exposures.expected_electrons import expected_of_light
 from phibench.datasets.frames.sensor_card import card_of
 from phibench.estimator.geometry.status import Status
 from phibench.estimator.limits.position_bound import spot_limit

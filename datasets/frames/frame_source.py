@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from phibench.datasets.common.errors import DatasetError, whole_number
 from phibench.datasets.common.shown_text import ShortForm
 from phibench.datasets.frames.distractors import Distractor
-from phibench.datasets.frames.request import FrameRequest, in_one_sentence
+from phibench.datasets.frames.frame_request import FrameRequest, in_one_sentence
 from phibench.datasets.store.layers import SpotWindow
 from phibench.datasets.store.schema import ManifestRow, SpotRow
 from phibench.render.sensor.camera_chain import Chain, auto_exposed
