@@ -1,6 +1,6 @@
 """Walks through the library: which of its files and functions run on three ways, counted while they run.
 
-    python tools/walks.py FOLDER [--list]
+    python -m tools.walks FOLDER [--list]
 
 The ways: a recipe's `stroke_m` to an MJPEG frame; two MJPEG pairs to a score by a function in this process; four
 pictures to D with sigma. All modules are imported before, so that only calls count; tasks run in this process.
@@ -9,61 +9,45 @@ pictures to D with sigma. All modules are imported before, so that only calls co
 from __future__ import annotations
 
 import argparse
+import contextlib
 import importlib
 import inspect
 import multiprocessing
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from types import CodeType, FrameType
 from typing import Any
 from unittest.mock import patch
 
+from phibench.calibration.captures.measure import measure, read_setting
+from phibench.calibration.captures.pair_photos import PairPhotos, PositionPhotos
+from phibench.calibration.captures.picture_files import read_photo
 from phibench.datasets.build.parts import OwnProcess
 from phibench.datasets.build.workers import describe
 from phibench.datasets.common.progress import progress_console
+from phibench.datasets.make import make
+from phibench.datasets.read import open_dataset
+from phibench.estimator.interface import Answer, Pair, Spot
 
 ROOT = Path(__file__).resolve().parent.parent
 DISTRICTS = ("scenes", "render", "datasets", "estimator", "calibration", "benchmark", "robot", "studies")
 RECIPE = """
-[dataset]
-name = "walk"
-seed = 0
-
-[ambient]
-quality = "training"
-texel_m = 0.5
-lamp_rays = 4
-bounces = 2
-bounce_rays = 8
-final_rays = 8
-
-[[targets]]
-name = "near"
-depth_m = 1.975
-azimuth_deg = 100.0
-height_m = 0.50
-
-[[experiments]]
-name = "seen"
-targets = ["near"]
-strokes_m = [0.5, 0.6]
+dataset = {name = "walk", seed = 0}
+ambient = {quality = "training", texel_m = 0.5, lamp_rays = 4, bounces = 2, bounce_rays = 8, final_rays = 8}
+targets = [{name = "near", depth_m = 1.975, azimuth_deg = 100.0, height_m = 0.50}]
+experiments = [{name = "seen", targets = ["near"], strokes_m = [0.5, 0.6]}]
 """
-RIG = "[rig]\n"
 
 
-class InThisProcess:
+class InThisProcess(contextlib.AbstractContextManager["InThisProcess"]):
     """Pool of workers that are this process."""
 
     width = 1
 
     def __init__(self, out: Path, *_: object) -> None:
         self._out = out
-
-    def __enter__(self) -> InThisProcess:
-        return self
 
     def __exit__(self, *_: object) -> None:
         return None
@@ -77,47 +61,15 @@ class InThisProcess:
         return OwnProcess(self._out)
 
 
-@contextmanager
-def counted(calls: Counter[CodeType]) -> Iterator[None]:
-    """Count calls of the library's functions."""
-    places = tuple(f"{ROOT / name}/" for name in DISTRICTS)
-
-    def profile(frame: FrameType, event: str, _: Any) -> None:
-        code = frame.f_code
-        # the paths of a checkout go through the links in `phibench`
-        if event == "call" and code.co_flags & inspect.CO_OPTIMIZED and real(code).startswith(places):
-            calls[code] += 1
-
-    sys.setprofile(profile)
-    try:
-        yield
-    finally:
-        sys.setprofile(None)
-
-
-_REAL: dict[str, str] = {}
-
-
-def real(code: CodeType) -> str:
-    """File of a code, links followed."""
-    name = code.co_filename
-    if name not in _REAL:
-        _REAL[name] = str(Path(name).resolve())
-    return _REAL[name]
-
-
 def to_frame(folder: Path) -> Callable[[], object]:
     """Way from a recipe's `stroke_m` to an MJPEG frame."""
-    from phibench.datasets.make import make
-    from phibench.datasets.read import open_dataset
-
     recipe = folder / "walk.toml"
     recipe.write_text(RECIPE, encoding="utf-8")
 
     def way() -> object:
         with patch("phibench.datasets.make.WorkerPool", InThisProcess):
             make(recipe, folder / "data", 1, progress_console())
-        return open_dataset(folder / "data")[0].camera_frames("mjpeg", laser_off=True)
+        return open_dataset(folder / "data")[0].camera_frames("mjpeg")
 
     return way
 
@@ -125,57 +77,68 @@ def to_frame(folder: Path) -> Callable[[], object]:
 def to_score(folder: Path) -> Callable[[], object]:
     """Way from two MJPEG pairs to a score, by a function in this process."""
     from phibench.benchmark.scores.score import score
-    from phibench.estimator.interface import Answer, Pair, Spot
 
     def brightest(pair: Pair) -> Answer:
-        images = (pair.down, pair.up)
-        places = [divmod(int(image.sum(axis=2).argmax()), image.shape[1]) for image in images]
-        return Answer(*(Spot((float(u), float(v))) for v, u in places))
+        places = [divmod(int(image.sum(axis=2).argmax()), image.shape[1]) for image in (pair.down, pair.up)]
+        down, up = (Spot((float(u), float(v))) for v, u in places)
+        return Answer(down, up)
 
     return lambda: score(folder / "data", brightest, "mjpeg", out=folder / "score.json")
 
 
 def to_depth(folder: Path) -> Callable[[], object]:
     """Way from four pictures to D with sigma."""
-    from phibench.cli.captures import PairPictures, measure
-    from phibench.datasets.read import open_dataset
+    sample, rig = open_dataset(folder / "data")[0], folder / "rig.toml"
+    rig.write_text("[rig]\n", encoding="utf-8")
+    for name, frame in sample.camera_frames("mjpeg", laser_off=True).by_name.items():
+        (folder / f"{name}.jpg").write_bytes(frame.jpeg or b"")
 
-    rig, sample = folder / "rig.toml", open_dataset(folder / "data")[0]
-    rig.write_text(RIG, encoding="utf-8")
-    frames = sample.camera_frames("mjpeg", laser_off=True).by_name
-    paths = {name: folder / f"{name}.jpg" for name in frames}
-    for name, frame in frames.items():
-        paths[name].write_bytes(frame.jpeg or b"")
-    pair = PairPictures((paths["down"],), (paths["up"],), sample.row.stroke_m, (paths["down_off"],), (paths["up_off"],))
-    return lambda: measure(rig=rig, pair=pair)
+    def way() -> object:
+        setting = read_setting(rig)
+        on_off = (
+            [(read_photo(folder / f"{position}{end}.jpg", setting.known.rig, None),) for end in ("", "_off")]
+            for position in ("down", "up")
+        )
+        return measure(PairPhotos(*(PositionPhotos(*frames) for frames in on_off)), sample.row.stroke_m, setting)
+
+    return way
 
 
 WAYS = {"recipe to frame": to_frame, "pairs to score": to_score, "pictures to D": to_depth}
 
 
-def walk(name: str, folder: Path, shows_files: bool) -> None:
+def walk(name: str, folder: Path, lists: bool) -> None:
     """Go one way and print what ran; alone in its process, so that no cache is warm."""
-    for district in DISTRICTS:
-        for file in sorted((ROOT / district).rglob("*.py")):
-            module = ".".join(file.relative_to(ROOT).with_suffix("").parts)
-            try:
-                importlib.import_module(module if module.startswith("phibench.") else f"phibench.{module}")
-            except ImportError as error:
-                print(f"not imported: {module}: {error}", file=sys.stderr)
-    way, calls = WAYS[name](folder), Counter[CodeType]()
-    with counted(calls):
+    files = {str(file): file for district in DISTRICTS for file in (ROOT / district).rglob("*.py")}
+    for file in files.values():
+        with contextlib.suppress(ImportError):  # of packages that are not installed
+            importlib.import_module(".".join(("phibench", *file.relative_to(ROOT).with_suffix("").parts)))
+    way, calls = WAYS[name](folder), set[CodeType]()
+    known: dict[CodeType, bool] = {}
+
+    def profile(frame: FrameType, event: str, _: Any) -> None:
+        code = frame.f_code
+        if code not in known:  # the paths go through the links in `phibench`; bodies of classes are no functions
+            is_function = bool(code.co_flags & inspect.CO_OPTIMIZED) and not code.co_name.startswith("<")
+            known[code] = is_function and str(Path(code.co_filename).resolve()) in files
+        if event == "call" and known[code]:
+            calls.add(code)
+
+    sys.setprofile(profile)
+    try:
         way()
-    functions = Counter(str(Path(real(code)).relative_to(ROOT)) for code in calls)
-    print(f"{name}: {len(functions)} files, {len(calls)} functions")
-    if shows_files:
-        for file, count in sorted(functions.items(), key=lambda item: item[1]):
-            ran = sorted(code.co_qualname for code in calls if real(code) == str(ROOT / file))
-            print(f"    {count:4d} {file}: {', '.join(ran[:6])}")
+    finally:
+        sys.setprofile(None)
+    counts = Counter(str(Path(code.co_filename).resolve().relative_to(ROOT)) for code in calls)
+    print(f"{name}: {len(counts)} files, {len(calls)} functions")
+    for file, count in counts.most_common() if lists else ():
+        ran = sorted(code.co_qualname for code in calls if code.co_filename.endswith(f"/{file}"))
+        print(f"    {count:4d} {file}: {', '.join(ran[:6])}")
 
 
 def main() -> None:
     """Go the three ways, one after the other: the first makes the data set of the others."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser("python -m tools.walks", description=__doc__.split("\n")[0])
     parser.add_argument("folder", type=Path, help="for the data set; empty or not there")
     parser.add_argument("--list", action="store_true", help="print the files with the functions that ran")
     given = parser.parse_args()

@@ -1,4 +1,4 @@
-"""Dense set: dense pairs in files, with their truth, for who has no layers; and its sealed form, which tells none.
+"""Dense set: dense pairs in files with their truth, for users without the layers; and its sealed form, without truth.
 
 dense_set.json   where the pairs come from
 pairs.jsonl      per pair: files, rig, stroke and sensor, and what the truth needs

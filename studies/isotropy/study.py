@@ -19,15 +19,7 @@ from pydantic import Field
 from phibench.benchmark.scores.answer_errors import Rules
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.read import Dataset, Sample
-from phibench.estimator.geometry.panorama import (
-    PanoramaGrid,
-    SeenEdge,
-    pixels_by_model,
-    seen_edge,
-    track,
-    unrolled,
-    vertical_edges,
-)
+from phibench.estimator.geometry.panorama import PanoramaGrid, pixels_by_model, unrolled
 from phibench.estimator.geometry.phi import outline_circle
 from phibench.render.sensor.settings import sensor
 from phibench.scenes.frames import Array
@@ -77,6 +69,7 @@ from phibench.studies.isotropy.lines import (
     lines_drawing,
     occlusion_findings,
 )
+from phibench.studies.isotropy.room_edges import SeenEdge, seen_edge, track, vertical_edges
 from phibench.studies.misaligned_rigs import Places, errors
 
 Depths = Annotated[tuple[Annotated[float, Field(gt=0.2, le=50.0)], ...], Field(strict=False, min_length=3)]

@@ -17,7 +17,7 @@ from scipy.optimize import brentq
 from phibench.benchmark.scores.intervals import Estimate
 from phibench.datasets.read import Dataset, open_dataset
 from phibench.datasets.recipe.load import find_recipe, load_recipe
-from phibench.estimator.geometry.panorama import PanoramaGrid, SeenEdge
+from phibench.estimator.geometry.panorama import PanoramaGrid
 from phibench.estimator.geometry.reflection import up_image
 from phibench.render.sensor.settings import sensor
 from phibench.scenes.misalignment import Misalignment
@@ -44,6 +44,7 @@ from phibench.studies.isotropy.lines import (
     moved,
     occlusion_findings,
 )
+from phibench.studies.isotropy.room_edges import SeenEdge
 from phibench.studies.isotropy.study import STUDY, edge_findings, grid_findings
 
 RIG = default_rig()

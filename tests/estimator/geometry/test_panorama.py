@@ -16,21 +16,18 @@ from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.read import open_dataset
 from phibench.estimator.geometry.panorama import (
     PanoramaGrid,
-    RoomEdge,
     panorama,
     pixels_by_model,
     pixels_by_truth,
     places,
     ray_directions,
-    seen_edge,
-    track,
     unrolled,
-    vertical_edges,
 )
 from phibench.render.optics.truth import spot_truth, truth_layer
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.room import default_rig, lab
+from phibench.studies.isotropy.room_edges import RoomEdge, seen_edge, track, vertical_edges
 
 GRID = PanoramaGrid(360, math.radians(-60.0), math.radians(30.0))
 
