@@ -230,10 +230,7 @@ def _count(workers: int | None) -> int:
 
 
 def _planned(
-    recipe: str | Path,
-    out: Path,
-    wanted: MakeOptions,
-    exported: Callable[[Recipe, RoomFiles], RoomFiles],
+    recipe: str | Path, out: Path, wanted: MakeOptions, exported: Callable[[Recipe, RoomFiles], RoomFiles]
 ) -> tuple[Plan, str, str]:
     """Plan, text of its recipe, and a line on samples that are kept although fewer are asked for.
 

@@ -51,11 +51,7 @@ def merge(out: str | Path, shards: Sequence[str | Path], console: Console | None
         If a shard is missing, given twice, unfinished, damaged, or of another recipe, code or environment than the
         rest.
     """
-    out, folders, console = (
-        Path(out),
-        [Path(shard) for shard in shards],
-        console or progress_console(),
-    )
+    out, folders, console = (Path(out), [Path(shard) for shard in shards], console or progress_console())
     head, whole, info, entries, refusals = _collect(folders)
     plan = whole.without(info.causes)
     names = task_names(plan)

@@ -39,13 +39,7 @@ from phibench.datasets.store.checksums import (
     strays,
 )
 from phibench.datasets.store.json_forms import alike, same_number, to_json
-from phibench.datasets.store.layers import (
-    SPOT_STACKS,
-    read_ambient_pair,
-    read_exr,
-    read_spot,
-    read_truth,
-)
+from phibench.datasets.store.layers import SPOT_STACKS, read_ambient_pair, read_exr, read_spot, read_truth
 from phibench.datasets.store.metadata import differences, parse_info
 from phibench.datasets.store.schema import LightRow, ManifestRow, PoseInfo, RoomInfo, SpotRow
 from phibench.datasets.store.sensitivity_file import sensitivity_fault

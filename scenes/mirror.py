@@ -122,9 +122,7 @@ def level(points_m: Array, radius_m: float, form: Form) -> Level:
     added = deviation(points_m, form)
     value = rho - radius_m - added.value_m
     return Level(
-        value,
-        n - added.gradient,
-        (I3 - n[..., :, None] * n[..., None, :]) / rho[..., None, None] - added.hessian_per_m,
+        value, n - added.gradient, (I3 - n[..., :, None] * n[..., None, :]) / rho[..., None, None] - added.hessian_per_m
     )
 
 

@@ -47,11 +47,7 @@ def cut_rig(rig: Rig, region: Region) -> Rig:
     """The rig with a sensor that has the region's pixels only."""
     camera, (height, width) = rig.camera, region.shape
     cut = replace(
-        camera,
-        width_px=width,
-        height_px=height,
-        cx_px=camera.cx_px - region.u0_px,
-        cy_px=camera.cy_px - region.v0_px,
+        camera, width_px=width, height_px=height, cx_px=camera.cx_px - region.u0_px, cy_px=camera.cy_px - region.v0_px
     )
     return replace(rig, camera=cut)
 

@@ -295,10 +295,7 @@ def centroid_px(view: View, point_m: Array) -> tuple[float, float]:
     if not image.sum() > 0.0:
         raise DatasetError(f"no light of a spot at {point_m.tolist()} reaches the image; choose other depths_m")
     v, u = np.mgrid[: image.shape[0], : image.shape[1]]
-    return (
-        layer.u0_px + float(np.sum(u * image) / image.sum()),
-        layer.v0_px + float(np.sum(v * image) / image.sum()),
-    )
+    return (layer.u0_px + float(np.sum(u * image) / image.sum()), layer.v0_px + float(np.sum(v * image) / image.sum()))
 
 
 # -- a simulated calibration -----------------------------------------------------------------------------------------

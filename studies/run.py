@@ -178,12 +178,7 @@ def _files(study: Study[Any], settings: Settings, result: StudyResult) -> dict[s
     tables = {f"{name}.parquet": parquet_bytes(table) for name, table in result.tables.items()}
     drawings = {drawing.file_name: drawing.data for drawing in result.drawings}
     text = json.dumps(settings.model_dump(mode="json"), indent=1) + "\n"
-    return {
-        **tables,
-        **drawings,
-        "settings.json": text.encode(),
-        FINDINGS: findings_text(study, result).encode(),
-    }
+    return {**tables, **drawings, "settings.json": text.encode(), FINDINGS: findings_text(study, result).encode()}
 
 
 def find_study(name: str) -> Study[Any]:

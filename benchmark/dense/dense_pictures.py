@@ -121,12 +121,7 @@ class DensePicture:
             median = float(np.median(np.abs(error[known]))) if known.any() else float("nan")
             title = f"error of D where both images show the point: median {100.0 * median:.2f} %"
             shown = self._panel(
-                axes[2],
-                np.where(known, 100.0 * error, np.nan),
-                title,
-                cmap="RdBu",
-                vmin=-100 * ERROR,
-                vmax=100 * ERROR,
+                axes[2], np.where(known, 100.0 * error, np.nan), title, cmap="RdBu", vmin=-100 * ERROR, vmax=100 * ERROR
             )
             figure.colorbar(shown, ax=axes[2], label="%, blue is too far", extend="both")
             colours = ListedColormap(list(CAUSE_COLOURS))

@@ -323,10 +323,7 @@ class EasyPairs(ShortForm):
     def _lights(self, camera: EasyCamera, number: int, spot: EasySpot) -> list[ExpectedRegion]:
         flux = _scene(self.rig, number).flux_e
         blue = [] if self.blue_px(number) is None else [self._across(spot)]
-        return [
-            camera.expected(spot, flux),
-            *(camera.expected(other, _BLUE_SHARE * flux, blue=True) for other in blue),
-        ]
+        return [camera.expected(spot, flux), *(camera.expected(other, _BLUE_SHARE * flux, blue=True) for other in blue)]
 
     def _across(self, spot: EasySpot) -> EasySpot:
         """A spot on the other side of the mirror's centre."""

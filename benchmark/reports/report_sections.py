@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from phibench.benchmark.reports.figures import (
-    EmbeddedFigure,
-)
+from phibench.benchmark.reports.figures import EmbeddedFigure
 from phibench.benchmark.reports.track_tables import track_tables
 from phibench.benchmark.scores.score_document import ScoreDocument
 

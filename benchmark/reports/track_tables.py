@@ -36,9 +36,7 @@ NUMBERS: dict[Track, TrackNumbers] = {
         {"perfect, one image": "perfect_localise", "perfect, both images": "perfect_localise_pair"},
     ),
     "find": TrackNumbers(
-        "Track find: Jaccard index at 3 px, higher is better",
-        ("detection_rate", "false_rate", "false_per_empty"),
-        {},
+        "Track find: Jaccard index at 3 px, higher is better", ("detection_rate", "false_rate", "false_per_empty"), {}
     ),
     "depth": TrackNumbers(
         "Track depth: average recall of D within 0.5 to 20 %, higher is better",

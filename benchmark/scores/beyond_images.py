@@ -221,11 +221,7 @@ def _of_finding(records: pl.DataFrame) -> Excess:
     seen = (
         records.filter("visible")
         .group_by("number", maintain_order=True)
-        .agg(
-            found=pl.col("detected").any(),
-            snr=(pl.col("snr") ** 2).sum().sqrt(),
-            area=pl.col("searched_px2").first(),
-        )
+        .agg(found=pl.col("detected").any(), snr=(pl.col("snr") ** 2).sum().sqrt(), area=pl.col("searched_px2").first())
     )
     chances = most_found(SNR_MARGIN * seen["snr"].to_numpy(), seen["area"].fill_null(0.0).to_numpy())
     faint = chances < _SURE

@@ -20,15 +20,7 @@ import polars as pl
 
 from phibench.benchmark.pair_sets.dataset_pairs import tracks_of
 from phibench.benchmark.scores.answer_errors import Rules
-from phibench.benchmark.scores.intervals import (
-    Clusters,
-    Estimate,
-    Statistic,
-    estimates,
-    exchange_chance,
-    holm,
-    mean_of,
-)
+from phibench.benchmark.scores.intervals import Clusters, Estimate, Statistic, estimates, exchange_chance, holm, mean_of
 from phibench.benchmark.scores.metrics import FAMILIES, METRICS, Metric, prepared, statistic_of, trusted
 from phibench.benchmark.scores.records import missed_relative, with_missed
 from phibench.benchmark.scores.score_document import ScoreDocument

@@ -236,12 +236,7 @@ def _joint_columns(
         [np.stack([images[p][u], images[p][v]], -1) for u, v in (_TRUE_PX, _ERROR_PX)] for p in POSITIONS
     )
     joint = pair_bounds(
-        nominal,
-        _nominal_stroke_m(truths),
-        pair["depth_m"],
-        (xy1, xy2),
-        (singles[0], singles[1]),
-        (e1, e2),
+        nominal, _nominal_stroke_m(truths), pair["depth_m"], (xy1, xy2), (singles[0], singles[1]), (e1, e2)
     )
     for position, uv, C in zip(POSITIONS, (xy1, xy2), (joint.down_px2, joint.up_px2), strict=True):
         images[position]["pair_bound_px2"] = np.trace(C, axis1=1, axis2=2)

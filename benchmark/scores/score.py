@@ -226,12 +226,7 @@ def examine(
 
 
 def _scored(
-    method: MethodCard,
-    pairs: PairSet,
-    parts: Sequence[Examined],
-    rules: Rules,
-    seed: int,
-    limits: Mapping[str, Any],
+    method: MethodCard, pairs: PairSet, parts: Sequence[Examined], rules: Rules, seed: int, limits: Mapping[str, Any]
 ) -> Scored:
     if not parts:
         raise DatasetError("the pair set is empty: there is nothing to score")

@@ -40,13 +40,7 @@ from phibench.datasets.recipe.load import RECIPES, load_recipe
 from phibench.datasets.recipe.tables import Recipe
 from phibench.datasets.store.checksums import checksums_text, read_checksums, writing_to
 from phibench.datasets.store.files import sha256, write_bytes, write_secret, write_text
-from phibench.datasets.store.pair_files import (
-    FRAMES,
-    MOST_PAIRS,
-    PAIRS,
-    PublicPair,
-    public_fields,
-)
+from phibench.datasets.store.pair_files import FRAMES, MOST_PAIRS, PAIRS, PublicPair, public_fields
 from phibench.datasets.store.schema import CHECKSUMS, SEALED_TRUTH, Document
 from phibench.datasets.store.temporary_folders import OwnedFolder, folder_for_work
 from phibench.estimator.interface import Pair

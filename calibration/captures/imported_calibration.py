@@ -50,10 +50,7 @@ _FAR_SIGMAS = 4.0  # of D, or of the gap of the rays, from what outline and rule
 
 
 def calibrate_imported(
-    folder: Path,
-    out: Path,
-    samples: Sequence[str] = (),
-    sources: CalibrationSources = OUTLINES,
+    folder: Path, out: Path, samples: Sequence[str] = (), sources: CalibrationSources = OUTLINES
 ) -> DatasetCalibration:
     """Calibrate the rig of an imported set and write the file.
 

@@ -108,10 +108,7 @@ def _inset(image: NDArray[np.uint8], found: Measurement, spot: SeenSpot, positio
 
 
 def _part(
-    image: NDArray[np.uint8],
-    box: Box,
-    size: tuple[int, int],
-    resampling: Image.Resampling = Image.Resampling.BILINEAR,
+    image: NDArray[np.uint8], box: Box, size: tuple[int, int], resampling: Image.Resampling = Image.Resampling.BILINEAR
 ) -> Image.Image:
     """Part of a picture, black outside of it, at another size."""
     corners = (box.u0_px, box.v0_px, box.u0_px + box.width_px, box.v0_px + box.height_px)

@@ -26,13 +26,7 @@ from phibench.calibration.outline.first_circle import grey, rig_circle
 from phibench.calibration.outline.limb_image import planes_of
 from phibench.calibration.outline.outline import find_outline
 from phibench.calibration.outline.outline_result import Outline
-from phibench.calibration.rig.edge_meeting import (
-    CameraTilt,
-    EdgeMeeting,
-    edge_meeting,
-    stated_tilt,
-    with_vertical,
-)
+from phibench.calibration.rig.edge_meeting import CameraTilt, EdgeMeeting, edge_meeting, stated_tilt, with_vertical
 from phibench.calibration.rig.outline_picture import overlay, shown, write_picture
 from phibench.calibration.rig.sphere_options import SphereOptions
 from phibench.calibration.rig.vertical_edges import MIN_EDGES, edges_about, measured_vertical

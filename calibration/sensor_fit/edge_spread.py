@@ -192,12 +192,7 @@ _CORNERS: Offsets = [(i, j, 0.25) for i in (-1, 1) for j in (-1, 1)]
 _BESIDE: Offsets = [(0, -1, 0.5), (0, 1, 0.5)]
 _ABOVE: Offsets = [(-1, 0, 0.5), (1, 0, 0.5)]
 _HERE: Offsets = [(0, 0, 1.0)]
-_BY_PLACE = (
-    (_HERE, _CROSS, _CORNERS),
-    (_BESIDE, _HERE, _ABOVE),
-    (_ABOVE, _HERE, _BESIDE),
-    (_CORNERS, _CROSS, _HERE),
-)
+_BY_PLACE = ((_HERE, _CROSS, _CORNERS), (_BESIDE, _HERE, _ABOVE), (_ABOVE, _HERE, _BESIDE), (_CORNERS, _CROSS, _HERE))
 """Where bilinear interpolation takes R, G and B from, by place of the mosaic."""
 _MEAN = (_TENT, [*((i, j, 0.5 * w) for i, j, w in _CROSS), (0, 0, 0.5)], _TENT)
 _LUMA = (0.299, 0.587, 0.114)

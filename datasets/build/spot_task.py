@@ -98,9 +98,7 @@ def _write_layer(out: Path, dataset: str, pair: PairPlan, position: str, answer:
         (out / file).unlink(missing_ok=True)
         return None  # a file of an earlier draw must not stay
     write_spot(
-        out / file,
-        _window(answer.layer),
-        {"dataset": dataset, "sample_id": pair.sample_id, "position": position},
+        out / file, _window(answer.layer), {"dataset": dataset, "sample_id": pair.sample_id, "position": position}
     )
     return file
 

@@ -75,12 +75,7 @@ def films_forecast(plan: Plan, films: Sequence[FilmPlan]) -> FilmsForecast:
     views = sum(sum(film.keys) for film in films)
     frames = sum(film.scene.times.frames for film in films)
     return FilmsForecast(
-        len(films),
-        frames,
-        views,
-        int(sum(map(_bytes, films))),
-        sum(map(_film_s, films)),
-        tuple(_bakes(plan, films)),
+        len(films), frames, views, int(sum(map(_bytes, films))), sum(map(_film_s, films)), tuple(_bakes(plan, films))
     )
 
 

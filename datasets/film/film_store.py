@@ -47,11 +47,7 @@ LIGHTS, LIGHT_IMAGES = TruthFile.LIGHTS.value, "light{:02d}.npz"
 SCHEMA_VERSION = 4
 _Model = TypeVar("_Model", bound=Document)
 _AGAIN = "run `phibench film make` again"
-_ARRAYS = {
-    "origin_px": ("<i8", 2),
-    "shape_px": ("<i8", 2),
-    "images_per_s": ("<f4", 1),
-}
+_ARRAYS = {"origin_px": ("<i8", 2), "shape_px": ("<i8", 2), "images_per_s": ("<f4", 1)}
 
 
 class FilmInfo(Document):

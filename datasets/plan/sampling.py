@@ -34,13 +34,7 @@ from phibench.datasets.recipe.recipe_scene import (
     true_stroke_m,
 )
 from phibench.datasets.recipe.spot_placement import Boards, Placed, place, shown_as
-from phibench.datasets.recipe.tables import (
-    DRAWABLE,
-    MisalignmentTable,
-    RandomTable,
-    Recipe,
-    RigTable,
-)
+from phibench.datasets.recipe.tables import DRAWABLE, MisalignmentTable, RandomTable, Recipe, RigTable
 from phibench.datasets.rooms.room_sources import ONLY_ROOM, MeshRoom, PanoramaRoom, RoomSource, is_exported, room_of
 from phibench.scenes.frames import Array
 from phibench.scenes.laser import LaserSpot

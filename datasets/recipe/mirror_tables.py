@@ -32,13 +32,11 @@ class HolderTable(OfHolder):
     )
     radius_m: HolderM | None = Field(default=None, description="of each rod; of post, arm and column; R/15")
     circle_m: HolderM | None = Field(
-        default=None,
-        description="from the axis to rods or column, 1.25 R + radius_m; to a tube, 1.25 R",
+        default=None, description="from the axis to rods or column, 1.25 R + radius_m; to a tube, 1.25 R"
     )
     plate_m: HolderM | None = Field(default=None, description="radius of the plates; 2 radius_m beyond rods or tube")
     rise_m: HolderM | None = Field(
-        default=None,
-        description="sphere centre or vertex to the upper plate or arm's top; 1.5 R, or rim + 0.5 R",
+        default=None, description="sphere centre or vertex to the upper plate or arm's top; 1.5 R, or rim + 0.5 R"
     )
     azimuth_deg: Annotated[float, Field(ge=-360.0, le=360.0)] = Field(
         default=30.0, description="of the first rod, or the column, from the camera's x axis"

@@ -11,14 +11,7 @@ import numpy as np
 
 from phibench.datasets.recipe.mirror_tables import OF_SHAPES, SHAPES, HolderTable, MirrorTable
 from phibench.datasets.recipe.room_tables import RoomTable
-from phibench.datasets.recipe.tables import (
-    OWN_ALBEDO,
-    LaserTable,
-    MisalignmentTable,
-    Recipe,
-    RigTable,
-    TargetTable,
-)
+from phibench.datasets.recipe.tables import OWN_ALBEDO, LaserTable, MisalignmentTable, Recipe, RigTable, TargetTable
 from phibench.datasets.rooms.room_sources import NamedRoom, room_of
 from phibench.render.optics.faces import face_table
 from phibench.scenes.camera import Camera

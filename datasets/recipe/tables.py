@@ -104,8 +104,7 @@ Exposure = Annotated[
     Discriminator(_exposure_tag),
 ]
 Albedo = Annotated[
-    Annotated[Unit, Tag("<number>")] | Annotated[Literal["surface"], Tag("<surface>")],
-    Discriminator(_albedo_tag),
+    Annotated[Unit, Tag("<number>")] | Annotated[Literal["surface"], Tag("<surface>")], Discriminator(_albedo_tag)
 ]
 """The tags keep pydantic from trying both; `validation` leaves what stands in angle brackets out of a path."""
 

@@ -156,12 +156,7 @@ def made_by(info: DatasetInfo) -> str:
     return version if isinstance(version, str) else "0.0.0"
 
 
-_SMALL = {
-    schema.TABLE: PARQUET,
-    schema.MANIFEST: JSON_LINES,
-    schema.RIGS: JSON_LINES,
-    schema.ROOMS: JSON_LINES,
-}
+_SMALL = {schema.TABLE: PARQUET, schema.MANIFEST: JSON_LINES, schema.RIGS: JSON_LINES, schema.ROOMS: JSON_LINES}
 
 
 def dataset_croissant(info: DatasetInfo, types: Mapping[str, str], hashes: Mapping[str, str]) -> str:

@@ -49,11 +49,7 @@ class _Angles:
 
 
 def depth_paper(
-    phi1_rad: ArrayLike,
-    phi2_rad: ArrayLike,
-    stroke_m: ArrayLike,
-    radius_m: float,
-    covariance_rad2: Array | None = None,
+    phi1_rad: ArrayLike, phi2_rad: ArrayLike, stroke_m: ArrayLike, radius_m: float, covariance_rad2: Array | None = None
 ) -> DepthEstimate:
     """Depth by eqs. (1) to (4).
 

@@ -330,11 +330,7 @@ def processed_on_off_limit(
 
 
 def _off_frames_of_codes(
-    card: SensorCard,
-    theta: Array,
-    blur: SpotBlur,
-    response: tuple[float, float, float],
-    frames: FrameCounts,
+    card: SensorCard, theta: Array, blur: SpotBlur, response: tuple[float, float, float], frames: FrameCounts
 ) -> SpotLimit:
     law, mean, derivatives = spot_codes(card, theta, blur, response, pattern_known=True)
     spot = theta[2] * derivatives[:, 2]

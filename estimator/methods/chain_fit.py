@@ -135,12 +135,7 @@ def _parts(pair: Pair, position: str, box: Box) -> tuple[NDArray[Any], NDArray[A
 
 
 def _srgb(
-    pair: Pair,
-    position: str,
-    start: Array,
-    blur: SpotBlur,
-    model: SpotModel,
-    near: tuple[float, float] | None,
+    pair: Pair, position: str, start: Array, blur: SpotBlur, model: SpotModel, near: tuple[float, float] | None
 ) -> SpotFit:
     """Fit a square of 17 x 17 pixels about the start."""
     card, square = pair.card, _square(start, pair.images[position])

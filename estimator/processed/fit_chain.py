@@ -23,14 +23,7 @@ from phibench.estimator.spots.fit_raw import LEAST_SNR, SpotData, SpotFit, fit_l
 from phibench.estimator.spots.gaussian_spot import SpotBlur, SpotModel, covariance_bound
 from phibench.estimator.spots.image_planes import full_scale_e
 from phibench.estimator.spots.pixel_statistics import code_law, code_table
-from phibench.estimator.spots.raw_pixels import (
-    Background,
-    GaussLaw,
-    PixelNoise,
-    bayer_filters,
-    noise_of,
-    spot_regions,
-)
+from phibench.estimator.spots.raw_pixels import Background, GaussLaw, PixelNoise, bayer_filters, noise_of, spot_regions
 from phibench.scenes.frames import Array
 
 _CUT_PX = 15  # side of the square of the first fit

@@ -152,13 +152,7 @@ def run(
         # it must not look rooms up
         limits, hidden = RunLimits(seconds=seconds), [robot.rooms] if robot.rooms is not None else []
         running = run_foreign(
-            setup,
-            PolicyFile.of(policy),
-            episodes,
-            seed,
-            limits=limits,
-            hidden=hidden,
-            told=isolations.add,
+            setup, PolicyFile.of(policy), episodes, seed, limits=limits, hidden=hidden, told=isolations.add
         )
     else:
         running = episodes_of(setup, policy, episodes, seed)

@@ -162,13 +162,11 @@ OneSample = Annotated[
     str | None, Parameter(help="Sample: its number, counted from 0, or its id; the first one by default.")
 ]
 SensorFile = Annotated[
-    Path | None,
-    Parameter(help="TOML file of the sensor; by default the preset of the kind of file is assumed."),
+    Path | None, Parameter(help="TOML file of the sensor; by default the preset of the kind of file is assumed.")
 ]
 Workers = Annotated[int | None, Parameter(converter=_whole, help="Number of processes; one for each core by default.")]
 Scheduler = Annotated[
-    str | None,
-    Parameter(help="Address or scheduler file of a running dask scheduler, to use its workers instead."),
+    str | None, Parameter(help="Address or scheduler file of a running dask scheduler, to use its workers instead.")
 ]
 PairsAtOnce = Annotated[
     int,

@@ -207,13 +207,7 @@ def make(directory: Path, *, out: Path, preset: OwnOrPreset = None) -> int:
 
 @seal.command
 def submit(
-    public: Path,
-    *,
-    method: str,
-    out: Path,
-    workers: Whole = 1,
-    limits: Limits = LIMITS,
-    own: OwnWord = OWN_WORD,
+    public: Path, *, method: str, out: Path, workers: Whole = 1, limits: Limits = LIMITS, own: OwnWord = OWN_WORD
 ) -> int:
     """Run a method on a sealed set and write its answers for who holds the truth; exit code 1 if it answered no pair.
 

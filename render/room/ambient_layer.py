@@ -108,13 +108,7 @@ def render_ambient(
 
 
 def view_film(
-    view: View,
-    room: Room,
-    light: LightMap,
-    settings: BakeSettings,
-    cells_per_pixel: int,
-    seed: int,
-    surfaces: Surfaces,
+    view: View, room: Room, light: LightMap, settings: BakeSettings, cells_per_pixel: int, seed: int, surfaces: Surfaces
 ) -> CellSampler:
     """Film of one view, whose cells can be sampled; arguments as for `render_ambient`."""
     mi = activate()

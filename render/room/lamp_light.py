@@ -107,13 +107,7 @@ class _Pairs:
 
 
 def _lamplight(
-    mi: ModuleType,
-    surfaces: Surfaces,
-    texels: Texels,
-    pairs: _Pairs,
-    rays: int,
-    seed: int,
-    mirror: MirrorBody | None,
+    mi: ModuleType, surfaces: Surfaces, texels: Texels, pairs: _Pairs, rays: int, seed: int, mirror: MirrorBody | None
 ) -> tuple[Array, Array]:
     """Light of lamps, shape (texels, 3), twice.
 

@@ -250,11 +250,7 @@ def encoded(image: NDArray[np.uint8], sensor: Sensor) -> bytes:
     # Pillow scales given tables by the quality in per cent: none is given with them
     steps = {"quality": sensor.jpeg_quality} if tables is None else {"qtables": [list(table) for table in tables]}
     Image.fromarray(image).save(
-        file,
-        "JPEG",
-        subsampling=sensor.jpeg_subsampling,
-        restart_marker_blocks=sensor.jpeg_restart_interval,
-        **steps,
+        file, "JPEG", subsampling=sensor.jpeg_subsampling, restart_marker_blocks=sensor.jpeg_restart_interval, **steps
     )
     return file.getvalue()
 

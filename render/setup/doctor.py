@@ -129,12 +129,7 @@ def llvm_finding(*, is_needed: bool) -> Diagnosis:
     if not is_installed("drjit"):
         return Diagnosis("LLVM", f"{text}, untried without drjit")
     if fault := prove(llvm):
-        return Diagnosis(
-            "LLVM",
-            text,
-            state,
-            f"LLVM {llvm.label} fails the proof, {fault}: {_remedy(fault)}.",
-        )
+        return Diagnosis("LLVM", text, state, f"LLVM {llvm.label} fails the proof, {fault}: {_remedy(fault)}.")
     return Diagnosis("LLVM", text)
 
 

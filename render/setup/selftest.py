@@ -74,10 +74,7 @@ def _scene(mitsuba: ModuleType) -> dict[str, Any]:
             "film": film,
         },
         "sky": {"type": "constant", "radiance": {"type": "rgb", "value": SKY}},
-        "ball": {
-            "type": "sphere",
-            "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": ALBEDO}},
-        },
+        "ball": {"type": "sphere", "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": ALBEDO}}},
     }
 
 

@@ -96,12 +96,7 @@ class FilmFrames:
     def some(self, on: Index, off: Index) -> FilmFrames:
         """Some of the frames, by their index among those with the laser on, and off; twice is allowed."""
         return replace(
-            self,
-            on=self.on[on],
-            off=self.off[off],
-            on_e=self.on_e[on],
-            off_e=self.off_e[off],
-            near_px=self.near_px[on],
+            self, on=self.on[on], off=self.off[off], on_e=self.on_e[on], off_e=self.off_e[off], near_px=self.near_px[on]
         )
 
     def until(self, frame: int) -> FilmFrames:

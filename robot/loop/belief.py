@@ -245,12 +245,7 @@ class TargetBelief(Belief):
     """
 
     def __init__(
-        self,
-        rig: Rig,
-        vehicle: Vehicle,
-        first: Direction,
-        stroke_m: float,
-        prior: TargetPrior = ANY_TARGET,
+        self, rig: Rig, vehicle: Vehicle, first: Direction, stroke_m: float, prior: TargetPrior = ANY_TARGET
     ) -> None:
         super().__init__(rig, vehicle, prior)
         self._imager = SphereImager(rig)

@@ -347,12 +347,7 @@ def _pixel_residual(p: Array, rays: Array) -> tuple[Array, Array]:
 
 
 def belief_of(
-    rig: Rig,
-    vehicle: Vehicle,
-    first: Direction,
-    stroke_m: float,
-    bias: RigBias,
-    prior: TargetPrior = ANY_TARGET,
+    rig: Rig, vehicle: Vehicle, first: Direction, stroke_m: float, bias: RigBias, prior: TargetPrior = ANY_TARGET
 ) -> Belief:
     """Belief for what is known: smoothed where the rig has deviations or frames share errors, filtered elsewhere."""
     if bias.count or any(first.shared_px):

@@ -177,19 +177,12 @@ def desk(rng: Rng, materials: MaterialSet) -> Assembly:
 
 def dining_table(rng: Rng, materials: MaterialSet) -> Assembly:
     """Table with chairs around and things on it."""
+    clutter = materials.properties.clutter
     made = Assembly()
     # four to ten people
     width, depth, high = float(rng.uniform(1.1, 2.2)), float(rng.uniform(0.75, 1.0)), float(rng.uniform(0.71, 0.77))
     _top(rng, materials, made, width, depth, high)
-    scatter(
-        rng,
-        made,
-        materials,
-        (-width / 2 + 0.05, width / 2 - 0.05),
-        (-0.2, 0.2),
-        high,
-        int(5 * materials.properties.clutter),
-    )
+    scatter(rng, made, materials, (-width / 2 + 0.05, width / 2 - 0.05), (-0.2, 0.2), high, int(5 * clutter))
     seat = chair if rng.random() < 0.7 else office_chair
     for k in range(int(width / 0.6)):  # a place is 60 cm wide
         for side, sign in enumerate((-1.0, 1.0)):
@@ -223,6 +216,7 @@ def round_table(rng: Rng, materials: MaterialSet) -> Assembly:
 
 def workbench(rng: Rng, materials: MaterialSet) -> Assembly:
     """Heavy bench with a board below, a pegboard with tools behind, and things."""
+    clutter = materials.properties.clutter
     made = Assembly()
     width, wood = float(rng.uniform(1.2, 2.2)), one_of(rng, materials, ("plywood", "light_wood"))
     steel = one_of(rng, materials, ("steel", "paint_blue", "paint_green", "grey_lacquer"))
@@ -231,27 +225,10 @@ def workbench(rng: Rng, materials: MaterialSet) -> Assembly:
     for k, (sx, sy) in enumerate(((-1, -1), (1, -1), (1, 1), (-1, 1))):
         x, y = sx * (width / 2 - 0.04), sy * 0.3
         made.box(f"leg_{k + 1}", (x - 0.035, x + 0.035), (y - 0.035, y + 0.035), (0.0, 0.82), steel)
-    scatter(
-        rng,
-        made,
-        materials,
-        (-width / 2 + 0.05, width / 2 - 0.05),
-        (-0.3, 0.25),
-        0.88,
-        int(7 * materials.properties.clutter),
-    )
-    scatter(
-        rng,
-        made,
-        materials,
-        (-width / 2 + 0.15, width / 2 - 0.15),
-        (-0.2, 0.2),
-        0.28,
-        int(5 * materials.properties.clutter),
-        "below",
-    )
+    scatter(rng, made, materials, (-width / 2 + 0.05, width / 2 - 0.05), (-0.3, 0.25), 0.88, int(7 * clutter))
+    scatter(rng, made, materials, (-width / 2 + 0.15, width / 2 - 0.15), (-0.2, 0.2), 0.28, int(5 * clutter), "below")
     made.box("pegboard", (-width / 2, width / 2), (0.36, 0.375), (0.95, 1.75), materials.surface("pegboard"))
-    for k in range(int(2 + 8 * materials.properties.clutter)):
+    for k in range(int(2 + 8 * clutter)):
         x, z = float(rng.uniform(-width / 2 + 0.1, width / 2 - 0.1)), float(rng.uniform(1.25, 1.6))
         surface = one_of(rng, materials, (*PAINTS, "steel", "dark_plastic", "light_wood"))
         made.box(
@@ -343,13 +320,8 @@ def cabinet(rng: Rng, materials: MaterialSet) -> Assembly:
     made, case = Assembly(), one_of(rng, materials, CASES, 2, upright=True)
     width, depth = float(rng.uniform(0.6, 1.8)), float(rng.uniform(0.4, 0.62))
     high = float(rng.choice([0.75, 0.9, 1.2, 1.8, 2.0]))  # steps in which cabinets are sold
-    made.box(
-        "plinth",
-        (-width / 2 + 0.02, width / 2 - 0.02),
-        (-depth / 2 + 0.05, depth / 2),
-        (0.0, 0.07),
-        materials.surface("dark_plastic"),
-    )
+    sides = (-width / 2 + 0.02, width / 2 - 0.02)
+    made.box("plinth", sides, (-depth / 2 + 0.05, depth / 2), (0.0, 0.07), materials.surface("dark_plastic"))
     made.box("case", (-width / 2, width / 2), (-depth / 2 + 0.02, depth / 2), (0.07, high), case)
     doors = max(int(width / 0.5), 1)  # a door of a cabinet is half a metre wide
     front = one_of(rng, materials, CASES, 2, upright=True)
@@ -375,7 +347,7 @@ def cabinet(rng: Rng, materials: MaterialSet) -> Assembly:
             rng,
             made,
             materials,
-            (-width / 2 + 0.02, width / 2 - 0.02),
+            sides,
             (-depth / 2 + 0.05, depth / 2 - 0.02),
             high,
             int(6 * materials.properties.clutter),

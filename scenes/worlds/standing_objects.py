@@ -7,15 +7,7 @@ import numpy as np
 from phibench.scenes.worlds import graphics
 from phibench.scenes.worlds.assembly import Assembly
 from phibench.scenes.worlds.materials import MaterialSet
-from phibench.scenes.worlds.tabletop import (
-    CLOTHS,
-    PAINTS,
-    THINGS,
-    Rng,
-    carton,
-    one_of,
-    scatter,
-)
+from phibench.scenes.worlds.tabletop import CLOTHS, PAINTS, THINGS, Rng, carton, one_of, scatter
 
 
 def figure(rng: Rng, materials: MaterialSet) -> Assembly:
@@ -153,16 +145,8 @@ def trolley(rng: Rng, materials: MaterialSet) -> Assembly:
     for k in range(3):
         z = 0.15 + 0.33 * k
         made.box(f"tray_{k + 1}", (-0.315, 0.315), (-0.18, 0.18), (z, z + 0.025), frame)
-        scatter(
-            rng,
-            made,
-            materials,
-            (-0.3, 0.3),
-            (-0.17, 0.17),
-            z + 0.025,
-            int(3 * materials.properties.clutter),
-            f"tray_{k + 1}_thing",
-        )
+        count = int(3 * materials.properties.clutter)
+        scatter(rng, made, materials, (-0.3, 0.3), (-0.17, 0.17), z + 0.025, count, f"tray_{k + 1}_thing")
     return made
 
 

@@ -19,16 +19,7 @@ from phibench.scenes.frames import Array
 from phibench.scenes.random_streams import Name, generator
 from phibench.scenes.rig import Rig
 from phibench.scenes.validation import nearest
-from phibench.studies.cause.model import (
-    COMMON,
-    GROUPS,
-    NOISE,
-    DepthModel,
-    Explanation,
-    Prior,
-    simulate,
-    without_table,
-)
+from phibench.studies.cause.model import COMMON, GROUPS, NOISE, DepthModel, Explanation, Prior, simulate, without_table
 from phibench.studies.cause.paper_reading import AZIMUTHS, TABLES, Experiments, published_experiments
 from phibench.studies.framework import Settings
 

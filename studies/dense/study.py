@@ -55,9 +55,7 @@ from phibench.studies.framework import (
     error_bars,
     line_style,
 )
-from phibench.studies.framework import (
-    Numbers as Values,
-)
+from phibench.studies.framework import Numbers as Values
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -153,12 +151,7 @@ def run(settings: DenseSettings, datasets: StudyDatasets) -> StudyResult:
 
 def _perfect(settings: DenseSettings) -> partial[Numbers]:
     asked = Asked(
-        settings.strokes_m,
-        settings.divisor,
-        settings.bands_m,
-        settings.matching_px,
-        settings.near_m,
-        settings.right_m,
+        settings.strokes_m, settings.divisor, settings.bands_m, settings.matching_px, settings.near_m, settings.right_m
     )
     exact = rigs()
     covariances = {AS_BUILT: np.diag(prior_sigmas() ** 2), CALIBRATED: _calibrated(settings)}

@@ -58,12 +58,7 @@ class Search:
 
 
 def tolerance_rows(
-    nominal: Rig,
-    places: Places,
-    search: Search,
-    coarse: Search,
-    calibrate: Calibrate,
-    parameters: Sequence[str] = ALL,
+    nominal: Rig, places: Places, search: Search, coarse: Search, calibrate: Calibrate, parameters: Sequence[str] = ALL
 ) -> Iterator[dict[str, Any]]:
     """One row per parameter, estimator, D and statistic over azimuths and signs; value None where it is never reached.
 

@@ -110,10 +110,7 @@ Told = Callable[[str], None]
 
 
 def run_experiments(
-    dataset: Dataset,
-    procedure: Procedure,
-    rigs: Sequence[str] | None = None,
-    told: Told = lambda what: None,
+    dataset: Dataset, procedure: Procedure, rigs: Sequence[str] | None = None, told: Told = lambda what: None
 ) -> pl.DataFrame:
     """Calibrate every rig and make its experiments.
 

@@ -80,10 +80,7 @@ class FilmProcedure:
 
 
 def run_film_experiments(
-    films: Films,
-    calibration: Dataset,
-    procedure: FilmProcedure,
-    told: Callable[[], None] = lambda: None,
+    films: Films, calibration: Dataset, procedure: FilmProcedure, told: Callable[[], None] = lambda: None
 ) -> pl.DataFrame:
     """Errors of D of every film, camera and way: one row each, `COLUMNS`; `told` is called after every film.
 

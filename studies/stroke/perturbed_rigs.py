@@ -15,11 +15,7 @@ import numpy as np
 from phibench.benchmark.scores.answer_errors import Rules
 from phibench.benchmark.scores.intervals import Clusters, Estimate, estimates, rms_of
 from phibench.estimator.geometry.least_squares_depth import depth_general
-from phibench.estimator.geometry.rig_parameters import (
-    PARAMETERS,
-    changed,
-    stroke_of,
-)
+from phibench.estimator.geometry.rig_parameters import PARAMETERS, changed, stroke_of
 from phibench.estimator.limits.best_stroke import ROOM_E_PER_S
 from phibench.estimator.limits.stroke_curve import covariance_root
 from phibench.estimator.methods.registry import METHODS

@@ -16,18 +16,10 @@ from phibench.calibration.outline.limb_image import PoseMeasurement
 from phibench.calibration.rig.bundle import calibrate
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.frames.sensor_card import SensorCard, sensor_card
-from phibench.estimator.geometry.rig_parameters import (
-    PARAMETERS,
-    prior_sigmas,
-)
+from phibench.estimator.geometry.rig_parameters import PARAMETERS, prior_sigmas
 from phibench.estimator.limits.best_stroke import best_stroke, spot_bound
 from phibench.estimator.limits.processed_bound import SpotSigma
-from phibench.estimator.limits.stroke_curve import (
-    StrokeCurve,
-    Surroundings,
-    stroke_curve,
-    stroke_grid,
-)
+from phibench.estimator.limits.stroke_curve import StrokeCurve, Surroundings, stroke_curve, stroke_grid
 from phibench.estimator.spots.spot_prediction import Laser
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import Rig

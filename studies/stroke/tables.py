@@ -9,25 +9,12 @@ import numpy as np
 import polars as pl
 
 from phibench.estimator.geometry.reflection import image_of
-from phibench.estimator.geometry.rig_parameters import (
-    PARAMETERS,
-    PRIOR_SIGMA,
-    RIG_PARAMETERS,
-    rig_gradient,
-)
+from phibench.estimator.geometry.rig_parameters import PARAMETERS, PRIOR_SIGMA, RIG_PARAMETERS, rig_gradient
 from phibench.estimator.limits.best_stroke import BestStroke
-from phibench.estimator.limits.stroke_curve import (
-    FREE,
-    StrokeCurve,
-)
+from phibench.estimator.limits.stroke_curve import FREE, StrokeCurve
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import Rig
-from phibench.studies.framework import (
-    Finding,
-    Row,
-    ends_text,
-    text_table,
-)
+from phibench.studies.framework import Finding, Row, ends_text, text_table
 from phibench.studies.stroke.perturbed_rigs import RenderedOutcome
 
 GROWS = 1.05
