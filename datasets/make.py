@@ -33,14 +33,7 @@ from phibench.datasets.build.earlier_runs import (
 from phibench.datasets.build.forecast import Forecast, forecast, slowdown
 from phibench.datasets.build.journal import Journal
 from phibench.datasets.build.parts import unfinished
-from phibench.datasets.build.room_export import (
-    damaged_exports,
-    export_lines,
-    export_rooms,
-    held,
-    own_files,
-    stale_exports,
-)
+from phibench.datasets.build.room_export import damaged_exports, export_lines, export_rooms, held, own_files
 from phibench.datasets.build.run_tasks import (
     Build,
     claimed,
@@ -50,6 +43,7 @@ from phibench.datasets.build.run_tasks import (
     plan_tasks,
     refuse_other,
     remove_files,
+    stale_exports,
     visibility_line,
 )
 from phibench.datasets.build.workers import Environment, NoRendererError, WorkerPool

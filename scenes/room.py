@@ -299,6 +299,24 @@ def _lamps() -> tuple[Rectangle, ...]:
     )
 
 
+def cut_part(view: View, plate: Cuboid) -> str | None:
+    """Name the part of the carriage (mirror, housing, mast, holder) that a board cuts; None if none.
+
+    Round parts of the holder count as the boxes around them, its glass included.
+    """
+    if plate.distance_m(view.sphere_centre_m) <= view.rig.mirror.bound_m:
+        return "mirror"
+    boxes = [
+        Cuboid(part_of_holder.name, part_of_holder.T_world_shape, part_of_holder.size_m)
+        for part_of_holder in view.holder_shapes
+    ]
+    if (tube := view.tube) is not None:
+        middle = tube.origin_m + 0.5 * (tube.low_m + tube.high_m) * tube.axis
+        upright = replace(boxes[0].T_world_shape, translation_m=as_vector(middle))
+        boxes.append(Cuboid("holder_tube", upright, (2.0 * tube.outer_m, 2.0 * tube.outer_m, tube.high_m - tube.low_m)))
+    return next((part.name.replace("_", " ") for part in (*carriage(view), *boxes) if plate.meets(part)), None)
+
+
 def default_rig() -> Rig:
     """Aligned rig without distortion, focused on the virtual image at z_c - R/2; numbers in docs/model.md."""
     return Rig()

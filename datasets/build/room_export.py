@@ -234,13 +234,6 @@ def damaged_exports(out: Path) -> list[str]:
     return [schema.room_file(name) for name, path in names.items() if path.is_file() and sha256(path) != known[name]]
 
 
-def stale_exports(out: Path, files: RoomFiles) -> list[str]:
-    """Exported files of a folder that no room has: of another seed or other settings, before `--replace`."""
-    names = (path.relative_to(out).as_posix() for path in (out / schema.ROOM_FILES / EXPORTED).glob("*"))
-    wanted = {schema.room_file(name) for name in files.digests}
-    return sorted(name for name in names if name not in wanted)
-
-
 def export_task(source: UnexportedRoom, ambient: AmbientTable) -> BuildTask:
     """Task that writes the file of a room. It has no key: its file's name tells it from all others."""
     kind = source.kind.removeprefix("unexported ")

@@ -33,7 +33,7 @@ from phibench.datasets.common.input_files import InputFile
 from phibench.datasets.common.progress import Steps
 from phibench.datasets.plan.plan import PairPlan, Plan, PosePlan
 from phibench.datasets.rooms.room_files import RoomFiles, checked_data
-from phibench.datasets.rooms.room_sources import ONLY_ROOM
+from phibench.datasets.rooms.room_sources import EXPORTED, ONLY_ROOM
 from phibench.datasets.store import schema
 from phibench.datasets.store.checksums import differing, filling, signed, write_documents
 from phibench.datasets.store.croissant import dataset_croissant
@@ -200,6 +200,13 @@ def stale_files(out: Path, expected: Collection[str]) -> list[str]:
     names = [path.relative_to(out).as_posix() for path in (*out.glob(schema.light_map_file(ONLY_ROOM)), *below)]
     wanted = set(expected)
     return sorted(name for name in names if schema.is_task_file(name) and name not in wanted)
+
+
+def stale_exports(out: Path, files: RoomFiles) -> list[str]:
+    """Exported files of a folder that no room has: of another seed or other settings, before `--replace`."""
+    names = (path.relative_to(out).as_posix() for path in (out / schema.ROOM_FILES / EXPORTED).glob("*"))
+    wanted = {schema.room_file(name) for name in files.digests}
+    return sorted(name for name in names if name not in wanted)
 
 
 def remove_files(out: Path, names: Collection[str]) -> None:

@@ -29,7 +29,7 @@ from phibench.datasets.recipe.recipe_scene import (
     true_stroke_m,
 )
 from phibench.datasets.recipe.room_checks import low_rooms, room_faults, tables_of_rooms
-from phibench.datasets.recipe.spot_placement import cut_part, free_margin_m
+from phibench.datasets.recipe.spot_placement import free_margin_m
 from phibench.datasets.recipe.tables import (
     DRAWABLE,
     MIN_STROKE_M,
@@ -48,7 +48,7 @@ from phibench.render.room.subpixel_grid import FilmGrid
 from phibench.render.sensor.settings import SensorError, sensor
 from phibench.scenes.mirror import OF_REVOLVED
 from phibench.scenes.rig import Rig
-from phibench.scenes.room import BOARD_SIZE_M, Room, board, chassis
+from phibench.scenes.room import BOARD_SIZE_M, Room, board, chassis, cut_part
 from phibench.scenes.validation import Fault, SceneError, close_names, nearest
 
 _ON_BOARD, _BY_RAY = ("target", "across_m", "up_m"), ("azimuth_deg", "height_m")

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -20,9 +20,8 @@ from phibench.render.optics.spot_layer import spot_layer
 from phibench.render.optics.truth import VISIBLE, spot_truth
 from phibench.scenes.frames import Array, as_vector
 from phibench.scenes.laser import LaserSpot
-from phibench.scenes.rig import POSITIONS, Rig, Stroke, View
-from phibench.scenes.room import BOARD_SIZE_M, Room, TargetBoard, board, carriage
-from phibench.scenes.shapes import Cuboid
+from phibench.scenes.rig import POSITIONS, Rig, Stroke
+from phibench.scenes.room import BOARD_SIZE_M, Room, TargetBoard, board, cut_part
 
 _HOUSING_REACH_M = 0.1  # housing and mast stay within this of the lens
 
@@ -53,24 +52,6 @@ class Boards:
 def _tilt(rig: Rig) -> float:
     """Sine of the angle between the optical axis and the vertical."""
     return math.hypot(*rig.T_world_camera.R[:2, 2])
-
-
-def cut_part(view: View, plate: Cuboid) -> str | None:
-    """Name the part of the carriage (mirror, housing, mast, holder) that a board cuts; None if none.
-
-    Round parts of the holder count as the boxes around them, its glass included.
-    """
-    if plate.distance_m(view.sphere_centre_m) <= view.rig.mirror.bound_m:
-        return "mirror"
-    boxes = [
-        Cuboid(part_of_holder.name, part_of_holder.T_world_shape, part_of_holder.size_m)
-        for part_of_holder in view.holder_shapes
-    ]
-    if (tube := view.tube) is not None:
-        middle = tube.origin_m + 0.5 * (tube.low_m + tube.high_m) * tube.axis
-        upright = replace(boxes[0].T_world_shape, translation_m=as_vector(middle))
-        boxes.append(Cuboid("holder_tube", upright, (2.0 * tube.outer_m, 2.0 * tube.outer_m, tube.high_m - tube.low_m)))
-    return next((part.name.replace("_", " ") for part in (*carriage(view), *boxes) if plate.meets(part)), None)
 
 
 Placed = tuple[str, LaserSpot] | str
