@@ -299,7 +299,7 @@ def sample_key(sample: Sample, options: FrameOptions, listed: Mapping[str, str])
         row = sample.truth_row(position)
         layers += [listed.get(row.view_ambient_file), listed.get(row.spot_file or "")]
     libraries = [f"{name} {version(name)}" for name in ("numpy", "scipy", "pillow", "OpenEXR")]
-    code = [code_behind(f"phibench.datasets.frames.{name}") for name in ("source", "frame_files")]
+    code = [code_behind(f"phibench.datasets.frames.{name}") for name in ("frame_source", "frame_files")]
     numbers = request.sensor().model_dump(mode="json")
     lights = [table.model_dump(mode="json") for table in sample.dataset.recipe.distractors]
     parts = [sample.stream_names, row_line(sample.row), _document(request), numbers, lights, layers, libraries, code]
