@@ -131,9 +131,9 @@ def walk(name: str, folder: Path, lists: bool) -> None:
         sys.setprofile(None)
     counts = Counter(str(Path(code.co_filename).resolve().relative_to(ROOT)) for code in calls)
     print(f"{name}: {len(counts)} files, {len(calls)} functions")
-    for file, count in counts.most_common() if lists else ():
-        ran = sorted(code.co_qualname for code in calls if code.co_filename.endswith(f"/{file}"))
-        print(f"    {count:4d} {file}: {', '.join(ran[:6])}")
+    for path, count in counts.most_common() if lists else ():
+        ran = sorted(code.co_qualname for code in calls if code.co_filename.endswith(f"/{path}"))
+        print(f"    {count:4d} {path}: {', '.join(ran[:6])}")
 
 
 def main() -> None:
