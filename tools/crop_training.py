@@ -468,11 +468,6 @@ def one_or_more(text: str) -> int:
     return int(text)
 
 
-def add_passes(parser: argparse.ArgumentParser, default: int, text: str) -> None:
-    """Add the option --passes."""
-    parser.add_argument("--passes", type=one_or_more, default=default, help=f"{text}; {default} by default")
-
-
 def told(made: Callable[[], Path]) -> int:
     """Make a file and print its name, or what is wrong; exit code."""
     try:
@@ -491,7 +486,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--preset", action="append", choices=list(REQUESTS), help="may be given again; all by default")
     parser.add_argument("--crops", type=one_or_more, default=TrainingSettings.crops, help="of all rooms")
-    add_passes(parser, TrainingSettings.passes, "times that the crops are used")
+    told_passes = f"times that the crops are used; {TrainingSettings.passes} by default"
+    parser.add_argument("--passes", type=one_or_more, default=TrainingSettings.passes, help=told_passes)
     parser.add_argument("--rescale", type=Path, metavar="FILE", help="a network that only gets a new covariance scale")
     given = parser.parse_args(arguments)
     settings = TrainingSettings(given.seed, tuple(given.preset or REQUESTS), given.crops, given.passes)

@@ -45,8 +45,8 @@ from tools.crop_training import (
     Answers,
     Parameters,
     TrainingSettings,
-    add_passes,
     first_layer,
+    one_or_more,
     rooms_of,
     scale_of,
     told,
@@ -357,7 +357,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, required=True, help="file to write, .onnx")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--spots", type=int, default=FrameSettings.spots, help="tiles with a spot")
-    add_passes(parser, FrameSettings.passes, "times that a round's tiles are used")
+    told_passes = f"times that a round's tiles are used; {FrameSettings.passes} by default"
+    parser.add_argument("--passes", type=one_or_more, default=FrameSettings.passes, help=told_passes)
     parser.add_argument("--rescale", type=Path, metavar="FILE", help="a detector that only gets a new covariance scale")
     given = parser.parse_args(arguments)
     settings = FrameSettings(given.seed, given.spots, passes=given.passes)
