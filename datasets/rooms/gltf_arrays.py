@@ -139,7 +139,7 @@ class GltfDocument:
         if not isinstance(uri, str):
             raise damaged(self.file)
         if not uri.startswith("data:"):
-            return self.companions.named(uri).read()
+            return self.companions.named(uri, is_uri=True).read()
         head, comma, text = uri.partition(",")
         if not comma:
             raise damaged(self.file)

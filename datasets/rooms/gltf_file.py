@@ -453,7 +453,7 @@ class _Reader:
         image, companions = self.document.row("images", number), self.document.companions
         uri = image.get("uri")
         if "bufferView" not in image and isinstance(uri, str) and not uri.startswith("data:"):
-            file = companions.named(uri)
+            file = companions.named(uri, is_uri=True)
             return file, file.read()
         inside = "bufferView" in image
         return self.file, self.document.view(image["bufferView"])[0] if inside else self.document.of_uri(uri)

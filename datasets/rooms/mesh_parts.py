@@ -11,6 +11,7 @@ import math
 import urllib.parse
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -226,30 +227,43 @@ class Companions:
         self._pictures: dict[str, Picture] = {}
         self._opacities: dict[str, Opacity | None] = {}
 
-    def is_there(self, name: str) -> bool:
-        """Tell whether a name is that of a file below the folder."""
-        path = (self.file.path.parent / _plain(name)).resolve()
-        return path.is_relative_to(self.file.path.parent.resolve()) and path.is_file()
+    def is_there(self, name: str, folder: Path | None = None) -> bool:
+        """Tell whether a name is that of a file, as `named` looks for it."""
+        return self._found(name, folder, False) is not None
 
-    def named(self, name: str) -> InputFile:
-        """File of a name.
+    def named(self, name: str, folder: Path | None = None, is_uri: bool = False) -> InputFile:
+        """File of a name, in the folder of the file that names it or in that of the mesh.
+
+        Parameters
+        ----------
+        name : str
+            A URI has blanks and others as `%20`; another name may hold `%` itself, and is tried first as it stands.
+        folder : Path or None
+        is_uri : bool
 
         Raises
         ------
         RoomError
-            If it is missing or not below the folder, or the mesh must be one file.
+            If it is missing or not below the mesh's folder, or the mesh must be one file.
         """
-        plain = _plain(name)
-        shown = f"names the file '{printable_line(plain)}'"
+        shown = f"names the file '{printable_line(name.strip())}'"
         if self.one_file:
             raise self.file.fault(f"{shown}, and here a mesh must be one file")
-        folder = self.file.path.parent.resolve()
-        path = (folder / plain).resolve()
-        if not path.is_relative_to(folder):
-            raise self.file.fault(f"{shown}, which is not in its folder")
-        if not path.is_file():
-            raise self.file.fault(f"{shown}, which is missing")
-        return InputFile(path, REMEDY, RoomError)
+        if path := self._found(name, folder, is_uri):
+            return InputFile(path, REMEDY, RoomError)
+        root = self.file.path.parent.resolve()
+        is_below = (root / _plain(name)).resolve().is_relative_to(root)
+        raise self.file.fault(f"{shown}, which is {'missing' if is_below else 'not in its folder'}")
+
+    def _found(self, name: str, folder: Path | None, is_uri: bool) -> Path | None:
+        root = self.file.path.parent.resolve()
+        spellings = [name.strip().replace("\\", "/"), _plain(name)]
+        for base in (root,) if folder is None else (folder, root):
+            for spelling in reversed(spellings) if is_uri else spellings:
+                path = (base / spelling).resolve()
+                if path.is_relative_to(root) and path.is_file():
+                    return path
+        return None
 
     def picture(self, name: str) -> Picture:
         """Pixels of a picture that has a file of its own."""

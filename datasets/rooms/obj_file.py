@@ -3,12 +3,17 @@
 Relative indices count back from the vertices read so far. Faces of any number of corners become triangles. Curves and
 free-form surfaces are refused by name; points and lines have no surface. A part is an object with one material.
 Material colours and vertex colours are sRGB. A picture replaces `Kd`: most programs write both and mean the picture.
+Where readers differ (a weight of a vertex, colours of vertices beside a material's), the file is refused.
+
+`#` begins a comment, but names may hold one: a name counts as it stands, or else without what follows a blank and `#`.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import numpy as np
 
@@ -43,6 +48,10 @@ _OF_NO_SHAPE = (
 _MOST_CORNERS = 10_000  # of a polygon: cutting it takes the square of them
 _MOST_VERTICES = 3 * MOST_TRIANGLES  # and as many texture coordinates
 _MOST_LINES = 4 * _MOST_VERTICES
+_LONGEST_LINE = 1_000_000  # characters: its words take fifty times their memory
+_SAME = 1.0 / 255.0  # by which colours that are written twice may differ
+_BLANKS = " \t\v\f"  # names may hold others
+_COMMENT_GOES_ON = re.compile(r"#[^\n]*\\\n[ \t]*[^#\s]")
 _OPTIONS = {
     **dict.fromkeys(("-blendu", "-blendv", "-clamp", "-cc", "-imfchan", "-texres", "-boost", "-bm", "-type"), 1),
     "-mm": 2,
@@ -52,9 +61,10 @@ _OPTIONS = {
 
 @dataclass(frozen=True)
 class _Map:
-    """Picture of a material: u' = scale u + offset."""
+    """Picture of a material, named from the folder of its library: u' = scale u + offset."""
 
     name: str
+    folder: Path
     scale: tuple[float, float] = (1.0, 1.0)
     offset: tuple[float, float] = (0.0, 0.0)
     clamped: bool = False
@@ -105,9 +115,11 @@ class _Reader:
         self.groups: dict[tuple[str, str], _Group] = {}
         self.label, self.material, self.triangles = "", "", 0
 
-    def line(self, words: list[str]) -> None:
-        """Take one line."""
-        key, values = words[0], words[1:]
+    def line(self, key: str, rest: str) -> None:
+        """Take one line: its first word and what follows."""
+        values = rest.partition("#")[0].split()
+        if key in ("v", "vt", "f", "fo") and ("_" in rest or not rest.isascii()):
+            self._check_digits(values)
         if key == "v":
             self._vertex(values)
         elif key == "vt":
@@ -118,9 +130,9 @@ class _Reader:
             self.label = " ".join(values) if key == "o" or not self._has_objects else self.label
             self._has_objects = self._has_objects or key == "o"
         elif key == "usemtl":
-            self.material = " ".join(values)
+            self.material = " ".join(rest.split(" "))
         elif key == "mtllib":
-            self.libraries.append(" ".join(values))
+            self.libraries.append(rest)
         elif key in _FREE_FORM:
             raise self.file.fault(f"has free-form curves or surfaces (`{key}`), which are not read: export triangles")
         elif key in _SCRIPTS:
@@ -130,17 +142,25 @@ class _Reader:
                 "names pictures without materials (`usemap`), which is not read: use map_Kd of an MTL"
             )
         elif key not in _OF_NO_SHAPE and key != "usemap":
-            raise self.file.fault(f"has a line that OBJ does not know, '{printable_line(' '.join(words), 60)}'")
+            raise self.file.fault(f"has a line that OBJ does not know, '{printable_line(f'{key} {rest}', 60)}'")
 
     _has_objects = False
 
+    def _check_digits(self, values: list[str]) -> None:
+        """Refuse what Python counts as a number and nobody else does: `1_000`, or digits of other scripts."""
+        for word in values:
+            if "_" in word or not word.isascii():
+                raise self.file.fault(f"has '{printable_line(word, 20)}' in the place of a number")
+
     def _vertex(self, values: list[str]) -> None:
         numbers = tuple(float(word) for word in values)
-        if len(numbers) not in (3, 4, 6, 7):  # x, y, z; with w; with a colour; with both
-            raise self.file.fault(f"has a vertex of {len(numbers)} numbers: 3, 4, 6 or 7 are read")
+        if len(numbers) not in (3, 4, 6):  # x, y, z; with a weight; with a colour; of seven readers differ
+            raise self.file.fault(f"has a vertex of {len(numbers)} numbers: 3, 4 or 6 are read")
+        if len(numbers) == 4 and numbers[3] != 1.0:  # by the definition of curves alone; some readers divide by it
+            raise self.file.fault(f"has a vertex of the weight {numbers[3]:g}: give three numbers, or the weight 1")
         self.vertices.append(numbers[:3])
-        if len(numbers) > 4:
-            self.colours.append(numbers[-3:])
+        if len(numbers) == 6:
+            self.colours.append(numbers[3:])
 
     def _face(self, values: list[str]) -> None:
         if not 3 <= len(values) <= _MOST_CORNERS:
@@ -179,10 +199,8 @@ def obj_parts(file: InputFile, companions: Companions) -> list[MeshPart]:
         If it is damaged, has what is not read, or names a file or a material that is not there.
     """
     reader = _Reader(file)
-    for line in _lines(file):
-        words = line.split()
-        if words:
-            reader.line(words)
+    for key, rest in _lines(file):
+        reader.line(key, rest)
     if max(len(reader.vertices), len(reader.places)) > _MOST_VERTICES:
         raise file.fault(f"has more than {_MOST_VERTICES} vertices or texture coordinates")
     materials = _materials(companions, reader.libraries)
@@ -195,9 +213,7 @@ def obj_parts(file: InputFile, companions: Companions) -> list[MeshPart]:
         raise file.fault(f"has {len(points)} vertices and colours of {len(tints)} of them: give all a colour, or none")
     parts, vertices, cutting = [], _Vertices(points, places, colours), Cutting()
     for (label, name), group in reader.groups.items():
-        material = materials.get(name)
-        if material is None and name and reader.libraries:
-            raise file.fault(f"uses the material '{printable_line(name, 60)}', which none of its libraries has")
+        material = _material_of(file, materials, name) if name and reader.libraries else None
         if material is not None and material.is_hidden:
             continue  # wholly transparent
         title = "_".join(filter(None, (label, name))) or file.path.stem
@@ -205,8 +221,24 @@ def obj_parts(file: InputFile, companions: Companions) -> list[MeshPart]:
     return parts
 
 
-def _lines(file: InputFile) -> Iterator[str]:
-    """Lines without comments; one that ends in a backslash goes on."""
+def _material_of(file: InputFile, materials: dict[str, list[_Material]], name: str) -> _Material:
+    """Material of a name; either name may have a comment after it."""
+    shown = printable_line(name, 60)
+    named = materials.get(name) or materials.get(_without_comment(name))
+    named = named or [one for key, them in materials.items() if _without_comment(key) == name for one in them]
+    if not named:
+        raise file.fault(f"uses the material '{shown}', which none of its libraries has")
+    if len(named) > 1:
+        raise file.fault(f"uses the material '{shown}', which its libraries define twice and not alike")
+    return named[0]
+
+
+def _without_comment(name: str) -> str:
+    return re.split(r"\s#", name, maxsplit=1)[0].rstrip()
+
+
+def _lines(file: InputFile) -> Iterator[tuple[str, str]]:
+    """First word and rest of each line that is no comment; one that ends in a backslash goes on."""
     data = file.read()
     if data.count(b"\n") + data.count(b"\r") > 2 * _MOST_LINES:
         raise file.fault(f"has more than {_MOST_LINES} lines")
@@ -214,8 +246,15 @@ def _lines(file: InputFile) -> Iterator[str]:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError:  # written before UTF-8: names that differ stay different
         text = data.decode("latin-1")
-    text = text.replace("\r\n", "\n").replace("\r", "\n").replace("\\\n", " ")
-    return (line.partition("#")[0] for line in text.split("\n"))
+    text = text.replace("\r\n", "\n").replace("\r", "\n")
+    if _COMMENT_GOES_ON.search(text):  # is what follows a part of the comment? readers differ
+        raise file.fault("has a comment that ends in a backslash, before a line that is none: take the backslash away")
+    for line in text.replace("\\\n", " ").split("\n"):
+        if len(line) > _LONGEST_LINE:
+            raise file.fault(f"has a line of {len(line)} characters: at most {_LONGEST_LINE} are read")
+        key, _, rest = line.strip(_BLANKS).replace("\t", " ").partition(" ")
+        if key and not key.startswith("#"):
+            yield key.partition("#")[0], rest.strip(_BLANKS)
 
 
 def _part(
@@ -244,22 +283,36 @@ def _part(
         _check_holes(file, companions, material)
         paint = _paint(file, companions, material, uv)
         light = _light(file, companions, material, uv)
-    if paint is None and colours is not None:
-        if not (np.isfinite(colours).all() and colours.min() >= 0.0 and colours.max() <= 1.0):
-            raise file.fault("has vertex colours outside 0 to 1")
-        paint = Paint(face_colours=srgb_decoded(colours)[triangles].mean(axis=1))
+    if colours is not None:
+        paint = _tinted(file, title, paint, colours[triangles])
     used, own = np.unique(triangles, return_inverse=True)  # a thousand parts do not carry all vertices each
     return MeshPart(title, points[used], own.reshape(-1, 3), paint, light)
+
+
+def _tinted(file: InputFile, title: str, paint: Paint | None, colours: Array) -> Paint:
+    """Paint of the colours of corners, shape (M, 3, 3), or of the material if they say the same or nothing."""
+    if not (np.isfinite(colours).all() and colours.min() >= 0.0 and colours.max() <= 1.0):
+        raise file.fault("has vertex colours outside 0 to 1")
+    linear = srgb_decoded(colours)
+    is_plain = paint is not None and paint.picture is None
+    if paint is not None and (colours.min() == 1.0 or (is_plain and np.abs(linear - paint.colour).max() < _SAME)):
+        return paint
+    if paint is not None and not (is_plain and paint.colour == WHITE):
+        raise file.fault(
+            f"has vertex colours beside those of a material in '{printable_line(title, 60)}', which readers join in "
+            "different ways: take one of them away"
+        )
+    return Paint(face_colours=linear.mean(axis=1))
 
 
 def _check_holes(file: InputFile, companions: Companions, material: _Material) -> None:
     """Refuse a picture of the opacity that has holes: what is half transparent counts as opaque."""
     if material.mask is None:
         return
-    owner = companions.named(material.mask.name)
+    owner = _file_of(companions, material.mask)
     alpha = companions.opacity(owner, owner.read())
     # a picture that is opaque everywhere tells the opacity by its brightness
-    mask = companions.picture(material.mask.name) if alpha is None or alpha.min() == 255 else alpha
+    mask = companions.pixels(owner, owner.read()) if alpha is None or alpha.min() == 255 else alpha
     if mask.min() == 0:
         shown = printable_line(material.name, 60)
         raise file.fault(f"has holes in the material '{shown}' (map_d): cut its faces along them, or take map_d away")
@@ -283,7 +336,8 @@ def _light(file: InputFile, companions: Companions, material: _Material, uv: Arr
 def _pictured(
     file: InputFile, companions: Companions, material: _Material, found: _Map, colour: Vector, uv: Array | None
 ) -> Paint:
-    picture = companions.picture(found.name)
+    owner = _file_of(companions, found)
+    picture = companions.pixels(owner, owner.read())
     if uv is None:
         shown = printable_line(material.name, 60)
         raise file.fault(f"has faces of the material '{shown}', which has a picture, without texture coordinates")
@@ -296,12 +350,18 @@ def _pictured(
 # Materials.
 
 
-def _materials(companions: Companions, libraries: list[str]) -> dict[str, _Material]:
-    materials: dict[str, _Material] = {}
+def _file_of(companions: Companions, found: _Map) -> InputFile:
+    name = found.name if companions.is_there(found.name, found.folder) else _without_comment(found.name)
+    return companions.named(name, found.folder)
+
+
+def _materials(companions: Companions, libraries: list[str]) -> dict[str, list[_Material]]:
+    """Materials by their names; of one name several, if they differ."""
+    materials: dict[str, list[_Material]] = {}
     for line in libraries:
         # one name with blanks, or several names
-        names = [line] if companions.is_there(line) or " " not in line else line.split()
-        for name in names:
+        whole = next((name for name in (line, _without_comment(line)) if companions.is_there(name)), "")
+        for name in [whole] if whole else _without_comment(line).split() or [line]:
             library = companions.named(name)
             for material in _library(library):
                 if material.transparency >= 1.0 and material.opacity is None:
@@ -309,33 +369,32 @@ def _materials(companions: Companions, libraries: list[str]) -> dict[str, _Mater
                         f"states Tr 1 and no d of '{printable_line(material.name, 60)}', by which programs mean opaque "
                         "or wholly transparent: write d 1 or d 0"
                     )
-                materials.setdefault(material.name, material)
+                same = materials.setdefault(material.name, [])
+                if material not in same:
+                    same.append(material)
     return materials
 
 
 def _library(file: InputFile) -> list[_Material]:
     materials: list[_Material] = []
-    for line in _lines(file):
-        words = line.split()
-        if not words:
-            continue
-        key, values = words[0], words[1:]
+    for key, rest in _lines(file):
         if key == "newmtl":
-            materials.append(_Material(" ".join(values)))
+            materials.append(_Material(" ".join(rest.split(" "))))
         elif materials:
-            materials[-1] = _with_line(file, materials[-1], key.lower(), values)
+            materials[-1] = _with_line(file, materials[-1], key.lower(), rest)
     return materials
 
 
-def _with_line(file: InputFile, material: _Material, key: str, values: list[str]) -> _Material:
+def _with_line(file: InputFile, material: _Material, key: str, rest: str) -> _Material:
+    values = rest.partition("#")[0].split()
     if key in ("kd", "ke"):
         colour = _colour(file, material.name, key, values)
         return replace(material, diffuse=colour) if key == "kd" else replace(material, emission=colour)
     if key in ("map_kd", "map_ke"):
-        picture = _map(file, material.name, key, values)
+        picture = _map(file, material.name, key, rest)
         return replace(material, picture=picture) if key == "map_kd" else replace(material, light_picture=picture)
     if key == "map_d":
-        return replace(material, mask=_map(file, material.name, key, values))
+        return replace(material, mask=_map(file, material.name, key, rest))
     if key == "d" and values:
         return replace(material, opacity=float(values[-1]))  # after -halo, where it stands
     if key == "tr" and values:
@@ -355,10 +414,12 @@ def _colour(file: InputFile, name: str, key: str, values: list[str]) -> Vector:
     return colour
 
 
-def _map(file: InputFile, name: str, key: str, values: list[str]) -> _Map:
+def _map(file: InputFile, name: str, key: str, rest: str) -> _Map:
     """Picture with its options, which stand before its name."""
     where = f"{key} of '{printable_line(name, 60)}'"
-    picture, k = _Map(""), 0
+    words_found = list(re.finditer(r"[^ ]+", rest))
+    values = [word[0] for word in words_found]
+    picture, k = _Map("", file.path.parent), 0
     while k < len(values) and values[k].startswith("-"):
         option = values[k]
         if option in ("-s", "-o", "-t"):
@@ -381,7 +442,7 @@ def _map(file: InputFile, name: str, key: str, values: list[str]) -> _Map:
         k += 1 + _OPTIONS[option]
     if k >= len(values):
         raise damaged(file)
-    return replace(picture, name=" ".join(values[k:]))
+    return replace(picture, name=rest[words_found[k].start() :])
 
 
 def _leading_numbers(words: list[str]) -> list[float]:
