@@ -161,7 +161,9 @@ class InputFile:
         if not stat.S_ISREG(status.st_mode):
             raise self.fault("is not readable: it is no ordinary file")
         with os.fdopen(handle, "rb", closefd=False) as file:
-            data = b"" if status.st_size > self.limit_bytes else file.read(self.limit_bytes + 1)
+            # not the limit at once, for which memory would be asked; files of the system may tell a size of 0
+            most = min(max(status.st_size, MIB), self.limit_bytes) + 1
+            data = b"" if status.st_size > self.limit_bytes else file.read(most)
         if max(status.st_size, len(data)) > self.limit_bytes:
             raise self.fault(f"is larger than {self.limit_bytes / MIB:.0f} MiB, the most that is read of its kind")
         return data

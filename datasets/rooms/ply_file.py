@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 import re
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -97,6 +98,9 @@ def ply_parts(file: InputFile, companions: Companions) -> list[MeshPart]:
     order, elements, pictures, start = _header(file, data)
     reader = _AsciiBody(file, data[start:]) if order == "" else _BinaryBody(file, data[start:], order)
     tables = {element.name: reader.table(element) for element in elements}
+    if rest := reader.rest():
+        raise file.fault(f"goes on for {rest} after the last entry of its header: its counts are too low")
+    _refuse_other_surfaces(file, elements)
     vertex, face = tables.get("vertex", {}), tables.get("face", {})
     if not all(name in vertex for name in "xyz"):
         raise file.fault("has no vertices with x, y and z")
@@ -104,7 +108,7 @@ def ply_parts(file: InputFile, companions: Companions) -> list[MeshPart]:
     polygons: Any = next((face[name] for name in _CORNERS if name in face), [])
     triangles, owner, corner = _triangles(file, points, polygons)
     strips: Any = next((tables["tristrips"][name] for name in _CORNERS if name in tables.get("tristrips", {})), [])
-    extra = _strips(strips)
+    extra = _strips(file, strips)
     check_count(file, len(triangles) + len(extra))
     whole = np.concatenate([triangles, extra])
     if whole.min() < 0 or whole.max() >= len(points):
@@ -114,6 +118,15 @@ def ply_parts(file: InputFile, companions: Companions) -> list[MeshPart]:
     paint = _picture_paint(file, companions, pictures, vertex, face, faces)
     paint = paint or _colour_paint(file, tables, kinds, faces)
     return [MeshPart(file.path.stem, points, whole, paint)]
+
+
+def _refuse_other_surfaces(file: InputFile, elements: list[_Element]) -> None:
+    """Refuse corners of an element of another name, such as `tristrip`: its surface would be missing."""
+    for element in elements:
+        corners = any(p.name in _CORNERS and p.count_kind for p in element.properties)
+        if corners and element.count and element.name not in ("face", "tristrips"):
+            shown = printable_line(element.name, 60)
+            raise file.fault(f"has an element '{shown}' with vertex indices, which is not read: make it faces")
 
 
 def _header(file: InputFile, data: bytes) -> tuple[str, list[_Element], list[str], int]:
@@ -136,10 +149,12 @@ def _header(file: InputFile, data: bytes) -> tuple[str, list[_Element], list[str
         if not words or words[0] == "obj_info":
             continue  # an older name of comments
         if words[0] == "comment":
-            if len(words) > 2 and words[1] == "TextureFile":
+            if len(words) > 2 and words[1].lower() == "texturefile":
                 pictures.append(line.split(None, 2)[2].strip())
         elif words[0] == "format":
             order = _ORDERS[words[1]]
+            if words[2:] != ["1.0"]:
+                raise file.fault(f"is PLY of the version {printable_line(' '.join(words[2:]), 20)}: 1.0 is read")
         elif words[0] == "element":
             elements.append(_Element(words[1], _count(file, words[2]), ()))
         elif words[0] == "property":
@@ -179,8 +194,15 @@ class _AsciiBody:
 
     def __init__(self, file: InputFile, data: bytes) -> None:
         self.file = file
-        self.numbers = np.array(data.split(), dtype=np.float64)
+        with warnings.catch_warnings():  # words as objects would take ten times the memory
+            warnings.simplefilter("error")  # of a word that is no number
+            self.numbers = np.fromstring(data.decode("ascii"), np.float64, sep=" ") if data.strip() else np.zeros(0)
         self.at = 0
+
+    def rest(self) -> str:
+        """What follows the last element."""
+        left = len(self.numbers) - self.at
+        return f"{left} numbers" if left else ""
 
     def table(self, element: _Element) -> Table:
         """Next element."""
@@ -210,6 +232,11 @@ class _BinaryBody:
 
     def __init__(self, file: InputFile, data: bytes, order: str) -> None:
         self.file, self.data, self.order, self.at = file, data, order, 0
+
+    def rest(self) -> str:
+        """What follows the last element; blanks and zeros are padding."""
+        left = len(self.data) - self.at
+        return f"{left} bytes" if self.data[self.at :].strip(b" \t\r\n\0") else ""
 
     def table(self, element: _Element) -> Table:
         """Next element; lists that are all equally long are read at once."""
@@ -270,19 +297,27 @@ def _corners(file: InputFile, count: float) -> int:
 # Faces.
 
 
+def _whole(file: InputFile, numbers: Any) -> NDArray[np.int64]:
+    """Numbers of vertices as integers."""
+    values = np.asarray(numbers)
+    if values.dtype.kind == "f" and not (np.floor(values) == values).all():
+        raise file.fault("has faces whose vertices are not whole numbers")
+    return values.astype(np.int64)
+
+
 def _triangles(file: InputFile, points: Array, polygons: Any) -> tuple[NDArray[np.int64], Any, Any]:
     """Triangles, the face of each, and which corners of the face it has, shape (M, 3)."""
     if len(polygons) == 0:
         return np.zeros((0, 3), np.int64), np.zeros(0, int), np.zeros((0, 3), int)
     if isinstance(polygons, np.ndarray) and polygons.shape[1] == 3:
         count = len(polygons)
-        return polygons.astype(np.int64), np.arange(count), np.tile(np.arange(3), (count, 1))
+        return _whole(file, polygons), np.arange(count), np.tile(np.arange(3), (count, 1))
     triangles: list[Any] = []
     owner: list[int] = []
     corner: list[Any] = []
     total, cutting = 0, Cutting()
     for number, polygon in enumerate(polygons):
-        index = np.asarray(polygon).astype(np.int64)
+        index = _whole(file, polygon)
         if len(index) < 3:
             continue  # a point or a line has no surface
         if len(index) > _MOST_CORNERS:
@@ -301,11 +336,11 @@ def _triangles(file: InputFile, points: Array, polygons: Any) -> tuple[NDArray[n
     return np.concatenate(triangles), np.array(owner), np.concatenate(corner)
 
 
-def _strips(strips: Any) -> NDArray[np.int64]:
+def _strips(file: InputFile, strips: Any) -> NDArray[np.int64]:
     """Triangles of strips; -1 begins a new one. Every other triangle turns around."""
     triangles = []
     for strip in strips:
-        index = np.asarray(strip).astype(np.int64)
+        index = _whole(file, strip)
         for run in np.split(index, np.flatnonzero(index == -1)):
             part = run[run != -1]
             if len(part) > 2:
@@ -399,5 +434,7 @@ def _colours(file: InputFile, table: Table, kinds: dict[str, str]) -> Array | No
         scale = 1.0 if kind in ("f4", "f8") else 65535.0 if kind == "u2" else 255.0  # largest value of the type
         if not (np.isfinite(values).all() and values.min() >= 0.0 and values.max() <= scale):
             raise file.fault(f"has colours outside 0 to {scale:g}, which are the ends of their type")
+        if kind[0] != "f" and (values != np.floor(values)).any():
+            raise file.fault("has colours that are not whole numbers, as their type says")
         columns.append(values / scale)
     return np.asarray(srgb_decoded(np.stack(columns, axis=1)))
