@@ -48,8 +48,9 @@ class GltfDocument:
         else:
             self.tree = file.json(data)
         version = self.table(self.tree, "asset").get("version", "2.0")
-        if not str(version).startswith("2."):
-            raise file.fault(f"is glTF {printable_line(str(version), 10)}: 2.0 is read")
+        least = self.table(self.tree, "asset").get("minVersion", "2.0")
+        if not str(version).startswith("2.") or least != "2.0":
+            raise file.fault(f"is glTF {printable_line(str(version), 10)} or needs {least!s:.10}: 2.0 is read")
         self._buffers: dict[int, bytes] = {}
         self._rows: dict[str, list[dict[str, Any]]] = {}
         self._read = 0
@@ -57,7 +58,12 @@ class GltfDocument:
     def _chunks(self, data: bytes) -> tuple[bytes, bytes]:
         """Text and binary chunk of a .glb file."""
         chunks: dict[bytes, bytes] = {}
-        at = 12  # after magic, version and length
+        version, length = (int.from_bytes(data[at : at + 4], "little") for at in (4, 8))
+        if version != 2:
+            raise self.file.fault(f"is a .glb of the version {version}: 2 is read")
+        if length > len(data):
+            raise self.file.fault(f"is damaged: it has {len(data)} of {length} bytes")
+        at, data = 12, data[:length]  # after magic, version and length
         while at + 8 <= len(data):  # of a chunk, length and kind come first
             length, kind = int.from_bytes(data[at : at + 4], "little"), data[at + 4 : at + 8]
             if at + 8 + length > len(data):
@@ -112,16 +118,18 @@ class GltfDocument:
 
     # Bytes and arrays.
 
-    def view(self, number: Any) -> tuple[bytes, int]:
-        """Bytes of a buffer view, and its stride, 0 where it states none."""
+    def view(self, number: Any) -> tuple[memoryview, int]:
+        """Bytes of a buffer view, not copied, and its stride, 0 where it states none."""
         view = self.row("bufferViews", number)
-        if "EXT_meshopt_compression" in self.table(view, "extensions"):
+        if any("meshopt" in name for name in self.table(view, "extensions")):  # of EXT and of KHR
             raise self.file.fault("has arrays compressed by meshopt: `gltf-transform cp IN.glb OUT.glb` unpacks them")
         data = self._buffer(self.whole(view, "buffer"))
         start, length = self.whole(view, "byteOffset", 0), self.whole(view, "byteLength")
         if start + length > len(data):
             raise damaged(self.file)
-        return data[start : start + length], self.whole(view, "byteStride", 0, 252)  # 252: glTF's largest stride
+        return memoryview(data)[start : start + length], self.whole(
+            view, "byteStride", 0, 252
+        )  # 252: glTF's largest stride
 
     def _buffer(self, number: int) -> bytes:
         if number not in self._buffers:
@@ -179,7 +187,7 @@ class GltfDocument:
             values = self._with_sparse(self.table(accessor, "sparse"), values)
         return values
 
-    def _strided(self, data: bytes, start: int, stride: int, shape: tuple[int, int], kind: str) -> NDArray[Any]:
+    def _strided(self, data: memoryview, start: int, stride: int, shape: tuple[int, int], kind: str) -> NDArray[Any]:
         size = np.dtype(kind).itemsize * shape[1]
         step = stride or size
         if shape[0] and (step < size or start + step * (shape[0] - 1) + size > len(data)):
@@ -202,6 +210,6 @@ class GltfDocument:
         values[index] = new
         return values
 
-    def _sparse_view(self, owner: dict[str, Any]) -> tuple[bytes, int]:
+    def _sparse_view(self, owner: dict[str, Any]) -> tuple[memoryview, int]:
         data, _ = self.view(owner.get("bufferView"))
         return data, self.whole(owner, "byteOffset", 0)

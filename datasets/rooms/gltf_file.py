@@ -9,7 +9,9 @@ as opaque. Skins, instances and compressed arrays are refused by name.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -18,11 +20,10 @@ from numpy.typing import NDArray
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import InputFile
 from phibench.datasets.rooms.gltf_arrays import GltfDocument
+from phibench.datasets.rooms.gltf_material import GltfMaterial, GltfTexture, gltf_material
+from phibench.datasets.rooms.gltf_sampling import finer, framed, mirrored, nearest_places, reaches_edge
 from phibench.datasets.rooms.mesh_parts import (
-    BLACK,
-    BRIGHTEST,
     ROUNDED,
-    WHITE,
     Companions,
     MeshPart,
     Opacity,
@@ -32,16 +33,15 @@ from phibench.datasets.rooms.mesh_parts import (
     check_parts,
     is_no_picture,
     leaves_picture,
-    mirrored_repeat,
     opacities,
-    three_numbers,
 )
 from phibench.scenes.frames import Array, Vector
 from phibench.scenes.validation import printable_line
 
+_LIGHTS = "KHR_lights_punctual"
 _READ_EXTENSIONS = (
     "KHR_texture_transform",
-    "KHR_lights_punctual",
+    _LIGHTS,
     "KHR_mesh_quantization",
     "EXT_texture_webp",
     "KHR_node_visibility",
@@ -52,33 +52,10 @@ _CONVERTERS = {
     "EXT_meshopt_compression": "`gltf-transform cp IN.glb OUT.glb` unpacks it",
     "KHR_texture_basisu": "`ktx extract` of KTX-Software makes PNG of its pictures",
 }
-_GLOSSY = "KHR_materials_pbrSpecularGlossiness"
-_DEPTH = 100  # of nodes in nodes
 _LIST, _STRIP, _FAN = 4, 5, 6  # modes of primitives: TRIANGLES, TRIANGLE_STRIP, TRIANGLE_FAN
 _WITHOUT_SURFACE = (0, 1, 2, 3)  # POINTS, LINES, LINE_LOOP, LINE_STRIP
 _REPEAT, _MIRRORED, _CLAMPED = 10497, 33648, 33071  # wrapS and wrapT
-
-
-@dataclass(frozen=True)
-class _Texture:
-    """Use of a picture by a material."""
-
-    index: Any
-    uv_set: int
-    transform: dict[str, Any]
-
-
-@dataclass(frozen=True)
-class _Material:
-    name: str = ""
-    colour: Vector = WHITE
-    picture: _Texture | None = None
-    light: Vector = BLACK
-    light_picture: _Texture | None = None
-    two_sided: bool = False
-    opacity: float = 1.0
-    cutoff: float | None = None
-    """Opacity below which nothing is seen; 0 of what blends, None of what is opaque whatever its alpha is."""
+_NEAREST = 9728  # magFilter
 
 
 def gltf_parts(file: InputFile, companions: Companions) -> list[MeshPart]:
@@ -92,36 +69,54 @@ def gltf_parts(file: InputFile, companions: Companions) -> list[MeshPart]:
     return _Reader(GltfDocument(file, companions)).parts()
 
 
+def lights_without_surface(file: InputFile) -> int:
+    """Lights of a glTF file that are points or directions (KHR_lights_punctual), which no part shows.
+
+    Raises
+    ------
+    RoomError
+        If the file is damaged.
+    """
+    reader = _Reader(GltfDocument(file, Companions(file, False)))
+    return sum(_LIGHTS in reader.document.table(node, "extensions") for _, node, _ in reader.nodes())
+
+
 class _Reader:
     """Parts of a document."""
 
     def __init__(self, document: GltfDocument) -> None:
         self.document, self.file = document, document.file
         self._refuse_unread()
-        self.materials = [self._material(row) for row in document.rows("materials")]
+        self.materials = [gltf_material(document, row) for row in document.rows("materials")]
         self._pictures: dict[int, Picture] = {}
+        self._repeats: dict[tuple[int, str], NDArray[np.uint8]] = {}
         self._seen: set[int] = set()
         self._count = 0
 
     def parts(self) -> list[MeshPart]:
         """All triangles of the scene."""
         mesh_parts: list[MeshPart] = []
-        waiting = [(number, np.eye(4), 1) for number in self._roots()]
+        for number, node, transform in self.nodes():
+            if "mesh" in node:
+                mesh_parts += self._of_node(number, node, transform)
+                check_parts(self.file, len(mesh_parts))
+        check_count(self.file, self._count)
+        return mesh_parts
+
+    def nodes(self) -> Iterator[tuple[int, dict[str, Any], Array]]:
+        """Nodes that are shown: number, table, place in the scene."""
+        waiting = deque((number, np.eye(4)) for number in self._roots())
         while waiting:
-            number, outer, depth = waiting.pop(0)
+            number, outer = waiting.popleft()
             node = self.document.row("nodes", number)
-            if number in self._seen or depth > _DEPTH:
+            if number in self._seen:
                 raise self.file.fault("is damaged: its nodes are no trees")
             self._seen.add(number)
             if self._is_hidden(node):
                 continue  # what is below a hidden node is hidden, too
             transform = outer @ self._transform(node)
-            if "mesh" in node:
-                mesh_parts += self._of_node(number, node, transform)
-                check_parts(self.file, len(mesh_parts))
-            waiting += [(child, transform, depth + 1) for child in node.get("children", [])]
-        check_count(self.file, self._count)
-        return mesh_parts
+            yield number, node, transform
+            waiting += [(child, transform) for child in node.get("children", [])]
 
     def _roots(self) -> list[Any]:
         """Nodes of the scene that is shown; of a file without scenes all that are no node's children."""
@@ -250,52 +245,24 @@ class _Reader:
             raise self.file.fault("is damaged: weights and targets are lists")
         for weight, target in zip(weights, targets, strict=False):
             if weight and isinstance(target, dict) and "POSITION" in target:
-                points = points + float(weight) * self.document.array(target["POSITION"], 3)
+                moves = self.document.array(target["POSITION"], 3)
+                if len(moves) != len(points):
+                    raise self.file.fault("is damaged: a morph target does not move every vertex")
+                points = points + float(weight) * moves
         return points
 
     # Materials.
 
-    def _material_of(self, primitive: dict[str, Any]) -> _Material | None:
+    def _material_of(self, primitive: dict[str, Any]) -> GltfMaterial | None:
         if "material" not in primitive:
             return None
         self.document.row("materials", primitive["material"])
         return self.materials[primitive["material"]]
 
-    def _material(self, row: dict[str, Any]) -> _Material:
-        document = self.document
-        extensions = document.table(row, "extensions")
-        base, factor, texture = document.table(row, "pbrMetallicRoughness"), "baseColorFactor", "baseColorTexture"
-        if _GLOSSY in extensions:
-            base, factor, texture = document.table(extensions, _GLOSSY), "diffuseFactor", "diffuseTexture"
-        strength = document.table(extensions, "KHR_materials_emissive_strength").get("emissiveStrength", 1.0)
-        light = tuple(x * float(strength) for x in document.numbers(row, "emissiveFactor", BLACK))
-        colour = three_numbers(document.numbers(base, factor, (1.0, 1.0, 1.0, 1.0))[:3])
-        shown = printable_line(str(row.get("name", "")), 60)
-        if not colour or not three_numbers(light):
-            raise self.file.fault(
-                f"has a material '{shown}' with a colour or emission that is not three numbers from 0 up"
-            )
-        if max(colour) > 1.0 + ROUNDED:
-            raise self.file.fault(f"has a material '{shown}' with a {factor} up to {max(colour):g}: it ends at 1")
-        mode, opacity = row.get("alphaMode", "OPAQUE"), document.numbers(base, factor, (1.0, 1.0, 1.0, 1.0))[3]
-        cutoffs = {"OPAQUE": None, "MASK": float(row.get("alphaCutoff", 0.5)), "BLEND": 0.0}
-        if mode not in cutoffs:
-            raise self.file.fault(f"has the alphaMode {printable_line(str(mode), 20)}, which glTF does not know")
-        return _Material(
-            str(row.get("name", "")),
-            tuple(min(x, 1.0) for x in colour),
-            self._texture(base, texture),
-            tuple(min(x, BRIGHTEST) for x in light),
-            self._texture(row, "emissiveTexture"),
-            bool(row.get("doubleSided", False)),
-            opacity,
-            cutoffs[mode],
-        )
-
     def _visible(
         self,
         label: str,
-        material: _Material | None,
+        material: GltfMaterial | None,
         attributes: dict[str, Any],
         triangles: NDArray[np.int64],
         count: int,
@@ -305,39 +272,30 @@ class _Reader:
             return triangles
         uv = alpha = corners = None
         if material.picture is not None and (alpha := self._opacity(material)) is not None:
-            uv = self._corners(label, material, material.picture, attributes, triangles)
-            uv = np.stack([uv[..., 0], 1.0 - uv[..., 1]], axis=-1)
+            alpha, uv = self._placed(label, material, material.picture, attributes, triangles, alpha)
         if (colours := self._vertex_colours(attributes, count)) is not None and colours.shape[1] == 4:
             corners = colours[triangles][..., 3]
         least, most = opacities(len(triangles), material.opacity, corners, uv, alpha).T
-        hidden = most < material.cutoff if material.cutoff else most <= 0.0
-        holes = ~hidden & (least < material.cutoff if material.cutoff else least <= 0.0)
+        hidden = most < material.cutoff
+        holes = ~hidden & (least < material.cutoff)
         if holes.any():
             shown = printable_line(f"{label}/{material.name}", 60)
             raise self.file.fault(f"has holes in '{shown}' (alphaMode): cut the surface along them, or make it OPAQUE")
         return triangles[~hidden]
 
-    def _opacity(self, material: _Material) -> Opacity | None:
+    def _opacity(self, material: GltfMaterial) -> Opacity | None:
         """Alpha of the picture of a material's base colour."""
         assert material.picture is not None
         image = self._image(self.document.row("textures", material.picture.index))
         owner, data = self._encoded(image)
         return self.document.companions.opacity(owner, data)
 
-    def _texture(self, owner: dict[str, Any], key: str) -> _Texture | None:
-        if not owner.get(key):
-            return None  # an empty table counts as none
-        stated = self.document.table(owner, key)
-        transform = self.document.table(self.document.table(stated, "extensions"), "KHR_texture_transform")
-        uv_set = self.document.whole(transform if "texCoord" in transform else stated, "texCoord", 0, 100)
-        return _Texture(stated.get("index"), uv_set, transform)
-
     def _paints(
         self,
         label: str,
         attributes: dict[str, Any],
         triangles: NDArray[np.int64],
-        material: _Material | None,
+        material: GltfMaterial | None,
         count: int,
     ) -> tuple[Paint | None, Paint | None]:
         colours = self._vertex_colours(attributes, count)
@@ -375,24 +333,37 @@ class _Reader:
     def _paint(
         self,
         label: str,
-        material: _Material,
+        material: GltfMaterial,
         colour: Vector,
-        texture: _Texture | None,
+        texture: GltfTexture | None,
         attributes: dict[str, Any],
         triangles: NDArray[np.int64],
     ) -> Paint:
         if texture is None:
             return Paint(colour)
-        corners = self._corners(label, material, texture, attributes, triangles)
         row = self.document.row("textures", texture.index)
-        picture, corners = self._repeated(row, self._picture(material, row), corners, label)
-        return Paint(colour, picture, np.stack([corners[..., 0], 1.0 - corners[..., 1]], axis=-1))
+        pixels = self._picture(material, row)
+        return Paint(colour, *self._placed(label, material, texture, attributes, triangles, pixels))
+
+    def _placed(
+        self,
+        label: str,
+        material: GltfMaterial,
+        texture: GltfTexture,
+        attributes: dict[str, Any],
+        triangles: NDArray[np.int64],
+        pixels: NDArray[np.uint8],
+    ) -> tuple[NDArray[np.uint8], Array]:
+        """Pixels, and the corners' places on them, v upwards, as the sampler says."""
+        corners = self._corners(label, material, texture, attributes, triangles)
+        pixels, corners = self._repeated(self.document.row("textures", texture.index), pixels, corners, label)
+        return pixels, np.stack([corners[..., 0], 1.0 - corners[..., 1]], axis=-1)
 
     def _corners(
         self,
         label: str,
-        material: _Material,
-        texture: _Texture,
+        material: GltfMaterial,
+        texture: GltfTexture,
         attributes: dict[str, Any],
         triangles: NDArray[np.int64],
     ) -> Array:
@@ -416,18 +387,41 @@ class _Reader:
         c, s = math.cos(angle), math.sin(angle)
         return uv * scale @ np.array([[c, -s], [s, c]]) + shift
 
-    def _repeated(self, texture: dict[str, Any], picture: Picture, uv: Array, label: str) -> tuple[Picture, Array]:
-        """Picture and coordinates such that it repeats as the sampler says; v counts downwards."""
+    def _repeated(
+        self, texture: dict[str, Any], pixels: NDArray[np.uint8], uv: Array, label: str
+    ) -> tuple[NDArray[np.uint8], Array]:
+        """Pixels and coordinates, v downwards, whose endless bilinear repeat is what the sampler says."""
         sampler = self.document.row("samplers", texture["sampler"]) if "sampler" in texture else {}
-        modes = [sampler.get(key, _REPEAT) for key in ("wrapS", "wrapT")]
-        if any(mode == _CLAMPED and leaves_picture(uv, axis) for axis, mode in enumerate(modes)):
-            shown = printable_line(label, 60)
-            raise self.file.fault(
-                f"has a picture in '{shown}' that ends at its edges (CLAMP_TO_EDGE) beside it: repeat it"
-            )
-        axes = [axis for axis, mode in enumerate(modes) if mode == _MIRRORED and leaves_picture(uv, axis)]
-        flipped, moved = mirrored_repeat(picture[::-1], uv, axes)
-        return flipped[::-1], moved
+        shown, modes = printable_line(label, 60), [sampler.get(key, _REPEAT) for key in ("wrapS", "wrapT")]
+        for axis, mode in enumerate(modes):
+            if mode not in (_REPEAT, _MIRRORED, _CLAMPED):
+                raise self.file.fault(f"has a picture in '{shown}' whose wrap {mode!s:.20} glTF does not know")
+            if mode == _CLAMPED and leaves_picture(uv, axis):
+                raise self.file.fault(
+                    f"has a picture in '{shown}' that ends at its edges (CLAMP_TO_EDGE) beside it: repeat it"
+                )
+        size = np.array(pixels.shape[1::-1])
+        if axes := [axis for axis, mode in enumerate(modes) if mode == _MIRRORED and leaves_picture(uv, axis)]:
+            pixels, uv = self._once(pixels, "mirrored", axes, mirrored), uv * np.where(np.isin((0, 1), axes), 0.5, 1.0)
+        # within a picture the mirror images begin as a clamped edge goes on
+        ends = [axis for axis, mode in enumerate(modes) if mode != _REPEAT and axis not in axes]
+        if sampler.get("magFilter") == _NEAREST:
+            uv = nearest_places(uv, np.array(pixels.shape[1::-1]), ends)
+            return self._once(pixels, "finer", (0, 1), finer), uv
+        if edges := [axis for axis in ends if reaches_edge(uv, axis, size[axis])]:
+            wide = np.where(np.isin((0, 1), edges), 1.0, 0.0)
+            uv = (uv * size + wide) / (size + 2.0 * wide)
+            pixels = self._once(pixels, "framed", edges, framed)
+        return pixels, uv
+
+    def _once(
+        self, pixels: NDArray[np.uint8], kind: str, axes: Sequence[int], make: Callable[[Any, Sequence[int]], Any]
+    ) -> NDArray[np.uint8]:
+        """Changed copy of pixels, made once: a thousand parts share it."""
+        key = (id(pixels), f"{kind}{axes}")
+        if key not in self._repeats:
+            self._repeats[key] = make(pixels, axes)
+        return self._repeats[key]
 
     def _image(self, texture: dict[str, Any]) -> int:
         """Number of the image of a texture."""
@@ -442,7 +436,7 @@ class _Reader:
         self.document.row("images", source)
         return int(source or 0)
 
-    def _picture(self, material: _Material, texture: dict[str, Any]) -> Picture:
+    def _picture(self, material: GltfMaterial, texture: dict[str, Any]) -> Picture:
         number = self._image(texture)
         if number not in self._pictures:
             self._pictures[number] = self._decoded(material, number)
@@ -456,9 +450,9 @@ class _Reader:
             file = companions.named(uri, is_uri=True)
             return file, file.read()
         inside = "bufferView" in image
-        return self.file, self.document.view(image["bufferView"])[0] if inside else self.document.of_uri(uri)
+        return self.file, bytes(self.document.view(image["bufferView"])[0]) if inside else self.document.of_uri(uri)
 
-    def _decoded(self, material: _Material, number: int) -> Picture:
+    def _decoded(self, material: GltfMaterial, number: int) -> Picture:
         owner, data = self._encoded(number)
         try:
             return self.document.companions.pixels(owner, data)

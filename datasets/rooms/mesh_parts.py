@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL.Image import Image
 
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import InputFile
@@ -291,8 +292,7 @@ class Companions:
         digest = hashlib.sha256(data).hexdigest()
         if digest not in self._opacities:
             image = owner.picture(PICTURES, data)
-            has = image.mode in ("RGBA", "LA", "PA") or "transparency" in image.info
-            self._opacities[digest] = np.asarray(image.convert("RGBA"))[..., 3].copy() if has else None
+            self._opacities[digest] = _alpha(image)
         return self._opacities[digest]
 
 
@@ -300,10 +300,21 @@ def _plain(name: str) -> str:
     return urllib.parse.unquote(name.strip()).replace("\\", "/")
 
 
+def _alpha(image: Image) -> Opacity | None:
+    if image.mode in _GREY_16 and "transparency" in image.info:  # one grey, which Pillow leaves
+        return np.where(np.asarray(image) == image.info["transparency"], 0, 255).astype(np.uint8)
+    has = image.mode in ("RGBA", "LA", "PA") or "transparency" in image.info
+    return np.asarray(image.convert("RGBA"))[..., 3].copy() if has else None
+
+
 def _pixels(owner: InputFile, data: bytes) -> Picture:
     image = owner.picture(PICTURES, data)
     if image.mode in _GREY_16:
         grey = np.asarray(image, float)
+        if image.format == "TIFF":  # bits, white as 0, sign: Pillow gives the numbers as they are
+            tags: Any = image.tag_v2  # type: ignore[attr-defined]
+            if (tags.get(258, (0,))[0], tags.get(262), tags.get(339, (1,))[0]) != (16, 1, 1):
+                raise owner.fault("is a grey TIFF of another kind than 16 bits, black 0: save it with 8 bits")
         if image.format not in ("PNG", "TIFF") or grey.min() < 0.0 or grey.max() > 65535.0:
             raise owner.fault("has a picture of more than 16 bits: save it with 8 bits a colour")
         return np.repeat(np.rint(grey / 257.0).astype(np.uint8)[..., None], 3, axis=2)  # 65535 / 255
@@ -326,19 +337,6 @@ def three_numbers(words: Any) -> Vector:
     except (TypeError, ValueError):  # the caller knows the material's name
         return ()
     return values if len(values) == 3 and all(math.isfinite(value) and value >= 0.0 for value in values) else ()
-
-
-def mirrored_repeat(picture: Picture, uv: Array, axes: Iterable[int]) -> tuple[Picture, Array]:
-    """Picture that repeats as one that is mirrored at its edges does along axes 0 (u) or 1 (v), and its coordinates."""
-    uv = uv.copy()
-    for axis in axes:
-        picture = (
-            np.concatenate([picture, picture[:, ::-1]], axis=1)
-            if axis == 0
-            else np.concatenate([picture[::-1], picture], axis=0)
-        )
-        uv[..., axis] *= 0.5
-    return picture, uv
 
 
 def leaves_picture(uv: Array, axis: int) -> bool:

@@ -20,7 +20,9 @@ from PIL import Image
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from phibench.datasets.rooms.mesh_parts import MeshPart, Paint, Picture
+from phibench.datasets.common.input_files import InputFile
+from phibench.datasets.rooms.gltf_file import lights_without_surface
+from phibench.datasets.rooms.mesh_parts import REMEDY, MeshPart, Paint, Picture
 from phibench.datasets.rooms.mesh_placement import (
     MIRROR_TOP_M,
     MeshSettings,
@@ -54,6 +56,7 @@ def mesh_room(settings: MeshSettings) -> Room:
         If the file or its size is not a room's, or nothing in it shines.
     """
     parts = [piece for part in placed_parts(settings) for piece in _split_by_light(part)]
+    _check_lights(settings)
     lamps, meshes = _lamps(settings, parts)
     if not lamps and not any(part.light for part in meshes):
         raise RoomError(
@@ -64,6 +67,17 @@ def mesh_room(settings: MeshSettings) -> Room:
     bitmaps = _bitmaps(settings, meshes, paints)
     shapes = tuple(mesh_shape(part, *bitmaps[k]) for k, part in enumerate(meshes))
     return Room(settings.name, lamps, shapes)
+
+
+def _check_lights(settings: MeshSettings) -> None:
+    """Refuse lights of a file that have no surface, unless lamps are stated in their places."""
+    if settings.lamps or settings.path.suffix.lower() not in (".glb", ".gltf"):
+        return
+    if count := lights_without_surface(InputFile(settings.path, REMEDY, RoomError)):
+        raise RoomError(
+            f"{settings.path} has {count} lights without a surface (KHR_lights_punctual), which are not read: state "
+            "lamps in their places as [[rooms.meshes.lamps]], or take them away"
+        )
 
 
 def _split_by_light(part: MeshPart) -> Iterator[MeshPart]:
