@@ -184,6 +184,11 @@ class Paint:
         uv = None if self.uv is None else self.uv[chosen]
         return replace(self, uv=uv, face_colours=None if self.face_colours is None else self.face_colours[chosen])
 
+    def pieces(self, owner: NDArray[np.int64], weights: Array) -> Paint:
+        """Paint of pieces of triangles: the triangle of each, and weights of its corners, shape (N, 3, 3)."""
+        uv = None if self.uv is None else weights @ self.uv[owner]
+        return replace(self, uv=uv, face_colours=None if self.face_colours is None else self.face_colours[owner])
+
 
 @dataclass(frozen=True, eq=False)
 class MeshPart:

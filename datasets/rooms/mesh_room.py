@@ -10,18 +10,16 @@ A texture finer than `texel_m` is averaged down to it, over areas, in linear lig
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from phibench.datasets.common.input_files import InputFile
 from phibench.datasets.rooms.gltf_file import lights_without_surface
+from phibench.datasets.rooms.mesh_lights import LitPictures, lamps_of, merged_places, split_by_light
 from phibench.datasets.rooms.mesh_parts import REMEDY, MeshPart, Paint, Picture
 from phibench.datasets.rooms.mesh_placement import (
     MIRROR_TOP_M,
@@ -32,18 +30,13 @@ from phibench.datasets.rooms.mesh_placement import (
 )
 from phibench.datasets.rooms.room_files import RoomError
 from phibench.render.sensor.srgb import srgb_decoded
-from phibench.scenes.frames import Array, Pose, as_matrix, as_vector
+from phibench.scenes.frames import Array, as_vector
 from phibench.scenes.room import Room
-from phibench.scenes.shapes import Bitmap, Mesh, Rectangle, Texture, Uniform, rectangle
+from phibench.scenes.shapes import Bitmap, Mesh, Texture, Uniform
 
 MOST_VALUES = 16_000_000
 """Of all bitmaps of a room, four a texel."""
-MOST_LAMPS = 12
-"""Rectangles that are sampled as lamps; what else shines is found by chance alone."""
 _LINEAR = srgb_decoded(np.arange(256) / 255.0)  # of every code of a picture
-_LEAST_LIGHT = 1e-3  # of an emission texture: below it a texel counts as dark
-_BLACK = Uniform((0.0, 0.0, 0.0))
-_SQUARE = 1e-4  # by which a rectangle's sides and angles may be off
 _BESIDE_M = (0.0013, 0.0007)  # a vertical beside the axis: on it, triangles like to meet
 
 
@@ -55,9 +48,10 @@ def mesh_room(settings: MeshSettings) -> Room:
     RoomError
         If the file or its size is not a room's, or nothing in it shines.
     """
-    parts = [piece for part in placed_parts(settings) for piece in _split_by_light(part)]
+    lit = LitPictures()
+    parts = [piece for part in placed_parts(settings) for piece in split_by_light(part, lit)]
     _check_lights(settings)
-    lamps, meshes = _lamps(settings, parts)
+    lamps, meshes = lamps_of(settings, parts)
     if not lamps and not any(part.light for part in meshes):
         raise RoomError(
             f"{settings.path} has no material that emits light, and no lamps are stated: without light the room is "
@@ -78,103 +72,6 @@ def _check_lights(settings: MeshSettings) -> None:
             f"{settings.path} has {count} lights without a surface (KHR_lights_punctual), which are not read: state "
             "lamps in their places as [[rooms.meshes.lamps]], or take them away"
         )
-
-
-def _split_by_light(part: MeshPart) -> Iterator[MeshPart]:
-    """Part whose emission is a texture, as triangles that shine and those that do not; any other part as it is."""
-    if part.light is None or part.light.picture is None or part.light.uv is None:
-        yield part
-        return  # one light for the whole part
-    uv = part.light.uv
-    places = np.concatenate([uv, 0.5 * (uv + np.roll(uv, -1, axis=1)), uv.mean(axis=1, keepdims=True)], axis=1)
-    height, width = part.light.picture.shape[:2]
-    column = np.floor(places[..., 0] * width).astype(int) % width
-    row = height - 1 - np.floor(places[..., 1] * height).astype(int) % height
-    light = _LINEAR[part.light.picture[row, column]] * np.array(part.light.colour)
-    shines = light.max(axis=(1, 2)) > _LEAST_LIGHT
-    if shines.any():
-        yield part.of(shines, f"{part.name} (light)")
-    if not shines.all():
-        yield replace(part.of(~shines, part.name), light=None)
-
-
-# Lamps.
-
-
-def _lamps(settings: MeshSettings, parts: list[MeshPart]) -> tuple[tuple[Rectangle, ...], list[MeshPart]]:
-    """Rectangles that shine evenly, the strongest of them as lamps, and all other parts."""
-    lamps = [
-        rectangle(
-            f"lamp_{k}", lamp.centre_m, lamp.normal, lamp.size_m, texture=_BLACK, radiance_w_m2_sr=lamp.radiance_w_m2_sr
-        )
-        for k, lamp in enumerate(settings.lamps, 1)
-    ]
-    rectangles: list[tuple[float, Rectangle, int, NDArray[np.bool_]]] = []
-    for number, part in enumerate(parts):
-        if part.light is None or part.light.picture is not None:
-            continue  # dark, or bright in places: no lamp
-        radiance = as_vector(settings.emission_w_m2_sr * np.array(part.light.colour))
-        for count, (chosen, pose, size) in enumerate(_rectangles(part), 1):
-            name = f"{part.name} (lamp {count})"
-            panel = Rectangle(name, pose, size, _BLACK, radiance)
-            rectangles.append((max(radiance) * size[0] * size[1], panel, number, chosen))
-    rectangles.sort(key=lambda each: (-each[0], each[1].name))
-    rest = {number: np.ones(len(part.triangles), dtype=bool) for number, part in enumerate(parts)}
-    for _, panel, number, chosen in rectangles[: max(MOST_LAMPS - len(lamps), 0)]:
-        lamps.append(panel)
-        rest[number] &= ~chosen
-    left = [(part, rest[number]) for number, part in enumerate(parts) if rest[number].any()]
-    return tuple(lamps), [part if keep.all() else part.of(keep, part.name) for part, keep in left]
-
-
-def _rectangles(part: MeshPart) -> Iterator[tuple[NDArray[np.bool_], Pose, tuple[float, float]]]:
-    """Yield pairs of triangles that touch no other and make a rectangle: which, pose, size."""
-    corners, index = corners_of(part), _merged(part)
-    count = len(index)
-    rows = np.repeat(np.arange(count), 3)
-    links = coo_array((np.ones(3 * count), (rows, count + index.ravel())), shape=(count + index.max() + 1,) * 2)
-    label = connected_components(links, directed=False)[1][:count]
-    order = np.argsort(label, kind="stable")
-    sizes = np.bincount(label)
-    for start in (np.cumsum(sizes) - sizes)[sizes == 2]:
-        pair = order[start : start + 2]
-        frame = _rectangle_frame(corners[pair], index[pair])
-        if frame is not None:
-            yield np.isin(np.arange(count), pair), *frame
-
-
-def _rectangle_frame(corners: Array, index: NDArray[np.int64]) -> tuple[Pose, tuple[float, float]] | None:
-    """Pose and size of the rectangle of two triangles, shape (2, 3, 3); None if they make none.
-
-    Each has one corner that the other lacks, the right angle; the two are opposite each other.
-    """
-    own = [np.flatnonzero(~np.isin(index[k], index[1 - k])) for k in (0, 1)]
-    if len(own[0]) != 1 or len(own[1]) != 1:
-        return None  # two triangles that share no edge
-    first = np.roll(corners[0], -int(own[0][0]), axis=0)
-    along, up = first[1] - first[0], first[2] - first[0]
-    a, b, normal = float(np.linalg.norm(along)), float(np.linalg.norm(up)), np.cross(along, up)
-    other = np.cross(corners[1][1] - corners[1][0], corners[1][2] - corners[1][0])
-    off = float(np.linalg.norm(first[0] + along + up - corners[1][int(own[1][0])]))
-    square = abs(float(along @ up)) <= _SQUARE * a * b and off <= _SQUARE * (a + b)
-    if not square or float(normal @ other) <= 0.0:
-        return None  # no rectangle, or folded
-    x, z = along / a, normal / np.linalg.norm(normal)
-    R = np.stack([x, np.cross(z, x), z], axis=1)
-    return Pose("world", "shape", as_vector(first[0] + 0.5 * (along + up)), as_matrix(R)), (a, b)
-
-
-_MIXING = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)  # odd, of no pattern
-
-
-def _merged(part: MeshPart) -> NDArray[np.int64]:
-    """Index of the place of each corner, shape (M, 3); what is less than about a micrometre apart is one place.
-
-    Places are told apart by a 64-bit sum of their coordinates: two of a million collide with a chance of 3e-8.
-    """
-    grid = np.rint(part.vertices * 1e6).astype(np.int64).view(np.uint64)  # micrometres: the same corner written twice
-    place = np.unique((grid * _MIXING).sum(axis=1), return_inverse=True)[1].reshape(-1)
-    return np.asarray(place[part.triangles], np.int64)
 
 
 # Bitmaps.
@@ -312,7 +209,7 @@ def mesh_shape(part: MeshPart, texture: Texture, texels: Array | None) -> Mesh:
 
 def _one_sided(part: MeshPart) -> bool:
     """Return True for a closed part whose normals look at the mirror's side: outwards, or inwards if it holds it."""
-    corners, index = corners_of(part), _merged(part)
+    corners, index = corners_of(part), merged_places(part)
     edges = np.concatenate([index[:, [0, 1]], index[:, [1, 2]], index[:, [2, 0]]])
     edges = edges[edges[:, 0] != edges[:, 1]]
     count = int(index.max()) + 1
