@@ -89,6 +89,8 @@ class _Reader:
         self._refuse_unread()
         self.materials = [gltf_material(document, row) for row in document.rows("materials")]
         self._pictures: dict[int, Picture] = {}
+        self._opacities: dict[int, Opacity | None] = {}
+        self._sources: dict[tuple[Any, Any], int] = {}
         self._repeats: dict[tuple[int, str], NDArray[np.uint8]] = {}
         self._seen: set[int] = set()
         self._count = 0
@@ -286,9 +288,10 @@ class _Reader:
     def _opacity(self, material: GltfMaterial) -> Opacity | None:
         """Alpha of the picture of a material's base colour."""
         assert material.picture is not None
-        image = self._image(self.document.row("textures", material.picture.index))
-        owner, data = self._encoded(image)
-        return self.document.companions.opacity(owner, data)
+        number = self._image(self.document.row("textures", material.picture.index))
+        if number not in self._opacities:
+            self._opacities[number] = self.document.companions.opacity(*self._encoded(number))
+        return self._opacities[number]
 
     def _paints(
         self,
@@ -424,7 +427,7 @@ class _Reader:
         return self._repeats[key]
 
     def _image(self, texture: dict[str, Any]) -> int:
-        """Number of the image of a texture."""
+        """Number of the image of a texture, the first of those that have the same bytes."""
         extensions = self.document.table(texture, "extensions")
         source = self.document.table(extensions, "EXT_texture_webp").get("source", texture.get("source"))
         if source is None and "KHR_texture_basisu" in extensions:
@@ -433,8 +436,8 @@ class _Reader:
         if source is None and extensions:
             shown = printable_line(str(next(iter(extensions))), 60)
             raise self.file.fault(f"has pictures of the glTF extension {shown}, which is not read")
-        self.document.row("images", source)
-        return int(source or 0)
+        image = self.document.row("images", source)
+        return self._sources.setdefault((image.get("bufferView"), image.get("uri")), int(source or 0))
 
     def _picture(self, material: GltfMaterial, texture: dict[str, Any]) -> Picture:
         number = self._image(texture)

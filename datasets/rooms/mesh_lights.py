@@ -26,8 +26,10 @@ _LINEAR = srgb_decoded(np.arange(256) / 255.0)  # of every code of a picture
 _LEAST_LIGHT = 1e-3  # of an emission texture: below it a texel counts as dark
 _BLACK = Uniform((0.0, 0.0, 0.0))
 _SQUARE = 1e-4  # by which a rectangle's sides and angles may be off
+_MOST_PANELS = 300  # of a part, the largest, that are looked at: few become lamps
 _CLOSED_M = 0.06  # from a panel: what is nearer closes its side
 _APART_M = 1e-3  # between the two lamps of a panel that shines to both sides
+_FARTHEST = 1e9  # texels from a picture: beyond, integers would end
 _FINE_M = 0.1  # longest side of a piece that is not cut further
 _CUTS = 7  # into four, one after the other
 _MOST_PIECES = 50_000  # of a part
@@ -53,8 +55,9 @@ class LitPictures:
         """
         sums = self._of(light)
         size = np.array(sums.shape[::-1]) - 1
-        low = np.floor(uv.min(axis=1) * size - 0.5 + _SQUARE).astype(np.int64)
-        high = np.floor(uv.max(axis=1) * size - 0.5 - _SQUARE).astype(np.int64) + 2
+        texel = np.clip(uv * size, -_FARTHEST, _FARTHEST)
+        low = np.floor(texel.min(axis=1) - 0.5 + _SQUARE).astype(np.int64)
+        high = np.floor(texel.max(axis=1) - 0.5 - _SQUARE).astype(np.int64) + 2
         high = np.minimum(np.maximum(high, low + 1), low + size)  # all around once is all
         lit = sum(
             sign * _repeated_sum(sums, x, y)
@@ -155,20 +158,20 @@ def lamps_of(settings: MeshSettings, parts: list[MeshPart]) -> tuple[tuple[Recta
         )
         for k, lamp in enumerate(settings.lamps, 1)
     ]
-    panels: list[tuple[float, Rectangle, int, NDArray[np.bool_]]] = []
+    panels: list[tuple[float, Rectangle, int, NDArray[np.int64]]] = []
     for number, part in enumerate(parts):
         if part.light is None or part.light.picture is not None:
             continue  # dark, or bright in places: no lamp
         radiance = as_vector(settings.emission_w_m2_sr * np.array(part.light.colour))
-        for count, (chosen, pose, size) in enumerate(_rectangles(part), 1):
+        for count, (pair, pose, size) in enumerate(_rectangles(part), 1):
             name = f"{part.name} (lamp {count})"
             panel = Rectangle(name, pose, size, _BLACK, radiance)
-            panels.append((max(radiance) * size[0] * size[1], panel, number, chosen))
+            panels.append((max(radiance) * size[0] * size[1], panel, number, pair))
     panels.sort(key=lambda each: (-each[0], each[1].name))
     rest = {number: np.ones(len(part.triangles), dtype=bool) for number, part in enumerate(parts)}
     is_obj = settings.path.suffix.lower() == ".obj"
     everything: Array | None = None
-    for _, panel, number, chosen in panels:
+    for _, panel, number, pair in panels:
         if len(lamps) >= MOST_LAMPS:
             break
         both, sides = parts[number].two_sided, [panel]
@@ -177,7 +180,7 @@ def lamps_of(settings: MeshSettings, parts: list[MeshPart]) -> tuple[tuple[Recta
             sides = _open_sides(panel, everything, both)
         if len(lamps) + len(sides) <= MOST_LAMPS:
             lamps += sides
-            rest[number] &= ~chosen
+            rest[number][pair] = False
     left = [(part, rest[number]) for number, part in enumerate(parts) if rest[number].any()]
     return tuple(lamps), [part if keep.all() else part.of(keep, part.name) for part, keep in left]
 
@@ -205,8 +208,8 @@ def _lamp(panel: Rectangle, t: Array, R: Array) -> Rectangle:
     return replace(panel, T_world_shape=Pose("world", "shape", as_vector(t), as_matrix(R)))
 
 
-def _rectangles(part: MeshPart) -> Iterator[tuple[NDArray[np.bool_], Pose, tuple[float, float]]]:
-    """Yield pairs of triangles that touch no other and make a rectangle: which, pose, size."""
+def _rectangles(part: MeshPart) -> Iterator[tuple[NDArray[np.int64], Pose, tuple[float, float]]]:
+    """Yield pairs of triangles that touch no other and make a rectangle, of the largest ones: which, pose, size."""
     corners, index = corners_of(part), merged_places(part)
     count = len(index)
     rows = np.repeat(np.arange(count), 3)
@@ -214,11 +217,14 @@ def _rectangles(part: MeshPart) -> Iterator[tuple[NDArray[np.bool_], Pose, tuple
     label = connected_components(links, directed=False)[1][:count]
     order = np.argsort(label, kind="stable")
     sizes = np.bincount(label)
-    for start in (np.cumsum(sizes) - sizes)[sizes == 2]:
-        pair = order[start : start + 2]
+    starts = (np.cumsum(sizes) - sizes)[sizes == 2]
+    pairs = order[starts[:, None] + [0, 1]]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    largest = np.sort(np.argsort(-area[pairs].sum(axis=1), kind="stable")[:_MOST_PANELS])
+    for pair in pairs[largest]:
         frame = _rectangle_frame(corners[pair], index[pair])
         if frame is not None:
-            yield np.isin(np.arange(count), pair), *frame
+            yield pair, *frame
 
 
 def _rectangle_frame(corners: Array, index: NDArray[np.int64]) -> tuple[Pose, tuple[float, float]] | None:

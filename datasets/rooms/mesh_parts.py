@@ -10,7 +10,7 @@ import hashlib
 import math
 import urllib.parse
 from collections.abc import Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,123 +23,6 @@ from phibench.datasets.common.input_files import InputFile
 from phibench.datasets.rooms.room_files import RoomError
 from phibench.scenes.frames import Array, Vector
 from phibench.scenes.validation import printable_line
-
-# Triangles of polygons: fans of convex ones, ears of concave ones.
-#
-# Corners lie in a plane, or nearly. The triangles have the polygon's corners and its sense.
-
-
-_FLAT = 1e-12  # of the polygon's area: turns below it are straight
-
-
-MOST_CUTTING = 30_000_000
-"""Corners that are looked at for all concave polygons of a file together, one for each ear; some 10 s."""
-_TURN_COST = 20  # corners that could be looked at in the time of one turn
-
-
-class CuttingError(ValueError):
-    """Concave polygons that would take too long."""
-
-
-@dataclass
-class Cutting:
-    """Rest of `MOST_CUTTING`: one for each file."""
-
-    left: int = field(default_factory=lambda: MOST_CUTTING)
-
-    def take(self, corners: int) -> None:
-        """Count corners that are looked at."""
-        self.left -= corners
-        if self.left < 0:
-            raise CuttingError("concave polygons of too many corners")
-
-
-def triangulated(points: Array, cutting: Cutting) -> NDArray[np.int64]:
-    """Triangles of one polygon by the numbers of its corners, shape (n - 2, 3).
-
-    Parameters
-    ----------
-    points : shape (n, 3), n from 3 up
-    cutting : Cutting
-
-    Raises
-    ------
-    CuttingError
-        If the concave polygons of the file take too long.
-
-    Notes
-    -----
-    Ears are cut off as G. H. Meisters proves that they exist ("Polygons have ears", 1975). A polygon that crosses
-    itself has no right answer: what is left of it becomes a fan.
-    """
-    count = len(points)
-    fan = np.stack([np.zeros(count - 2, int), np.arange(1, count - 1), np.arange(2, count)], axis=1)
-    if count == 3:
-        return fan
-    normal = _normal(points)
-    size = float(np.linalg.norm(normal))
-    if not size > 0.0:
-        return fan
-    flat = _flattened(points, normal / size)
-    if _is_convex(flat, size):
-        return fan
-    return _by_ears(flat, size, cutting)
-
-
-def _normal(points: Array) -> Array:
-    """Twice the area times the normal (M. E. Newell)."""
-    return np.asarray(np.cross(points - points[0], np.roll(points, -1, axis=0) - points[0]).sum(axis=0))
-
-
-def _flattened(points: Array, normal: Array) -> Array:
-    """Coordinates in the polygon's plane, shape (n, 2), against the clock."""
-    first = np.eye(3)[int(np.argmin(np.abs(normal)))]
-    u = np.cross(normal, first)
-    u /= np.linalg.norm(u)
-    return np.stack([points @ u, points @ np.cross(normal, u)], axis=1)
-
-
-def _turn(a: Array, b: Array, c: Array) -> Array:
-    """Twice the signed area of a, b, c; above 0 against the clock."""
-    return np.asarray(
-        (b[..., 0] - a[..., 0]) * (c[..., 1] - a[..., 1]) - (b[..., 1] - a[..., 1]) * (c[..., 0] - a[..., 0])
-    )
-
-
-def _is_convex(flat: Array, size: float) -> bool:
-    turns = _turn(np.roll(flat, 1, axis=0), flat, np.roll(flat, -1, axis=0))
-    if (turns < -_FLAT * size).any():
-        return False  # a corner turns the other way
-    edges = np.roll(flat, -1, axis=0) - flat
-    angle = np.arctan2(edges[:, 1], edges[:, 0])
-    around = np.angle(np.exp(1j * (np.roll(angle, -1) - angle))).sum()
-    return abs(around - 2.0 * np.pi) < 1.0  # once around: a star that winds twice is not convex
-
-
-def _by_ears(flat: Array, size: float, cutting: Cutting) -> NDArray[np.int64]:
-    left, triangles = list(range(len(flat))), []
-    while len(left) > 3:
-        ear = next((k for k in range(len(left)) if _is_ear(flat, left, k, size, cutting)), None)
-        if ear is None:  # it crosses itself
-            break
-        triangles.append((left[ear - 1], left[ear], left[(ear + 1) % len(left)]))
-        del left[ear]
-    triangles += [(left[0], left[k], left[k + 1]) for k in range(1, len(left) - 1)]
-    return np.array(triangles, np.int64)
-
-
-def _is_ear(flat: Array, left: list[int], k: int, size: float, cutting: Cutting) -> bool:
-    cutting.take(_TURN_COST)
-    a, b, c = left[k - 1], left[k], left[(k + 1) % len(left)]
-    if float(_turn(flat[a], flat[b], flat[c])) <= _FLAT * size:
-        return False  # flat, or turned inwards: no ear
-    cutting.take(len(left))
-    others = flat[[p for p in left if p not in (a, b, c)]]
-    corners = flat[[a, b, c]]
-    others = others[~(others[:, None] == corners).all(axis=2).any(axis=1)]  # a corner that occurs twice is no obstacle
-    inside = [_turn(corners[i], corners[(i + 1) % 3], others) >= -_FLAT * size for i in range(3)]
-    return not bool(np.logical_and.reduce(inside).any())
-
 
 MOST_TRIANGLES = 1_000_000
 MOST_PARTS = 5_000
@@ -231,6 +114,8 @@ class Companions:
     def __init__(self, file: InputFile, one_file: bool) -> None:
         self.file, self.one_file = file, one_file
         self._pictures: dict[str, Picture] = {}
+        self._of_files: dict[Path, Picture] = {}
+        self._holes: dict[Path, bool] = {}
         self._opacities: dict[str, Opacity | None] = {}
 
     def is_there(self, name: str, folder: Path | None = None) -> bool:
@@ -271,10 +156,20 @@ class Companions:
                     return path
         return None
 
-    def picture(self, name: str) -> Picture:
-        """Pixels of a picture that has a file of its own."""
-        file = self.named(name)
-        return self.pixels(file, file.read())
+    def picture(self, file: InputFile) -> Picture:
+        """Pixels of a picture that has a file of its own, which is read once."""
+        if file.path not in self._of_files:
+            self._of_files[file.path] = self.pixels(file, file.read())
+        return self._of_files[file.path]
+
+    def has_holes(self, file: InputFile) -> bool:
+        """Tell whether a picture of opacity is 0 somewhere: its alpha, or its brightness if it is opaque everywhere."""
+        if file.path not in self._holes:
+            data = file.read()
+            alpha = self.opacity(file, data)
+            mask = self.pixels(file, data) if alpha is None or alpha.min() == 255 else alpha
+            self._holes[file.path] = bool(mask.min() == 0)
+        return self._holes[file.path]
 
     def pixels(self, owner: InputFile, data: bytes) -> Picture:
         """Pixels of an encoded picture, 8 bits, sRGB; 16 bits of grey are scaled.
@@ -349,6 +244,7 @@ def leaves_picture(uv: Array, axis: int) -> bool:
     return bool(uv.size) and bool(uv[..., axis].min() < -_OUTSIDE or uv[..., axis].max() > 1.0 + _OUTSIDE)
 
 
+_AT_ONCE = 2000  # triangles
 _STEPS = 16  # of a triangle's sides, at whose places its opacity is looked at
 # middles of parts
 _INSIDE = np.array([(i + 1 / 3, j + 1 / 3) for i in range(_STEPS) for j in range(_STEPS - i)]) / _STEPS
@@ -366,16 +262,20 @@ def opacities(triangles: int, uniform: float, corners: Array | None, uv: Array |
     uv : shape (M, 3, 2), places of the corners on the picture, v upwards, or None
     alpha : picture's alpha, or None for 1
     """
-    values = np.full((triangles, 1), uniform)
-    if corners is not None:
-        values = values * (corners @ _WEIGHTS.T)
-    if uv is not None and alpha is not None:
-        places = np.einsum("sk,mkd->msd", _WEIGHTS, uv)
-        height, width = alpha.shape
-        column = np.floor(places[..., 0] * width).astype(int) % width
-        row = height - 1 - np.floor(places[..., 1] * height).astype(int) % height
-        values = values * (alpha[row, column] / 255.0)
-    return np.stack([values.min(axis=1), values.max(axis=1)], axis=1)
+    result = np.empty((triangles, 2))
+    for start in range(0, triangles, _AT_ONCE):  # a million triangles at once would take gigabytes
+        few = slice(start, start + _AT_ONCE)
+        values = np.full((len(result[few]), 1), uniform)
+        if corners is not None:
+            values = values * (corners[few] @ _WEIGHTS.T)
+        if uv is not None and alpha is not None:
+            places = np.einsum("sk,mkd->msd", _WEIGHTS, uv[few])
+            height, width = alpha.shape
+            column = np.floor(places[..., 0] * width).astype(int) % width
+            row = height - 1 - np.floor(places[..., 1] * height).astype(int) % height
+            values = values * (alpha[row, column] / 255.0)
+        result[few] = np.stack([values.min(axis=1), values.max(axis=1)], axis=1)
+    return result
 
 
 def check_count(file: InputFile, count: int) -> None:

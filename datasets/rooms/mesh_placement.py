@@ -26,7 +26,6 @@ from phibench.datasets.rooms.gltf_file import gltf_parts
 from phibench.datasets.rooms.mesh_parts import (
     REMEDY,
     Companions,
-    CuttingError,
     MeshPart,
     check_count,
     check_part,
@@ -34,6 +33,7 @@ from phibench.datasets.rooms.mesh_parts import (
     damaged,
     named_parts,
 )
+from phibench.datasets.rooms.mesh_polygons import CuttingError
 from phibench.datasets.rooms.obj_file import obj_parts
 from phibench.datasets.rooms.ply_file import ply_parts
 from phibench.datasets.rooms.room_files import RoomError

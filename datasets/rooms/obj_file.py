@@ -25,7 +25,6 @@ from phibench.datasets.rooms.mesh_parts import (
     ROUNDED,
     WHITE,
     Companions,
-    Cutting,
     MeshPart,
     Paint,
     check_count,
@@ -33,8 +32,8 @@ from phibench.datasets.rooms.mesh_parts import (
     damaged,
     leaves_picture,
     three_numbers,
-    triangulated,
 )
+from phibench.datasets.rooms.mesh_polygons import QUAD, Cutting, plain_quads, triangulated
 from phibench.render.sensor.srgb import srgb_decoded
 from phibench.scenes.frames import Array, Vector, as_vector
 from phibench.scenes.validation import printable_line
@@ -268,10 +267,12 @@ def _part(
 ) -> MeshPart:
     points, places, colours = vertices.points, vertices.places, vertices.colours
     corners, uv_corners = [], []
-    for polygon, place in zip(group.corners, group.places, strict=True):
+    plain = plain_quads(points, group.corners)
+    for polygon, place, is_plain in zip(group.corners, group.places, plain, strict=True):
         if max(polygon) >= len(points) or max(place) >= len(places):
             raise file.fault("has faces with vertices or texture coordinates that are not there")
-        pieces = np.array([[0, 1, 2]]) if len(polygon) == 3 else triangulated(points[list(polygon)], cutting)
+        is_triangle = len(polygon) == 3
+        pieces = QUAD[:1] if is_triangle else QUAD if is_plain else triangulated(points[list(polygon)], cutting)
         corners.append(np.array(polygon, np.int64)[pieces])
         uv_corners.append(np.array(place, np.int64)[pieces])
     triangles, numbers = np.concatenate(corners), np.concatenate(uv_corners)
@@ -309,11 +310,7 @@ def _check_holes(file: InputFile, companions: Companions, material: _Material) -
     """Refuse a picture of the opacity that has holes: what is half transparent counts as opaque."""
     if material.mask is None:
         return
-    owner = _file_of(companions, material.mask)
-    alpha = companions.opacity(owner, owner.read())
-    # a picture that is opaque everywhere tells the opacity by its brightness
-    mask = companions.pixels(owner, owner.read()) if alpha is None or alpha.min() == 255 else alpha
-    if mask.min() == 0:
+    if companions.has_holes(_file_of(companions, material.mask)):
         shown = printable_line(material.name, 60)
         raise file.fault(f"has holes in the material '{shown}' (map_d): cut its faces along them, or take map_d away")
 
@@ -336,8 +333,7 @@ def _light(file: InputFile, companions: Companions, material: _Material, uv: Arr
 def _pictured(
     file: InputFile, companions: Companions, material: _Material, found: _Map, colour: Vector, uv: Array | None
 ) -> Paint:
-    owner = _file_of(companions, found)
-    picture = companions.pixels(owner, owner.read())
+    picture = companions.picture(_file_of(companions, found))
     if uv is None:
         shown = printable_line(material.name, 60)
         raise file.fault(f"has faces of the material '{shown}', which has a picture, without texture coordinates")

@@ -22,13 +22,12 @@ from phibench.datasets.common.input_files import InputFile
 from phibench.datasets.rooms.mesh_parts import (
     MOST_TRIANGLES,
     Companions,
-    Cutting,
     MeshPart,
     Paint,
     check_count,
     damaged,
-    triangulated,
 )
+from phibench.datasets.rooms.mesh_polygons import QUAD, Cutting, plain_quads, triangulated
 from phibench.render.sensor.srgb import srgb_decoded
 from phibench.scenes.frames import Array
 from phibench.scenes.validation import printable_line
@@ -315,7 +314,7 @@ def _triangles(file: InputFile, points: Array, polygons: Any) -> tuple[NDArray[n
     triangles: list[Any] = []
     owner: list[int] = []
     corner: list[Any] = []
-    total, cutting = 0, Cutting()
+    total, cutting, plain = 0, Cutting(), plain_quads(points, polygons)
     for number, polygon in enumerate(polygons):
         index = _whole(file, polygon)
         if len(index) < 3:
@@ -324,7 +323,7 @@ def _triangles(file: InputFile, points: Array, polygons: Any) -> tuple[NDArray[n
             raise file.fault(f"has a face of {len(index)} corners: at most {_MOST_CORNERS} are read")
         if index.min() < 0 or index.max() >= len(points):
             raise file.fault("has faces with vertices that are not there")
-        pieces = triangulated(points[index], cutting)
+        pieces = QUAD if plain[number] else triangulated(points[index], cutting)
         total += len(pieces)
         if total > MOST_TRIANGLES:
             check_count(file, total)
@@ -370,7 +369,7 @@ def _picture_paint(
         uv = np.stack([np.asarray(vertex[name], float) for name in places], axis=1)[faces.triangles]
     else:
         raise file.fault(f"names the picture '{printable_line(pictures[0])}' and no texture coordinates")
-    return Paint(picture=companions.picture(pictures[0]), uv=uv)
+    return Paint(picture=companions.picture(companions.named(pictures[0])), uv=uv)
 
 
 def _face_places(file: InputFile, rows: Any, faces: _Faces) -> Array:

@@ -27,7 +27,7 @@ from phibench.calibration.sensor_fit.capture_folder import read_header
 from phibench.datasets.common.camera_pictures import read_camera_picture
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import InputFile
-from phibench.datasets.rooms import mesh_parts
+from phibench.datasets.rooms import mesh_polygons
 from phibench.datasets.rooms.mesh_placement import read_mesh
 from phibench.datasets.rooms.panorama_files import read_light
 from phibench.datasets.rooms.room_files import RoomFiles, checked_data
@@ -138,7 +138,7 @@ def test_polygons_of_ten_thousand_corners(
     form: str, part: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A comb: each tooth is looked at against all others. Time goes with the corners that may be looked at."""
-    monkeypatch.setattr(mesh_parts, "MOST_CUTTING", mesh_parts.MOST_CUTTING // part)
+    monkeypatch.setattr(mesh_polygons, "MOST_CUTTING", mesh_polygons.MOST_CUTTING // part)
     count = 10_000
     points = [(k, 0.0 if k % 2 else 1.0 + k % 7, 0.0) for k in range(count - 1)] + [(0.5 * count, -5.0, 0.0)]
     if form == "obj":

@@ -12,8 +12,9 @@ from helpers.gltf_documents import SQUARE, UV
 from helpers.mesh_files import area, normals, write_obj, write_ply
 from PIL import Image
 
-from phibench.datasets.rooms.mesh_parts import Cutting, MeshPart, triangulated
+from phibench.datasets.rooms.mesh_parts import MeshPart
 from phibench.datasets.rooms.mesh_placement import read_mesh
+from phibench.datasets.rooms.mesh_polygons import Cutting, triangulated
 from phibench.datasets.rooms.room_files import RoomError
 
 # -- OBJ -----------------------------------------------------------------------------------------------------------
