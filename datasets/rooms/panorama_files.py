@@ -4,13 +4,15 @@ Photographs of 8 bits count as sRGB and are turned upright as their EXIF data sa
 All give an array of bands R, G, B in any unit, upper row first.
 
 Radiance HDR: G. Ward, in Graphics Gems II (1991); a pixel holds three mantissas and an exponent e, and means
-mantissa x 2^(e - 136). Rows may be run-length coded, a byte plane at a time.
+mantissa x 2^(e - 136), over all exposures and corrections of colour. Rows may be run-length coded, a byte plane at a
+time. Crops, cube maps and other primaries than Rec. 709 are refused.
 """
 
 from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +21,7 @@ from phibench.datasets.common.camera_pictures import IN_WORDS, read_camera_pictu
 from phibench.datasets.common.input_files import PICTURE_PIXELS, InputFile, quiet_terminal
 from phibench.datasets.rooms.room_files import RoomError
 from phibench.render.sensor.srgb import srgb_decoded
+from phibench.scenes.frames import Array
 from phibench.scenes.validation import printable_line
 
 Light = NDArray[np.float32]
@@ -32,6 +35,8 @@ _HDR_MAGIC = (b"#?RADIANCE", b"#?RGBE")
 _OVERSHOOT = 0.01  # of the light, below 0
 _EXR_MAGIC = b"\x76\x2f\x31\x01"
 _EXR_VALUES = 4 * PICTURE_PIXELS  # of all channels: R, G, B and A of the largest picture
+_PRIMARIES = np.array([0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290])  # Rec. 709, white last
+_OFF = 0.025  # of a coordinate: Radiance's own have green at 0.29 and white at 1/3
 _EXPOSURE = re.compile(rb"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 _ROWS = 256  # decoded at once
 
@@ -103,6 +108,8 @@ def _exr(file: InputFile) -> Light:
         with quiet_terminal(), OpenEXR.File(str(file.path), header_only=True) as opened:
             low, high = (np.asarray(corner, dtype=np.int64) for corner in opened.header()["dataWindow"])
             channels, parts = len(opened.header().get("channels", ())), len(opened.parts)
+            header = dict(opened.header())
+        _check_exr(file, header)
         columns, rows = (high - low + 1).tolist()
         if not (0 < columns and 0 < rows and columns * rows <= PICTURE_PIXELS):
             raise file.fault(f"has {columns} x {rows} pixels: at most {PICTURE_PIXELS:.0e} are read")
@@ -110,10 +117,30 @@ def _exr(file: InputFile) -> Light:
             raise file.fault(f"has {channels} channels in {parts} parts: one part with R, G and B is read")
         with quiet_terminal(), OpenEXR.File(str(file.path), separate_channels=True) as opened:
             planes = {name: np.asarray(channel.pixels) for name, channel in opened.channels().items()}
+    if "R" not in planes and (coded := sorted({"RY", "BY", "X"} & set(planes))):
+        raise file.fault(f"has colours as {' and '.join(['Y', *coded])}, which are not read: save red, green and blue")
     names = ("R", "G", "B") if "R" in planes else ("Y", "Y", "Y")
     if not all(name in planes and planes[name].shape == (rows, columns) for name in names):
         raise file.fault("has no channels R, G and B of one size")
     return np.stack([planes[name].astype(np.float32) for name in names], axis=-1)
+
+
+def _check_exr(file: InputFile, header: dict[str, Any]) -> None:
+    """Refuse what changes the meaning of the pixels: a crop, other primaries, a cube."""
+    windows = [np.array(header[name], np.int64).tolist() for name in ("dataWindow", "displayWindow")]
+    if windows[0] != windows[1]:
+        raise file.fault(
+            f"holds the pixels {windows[0]} (dataWindow) of the picture {windows[1]} (displayWindow): save it uncropped"
+        )
+    if "chromaticities" in header:
+        _check_primaries(file, "chromaticities", np.ravel(header["chromaticities"]))
+    if "cube" in str(header.get("envmap", "")).lower():
+        raise file.fault("is a cube map (envmap): convert it to an equirectangular picture")
+
+
+def _check_primaries(file: InputFile, name: str, values: Array) -> None:
+    if values.shape != (8,) or not np.abs(values - _PRIMARIES).max() <= _OFF:
+        raise file.fault(f"has colours of other primaries than Rec. 709 ({name}): convert it to linear Rec. 709")
 
 
 # Radiance HDR.
@@ -121,7 +148,7 @@ def _exr(file: InputFile) -> Light:
 
 def _hdr(file: InputFile, data: bytes) -> Light:
     head, _, rest = data.partition(b"\n\n")
-    if b"FORMAT=32-bit_rle_rgbe" not in head:
+    if re.findall(rb"^FORMAT=[ \t]*(.*?)\s*$", head, re.M) != [b"32-bit_rle_rgbe"]:
         raise file.fault("is no Radiance file of the format 32-bit_rle_rgbe")
     line, _, pixels = rest.partition(b"\n")
     size = re.fullmatch(rb"-Y (\d{1,6}) \+X (\d{1,6})\s*", line)
@@ -134,13 +161,13 @@ def _hdr(file: InputFile, data: bytes) -> Light:
         coded = _hdr_pixels(pixels, rows, columns)
     except (IndexError, ValueError) as error:
         raise file.fault("is a damaged Radiance file: its rows do not have the stated length") from error
-    exposure = _exposure(file, head)
+    exposure = _exposure(file, head) * _correction(file, head)
     light = np.empty((rows, columns, 3), np.float32)
     for start in range(0, rows, _ROWS):
         lines = coded[start : start + _ROWS]
         # RGBE: 128 of the exponent, 8 of the mantissa's bits
         scale = np.exp2(lines[..., 3].astype(np.int32) - 136.0) * (lines[..., 3] > 0)
-        light[start : start + _ROWS] = lines[..., :3] * (scale / exposure)[..., None]
+        light[start : start + _ROWS] = lines[..., :3] * (scale[..., None] / exposure)
     return light
 
 
@@ -155,12 +182,35 @@ def _exposure(file: InputFile, head: bytes) -> float:
     return exposure
 
 
+def _correction(file: InputFile, head: bytes) -> Array:
+    """Product of all corrections of colour that a header states, shape (3,); other primaries and curves are refused."""
+    correction = np.ones(3)
+    for name, count in ((b"COLORCORR", 3), (b"PRIMARIES", 8), (b"GAMMA", 1)):
+        for text in re.findall(rb"^" + name + rb"=(.*)$", head, re.M):
+            words = text.split()
+            is_plain = len(words) == count and all(_EXPOSURE.fullmatch(word) for word in words)
+            values = np.array([float(word) for word in words]) if is_plain else np.full(count, np.nan)
+            if not values.any():
+                continue  # all 0 is written where nothing is known
+            if name == b"PRIMARIES":
+                _check_primaries(file, "PRIMARIES", values)
+            elif not (1e-30 < values.min() and values.max() < 1e30) or (name == b"GAMMA" and values != 1.0):
+                shown = printable_line(text.decode("latin-1").strip(), 40)
+                raise file.fault(f"has {name.decode()}={shown}, which is not read: save linear light")
+            else:
+                correction *= values
+    return correction
+
+
 def _hdr_pixels(data: bytes, rows: int, columns: int) -> NDArray[np.uint8]:
     """Mantissas and exponents, shape (rows, columns, 4)."""
     if data[:2] != b"\x02\x02" or not 8 <= columns < 32768:  # the newer code's limits, by Radiance's own reader
         if len(data) != 4 * rows * columns:
             raise ValueError("neither plain nor of the newer run-length code")
-        return np.frombuffer(data, np.uint8).reshape(rows, columns, 4)
+        coded = np.frombuffer(data, np.uint8).reshape(rows, columns, 4)
+        if (coded[..., :3] == 1).all(axis=-1).any():  # of a pixel the largest mantissa has 128 or more
+            raise ValueError("runs of the older code")
+        return coded
     result = np.empty((rows, 4, columns), np.uint8)
     at = 0
     for row in result:

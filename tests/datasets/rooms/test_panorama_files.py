@@ -138,3 +138,89 @@ def test_sixteen_bits_are_not_guessed_at(tmp_path):
     Image.fromarray(np.full((16, 32), 40_000, np.uint16)).save(tmp_path / "a.png")
     with pytest.raises(SceneError, match="8 bits"):
         read_light(tmp_path / "a.png")
+
+
+def equal_planes(*names: str) -> dict[str, np.ndarray]:
+    return {name: np.full((16, 32), 0.5, np.float32) for name in names}
+
+
+@pytest.mark.parametrize(
+    ("names", "words"), [(("Y", "RY", "BY"), "colours as Y and BY and RY"), (("X", "Y", "Z"), "colours as Y and X")]
+)
+def test_an_exr_with_colours_of_another_kind_is_not_grey(tmp_path, names, words):
+    with pytest.raises(SceneError, match=words):
+        read_light(write_exr(tmp_path / "a.exr", equal_planes(*names)))
+    assert read_light(write_exr(tmp_path / "b.exr", equal_planes("Y", "Z"))).shape == (16, 32, 3)  # with depths
+
+
+WINDOW = (np.array([0, 8], np.int32), np.array([31, 23], np.int32))
+ACES = (0.7347, 0.2653, 0.0, 1.0, 0.0001, -0.077, 0.32168, 0.33767)
+REC_709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
+
+
+@pytest.mark.parametrize(
+    ("header", "words"),
+    [
+        ({"dataWindow": WINDOW, "displayWindow": (np.array([0, 0], np.int32), WINDOW[1])}, "save it uncropped"),
+        ({"dataWindow": WINDOW, "displayWindow": WINDOW, "chromaticities": REC_709}, ""),
+        ({"chromaticities": ACES}, r"other primaries than Rec\. 709 \(chromaticities\)"),
+    ],
+)
+def test_what_an_exr_header_says_of_its_pixels_counts(tmp_path, header, words):
+    """A crop was stretched over the whole sphere, and wide primaries were taken for those of sRGB."""
+    head = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **header}
+    with OpenEXR.File(head, equal_planes("R", "G", "B")) as file:
+        file.write(str(tmp_path / "a.exr"))
+    if words:
+        with pytest.raises(SceneError, match=words):
+            read_light(tmp_path / "a.exr")
+    else:
+        assert read_light(tmp_path / "a.exr")[0, 0] == pytest.approx([0.5] * 3)
+
+
+def test_a_cube_map_is_no_panorama(tmp_path):
+    """The library writes a number where the definition has a type of its own; of the same length."""
+    head = {"compression": OpenEXR.NO_COMPRESSION, "type": OpenEXR.scanlineimage, "envmap": 1}
+    with OpenEXR.File(head, equal_planes("R", "G", "B")) as file:
+        file.write(str(tmp_path / "a.exr"))
+    number, own = b"envmap\0int\0\4\0\0\0\1\0\0\0", b"envmap\0envmap\0\1\0\0\0\1"
+    data = (tmp_path / "a.exr").read_bytes()
+    assert data.count(number) == 1
+    (tmp_path / "a.exr").write_bytes(data.replace(number, own))
+    with pytest.raises(SceneError, match=r"cube map \(envmap\)"):
+        read_light(tmp_path / "a.exr")
+
+
+@pytest.mark.parametrize(
+    ("line", "factor", "words"),
+    [
+        (b"COLORCORR=2 1 4", (0.5, 1.0, 0.25), ""),
+        (b"COLORCORR=1 0 1", None, "COLORCORR=1 0 1"),
+        (b"PRIMARIES=0.64 0.33 0.29 0.6 0.15 0.06 0.333 0.333", (1.0, 1.0, 1.0), ""),
+        (b"PRIMARIES=0 0 0 0 0 0 0 0", (1.0, 1.0, 1.0), ""),
+        (b"PRIMARIES=0.7347 0.2653 0 1 0.0001 -0.077 0.32168 0.33767", None, r"other primaries than Rec\. 709"),
+        (b"GAMMA=1", (1.0, 1.0, 1.0), ""),
+        (b"GAMMA=2.2", None, r"GAMMA=2\.2, which is not read"),
+        (b"# FORMAT=32-bit_rle_rgbe\nFORMAT=32-bit_rle_xyze", None, "format 32-bit_rle_rgbe"),
+    ],
+)
+def test_what_a_radiance_header_says_of_its_colours_counts(tmp_path, line, factor, words):
+    """Corrections are divided out, as exposures are; others were passed over."""
+    (tmp_path / "a.hdr").write_bytes(plain_hdr(LIGHT))
+    head = b"#?RADIANCE\n" + (b"" if b"xyze" in line else b"FORMAT=32-bit_rle_rgbe\n") + line + b"\n"
+    (tmp_path / "b.hdr").write_bytes(plain_hdr(LIGHT, head))
+    if words:
+        with pytest.raises(SceneError, match=words):
+            read_light(tmp_path / "b.hdr")
+    else:
+        expected = read_light(tmp_path / "a.hdr") * np.array(factor)
+        np.testing.assert_allclose(read_light(tmp_path / "b.hdr"), expected, rtol=1e-6)
+
+
+def test_runs_of_the_older_code_are_no_pixels(tmp_path):
+    """A pixel of mantissas 1, 1, 1 repeats the one before; a file of another length was refused before."""
+    data = bytearray(plain_hdr(LIGHT))
+    data[-4:] = bytes((1, 1, 1, 4))
+    (tmp_path / "a.hdr").write_bytes(data)
+    with pytest.raises(SceneError, match="do not have the stated length"):
+        read_light(tmp_path / "a.hdr")
