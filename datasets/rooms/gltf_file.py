@@ -21,7 +21,6 @@ from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import InputFile
 from phibench.datasets.rooms.gltf_arrays import GltfDocument
 from phibench.datasets.rooms.gltf_material import GltfMaterial, GltfTexture, gltf_material
-from phibench.datasets.rooms.gltf_sampling import finer, framed, mirrored, nearest_places, reaches_edge
 from phibench.datasets.rooms.mesh_parts import (
     ROUNDED,
     Companions,
@@ -35,6 +34,7 @@ from phibench.datasets.rooms.mesh_parts import (
     leaves_picture,
     opacities,
 )
+from phibench.datasets.rooms.samplers import finer, framed, mirrored, nearest_places, reaches_edge
 from phibench.scenes.frames import Array, Vector
 from phibench.scenes.validation import printable_line
 

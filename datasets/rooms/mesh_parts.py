@@ -21,6 +21,7 @@ from PIL.Image import Image
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import InputFile
 from phibench.datasets.rooms.room_files import RoomError
+from phibench.datasets.rooms.samplers import framed
 from phibench.scenes.frames import Array, Vector
 from phibench.scenes.validation import printable_line
 
@@ -36,6 +37,7 @@ BRIGHTEST = 1e6
 """Of an emission, in units of the file."""
 ROUNDED = 1e-6
 """By which numbers that are written as 32-bit floats may be off: a colour may end at 1.000001."""
+_ORIENTATION = 0x0112  # EXIF's tag
 _GREY_16 = ("I", "I;16", "I;16L", "I;16B")
 _OF_8_BITS = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBX")
 _OUTSIDE = 1e-5  # by which coordinates may leave a picture that does not repeat
@@ -114,7 +116,7 @@ class Companions:
     def __init__(self, file: InputFile, one_file: bool) -> None:
         self.file, self.one_file = file, one_file
         self._pictures: dict[str, Picture] = {}
-        self._of_files: dict[Path, Picture] = {}
+        self._of_files: dict[tuple[Path, bool], Picture] = {}
         self._holes: dict[Path, bool] = {}
         self._opacities: dict[str, Opacity | None] = {}
 
@@ -156,11 +158,12 @@ class Companions:
                     return path
         return None
 
-    def picture(self, file: InputFile) -> Picture:
-        """Pixels of a picture that has a file of its own, which is read once."""
-        if file.path not in self._of_files:
-            self._of_files[file.path] = self.pixels(file, file.read())
-        return self._of_files[file.path]
+    def picture(self, file: InputFile, is_framed: bool = False) -> Picture:
+        """Pixels of a picture that has a file of its own, which is read once; `framed` if it ends at its edges."""
+        key = (file.path, is_framed)
+        if key not in self._of_files:
+            self._of_files[key] = framed(self.picture(file), (0, 1)) if is_framed else self.pixels(file, file.read())
+        return self._of_files[key]
 
     def has_holes(self, file: InputFile) -> bool:
         """Tell whether a picture of opacity is 0 somewhere: its alpha, or its brightness if it is opaque everywhere."""
@@ -209,6 +212,12 @@ def _alpha(image: Image) -> Opacity | None:
 
 def _pixels(owner: InputFile, data: bytes) -> Picture:
     image = owner.picture(PICTURES, data)
+    with owner.decoding("has damaged EXIF data; `exiftool -all= FILE` removes them"):
+        orientation = image.getexif().get(_ORIENTATION, 1)
+    if orientation not in (0, 1):
+        raise owner.fault(
+            f"has a picture of the EXIF orientation {orientation}, by which some readers turn it: save it upright"
+        )
     if image.mode in _GREY_16:
         grey = np.asarray(image, float)
         if image.format == "TIFF":  # bits, white as 0, sign: Pillow gives the numbers as they are

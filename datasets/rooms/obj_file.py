@@ -333,13 +333,16 @@ def _light(file: InputFile, companions: Companions, material: _Material, uv: Arr
 def _pictured(
     file: InputFile, companions: Companions, material: _Material, found: _Map, colour: Vector, uv: Array | None
 ) -> Paint:
-    picture = companions.picture(_file_of(companions, found))
+    picture = companions.picture(_file_of(companions, found), found.clamped)
     if uv is None:
         shown = printable_line(material.name, 60)
         raise file.fault(f"has faces of the material '{shown}', which has a picture, without texture coordinates")
     moved = uv * np.array(found.scale) + np.array(found.offset)
     if found.clamped and any(leaves_picture(moved, axis) for axis in (0, 1)):
         raise file.fault(f"has a picture that ends at its edges (-clamp on) in '{printable_line(material.name, 60)}'")
+    if found.clamped:
+        size = np.array(picture.shape[1::-1]) - 2.0
+        moved = (moved * size + 1.0) / (size + 2.0)
     return Paint(colour, picture, moved)
 
 
@@ -354,7 +357,7 @@ def _file_of(companions: Companions, found: _Map) -> InputFile:
 def _materials(companions: Companions, libraries: list[str]) -> dict[str, list[_Material]]:
     """Materials by their names; of one name several, if they differ."""
     materials: dict[str, list[_Material]] = {}
-    for line in libraries:
+    for line in dict.fromkeys(libraries):
         # one name with blanks, or several names
         whole = next((name for name in (line, _without_comment(line)) if companions.is_there(name)), "")
         for name in [whole] if whole else _without_comment(line).split() or [line]:

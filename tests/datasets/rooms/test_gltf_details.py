@@ -179,6 +179,22 @@ def test_a_grey_tiff_of_more_bits_has_its_values(
     assert np.unique(part.paint.picture).tolist() == [code]
 
 
+@pytest.mark.parametrize(("orientation", "words"), [(1, ""), (6, "EXIF orientation 6")])
+def test_a_picture_that_some_readers_turn_is_told(tmp_path: Path, orientation: int, words: str) -> None:
+    document, exif, stream = Gltf(), Image.Exif(), io.BytesIO()
+    exif[0x0112] = orientation
+    Image.new("RGB", (8, 8)).save(stream, "JPEG", exif=exif)
+    document.primitive["attributes"]["TEXCOORD_0"] = document.array(UV)
+    document.tree["images"] = [{"bufferView": document.view(stream.getvalue())}]
+    document.tree["textures"] = [{"source": 0}]
+    document.material(pbrMetallicRoughness={"baseColorTexture": {"index": 0}})
+    if words:
+        with pytest.raises(RoomError, match=words):
+            document.read(tmp_path)
+    else:
+        assert document.one(tmp_path).paint is not None
+
+
 def test_long_chains_of_nodes_are_trees(tmp_path: Path) -> None:
     document = Gltf()
     chain = [{"children": [k + 1], "translation": [0.01, 0, 0]} for k in range(300)]

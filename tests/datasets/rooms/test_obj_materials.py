@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from phibench.datasets.common.input_files import InputFile
 from phibench.datasets.rooms import obj_file
 from phibench.datasets.rooms.mesh_parts import MeshPart
 from phibench.datasets.rooms.mesh_placement import read_mesh
 from phibench.datasets.rooms.room_files import RoomError
+from phibench.scenes.shapes import Bitmap
 
 V = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
 VT = "vt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n"
@@ -136,3 +138,25 @@ def test_a_line_without_end_is_refused(tmp_path: Path, monkeypatch: pytest.Monke
     monkeypatch.setattr(obj_file, "_LONGEST_LINE", 1000)
     with pytest.raises(RoomError, match="a line of 2001 characters: at most 1000"):
         obj(tmp_path, V + "f" + " 1" * 1000 + "\n")
+
+
+@pytest.mark.parametrize("option", ["-clamp on", "-clamp off"])
+def test_a_clamped_picture_ends_at_its_edges(tmp_path: Path, option: str) -> None:
+    """Half a texel of its other side shone through; at v = 0 in the middle of the lower row, between both otherwise."""
+    pixels = np.array([[RED] * 2, [GREEN] * 2])
+    Image.fromarray(np.uint8(255 * pixels)).save(tmp_path / "f.png")
+    [part] = obj(tmp_path, USED, f"newmtl a\nmap_Kd {option} f.png\n")
+    assert part.paint is not None
+    assert part.paint.picture is not None
+    assert part.paint.uv is not None
+    values = np.concatenate([part.paint.picture[::-1], part.paint.picture[::-1, :, :1]], axis=-1) / np.float32(255)
+    bitmap = Bitmap(values, (1.0, 1.0))
+    lower = bitmap.sample(part.paint.uv[0, 0] * part.paint.picture.shape[1::-1])[:3]
+    np.testing.assert_allclose(lower, GREEN if option == "-clamp on" else (0.5, 0.5, 0.0), atol=1e-6)
+
+
+def test_a_library_is_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    read, whole = [], InputFile.read
+    monkeypatch.setattr(InputFile, "read", lambda file: read.append(file.path.suffix) or whole(file))
+    assert len(obj(tmp_path, "mtllib a.mtl\n" * 50 + USED, "newmtl a\nKd 1 0 0\n")) == 1
+    assert sorted(read) == [".mtl", ".obj"]
