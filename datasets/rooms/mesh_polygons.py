@@ -80,13 +80,13 @@ def plain_quads(points: Array, polygons: Any) -> NDArray[np.bool_]:
     if not plain.any():
         return plain
     index = np.array([polygon for polygon, four in zip(polygons, plain, strict=True) if four]).astype(np.int64)
-    there = ((index >= 0) & (index < len(points))).all(axis=1)
+    there = np.all((index >= 0) & (index < len(points)), axis=1)
     corners = points[np.where(there[:, None], index, 0)]
     along = np.roll(corners, -1, axis=1) - corners
     turns = np.cross(np.roll(along, 1, axis=1), along)
     normal = np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])  # twice the area, as Newell's
     size = np.einsum("ni,ni->n", normal, normal)
-    plain[plain] = there & (np.einsum("nki,ni->nk", turns, normal) > _FLAT * size[:, None]).all(axis=1)
+    plain[plain] = there & np.all(np.einsum("nki,ni->nk", turns, normal) > _FLAT * size[:, None], axis=1)
     return plain
 
 
