@@ -199,7 +199,7 @@ class _AsciiBody:
         self.at = 0
 
     def rest(self) -> str:
-        """What follows the last element."""
+        """Tell how much follows the last element."""
         left = len(self.numbers) - self.at
         return f"{left} numbers" if left else ""
 
@@ -233,7 +233,7 @@ class _BinaryBody:
         self.file, self.data, self.order, self.at = file, data, order, 0
 
     def rest(self) -> str:
-        """What follows the last element; blanks and zeros are padding."""
+        """Tell how much follows the last element; blanks and zeros are padding."""
         left = len(self.data) - self.at
         return f"{left} bytes" if self.data[self.at :].strip(b" \t\r\n\0") else ""
 
