@@ -6,7 +6,7 @@ temporal and the spatial variance of a rounded Gaussian whose place between two 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,8 @@ from phibench.scenes.frames import Array
 
 _BLOCKS = 8  # along each side; sigma of sigma is 1 / sqrt(2 x 63) = 9 %
 _BOX = 5  # pixels of one filter
+_FULL_SHARE = 1e-3  # of values at the last code, from which on they take 0.1 % of the noise
+_PART, _BRIGHTER, _FALLEN = 8, 1.1, 0.8  # blocks, their signal over the median ones', and the noise of full ones
 _ROW_SIGMAS = 4.0  # below it row noise is not told from none, and is left out
 _FRAME_SIGMAS = 8.0  # chi-square with 1 degree of freedom exceeds 1 + 8 sqrt 2 once in 2e3, with 15 once in 1e6
 
@@ -33,8 +35,10 @@ class BlockSums:
     mean : sum of the pixels' means, DN
     temporal : sum of the pixels' variances from frame to frame, DN^2
     spatial : sum of squares of the pixels' means after shading is removed, DN^2
+    shade : sum of squares of the shading, DN^2
     frames : number of frames
-    full, zero : shares of values at the last code and at 0
+    full : share of values at the last code
+    lowest, at_lowest : least code, and the share of values at it
     flicker_dn2 : variance of the mean of all frames, of the scatter of the frames' means
     """
 
@@ -42,9 +46,11 @@ class BlockSums:
     mean: Array
     temporal: Array
     spatial: Array
+    shade: Array
     frames: int
     full: float
-    zero: float
+    lowest: int
+    at_lowest: float
     flicker_dn2: float
 
     def jackknife(self) -> BlockSums:
@@ -53,8 +59,9 @@ class BlockSums:
         def totals(x: Array) -> Array:
             return np.concatenate([[x.sum()], x.sum() - x])
 
-        pixels, mean, temporal, spatial = (totals(x) for x in (self.pixels, self.mean, self.temporal, self.spatial))
-        return BlockSums(pixels, mean, temporal, spatial, self.frames, self.full, self.zero, self.flicker_dn2)
+        sums = (totals(x) for x in (self.pixels, self.mean, self.temporal, self.spatial, self.shade))
+        pixels, mean, temporal, spatial, shade = sums
+        return replace(self, pixels=pixels, mean=mean, temporal=temporal, spatial=spatial, shade=shade)
 
     @property
     def mean_dn(self) -> Array:
@@ -67,9 +74,46 @@ class BlockSums:
         return self.temporal / self.pixels
 
     @property
+    def shade_dn2(self) -> Array:
+        """Variance of the shading."""
+        return self.shade / self.pixels - self.mean_dn**2
+
+    @property
     def spatial_dn2(self) -> Array:
         """Variance of the fixed pattern."""
         return self.spatial / self.pixels - self.temporal_dn2 / self.frames
+
+    def is_partly_full(self, dark: BlockSums) -> bool:
+        """Part of the picture is saturated, at the converter's end or below it, where shading makes that part bright.
+
+        Of the jackknife's totals. Hot pixels are full in the dark, too.
+        """
+        if self.full > dark.full + _FULL_SHARE:
+            return True
+        pixels, mean, noise = (x[0] - x[1:] for x in (self.pixels, self.mean, self.temporal))
+        order = np.argsort(mean / pixels)
+        (usual, bright), (usual_noise, bright_noise) = (
+            [x[part].sum() / pixels[part].sum() for part in (order[len(order) // 2 :][:_PART], order[-_PART:])]
+            for x in (mean, noise)
+        )
+        black = float(dark.mean_dn[0])
+        return bool(bright - black > _BRIGHTER * (usual - black) and bright_noise < _FALLEN * usual_noise)
+
+    def uneven(self, dark: BlockSums) -> tuple[float, float]:
+        """Variance of noise over signal from block to block, relative, less what counting adds; and its own sigma.
+
+        Of the jackknife's totals.
+        """
+        pixels, mean, noise = (x[0] - x[1:] for x in (self.pixels, self.mean, self.temporal))
+        signal, excess = mean / pixels - dark.mean_dn[0], noise / pixels - dark.temporal_dn2[0]
+        share = excess / np.maximum(signal, 1e-9)
+        usual = float(np.median(share))
+        if usual <= 0.0:
+            return 0.0, 1.0
+        spread = 1.4826 * float(np.median(np.abs(share - usual))) / usual  # no block of defects rules
+        freedom = np.maximum(pixels * (self.frames - 1), 1.0)
+        counted = float(np.median(2.0 / freedom * (noise / pixels / np.maximum(excess, 1e-9)) ** 2))
+        return spread**2 - counted, 0.3 * counted  # of a median absolute deviation of 64: 13 % of sigma
 
 
 def block_sums(frames: NDArray[Any], top_dn: int) -> BlockSums:
@@ -84,15 +128,19 @@ def block_sums(frames: NDArray[Any], top_dn: int) -> BlockSums:
         square += change * change
     pixel_mean = total / n + levels.mean()
     temporal = (square - total * total / n) / (n - 1)
-    rough = pixel_mean - uniform_filter(pixel_mean, _BOX, mode="reflect")
+    shade = uniform_filter(pixel_mean, _BOX, mode="reflect")
+    rough = pixel_mean - shade
     half = _BOX // 2
     inner = (slice(half, -half),) * 2
+    rough -= rough[inner].mean()  # shading that bends as much everywhere is no pattern
     spatial = rough[inner] ** 2 / (1.0 - 1.0 / _BOX**2)
     pixels, mean, noise = (_by_blocks(x[inner]) for x in (np.ones_like(pixel_mean), pixel_mean, temporal))
     full = sum(int((frame >= top_dn).sum()) for frame in frames) / frames.size
-    zero = sum(int((frame <= 0).sum()) for frame in frames) / frames.size
+    lowest = int(frames.min())
+    at_lowest = int((frames == lowest).sum()) / frames.size
     flicker = float(levels.var(ddof=1)) / n
-    return BlockSums(pixels, mean, noise, _by_blocks(spatial), n, full, zero, flicker)
+    squares = _by_blocks(spatial), _by_blocks(shade[inner] ** 2)
+    return BlockSums(pixels, mean, noise, *squares, n, full, lowest, at_lowest, flicker)
 
 
 def _by_blocks(values: Array) -> Array:

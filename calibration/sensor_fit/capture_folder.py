@@ -14,6 +14,7 @@ R, G, B, or the camera's JPEG. `docs/capture.py` writes such a folder.
 
 from __future__ import annotations
 
+import hashlib
 import io
 import re
 import struct
@@ -41,6 +42,7 @@ _SUFFIXES = (".png", ".pgm", ".tif", ".tiff", ".bmp", ".yuyv", ".jpg", ".jpeg")
 _DRIFT = 0.02  # of the mean, from the least to the largest frame mean of one level
 _DRIFT_OF_RANGE = 0.0025  # of full scale: levels near zero jitter by more than a share of themselves
 _DRIFT_SIGMAS = 8.0  # of the frames' means: their own noise is no drift
+_SHAPE = "16 pixels or more of each filter along both sides are needed"
 _FRAME_BYTES = 512 * 2**20  # 250 million pixels of 16 bits
 
 
@@ -143,7 +145,7 @@ class Capture:
         Raises
         ------
         CaptureError
-            If there is one frame only, or the level drifts.
+            If there is one frame only, one came twice, or the level drifts.
         """
         if len(group.files) < 2:
             raise CaptureError(
@@ -151,7 +153,26 @@ class Capture:
             )
         frames = np.stack([self.read(path) for path in group.files])
         self._refuse_drift(group, frames)
+        self._refuse_twins(group, frames)
         return frames
+
+    def _refuse_twins(self, group: FrameGroup, frames: NDArray[Any]) -> None:
+        """Refuse one frame under two names: its noise counts once. Frames of one or two codes may be alike."""
+        for k, twin in self._twins(frames):
+            if np.median(np.abs(np.diff(frames[k].astype(float), n=2, axis=0))) >= 1.0:
+                one, other = (group.files[i].name for i in (twin, k))
+                raise CaptureError(
+                    f"{self.folder / group.name}: {one} and {other} are the same frame; noise needs frames that were "
+                    "taken one by one, so drop what the camera or its program sent twice"
+                )
+
+    @staticmethod
+    def _twins(frames: NDArray[Any]) -> Iterator[tuple[int, int]]:
+        first: dict[bytes, int] = {}
+        for k, frame in enumerate(frames):
+            twin = first.setdefault(hashlib.sha256(frame.tobytes()).digest(), k)
+            if twin != k:
+                yield k, twin
 
     def _refuse_drift(self, group: FrameGroup, frames: NDArray[Any]) -> None:
         values = frames[..., 0] if self.kind == "yuyv" else frames
@@ -232,6 +253,47 @@ def read_frame(path: Path, notes: CaptureNotes) -> tuple[Kind, NDArray[Any]]:
     if picture.mode in ("RGB", "RGBA", "RGBX"):
         return "srgb8", picture.pixels
     raise file.fault(f"has the mode {picture.mode}: one plane (raw), two (YUYV) or R, G, B are read")
+
+
+def raw_frames(capture: Capture, group: FrameGroup) -> NDArray[Any]:
+    """Raw frames of one level, shape (n, h, w).
+
+    Raises
+    ------
+    CaptureError
+        If they are not codes of the stated bits as a converter writes them, or too small.
+    """
+    frames, top = capture.stack(group), (1 << capture.notes.bits) - 1
+    if int(frames.max()) > top:
+        raise CaptureError(
+            f"{capture.folder / group.name} has the code {int(frames.max())}, and {capture.notes.bits} bits end at "
+            f"{top}: write `bits` into capture.toml, and give codes that are not scaled to 16 bits"
+        )
+    codes = np.flatnonzero(np.bincount(frames[0].ravel()))
+    step = int(np.diff(codes).min()) if len(codes) > 2 else 1
+    if step > 1:  # rounding is a whole step then, and not one code
+        unused = step.bit_length() - 1
+        stretched = top / (top >> unused)  # of a program that makes the last code the last one of more bits
+        most = 1.0 if step > 3 else 0.5  # upper bits that are repeated below are up to 1 off
+        shifted = any(np.abs(codes - s * np.rint(codes / s)).max() <= most for s in (1 << unused, stretched))
+        remedy = (
+            f"which a program scaled: shift them right by {unused} bits, and write bits = "
+            f"{capture.notes.bits - unused} into capture.toml"
+            if shifted
+            else "which a table or a digital gain spread: give the codes of the converter"
+        )
+        raise CaptureError(f"{capture.folder / group.name} has codes {step} or more apart, {remedy}")
+    if min(frames.shape[1:]) < 32:
+        raise CaptureError(f"{capture.folder / group.name}: {frames.shape[2]} x {frames.shape[1]} pixels; {_SHAPE}")
+    return frames
+
+
+def of_filters(frames: NDArray[Any], kind: Kind) -> list[tuple[str, NDArray[Any]]]:
+    """Pixels of each filter of an RGGB mosaic, or all of them."""
+    if kind == "mono-raw":
+        return [("mono", frames)]
+    names = (("R", 0, 0), ("G1", 0, 1), ("G2", 1, 0), ("B", 1, 1))
+    return [(name, frames[:, row::2, column::2]) for name, row, column in names]
 
 
 def _yuyv(file: InputFile, notes: CaptureNotes) -> NDArray[np.uint8]:

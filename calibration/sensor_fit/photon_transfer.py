@@ -2,22 +2,20 @@
 
 Terms and equations are those of EMVA 1288, release 4.0. The variance from frame to frame of a level against its mean
 has the slope K. The variance from pixel to pixel of the mean frame is the fixed pattern, after what temporal noise adds
-has been taken off. Four things differ:
+has been taken off. Five things differ:
 
 * Whether the line is straight is asked, and a response that bends is fitted: see `response_fit`.
 * Rounding at a noise below half a code has its exact moments: see `block_sums`.
-* Shading of lamp and lens is removed by a mean over 5 x 5 pixels of one filter. Of white noise 24/25 of the variance
-  remain.
-* Sigmas come from a jackknife over blocks of pixels: everything is estimated again without one block.
+* Shading of lamp and lens is removed by a mean over 5 x 5 pixels of one filter; 24/25 of white noise remain.
+* Sigmas come from a jackknife over blocks of pixels: all is estimated again without one.
+* Whether the frames are raw ones is asked: see `noise_likeness`.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from phibench.calibration.sensor_fit.block_sums import (
@@ -28,19 +26,28 @@ from phibench.calibration.sensor_fit.block_sums import (
     common_noise,
     jackknife_sigma,
 )
-from phibench.calibration.sensor_fit.capture_folder import Capture, CaptureError, FrameGroup
-from phibench.calibration.sensor_fit.response_fit import LightLevel, NoiseOfLevel, Response, fit_linearity, fit_response
+from phibench.calibration.sensor_fit.capture_folder import Capture, CaptureError, FrameGroup, of_filters, raw_frames
+from phibench.calibration.sensor_fit.noise_likeness import NoiseLikeness, noise_likeness, raw_noise
+from phibench.calibration.sensor_fit.response_fit import (
+    LightLevel,
+    NoiseOfLevel,
+    Response,
+    fit_linearity,
+    fit_response,
+    intercept,
+)
 from phibench.scenes.frames import Array
 
 _MARGIN_SIGMAS = 6.0  # a level is used if so many deviations of its noise lie below saturation
+_ONE_CODE = 0.999  # of the dark values
 _HIDDEN_DN = 0.15  # noise below it leaves too few codes to be told from rounding
 _NARROW_DN = 0.4  # noise below it does not smooth the steps of codes: 1 % of a code is left of them
 _THIRD_CODE = 30.0  # values of a third code, below which the noise is that of any width
 _ROUNDING_DN = 12.0**-0.5  # of a level that rounding hides
 _CUT = 1e-3  # of dark values at the converter's lower end: below, their variance lacks less than 1 %
+_DARKER, _DARKER_DN = 0.005, 1.0  # of the range: dark levels move by less
 _FAINT = 0.02  # of the range: below, a level's noise over its signal says nothing
 _BY_GAIN = ("gain_dn_per_e", "dark_e_per_s", "read_noise_e", "row_noise_e", "dsnu_e", "full_well_e")
-_SHAPE = "16 pixels or more of each filter along both sides are needed"
 
 
 @dataclass(frozen=True)
@@ -88,6 +95,7 @@ class _Level:
     sums: BlockSums
     light: tuple[float, str] | None = None  # photons or seconds
     seconds: float | None = None
+    likeness: NoiseLikeness | None = None
 
 
 def fit_transfer(capture: Capture) -> TransferFit:
@@ -103,11 +111,11 @@ def fit_transfer(capture: Capture) -> TransferFit:
     if not capture.flats:
         raise CaptureError(f"{capture.folder} has no flat frames: put frames of an even surface into flat/LEVEL/")
     top = (1 << capture.notes.bits) - 1
-    dark_frames = _frames(capture, capture.dark, top)
+    dark_frames = raw_frames(capture, capture.dark)
     levels = [level for group in capture.flats for level in _levels(capture, group, top)]
     exposures = [level for group in capture.exposures if len(group.files) > 1 for level in _levels(capture, group, top)]
     timed = [
-        (float(group.seconds or 0.0), block_sums(_frames(capture, group, top), top).jackknife())
+        (float(group.seconds or 0.0), block_sums(raw_frames(capture, group), top).jackknife())
         for group in capture.dark_exposures
     ]
     dark = block_sums(dark_frames, top).jackknife()
@@ -119,38 +127,12 @@ def _levels(capture: Capture, group: FrameGroup, top: int) -> list[_Level]:
     light = (group.photons, "photons") if group.photons is not None else None
     if group.name.startswith("exposure/"):
         light = (group.seconds or 0.0, "seconds")
+    frames = raw_frames(capture, group)
+    likeness = noise_likeness(frames, 1 if capture.kind == "mono-raw" else 2)
     return [
-        _Level(group.name, site, block_sums(pixels, top).jackknife(), light, group.seconds)
-        for site, pixels in _sites(_frames(capture, group, top), capture.kind)
+        _Level(group.name, site, block_sums(pixels, top).jackknife(), light, group.seconds, likeness)
+        for site, pixels in of_filters(frames, capture.kind)
     ]
-
-
-def _frames(capture: Capture, group: FrameGroup, top: int) -> NDArray[Any]:
-    frames = capture.stack(group)
-    if int(frames.max()) > top:
-        raise CaptureError(
-            f"{capture.folder / group.name} has the code {int(frames.max())}, and {capture.notes.bits} bits end at "
-            f"{top}: write `bits` into capture.toml, and give codes that are not scaled to 16 bits"
-        )
-    codes = np.flatnonzero(np.bincount(frames[0].ravel()))
-    step = int(np.diff(codes).min()) if len(codes) > 2 else 1
-    if step > 1:  # rounding is a whole step then, and not one code
-        unused = step.bit_length() - 1
-        raise CaptureError(
-            f"{capture.folder / group.name} has codes {step} or more apart, which a program scaled: shift them right "
-            f"by {unused} bits, and write bits = {capture.notes.bits - unused} into capture.toml"
-        )
-    if min(frames.shape[1:]) < 32:
-        raise CaptureError(f"{capture.folder / group.name}: {frames.shape[2]} x {frames.shape[1]} pixels; {_SHAPE}")
-    return frames
-
-
-def _sites(frames: NDArray[Any], kind: str) -> list[tuple[str, NDArray[Any]]]:
-    """Pixels of each filter of an RGGB mosaic, or all of them."""
-    if kind == "mono-raw":
-        return [("mono", frames)]
-    names = (("R", 0, 0), ("G1", 0, 1), ("G2", 1, 0), ("B", 1, 1))
-    return [(name, frames[:, row::2, column::2]) for name, row, column in names]
 
 
 class _Fit:
@@ -177,6 +159,8 @@ class _Fit:
             self.dark_dn2 = np.maximum(dark.temporal_dn2 - 1.0 / 12.0, 0.0)
         self.values: dict[str, Array] = {}
         self.extra: dict[str, float] = {}
+        # relative standard deviations, beside that of the response: of the gain, and of it by the noise's likeness
+        self.gain_doubt, self.noise_doubt = 0.0, 0.0
         self.reasons: dict[str, str] = {}
         self.measured: dict[str, tuple[float | list[float], float | list[float], str]] = {}
         self.findings: dict[str, str] = {}
@@ -184,13 +168,17 @@ class _Fit:
     def result(self) -> TransferFit:
         used = self._usable()
         response = self._response(used)
+        self._raw_noise(used)
         self.values["gain_dn_per_e"] = response.gain / self.notes.analogue_gain
         dark_dn_per_s = self._dark_current(response.gain)
         self._noise(response.gain, dark_dn_per_s / response.gain)
         self._prnu(used, response)
         self._full_well(response)
         self._linearity(float(dark_dn_per_s[0]))
-        points = tuple(self._point(level, level in used) for level in self.levels)
+        points = tuple(
+            TransferPoint(one.name, one.site, float(self._signal(one)[0]), self._excess(one), one in used)
+            for one in self.levels
+        )
         values = {name: float(x[0]) for name, x in self.values.items()}
         return TransferFit(
             values,
@@ -207,12 +195,25 @@ class _Fit:
         """Of the blocks, of what frames and rows have in common, and of the choice of the response."""
         own = self.extra.get(name, 0.0)
         # numbers in electrons carry the relative error of the gain
-        by_gain = abs(float(x[0])) * response.spread / float(response.gain[0]) if name in _BY_GAIN else 0.0
+        doubt = float(np.hypot(response.spread / float(response.gain[0]), self.gain_doubt))
+        by_gain = abs(float(x[0])) * doubt if name in _BY_GAIN else 0.0
         return float(np.sqrt(jackknife_sigma(x) ** 2 + own**2 + by_gain**2))
 
     def _usable(self) -> list[_Level]:
+        darkest = min(self.levels, key=lambda level: float(self._signal(level)[0]))
+        if self._signal(darkest)[0] < -max(_DARKER * self._range, _DARKER_DN):
+            raise CaptureError(
+                f"{self.folder / darkest.name} is darker than dark/, {darkest.sums.mean_dn[0]:.1f} and "
+                f"{self.dark.mean_dn[0]:.1f} DN: cap the lens for dark/, and look whether folders were exchanged"
+            )
         ceiling = self._ceiling()
-        used = [level for level in self.levels if self._reach(level) < ceiling and self._signal(level)[0] > 0.0]
+        used = [
+            level
+            for level in self.levels
+            if self._reach(level) < ceiling
+            and self._signal(level)[0] > 0.0
+            and not level.sums.is_partly_full(self.dark)
+        ]
         if not used and any(self._reach(level) < self.top for level in self._plateau()):
             raise self._no_growth()
         if not used:
@@ -228,6 +229,11 @@ class _Fit:
         s = one.sums
         # brightest pixel that is to be expected: noise and fixed pattern together
         return float(s.mean_dn[0] + _MARGIN_SIGMAS * np.sqrt(s.temporal_dn2[0] + max(s.spatial_dn2[0], 0.0)))
+
+    @staticmethod
+    def _is_wide(one: _Level) -> bool:
+        """Behind less noise, rounding hides or doubles small differences of pixels."""
+        return bool(one.sums.temporal_dn2[0] > _NARROW_DN**2 + 1.0 / 12.0)
 
     def _plateau(self) -> list[_Level]:
         """Levels at which the wells are full: hardly more noise than in the dark, below the last code."""
@@ -267,17 +273,22 @@ class _Fit:
             for level in used
         ]
         no_dark = self._is_cut or self.is_hidden  # the dark frames' own variance says nothing
-        dark_dn2 = _intercept(levels) if no_dark and len({level.name for level in used}) > 1 else self.dark_dn2
+        dark_dn2 = intercept(levels) if no_dark and len({level.name for level in used}) > 1 else self.dark_dn2
         try:
             response = fit_response(levels, dark_dn2, self._range)
         except ValueError:
             raise self._no_growth() from None
+        if response.sigma > float(response.gain[0]):
+            raise CaptureError(
+                f"{self.folder}: no response explains the noise of flat/, a straight line leaves "
+                f"{response.straight_misfit:.3g} times its variance: take all levels with one gain and one setting"
+            )
         signal = np.array([float(level.signal_dn[0]) for level in levels])
         unknown = float(response.gain[0]) * self._unknown_black() * float(signal.sum() / np.sum(signal**2))
         if no_dark and response.is_bent:  # a line through levels that bend has another intercept
             other = fit_response(levels, self.dark_dn2, self._range)
             unknown = float(np.hypot(unknown, other.gain[0] - response.gain[0]))
-        self.extra["gain_dn_per_e"] = unknown / self.notes.analogue_gain
+        self.gain_doubt = unknown / float(response.gain[0])
         if (said := response.finding()) is not None:
             self.findings["photon_transfer"] = said
         if response.is_bent:
@@ -291,6 +302,21 @@ class _Fit:
             )
         return response
 
+    def _raw_noise(self, used: list[_Level]) -> None:
+        """What the likeness of the levels' noise says of the gain."""
+        used = [level for level in used if self._is_wide(level)]
+        partly = {level.name for level in self.levels if level not in used}  # some filters are saturated
+        likeness = {one.name: one.likeness for one in used if one.likeness is not None and one.name not in partly}
+        if not likeness:
+            return
+        uneven = [level.sums.uneven(self.dark) for level in used]
+        told = raw_noise(list(likeness.values()), uneven, self.common.seen_row_dn2)
+        if told.not_raw:
+            raise CaptureError(f"{self.folder}: {told.finding}; give raw frames as the converter wrote them")
+        self.noise_doubt, self.gain_doubt = told.doubt, float(np.hypot(self.gain_doubt, told.doubt))
+        if told.finding:
+            self.findings["noise"] = f"{told.finding}; the sigma of the gain is widened by it"
+
     def _no_growth(self) -> CaptureError:
         return CaptureError(
             f"{self.folder}: the noise of flat/ does not grow with its level; are these raw frames, without a curve?"
@@ -303,7 +329,7 @@ class _Fit:
     def _unknown_black(self) -> float:
         """Standard deviation of the black level that the dark frames' own codes leave: cut, or hidden by rounding."""
         if self._is_cut:
-            return max(float(self.black[0]), _ROUNDING_DN)
+            return max(float(self.black[0]) - self.dark.lowest, _ROUNDING_DN)
         return _ROUNDING_DN if self.is_hidden else 0.0
 
     def _is_hidden(self) -> bool:
@@ -351,7 +377,7 @@ class _Fit:
 
     def _noise(self, gain: Array, dark_rate: Array) -> None:
         if self._is_cut:
-            reason = "dark frames are cut at code 0; raise the camera's offset (brightness)"
+            reason = f"dark frames are cut at code {self.dark.lowest}; raise the camera's offset (brightness)"
             self.reasons |= {"read_noise_e": reason, "dsnu_e": reason, "row_noise_e": reason}
             self.findings["dark"] = (
                 f"{reason}; the black level is too high by it, and the gain is that of the slope between the levels"
@@ -359,6 +385,10 @@ class _Fit:
             return
         if self.is_hidden:
             reason = f"below {_HIDDEN_DN} DN: rounding hides it; take dark frames at a higher gain"
+            if self.dark.at_lowest > _ONE_CODE:
+                self.findings["dark"] = (
+                    f"dark frames hold the code {self.dark.lowest} alone: their noise is hidden, or they were cut there"
+                )
             self.reasons |= {"read_noise_e": reason, "dsnu_e": reason, "row_noise_e": reason}
             return
         share, row_sigma = self.common.seen_row_dn2, self.common.row_sigma_dn2
@@ -380,30 +410,41 @@ class _Fit:
             self.reasons["dsnu_e"] = "lost in temporal noise and rounding: take more dark frames, at a higher gain"
 
     def _cut_share(self) -> float:
-        """Share of the dark values below -0.5 DN, which a converter turns into 0; 1 where most values are 0."""
-        if self.dark.zero > 0.5:
+        """Share of the dark values below their lowest code, to which they were cut; 1 where most are at it.
+
+        A converter cuts at 0, a program at any code.
+        """
+        if self.is_hidden and self.dark.lowest > 0:
+            return 0.0
+        if self.dark.at_lowest > 0.5:
             return 1.0
         spread = np.sqrt(max(float(self.dark_dn2[0] + self.offset_dn2[0]), 1e-6))
-        # no more than the zeros that are there: hot pixels have a spread that is no Gaussian's
-        return min(float(ndtr((-0.5 - float(self.black[0])) / spread)), self.dark.zero)
+        # no more than are at that code: hot pixels have a spread that is no Gaussian's
+        return min(float(ndtr((self.dark.lowest - 0.5 - float(self.black[0])) / spread)), self.dark.at_lowest)
 
     def _prnu(self, used: list[_Level], response: Response) -> None:
-        # behind less noise, rounding hides or doubles small differences of pixels
-        used = [level for level in used if level.sums.temporal_dn2[0] > _NARROW_DN**2 + 1.0 / 12.0] or used
+        used = [level for level in used if self._is_wide(level)] or used
         shown = np.stack([self._signal(level) for level in used])
         signal = np.stack([response.linear(y) / response.slope(y) for y in shown])  # dy / y' is the change of x
+        # the pattern's variance grows with the square of a signal that shading makes uneven
+        signal *= np.sqrt(1.0 + np.stack([np.maximum(level.sums.shade_dn2, 0.0) for level in used]) / shown**2)
         pattern = np.stack([level.sums.spatial_dn2 for level in used]) - self.dark.spatial_dn2
         temporal = np.array([level.sums.temporal_dn2[0] / level.sums.frames for level in used])
         # inverse variance of pattern / signal^2: a variance is known to its own size
         weights = (signal[:, 0] ** 2 / (np.maximum(pattern[:, 0], 0.0) + temporal)) ** 2
-        square = np.sum(weights[:, None] * pattern / signal**2, axis=0) / weights.sum()
+        squares = pattern / signal**2
+        square = np.sum(weights[:, None] * squares, axis=0) / weights.sum()
+        # a response that is not the sensor's gives another pattern at each level
+        apart = float(np.sqrt(np.sum(weights * (squares[:, 0] - square[0]) ** 2) / weights.sum() / max(len(used), 1)))
         if self._is_cut and response.is_bent:
-            self.reasons["prnu"] = "dark frames are cut at code 0, and levels bend: the signal is not known"
+            self.reasons["prnu"] = "dark frames are cut, and levels bend: the signal is not known"
         elif square[0] > 3.0 * jackknife_sigma(square):
             self.values["prnu"] = np.sqrt(np.maximum(square, 0.0))
             # x / x' of a bend a_1 differs by a_1 u
             bend = response.unseen_bend * response.reach_dn / response.range_dn
-            self.extra["prnu"] = float(self.values["prnu"][0]) * bend
+            apart *= 0.5 / float(square[0]) if response.is_bent or response.refused else 0.0
+            doubt = float(np.hypot.reduce([bend, self.noise_doubt, apart]))
+            self.extra["prnu"] = float(self.values["prnu"][0]) * doubt
         else:
             self.reasons["prnu"] = "lost in temporal noise: take more frames of the brighter levels"
 
@@ -457,16 +498,3 @@ class _Fit:
         level = {one.site: float(self._signal(one)[0]) for one in used if one.name == best}
         green = 0.5 * (level["G1"] + level["G2"])
         return level["R"] / green, 1.0, level["B"] / green
-
-    def _point(self, one: _Level, used: bool) -> TransferPoint:
-        return TransferPoint(one.name, one.site, float(self._signal(one)[0]), self._excess(one), used)
-
-
-def _intercept(levels: list[NoiseOfLevel]) -> Array:
-    """Variance at no light by the line through the levels alone, DN^2, at least 0, shape (replicates,)."""
-    y = np.stack([level.signal_dn for level in levels])
-    v = np.stack([level.temporal_dn2 for level in levels]) - 1.0 / 12.0
-    weight = v[:, :1] ** -2.0
-    y0, v0 = ((weight * x).sum(axis=0) / weight.sum() for x in (y, v))
-    slope = np.sum(weight * (y - y0) * (v - v0), axis=0) / np.sum(weight * (y - y0) ** 2, axis=0)
-    return np.asarray(np.maximum(v0 - slope * y0, 0.0))

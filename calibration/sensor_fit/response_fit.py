@@ -188,6 +188,16 @@ def fit_response(levels: Sequence[NoiseOfLevel], dark_dn2: Array, range_dn: floa
     return _mean(sets, len(levels), names, range_dn, float(signal[:, 0].max()), by_rounding)
 
 
+def intercept(levels: list[NoiseOfLevel]) -> Array:
+    """Variance at no light by the line through the levels alone, DN^2, at least 0, shape (replicates,)."""
+    y = np.stack([level.signal_dn for level in levels])
+    v = np.stack([level.temporal_dn2 for level in levels]) - 1.0 / 12.0
+    weight = v[:, :1] ** -2.0
+    y0, v0 = ((weight * x).sum(axis=0) / weight.sum() for x in (y, v))
+    slope = np.sum(weight * (y - y0) * (v - v0), axis=0) / np.sum(weight * (y - y0) ** 2, axis=0)
+    return np.asarray(np.maximum(v0 - slope * y0, 0.0))
+
+
 def _sets(names: int, count: int) -> list[tuple[int, ...]]:
     return [
         terms
