@@ -98,9 +98,9 @@ def read_camera_picture(file: InputFile, data: bytes | None = None) -> CameraPic
     ):  # what a decoder has not looked at yet: texts, tags and tables
         warnings.simplefilter("ignore", UserWarning)  # of damaged tags, without the name of the file
         decoded = _of_decoded(file, picture)
-        # Pillow turns a TIFF as it decodes it, and forgets so
-        told = _directory(data).get(_ORIENTATION, 1) if decoded.kind == "raw" and picture.format == "TIFF" else 1
-        _orientation(file, told, decoded.kind)
+        if picture.format == "TIFF":  # Pillow turns one as it decodes it, and forgets so
+            told = _directory(data).get(_ORIENTATION, 1)
+            decoded = replace(decoded, orientation=_orientation(file, told, decoded.kind))
         if decoded.kind == "rgb" and _has_16_bits(picture, data) and decoded.pixels.max() < _UPPER_CODES:
             raise file.fault("has colours of 16 bits that end below 4096: scale them to 65535, or save 8 bits a colour")
     return decoded

@@ -153,7 +153,9 @@ def test_dn_of_a_tiff_are_as_stored_or_refused(tmp_path: Path) -> None:
         with pytest.raises(DatasetError, match=words):
             read(tmp_path / "a.tif")
     Image.fromarray(COLOUR).save(tmp_path / "b.tif", tiffinfo={0x0112: 3})
-    np.testing.assert_array_equal(read(tmp_path / "b.tif").pixels, COLOUR[::-1, ::-1])
+    turned = read(tmp_path / "b.tif")
+    np.testing.assert_array_equal(turned.pixels, COLOUR[::-1, ::-1])
+    assert turned.orientation == 3  # pictures of a pair must be turned alike
 
 
 def _tiff_with_tag(tag: int) -> bytes:
