@@ -12,13 +12,13 @@ import numpy as np
 
 from phibench.calibration.captures.imported_set import ImportedRow, ImportedSet, open_imported
 from phibench.calibration.captures.measure import (
-    outlines_as_one,
     seen_images,
     seen_spots,
     shape_prior,
     widened_by_shape,
     with_blur_of,
 )
+from phibench.calibration.captures.rig_doubts import outlines_as_one
 from phibench.calibration.captures.spot_shape import SHAPE, UNLIKE, SpotPicture, SpotShape, fit_shape
 from phibench.calibration.outline.limb_image import PoseMeasurement
 from phibench.calibration.outline.outline import find_outline

@@ -34,6 +34,7 @@ from phibench.calibration.captures.pair_photos import (
     pair_of_photos,
 )
 from phibench.calibration.captures.picture_files import Photo, SensorChoice, require_colour, sensor_choice
+from phibench.calibration.captures.rig_doubts import apart, calibration_note, contradicted, outlines_as_one
 from phibench.calibration.captures.rig_file import MeasuredRig, read_rig_file, require_camera_size
 from phibench.calibration.captures.spot_shape import (
     OUTLINE_SIGMA_PX,
@@ -47,9 +48,8 @@ from phibench.calibration.captures.spot_shape import (
     spot_images,
 )
 from phibench.calibration.captures.tested_chain import ChainTest, chain_test
-from phibench.calibration.outline.limb_image import PoseMeasurement
 from phibench.calibration.outline.outline import find_outline
-from phibench.calibration.outline.outline_result import Outline, mean_outline
+from phibench.calibration.outline.outline_result import Outline
 from phibench.calibration.rig.bundle import calibrate
 from phibench.calibration.rig.calibration_file import Calibration, read_calibration
 from phibench.datasets.common.errors import DatasetError
@@ -237,6 +237,7 @@ def _measured(test: ChainTest, stroke_m: float, setting: KnownNumbers) -> Measur
         raise fault
     gap, is_one = _gap(depth), float(depth.p_value) >= DOUBTFUL_P
     faults_of_spots = _torn(down, "down"), _torn(up, "up"), *_moved(found.pair, photos), _foreign(test)
+    faults_of_spots += (found.doubt, apart(found.limb[0]))
     notes = chosen.note, test.note, *found.notes, frames_note(photos), gap, *faults_of_spots
     doubts = "" if is_one else gap, *faults_of_spots
     told, doubted = (tuple(text for text in texts if text) for texts in (notes, doubts))
@@ -259,6 +260,7 @@ class _Fitted:
     stroke_m: float
     limb: _Limb
     notes: tuple[str, ...]
+    doubt: str
 
 
 def _fitted(
@@ -267,7 +269,7 @@ def _fitted(
     """Fit both spots; outlines are looked for, or are those of `limb`, with why there are none."""
     pair = pair_of_photos(photos, stroke_m, setting.known, card)
     outlines, missing = limb = limb or _outlines(pair, setting.calibration is not None)
-    rig, covariance, values, note = _corrected(setting, outlines, missing)
+    rig, covariance, values, note, doubt = _corrected(setting, outlines, missing)
     stroke = float(stroke_of(np.array(stroke_m), values))
     seen = replace(pair, rig=with_blur_of(rig, outlines), stroke_m=stroke)
     images = seen_images(seen)
@@ -276,7 +278,7 @@ def _fitted(
     ready = replace(pair, rig=rig, stroke_m=stroke)
     spots = seen_spots(_answer(ready, photos))
     wide = {name: widened_by_shape(spots[name], images.get(name), shape) for name in POSITIONS}
-    return _Fitted(ready, wide, rig, covariance, stroke, limb, (note, _shape_note(shape, setting)))
+    return _Fitted(ready, wide, rig, covariance, stroke, limb, (note, _shape_note(shape, setting)), doubt)
 
 
 def _mixed(parts: Sequence[tuple[SeenSpot, float]], added_px: float) -> SeenSpot:
@@ -359,56 +361,26 @@ def _picture(pair: Pair, position: str) -> Image:
     return pair.images[name] if pair.card.output == "raw" else pair.stack(name)[0]
 
 
-def _corrected(setting: KnownNumbers, outlines: Sequence[Outline], why: str) -> tuple[Rig, Array, Array, str]:
-    """Corrected rig, covariance and values of `PARAMETERS`, and a sentence."""
+def _corrected(setting: KnownNumbers, outlines: Sequence[Outline], why: str) -> tuple[Rig, Array, Array, str, str]:
+    """Corrected rig, covariance and values of `PARAMETERS`, a sentence, and a doubt."""
     nominal = setting.known.rig
     if setting.calibration is not None:
         held = setting.calibration
-        return held.rig, held.covariance, held.values, _calibration_note(held, outlines)
+        return held.rig, held.covariance, held.values, *calibration_note(held, outlines)
     if not outlines:
         values, covariance = np.zeros(len(PARAMETERS)), np.diag(prior_sigmas() ** 2)
-        return nominal, covariance, values, f"rig: as in the rig file, with the errors of a ruler; no outline: {why}"
-    bundle = calibrate(nominal, outlines_as_one(outlines))
+        return (
+            nominal,
+            covariance,
+            values,
+            f"rig: as in the rig file, with the errors of a ruler; no outline: {why}",
+            "",
+        )
+    outline = outlines_as_one(outlines)
+    bundle = calibrate(nominal, outline)
     kind = ", by its edge alone" if any(outline.by_edge for outline in outlines) else ""
     text = f"rig: corrected by the mirror's outline in these pictures{kind}; the rest has the errors of a ruler"
-    return bundle.rig, bundle.covariance, bundle.values, text
-
-
-def outlines_as_one(outlines: Sequence[Outline]) -> PoseMeasurement:
-    """Weighted mean of outlines of one rig, with the covariance of a single one.
-
-    What an outline claims is mostly what all of them share: the lens's blur, where the limb lies in its edge, the
-    nominal camera. Ten outlines of a rig in ten rooms were all 0.4 to 0.6 mm short, each within its sigma.
-    """
-    mean = mean_outline(outlines)
-    return replace(mean, covariance=mean.covariance * len(outlines))
-
-
-_MOVED_SIGMAS = 5.0  # of the outline against the calibration's: 1e-5 of rigs that did not move are further off
-_GROWN = 0.003  # of the outline's size: one rig's outlines in ten rooms differ by less
-
-
-def _calibration_note(held: Calibration, outlines: Sequence[Outline]) -> str:
-    """Sentence on the calibration, and whether the mirror is still where it was."""
-    made, text = held.made_from.get("sphere_in_camera_m"), "rig: of the calibration file"
-    if not made or not outlines:
-        return text
-    sigmas = np.array(held.made_from["sigma_m"])
-    then = PoseMeasurement(np.mean(made, axis=0), np.diag(np.mean(sigmas**2, axis=0)))
-    now = outlines_as_one(outlines)
-    across = (now.value - then.value)[:2]
-    off = float(np.sqrt(across @ np.linalg.solve((now.covariance + then.covariance)[:2, :2], across)))
-    if off > _MOVED_SIGMAS:
-        moved = 1e3 * float(np.linalg.norm(across))
-        return f"{text}; doubtful: the mirror has moved by {moved:.2f} mm ({off:.0f} sigma) since; calibrate again"
-    grown, sigma = (then.value - now.value)[2] / now.value[2], np.sqrt((now.covariance + then.covariance)[2, 2])
-    if abs(grown) > max(_GROWN, _MOVED_SIGMAS * float(sigma) / now.value[2]):
-        size = f"{100.0 * abs(grown):.1f} % {'larger' if grown > 0.0 else 'smaller'}"
-        return (
-            f"{text}; doubtful: the mirror's outline is {size} than then: the lens was refocused, or the mirror moved "
-            "along the axis; calibrate again"
-        )
-    return f"{text}; the mirror is still where it was"
+    return bundle.rig, bundle.covariance, bundle.values, text, contradicted(nominal, outline, bundle.chi2)
 
 
 def with_blur_of(rig: Rig, outlines: Sequence[Outline]) -> Rig:

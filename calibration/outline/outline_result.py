@@ -123,6 +123,27 @@ def mean_measured(parts: Sequence[PoseMeasurement]) -> PoseMeasurement:
     return PoseMeasurement(mean, covariance * max(1.0, chi2 / degrees if degrees else 1.0))
 
 
+_MOVED_SIGMAS = 5.0  # of one outline against another: 1e-5 of rigs that did not move are further off
+_GROWN = 0.003  # of the outline's size: one rig's outlines in ten rooms differ by less
+
+
+def mirror_moved(then: PoseMeasurement, now: PoseMeasurement) -> str:
+    """Words on a mirror that is not where it was, or not as large; "" for one that is."""
+    covariance = now.covariance + then.covariance
+    across = (now.value - then.value)[:2]
+    off = float(np.sqrt(across @ np.linalg.solve(covariance[:2, :2], across)))
+    if off > _MOVED_SIGMAS:
+        return f"the mirror has moved by {1e3 * float(np.linalg.norm(across)):.2f} mm ({off:.0f} sigma)"
+    grown, sigma = (then.value - now.value)[2] / now.value[2], float(np.sqrt(covariance[2, 2])) / now.value[2]
+    if abs(grown) <= max(_GROWN, _MOVED_SIGMAS * sigma):
+        return ""
+    size = "larger" if grown > 0.0 else "smaller"
+    return (
+        f"the mirror's outline became {100.0 * abs(grown):.1f} % {size} (the lens was refocused, or the mirror moved "
+        "along the axis)"
+    )
+
+
 # -- what mirrors of all shapes have for the fit -----------------------------------------------------------------------
 
 MIN_ARC = 0.5

@@ -12,9 +12,10 @@ import pytest
 from helpers.camera_files import NAMES, write_pictures
 from PIL import Image
 
-from phibench.calibration.captures.measure import _calibration_note, measure, outlines_as_one, read_setting
+from phibench.calibration.captures.measure import _corrected, measure, read_setting
 from phibench.calibration.captures.pair_photos import PairPhotos, PositionPhotos
 from phibench.calibration.captures.picture_files import read_photo
+from phibench.calibration.captures.rig_doubts import apart, calibration_note, outlines_as_one
 from phibench.calibration.outline.outline_result import Outline
 from phibench.cli.main import main
 from phibench.datasets.common.errors import DatasetError
@@ -364,8 +365,8 @@ def test_a_grey_jpeg_is_told(case: Case, tmp_path: Path, capsys) -> None:
     ("depth_m", "words"),
     [
         (0.2600, "still where it was"),
-        (0.2577, "0.9 % larger than then: the lens was refocused, or"),
-        (0.2623, "0.9 % smaller than then"),
+        (0.2577, "0.9 % larger (the lens was refocused, or"),
+        (0.2623, "0.9 % smaller"),
     ],
 )
 def test_a_calibration_says_that_the_lens_was_turned(depth_m: float, words: str) -> None:
@@ -376,4 +377,39 @@ def test_a_calibration_says_that_the_lens_was_turned(depth_m: float, words: str)
 
     made = {"sphere_in_camera_m": [[0.0, 0.0, 0.26]], "sigma_m": [[4e-6, 4e-6, 2e-5]]}
     held = SimpleNamespace(made_from=made)
-    assert words in _calibration_note(held, [outline(depth_m)])
+    assert words in "; ".join(calibration_note(held, [outline(depth_m)]))
+
+
+def _outline(x: float, y: float, z: float) -> Outline:
+    return Outline(np.array([x, y, z]), np.diag([2e-5, 2e-5, 1e-4]) ** 2, 1.0, 1.0, 0.7, 0.1, 1000, 5)
+
+
+def test_a_mirror_elsewhere_in_the_second_picture_is_told() -> None:
+    """4 px aside, and 1 % larger: a camera that was pushed, or zoomed, from one position to the other."""
+    first = _outline(0.0, 0.0, 0.26)
+    assert not apart([first, _outline(2e-5, -2e-5, 0.2601)])
+    assert not apart([first])
+    assert "moved by 0.73 mm (26 sigma) from the picture down" in apart([first, _outline(7.3e-4, 0.0, 0.26)])
+    assert "1.0 % larger" in apart([first, _outline(0.0, 0.0, 0.2574)])
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ("", ""),
+        ("z_c_m = 0.263", ""),
+        ("radius_m = 0.05", "+20.0 % larger than fx_px, radius_m and z_c_m say"),
+        ("z_c_m = 0.30", "+15.4 % larger"),
+        ("fx_px = 1550.0\nfy_px = 1550.0", "% larger"),
+    ],
+)
+def test_a_rig_file_that_the_outline_contradicts_is_told(tmp_path: Path, given: str, said: str) -> None:
+    """D was 17 % off without a word: outlines tell the radius over the distance, and the rig file both."""
+    (tmp_path / "rig.toml").write_text(f"[rig]\n{given}\n")
+    setting = read_setting(tmp_path / "rig.toml")
+    camera, radius = setting.known.rig.camera, setting.known.rig.sphere.radius_m
+    # the same picture, by the focal length and the radius that the file says: 60 mm at 0.26 m under 1430 px
+    z = 0.26 * radius / 0.06 * camera.fx_px / 1430.0
+    doubt = _corrected(setting, [_outline(0.0, 0.0, z)], "")[-1]
+    assert said in doubt
+    assert bool(doubt) == bool(said)
