@@ -88,7 +88,7 @@ def noise_likeness(frames: NDArray[Any], filters: int) -> NoiseLikeness:
 
 @dataclass(frozen=True)
 class RawNoise:
-    """What the likeness of all levels says of the gain.
+    """Verdict of the likeness of all levels on the gain.
 
     Attributes
     ----------

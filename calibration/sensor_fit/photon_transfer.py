@@ -303,7 +303,7 @@ class _Fit:
         return response
 
     def _raw_noise(self, used: list[_Level]) -> None:
-        """What the likeness of the levels' noise says of the gain."""
+        """Weigh the likeness of the levels' noise."""
         used = [level for level in used if self._is_wide(level)]
         partly = {level.name for level in self.levels if level not in used}  # some filters are saturated
         likeness = {one.name: one.likeness for one in used if one.likeness is not None and one.name not in partly}
