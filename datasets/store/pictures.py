@@ -65,7 +65,7 @@ def save_png(path: Path, picture: Picture) -> Path:
         raise DatasetError(f"{path}: pictures are written as PNG; give a name that ends in .png")
     buffer = io.BytesIO()
     # stated: the bytes must not follow Pillow's default
-    Image.fromarray(picture).save(buffer, format="PNG", compress_level=3)
+    Image.fromarray(picture).save(buffer, format="PNG", compress_level=1)
     return write_bytes(path, buffer.getvalue())
 
 

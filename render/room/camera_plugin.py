@@ -12,6 +12,7 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from phibench.scenes.camera import Camera
 from phibench.scenes.rig import View
@@ -20,6 +21,7 @@ PLUGIN = "c310"
 MM_PER_M = 1000.0
 _MOST_STEPS = 12
 _CLOSE = 1e-12  # normalised image coordinates
+_ROUNDED = 1e-6  # more than float32 leaves
 _TAIL_SIGMAS = 6.0  # of the blur, beyond the image
 
 
@@ -47,7 +49,7 @@ def sensor_dict(mi: ModuleType, view: View, crop: tuple[int, int, int, int] | No
         numbers |= {f"{axis}_{row}": float(axes[i, column]) for i, row in enumerate("xyz")}
     position = MM_PER_M * view.T_world_camera.directions(-view.rig.T_camera_sphere.t)
     numbers |= {f"origin_{row}": float(position[i]) for i, row in enumerate("xyz")}
-    numbers["undistort_steps"] = undistort_steps(camera)
+    numbers["single_steps"], numbers["double_steps"] = undistort_steps(camera)
     numbers["aperture_radius_m"] = camera.aperture_radius_m
     for name, value in zip("RGB", camera.detector.band_electrons_per_joule(), strict=True):
         numbers[f"electrons_per_joule_{name}"] = value
@@ -69,9 +71,13 @@ def _register(mi: ModuleType) -> None:
 
         def __init__(self, props: Any) -> None:
             super().__init__(props)
-            self.number = {name: mi.Float64(props[name]) for name in props.keys() if name not in _NOT_NUMBERS}  # noqa: SIM118
-            dr.make_opaque(self.number)  # same kernel for every camera
-            self.steps = int(props["undistort_steps"])
+            number = {name: float(props[name]) for name in props.keys() if name not in _NOT_NUMBERS}  # noqa: SIM118
+            number |= {f"per_{name}": 1.0 / number[name] for name in ("fx_px", "fy_px", "focus_distance_m")}
+            lens = math.pi * number["aperture_radius_m"] ** 2 * number["per_fx_px"] * number["per_fy_px"]
+            self.number = {name: mi.Float64(value) for name, value in number.items()}
+            self.weights = [mi.Float(lens * number[f"electrons_per_joule_{c}"]) for c in "RGB"]
+            dr.make_opaque(self.number, self.weights)  # same kernel for every camera
+            self.steps = int(props["single_steps"]), int(props["double_steps"])
             self.m_needs_sample_2 = True
             self.m_needs_sample_3 = True
 
@@ -100,17 +106,18 @@ def _register(mi: ModuleType) -> None:
             The weight is electrons/s per W/(m^2 sr). `lens` lies on the unit disc. Optical blur is the caller's.
             """
             n, F64 = self.number, mi.Float64
-            xd, yd = (u - n["cx_px"]) / n["fx_px"], (v - n["cy_px"]) / n["fy_px"]
-            x, y, jacobian = _undistort(n, xd, yd, self.steps) if self.steps else (xd, yd, F64(1.0))
+            xd, yd = (u - n["cx_px"]) * n["per_fx_px"], (v - n["cy_px"]) * n["per_fy_px"]
+            x, y, jacobian = _undistort(mi, n, xd, yd, self.steps) if any(self.steps) else (xd, yd, None)
             a, b = F64(lens.x) * n["aperture_radius_m"], F64(lens.y) * n["aperture_radius_m"]
-            dx, dy = x - a / n["focus_distance_m"], y - b / n["focus_distance_m"]
+            dx, dy = x - a * n["per_focus_distance_m"], y - b * n["per_focus_distance_m"]
             cos2 = 1.0 / (1.0 + dx * dx + dy * dy)
             cos = dr.sqrt(cos2)
             origin = [n[f"origin_{i}"] + MM_PER_M * (a * n[f"x_{i}"] + b * n[f"y_{i}"]) for i in "xyz"]
             direction = [cos * (dx * n[f"x_{i}"] + dy * n[f"y_{i}"] + n[f"z_{i}"]) for i in "xyz"]
-            etendue = math.pi * n["aperture_radius_m"] ** 2 * cos2 * cos2 / (n["fx_px"] * n["fy_px"] * jacobian)
-            weight = mi.Color3f(*(mi.Float(etendue * n[f"electrons_per_joule_{c}"]) for c in "RGB"))
-            return mi.Vector3d(*origin), mi.Vector3d(*direction), weight
+            slant = dr.square(mi.Float(cos2))  # solid angle and both cosines
+            if jacobian is not None:
+                slant /= jacobian
+            return mi.Vector3d(*origin), mi.Vector3d(*direction), mi.Color3f(*(slant * one for one in self.weights))
 
         def bbox(self):  # type: ignore[no-untyped-def]
             return mi.ScalarBoundingBox3f()
@@ -121,7 +128,7 @@ def _register(mi: ModuleType) -> None:
     mi.register_sensor(PLUGIN, C310)
 
 
-_NOT_NUMBERS = ("film", "sampler", "id", "undistort_steps")
+_NOT_NUMBERS = ("film", "sampler", "id", "single_steps", "double_steps")
 
 
 def _hashed_pair(mi: ModuleType, dr: ModuleType, position: Any, aperture: Any) -> Any:
@@ -132,40 +139,61 @@ def _hashed_pair(mi: ModuleType, dr: ModuleType, position: Any, aperture: Any) -
     return mi.Point2f(*(mi.Float(word >> 8) * (1.0 / 16777216.0) for word in second))
 
 
-def undistort_steps(camera: Camera) -> int:
-    """Newton steps from the distorted position to the undistorted one anywhere on the film; 0 without distortion.
+def undistort_steps(camera: Camera) -> tuple[int, int]:
+    """Newton steps in float32, then in float64, from the distorted position to the undistorted one; 0 without it.
 
-    `Camera.normalised` goes as far as it takes; here the steps are counted until no point of a grid over the film is
-    off by more than 1e-12 (1.4e-9 px), and one is added.
+    Those in float32 are as many as would leave no point of a grid over the film off by more than 1e-12 (1.4e-9 px) in
+    float64. What float32 leaves, those in float64 bring below that.
     """
     if not any((camera.k1, camera.k2, camera.k3, camera.p1, camera.p2)):
-        return 0
+        return 0, 0
     reach = math.ceil(_TAIL_SIGMAS * camera.blur_sigma_px)
     u, v = (np.linspace(-reach, size + reach, 33) for size in (camera.width_px, camera.height_px))
     film = np.stack(np.meshgrid(u, v), axis=-1)
     target = (film - [camera.cx_px, camera.cy_px]) / [camera.fx_px, camera.fy_px]
-    xy = target
-    for step in range(1, _MOST_STEPS):
-        xy = xy + np.linalg.solve(camera.distort_jacobian(xy), (target - camera.distort(xy))[..., None])[..., 0]
-        if np.abs(camera.distort(xy) - target).max() < _CLOSE:
-            return step + 1
-    return _MOST_STEPS
+
+    def steps_from(xy: NDArray[np.float64]) -> tuple[int, NDArray[np.float64]]:
+        for step in range(1, _MOST_STEPS):
+            xy = xy + np.linalg.solve(camera.distort_jacobian(xy), (target - camera.distort(xy))[..., None])[..., 0]
+            if np.abs(camera.distort(xy) - target).max() < _CLOSE:
+                return step, xy
+        return _MOST_STEPS, xy
+
+    single, xy = steps_from(target)
+    return single, steps_from(xy + _ROUNDED)[0]
 
 
-def _undistort(n: dict[str, Any], xd: Any, yd: Any, steps: int) -> tuple[Any, Any, Any]:
-    """Invert Brown's distortion by Newton's method; also the determinant of its Jacobian at the solution."""
-    x, y = xd, yd
-    for step in range(steps + 1):
-        r2 = x * x + y * y
-        radial = 1.0 + r2 * (n["k1"] + r2 * (n["k2"] + r2 * n["k3"]))
-        slope = 2.0 * (n["k1"] + r2 * (2.0 * n["k2"] + r2 * 3.0 * n["k3"]))
-        xx = radial + x * x * slope + 2.0 * n["p1"] * y + 6.0 * n["p2"] * x
-        yy = radial + y * y * slope + 6.0 * n["p1"] * y + 2.0 * n["p2"] * x
-        xy = x * y * slope + 2.0 * (n["p1"] * x + n["p2"] * y)
-        det = xx * yy - xy * xy
-        if step == steps:
-            break
-        ex = x * radial + 2.0 * n["p1"] * x * y + n["p2"] * (r2 + 2.0 * x * x) - xd
-        ey = y * radial + n["p1"] * (r2 + 2.0 * y * y) + 2.0 * n["p2"] * x * y - yd
-        x, y = x - (yy * ex - xy * ey) / det, y - (xx * ey - xy * ex) / det
-    return x, y, det
+def _undistort(
+    mi: ModuleType, n: dict[str, Any], xd: Any, yd: Any, steps: tuple[int, int]
+) -> tuple[Any, Any, Any]:
+    """Invert Brown's distortion by Newton's method; also the determinant of its Jacobian at the solution, float32."""
+    rounded = {name: mi.Float(n[name]) for name in ("k1", "k2", "k3", "p1", "p2")}
+    target = mi.Float(xd), mi.Float(yd)
+    x, y = target
+    for _ in range(steps[0]):
+        x, y = _newton(rounded, x, y, *target)
+    x, y = mi.Float64(x), mi.Float64(y)
+    for _ in range(steps[1]):
+        x, y = _newton(n, x, y, xd, yd)
+    xx, yy, xy, _ = _bent(rounded, mi.Float(x), mi.Float(y))
+    return x, y, xx * yy - xy * xy
+
+
+def _newton(n: dict[str, Any], x: Any, y: Any, xd: Any, yd: Any) -> tuple[Any, Any]:
+    """Next place that is distorted to (xd, yd)."""
+    xx, yy, xy, radial = _bent(n, x, y)
+    r2 = x * x + y * y
+    ex = x * radial + 2.0 * n["p1"] * x * y + n["p2"] * (r2 + 2.0 * x * x) - xd
+    ey = y * radial + n["p1"] * (r2 + 2.0 * y * y) + 2.0 * n["p2"] * x * y - yd
+    per_det = 1.0 / (xx * yy - xy * xy)
+    return x - (yy * ex - xy * ey) * per_det, y - (xx * ey - xy * ex) * per_det
+
+
+def _bent(n: dict[str, Any], x: Any, y: Any) -> tuple[Any, Any, Any, Any]:
+    """Derivatives of Brown's distortion, d xd / dx, d yd / dy and d xd / dy = d yd / dx, and its radial factor."""
+    r2 = x * x + y * y
+    radial = 1.0 + r2 * (n["k1"] + r2 * (n["k2"] + r2 * n["k3"]))
+    slope = 2.0 * (n["k1"] + r2 * (2.0 * n["k2"] + r2 * 3.0 * n["k3"]))
+    xx = radial + x * x * slope + 2.0 * n["p1"] * y + 6.0 * n["p2"] * x
+    yy = radial + y * y * slope + 6.0 * n["p1"] * y + 2.0 * n["p2"] * x
+    return xx, yy, x * y * slope + 2.0 * (n["p1"] * x + n["p2"] * y), radial

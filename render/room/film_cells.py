@@ -20,7 +20,7 @@ from phibench.render.room.subpixel_grid import FilmGrid, Stack
 
 NEAR_PX = 3  # pixels beside the mirror that are treated as those in it
 _BAND_PX = 48  # rows that are summed at a time
-_GAP_PX = 64  # columns without a change that are worth leaving out
+_GAP_PX = 64  # columns without a change, or without cells, that are worth treating apart
 _WIDE_SIGMAS = 2.5  # cells of a lamp 20 times as bright as a full pixel count for pixels as far away
 
 Box = tuple[slice, slice]
@@ -105,21 +105,41 @@ def of_rank(values: Stack, rank: NDArray[np.int32]) -> Stack:
     """Values, shape (.., N), of some pixels that are cut; those of whole rows lie together."""
     if len(rank) and len(rank) == rank[-1] - rank[0] + 1 and np.all(np.diff(rank) == 1):
         return values[..., rank[0] : rank[-1] + 1]
-    return values[..., rank]
+    return np.take(values, rank, axis=-1)
 
 
 def fold(cells: Cells, pixels: Stack, rows: slice, columns: slice) -> None:
-    """Set pixels of a part of the window by their cells, some rows at a time."""
+    """Set pixels of a part of the window by their cells, some rows at a time; where none is cut, by whole pixels."""
     grid, span = cells.grid, 2 * cells.grid.margin_px
     for first in range(rows.start, rows.stop, _BAND_PX):
         last = min(first + _BAND_PX, rows.stop)
-        part = (slice(first, last + span), slice(columns.start, columns.stop + span))
-        row, column, rank = cut_in(cells, part)
-        mean, variance = (plane[:, *part] for plane in cells.whole)
-        variance = variance * np.float32(grid.cells**2)  # a whole pixel's, shared by all its cells
-        own = 0.5 * (of_rank(cells.halves[0], rank) + of_rank(cells.halves[1], rank)), variance_of(cells, rank)
-        for k, (whole, cut) in enumerate(zip((mean, variance), own, strict=True)):
-            pixels[k, :, first:last, columns] = grid.pixels(cell_plane(grid, whole, row, column, cut), power=k + 1)
+        down = slice(first, last + span)
+        for low, high, cut in _runs(cells.rank[down, columns.start : columns.stop + span] >= 0, span):
+            run = slice(columns.start + low, columns.start + high)
+            part = (down, slice(run.start, run.stop + span))
+            mean, variance = (plane[:, *part] for plane in cells.whole)
+            if not cut:
+                for k, whole in enumerate((mean, variance)):
+                    pixels[k, :, first:last, run] = grid.pixels_of_whole(whole, power=k + 1)
+                continue
+            row, column, rank = cut_in(cells, part)
+            variance = variance * np.float32(grid.cells**2)  # a whole pixel's, shared by all its cells
+            own = 0.5 * (of_rank(cells.halves[0], rank) + of_rank(cells.halves[1], rank)), variance_of(cells, rank)
+            for k, (whole, values) in enumerate(zip((mean, variance), own, strict=True)):
+                pixels[k, :, first:last, run] = grid.pixels(cell_plane(grid, whole, row, column, values), power=k + 1)
+
+
+def _runs(cut: NDArray[np.bool_], span: int) -> Iterator[tuple[int, int, bool]]:
+    """First and last column of runs of pixels, and whether any that is cut counts for them; `cut` is wider by a span.
+
+    Runs begin at multiples of `_GAP_PX`.
+    """
+    width = cut.shape[1] - span
+    reached = np.concatenate([[0], np.cumsum(cut.any(axis=0))])
+    reached = np.add.reduceat(reached[span + 1 :] > reached[: -span - 1], np.arange(0, width, _GAP_PX)) > 0
+    starts = np.flatnonzero(np.diff(reached, prepend=not reached[0]))
+    for start, stop in zip(starts, [*starts[1:], len(reached)], strict=True):
+        yield int(start) * _GAP_PX, min(int(stop) * _GAP_PX, width), bool(reached[start])
 
 
 def cut_in(cells: Cells, part: Box) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.int32]]:

@@ -48,6 +48,7 @@ def _ball(mi: ModuleType, radius_m: float) -> Meeting:
     import drjit as dr
 
     radius = dr.opaque(mi.Float64, MM_PER_M * radius_m)
+    per_radius = dr.opaque(mi.Float64, 1.0 / (MM_PER_M * radius_m))
 
     def meet(origin: Any, direction: Any) -> tuple[Any, Any, Any]:
         approach = -dr.dot(origin, direction)
@@ -55,7 +56,7 @@ def _ball(mi: ModuleType, radius_m: float) -> Meeting:
         square = dr.square(radius) - dr.squared_norm(foot)
         found = (square > 0.0) & (approach > 0.0)
         point = foot - dr.sqrt(dr.maximum(square, 0.0)) * direction
-        return point, point / radius, found
+        return point, point * per_radius, found
 
     return meet
 

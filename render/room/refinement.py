@@ -55,11 +55,10 @@ from phibench.render.room.film_cells import (
 from phibench.render.room.noise_budget import allowed_per_s2, excess, is_full
 from phibench.render.room.subpixel_grid import RIM_PX, CellSampler, Crop, Stack
 
-_SIDES = np.array([1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128], dtype=np.int32)  # strata along a cell
-_NEXT_SIDE = _SIDES[np.searchsorted(_SIDES, np.arange(_SIDES[-1] + 1))]
+_MOST_SIDE = 128  # strata along a cell
 _GROWTH = 8.0  # of the strata along a side, in one round
 _LAMP_SIDE = 2  # strata at first where a lamp's part is computed
-_SMALL = 0.1  # a cell below this part of its allowance is not what keeps a pixel above its budget
+_SMALL = 0.3  # a cell below this part of its allowance is not what keeps a pixel above its budget: 0.3 and `_AIM` are 1
 _SURELY = 2.0  # by few samples a pixel at the edge of a lamp may look full that is not
 _AIM = 0.7  # of the allowed variance
 _EVEN = 1.0 / 16.0  # of the allowed variance: a whole pixel's sample, that counts at its centre, moves no edge then
@@ -108,7 +107,7 @@ def first_pass(film: CellSampler, window: Crop, budget: float) -> Cells:
     while new.any():
         _cut(film, cells, *np.nonzero(new))
         new = matters & grown(cells.met >= 0, reach_px(grid)) & (cells.rank < 0)
-    if (whole := np.flatnonzero(cells.rank < 0)).size:  # none where every pixel is cut
+    if (whole := cells.rank < 0).any():  # none where every pixel is cut
         _sample_whole(film, cells, whole)
     cells.lamps = _lamps_near(film, cells)
     return cells
@@ -125,15 +124,15 @@ def _scouted(film: CellSampler, squares: NDArray[np.uint32]) -> tuple[Stack, NDA
     return found.electrons_per_s.reshape(3, *shape), np.asarray(found.mirrored.reshape(shape).any(axis=0)), met
 
 
-def _sample_whole(film: CellSampler, cells: Cells, chosen: NDArray[np.intp]) -> None:
-    """Two samples of whole pixels, given by flat indices."""
-    numbers = cells.squares.ravel()[chosen]
+def _sample_whole(film: CellSampler, cells: Cells, chosen: NDArray[np.bool_]) -> None:
+    """Two samples of whole pixels, which a mask chooses."""
+    numbers = cells.squares[chosen]
     a, b = (film.sample_once(numbers, _FIRST + half, 1) for half in (0, 1))
     for k in range(3):
         one, other = a.electrons_per_s[k], b.electrons_per_s[k]
-        cells.whole[0][k].ravel()[chosen] = 0.5 * (one + other)
-        cells.whole[1][k].ravel()[chosen] = (0.5 * (one - other)) ** 2
-    cells.mirrored.ravel()[chosen] |= a.mirrored | b.mirrored
+        cells.whole[0][k][chosen] = 0.5 * (one + other)
+        cells.whole[1][k][chosen] = (0.5 * (one - other)) ** 2
+    cells.mirrored[chosen] |= a.mirrored | b.mirrored
 
 
 def _cut(film: CellSampler, cells: Cells, row: NDArray[np.intp], column: NDArray[np.intp]) -> None:
@@ -240,7 +239,7 @@ def _strata(
 
 def _next_side(wanted: Stack) -> NDArray[np.int32]:
     """Numbers of strata along a side that are at least what is wanted."""
-    return _NEXT_SIDE[np.ceil(np.minimum(wanted, np.float32(_SIDES[-1]))).astype(np.int32)]
+    return np.asarray(np.ceil(np.clip(wanted, 1.0, _MOST_SIDE)).astype(np.int32))
 
 
 def _sample_half(

@@ -106,7 +106,11 @@ class FilmGrid:
 
     def pixels(self, cells: Stack, power: int = 1) -> Stack:
         """Pixels (n, height, width) of cells (n, rows, columns), with weights to a power: 2 for variances."""
-        return _across(self, _down(self, cells, power), power)
+        return _across(self, _down(self, cells, power, self.cells), power, self.cells)
+
+    def pixels_of_whole(self, squares: Stack, power: int = 1) -> Stack:
+        """The same of whole pixels (n, rows, columns), whose cells are alike; a variance is that of their mean."""
+        return _across(self, _down(self, squares, power, 1), power, 1)
 
     def squares(self, window: Crop) -> NDArray[np.uint32]:
         """Numbers of whole pixels of a window and `RIM_PX` more around it than its blur asks for."""
@@ -147,35 +151,37 @@ _BLOCK_PX = 16  # pixels whose weights are one dense matrix: three times as fast
 
 
 @lru_cache(maxsize=64)
-def _fold(grid: FilmGrid, pixels: int, power: int) -> Stack:
-    """Matrix (pixels, cells along an axis) of the weights."""
-    taps, step = grid.taps**power, grid.cells
+def _fold(grid: FilmGrid, pixels: int, power: int, step: int) -> Stack:
+    """Matrix (pixels, places along an axis) of the weights; `step` places a pixel: its cells, or 1 for the whole."""
+    taps = grid.taps**power
+    if step == 1:  # a mean of n cells has a variance n times smaller than each
+        taps = np.float32(grid.cells ** (power - 1)) * taps.reshape(-1, grid.cells).sum(axis=1)
     matrix = np.zeros((pixels, (pixels - 1) * step + len(taps)), dtype=np.float32)
     for k in range(pixels):
         matrix[k, k * step : k * step + len(taps)] = taps
     return matrix
 
 
-def _down(grid: FilmGrid, cells: Stack, power: int) -> Stack:
+def _down(grid: FilmGrid, places: Stack, power: int, step: int) -> Stack:
     """Pixels along the rows' axis: (n, rows, columns) to (n, height, columns)."""
-    count, rows, columns = cells.shape
-    height = rows // grid.cells - 2 * grid.margin_px
+    count, rows, columns = places.shape
+    height = rows // step - 2 * grid.margin_px
     result = np.empty((count, height, columns), dtype=np.float32)
     for first in range(0, height, _BLOCK_PX):
-        weights = _fold(grid, min(_BLOCK_PX, height - first), power)
-        start = first * grid.cells
-        np.matmul(weights, cells[:, start : start + weights.shape[1]], out=result[:, first : first + len(weights)])
+        weights = _fold(grid, min(_BLOCK_PX, height - first), power, step)
+        start = first * step
+        np.matmul(weights, places[:, start : start + weights.shape[1]], out=result[:, first : first + len(weights)])
     return result
 
 
-def _across(grid: FilmGrid, lines: Stack, power: int) -> Stack:
+def _across(grid: FilmGrid, lines: Stack, power: int, step: int) -> Stack:
     """Pixels along the other axis: (n, height, columns) to (n, height, width)."""
     count, height, columns = lines.shape
-    width = columns // grid.cells - 2 * grid.margin_px
+    width = columns // step - 2 * grid.margin_px
     result = np.empty((count, height, width), dtype=np.float32)
     for first in range(0, width, _BLOCK_PX):
-        weights = _fold(grid, min(_BLOCK_PX, width - first), power)
-        start = first * grid.cells
+        weights = _fold(grid, min(_BLOCK_PX, width - first), power, step)
+        start = first * step
         part = lines[:, :, start : start + weights.shape[1]]
         np.matmul(part, weights.T, out=result[:, :, first : first + len(weights)])
     return result
@@ -337,19 +343,21 @@ class CellSampler:
         lanes, m, first, end = (
             mi.UInt32(aligned(values, np.uint32)) for values in (numbers[cell], side[cell], start, stop)
         )
-        m = dr.maximum(m, 1)  # lanes beyond the last have none, and are divided by nonetheless
+        m = mi.Float(dr.maximum(m, 1))  # lanes beyond the last have none, and are divided by nonetheless
         shift = paired_shifts(mi, lanes, self._dimensions, dr.opaque(mi.UInt32, key))
         corner, h = self._corner(lanes)
+        step, per_m = h / mi.Float64(m), 1.0 / m
         if lamp is not None:
             light, part = self._shares(numbers, side, key, lamp)
             which = mi.Int32(aligned(lamp[cell], np.int32))
             shine = mi.Color3f(*(mi.Float(aligned(plane[cell])) for plane in light))
 
         def body(i: Any, total: Any, square: Any) -> tuple[Any, Any, Any]:
-            x = points(mi, shift, i)
+            x, place = points(mi, shift, i), mi.Float(i)
+            row = dr.floor((place + 0.5) * per_m)  # exact, and faster than a division of whole numbers
             u, v = (
-                low + (mi.Float64(k) + mi.Float64(value)) / mi.Float64(m) * h
-                for low, k, value in zip(corner, (i % m, i // m), x[:2], strict=True)
+                low + (mi.Float64(k) + mi.Float64(value)) * step
+                for low, k, value in zip(corner, (place - row * m, row), x[:2], strict=True)
             )
             value, _, _, ray = self._look.electrons(u, v, x[2:])
             if self.lamps is not None and lamp is not None:
@@ -360,9 +368,7 @@ class CellSampler:
         _, *sums = dr.while_loop(zero, lambda i, *_: i < end, body)
         dr.eval(*sums)
         per_sample = 1.0 / side.astype(float) ** 2
-        mean, square = (
-            np.stack([np.bincount(cell, plane, len(side)) for plane in _planes(one)]) * per_sample for one in sums
-        )
+        mean, square = (_of_cells(cell, _planes(one), len(side)) * per_sample for one in sums)
         spread = np.maximum(square - mean**2, 0.0).astype(np.float32)
         if lamp is not None:
             mean = mean + light * part
@@ -408,10 +414,13 @@ class CellSampler:
         import drjit as dr
 
         mi, grid = self._mi, self.grid
-        columns = dr.opaque(mi.UInt32, grid.square_columns * parts if parts else grid.columns)
+        columns = grid.square_columns * parts if parts else grid.columns
         edge = grid.margin_px + (RIM_PX if parts else 0)
-        h, start = (dr.opaque(mi.Float64, value) for value in (1.0 / (parts or grid.cells), -0.5 - edge))
-        return [mi.Float64(place) * h + start for place in (lanes % columns, lanes // columns)], h
+        numbers = (1.0 / (parts or grid.cells), -0.5 - edge, columns, 1.0 / columns)
+        h, start, across, per_row = (dr.opaque(mi.Float64, float(value)) for value in numbers)
+        lane = mi.Float64(lanes)
+        row = dr.floor((lane + 0.5) * per_row)  # exact, and faster than a division of whole numbers
+        return [place * h + start for place in (lane - row * across, row)], h
 
     def _key(self, stream: int) -> int:
         """32-bit seed of one of the view's streams."""
@@ -421,12 +430,30 @@ class CellSampler:
 def _chunks(side: NDArray[np.int32]) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
     """Cell, first sample and end of each lane; lanes of like length lie together, because 16 lanes run as one."""
     samples = side.astype(np.intp) ** 2
+    if samples.max(initial=0) <= _CHUNK:  # a lane each
+        order = _longest_first(samples)
+        return order, np.zeros_like(order), samples[order]
     count = -(-samples // _CHUNK)
     cell = np.repeat(np.arange(len(side)), count)
     start = (np.arange(len(cell)) - np.repeat(np.cumsum(count) - count, count)) * _CHUNK
     stop = np.minimum(start + _CHUNK, samples[cell])
-    order = np.argsort((start - stop).astype(np.int16), kind="stable")  # by radix: ten times as fast as whole words
+    order = _longest_first(stop - start)
     return cell[order], start[order], stop[order]
+
+
+def _longest_first(samples: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Order of lanes; by radix, which takes a tenth of the time that whole words take."""
+    return np.argsort((-samples).astype(np.int16), kind="stable")
+
+
+def _of_cells(cell: NDArray[np.intp], lanes: Stack, count: int) -> NDArray[np.float64]:
+    """Sums (3, count) over the lanes (3, n) of each cell."""
+    if len(cell) > count:
+        return np.stack([np.bincount(cell, plane, count) for plane in lanes])
+    sums = np.empty((3, count))  # a lane each: its number need not be added to anything
+    for plane, values in zip(sums, lanes, strict=True):
+        plane[cell] = values
+    return sums
 
 
 def _starts(cells: int) -> range:

@@ -157,9 +157,15 @@ class Surfaces:
         if not self.has_coats:
             return value
         onward, coated, mirrored = self.mirrored(patch, point, direction, active)
-        t, other, valid = self.hit(onward, coated)
-        light = self.light(self.ground(other, onward(t), onward.d, valid, True))
-        return value + dr.select(coated, mirrored, 0.0) * light
+
+        def beyond(start: Any, way: Any, part: Any) -> Any:
+            ray = self._mi.Ray3f(start, way)
+            t, other, valid = self.hit(ray)
+            return part * self.light(self.ground(other, ray(t), way, valid, True))
+
+        # most lanes of a kernel meet no coat: it leaves out what none of those that run together needs
+        start = onward.o, onward.d, mirrored
+        return value + dr.if_stmt(start, coated, beyond, lambda *_: dr.zeros(self._mi.Color3f))
 
     def mirrored(self, patch: Any, point: Any, direction: Any, active: Any) -> tuple[Any, Any, Any]:
         """Rays that coats mirror, where there is a coat, and its reflectance."""
