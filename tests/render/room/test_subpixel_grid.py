@@ -17,6 +17,7 @@ from phibench.render.optics.spot_layer import spot_layer
 from phibench.render.optics.truth import spot_truth, truth_layer
 from phibench.render.room import refinement
 from phibench.render.room.ambient_layer import render_ambient, view_film, view_surfaces
+from phibench.render.room.film_cells import Cells, cell_plane, fold
 from phibench.render.room.light_map import BakeSettings, LightMap, bake
 from phibench.render.room.noise_budget import (
     BUDGET,
@@ -96,6 +97,26 @@ def test_a_grid_too_coarse_for_the_blur_is_made_finer() -> None:
 def test_weights_keep_the_light() -> None:
     for sigma in (0.05, 0.3, 0.7, 2.0):
         assert FilmGrid(32, 32, sigma, 2).taps.sum() == pytest.approx(1.0, abs=3e-6)
+
+
+def test_whole_pixels_are_summed_as_their_cells() -> None:
+    """A window of 200 x 8 pixels of which one is cut: its columns by cells, the others by whole pixels."""
+    grid = FilmGrid(200, 8, 0.7, 2)
+    squares = grid.squares((0, 0, 200, 8))[3:-3, 3:-3]
+    off, rng = np.zeros(squares.shape, dtype=bool), np.random.default_rng(0)
+    cells = Cells.uncut(grid, squares, off, off, np.zeros(squares.shape, dtype=np.float32))
+    for plane in cells.whole:
+        plane[:] = rng.random(plane.shape)
+    cells.rank[6, 150] = 0
+    cells.halves = [rng.random((3, 2, 2, 1)).astype(np.float32) for _ in range(2)]
+    cells.edges = np.zeros((3, 2, 2, 1), dtype=np.float32)
+    pixels = np.empty((2, 3, 8, 200), dtype=np.float32)
+    fold(cells, pixels, slice(0, 8), slice(0, 200))
+    (a, b), place = cells.halves, (np.array([6]), np.array([150]))
+    own = 0.5 * (a + b), np.square(0.5 * (a - b))
+    for k, (whole, cut) in enumerate(zip((cells.whole[0], 4.0 * cells.whole[1]), own, strict=True)):
+        wanted = grid.pixels(cell_plane(grid, whole, *place, cut), power=k + 1)
+        assert np.allclose(pixels[k], wanted, rtol=1e-6, atol=0.0)
 
 
 @pytest.mark.parametrize("shifts", [shifts, paired_shifts])
