@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from phibench.calibration.sensor_fit.capture_folder import CaptureError
-from phibench.calibration.sensor_fit.fit import fit_sensor
+from phibench.calibration.sensor_fit.fit_sensor import fit_sensor
 from phibench.datasets.frames.sensor_file import SensorFile
 
 CAMERA = BentCamera(0.15, 12.0, 150.0, size=(96, 96))

@@ -15,7 +15,6 @@ import pytest
 from helpers.valid_files import LIGHT, npy_members, npz, reshaped
 
 from phibench.datasets.build.bake_task import read_light_map
-from phibench.datasets.build.workers import MEMORY
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.store import schema
 from phibench.render.room.light_map import encoded
@@ -81,11 +80,12 @@ KEPT = """
 import os
 from pathlib import Path
 import numpy as np
-from phibench.datasets.common.parallel import return_memory
+from phibench.datasets.common.parallel import keep_memory, return_memory
 
 def resident_mb():
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
 
+keep_memory()
 before = resident_mb()
 held = [np.ones(250_000) for _ in range(100)]  # 2 MB each
 last = np.ones(1000)  # lies above them: the heap cannot shrink from its end
@@ -98,9 +98,9 @@ print(kept, resident_mb() - before)
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="another C library gives memory back by itself, or not")
 def test_memory_that_is_free_is_given_back(python: Callable[..., subprocess.CompletedProcess[str]]) -> None:
-    child = python(KEPT, **MEMORY)
+    child = python(KEPT)
     assert child.returncode == 0, child.stderr
     kept, left = map(float, child.stdout.split())
-    if kept < 190.0:  # before 2.35 glibc refuses the threshold that `MEMORY` asks for
+    if kept < 190.0:  # before 2.35 glibc refuses the threshold that `keep_memory` asks for
         pytest.skip("this glibc keeps nothing")
     assert left < 10.0
