@@ -57,7 +57,7 @@ UNIFORM = {"uniform": [0.1, 1.4]}
         ({"rig": {"width_px": {"choice": [640]}}}, "random.rig.width_px", ("same for all samples",)),
         ({"rig": {"f_number": {"uniform": [0.1, 3]}}}, "random.rig.f_number", ("reaches 0.1", "from 0.5 up to 256")),
         ({"rig": {"z_c_m": {"choice": [0.3, 7.0]}}}, "random.rig.z_c_m", ("reaches 7", "up to 5")),
-        ({"rig": {"k1": True}}, "random.rig.k1", ("True", "a number or a distribution")),
+        ({"rig": {"k1": True}}, "random.rig.k1", ("true", "a number or a distribution")),
         ({"rig": {"holder": {"kind": "tripod"}}}, "random.rig.holder.kind.choice[0]", ("'tripod'", "'post', 'tube'")),
         ({"rig": {"holder": {"kind": {"choice": []}}}}, "random.rig.holder.kind.choice", ("at least 1",)),
         ({"rig": {"holder": {"radius_m": -0.1}}}, "random.rig.holder.radius_m", ("reaches -0.1", "from 0.0001")),

@@ -75,7 +75,7 @@ def test_the_spot_grows_with_distance_or_has_one_diameter() -> None:
         (changed(rig={"z_c": 0.3}), "rig.z_c", ("unknown", "'z_c_m'")),
         (changed(rig={"preset": "defalt"}), "rig.preset", ("'default', 'c310'",)),
         (changed(rig={"k1": math.nan}), "rig.k1", ("nan", "from -1000 up to 1000")),
-        (changed(rig={"f_number": True}), "rig.f_number", ("True", "a number from 0.5")),
+        (changed(rig={"f_number": True}), "rig.f_number", ("true", "a number from 0.5")),
         (changed(rig={"z_c_m": "0.3"}), "rig.z_c_m", ("'0.3'", "a number above 0")),
         (changed(rig={"z_c_m": 0.05}), "rig", ("0.0500 m", "mirror radius", "z_c_m = 0.05", "radius_m = 0.06")),
         (changed(rig={"camera_height_m": 3.0}), "rig.camera_height_m", ("ceiling", "less than 2.679")),
