@@ -1,10 +1,13 @@
-"""CPU time of light maps, of views with all that is written of them, and of a film, one thread, as a worker does them.
+"""CPU time of light maps, of views with all that is written of them, and of a film; noise of a view over seeds.
+
+One thread, as a worker does them.
 
 python docs/measure_views.py bake lab
 python docs/measure_views.py bake worlds --rooms 20
 python docs/measure_views.py bake bench-test --only mesh000005 mesh000015
 python docs/measure_views.py view paper
 python docs/measure_views.py view worlds
+python docs/measure_views.py noise worlds
 python docs/measure_views.py film bench-drives
 """
 
@@ -29,7 +32,7 @@ from unittest.mock import patch
 
 import numpy as np
 
-from phibench.datasets.build.bake_task import bake_room, bake_settings
+from phibench.datasets.build.bake_task import bake_room, bake_settings, read_light_map
 from phibench.datasets.build.view_task import render_view
 from phibench.datasets.common.parallel import ONE_THREAD, keep_memory, return_memory
 from phibench.datasets.film.film_plan import film_plans
@@ -38,9 +41,14 @@ from phibench.datasets.film.film_task import make_film
 from phibench.datasets.plan.draws import draw_rooms
 from phibench.datasets.plan.plan import make_plan
 from phibench.datasets.recipe.load import load_recipe, parse_recipe, recipe_text
-from phibench.datasets.store.schema import view_file
+from phibench.datasets.rooms.room_sources import room_of
+from phibench.datasets.store.layers import TRUTH_PLANES
+from phibench.datasets.store.schema import ROOM_FILES, view_file
+from phibench.render.optics.room_tracer import room_geometry
+from phibench.render.optics.truth import truth_layer
+from phibench.render.room.ambient_layer import ROUNDS, render_ambient, view_surfaces
 from phibench.render.room.light_map import BakeSettings, bake
-from phibench.render.room.noise_budget import BUDGETS
+from phibench.render.room.noise_budget import BUDGETS, allowed_per_s2, is_full
 from phibench.render.room.subpixel_grid import CellSampler
 from phibench.render.setup.variant import activate
 from phibench.scenes.room import Room, default_rig, lab
@@ -123,6 +131,42 @@ def measure_views(what: str, quality: str | None, repeat: int) -> None:
     print(f"{count / 1e6:.2f} million rays; memory {_memory_mb():.0f} MB")
 
 
+def measure_noise(what: str, quality: str | None, seeds: int) -> None:
+    """Render the first view of a recipe with several seeds; print its scatter beside what is stated and allowed."""
+    recipe = load_recipe(what)
+    ambient = recipe.ambient.model_copy(update={"quality": quality or recipe.ambient.quality})
+    plan = make_plan(recipe)
+    pose = plan.poses[0]
+    view, budget = plan.rigs[pose.rig].at(pose.offset_m), BUDGETS[ambient.quality]
+    with TemporaryDirectory() as folder:
+        out = Path(folder)
+        bake_room(out, plan.rig, pose.room, plan.rooms[pose.room], ambient)
+        room, light = room_of(plan.rooms[pose.room], out / ROOM_FILES), read_light_map(out, pose.room)
+    settings, surfaces = bake_settings(ambient), view_surfaces(view, room)
+    drawn = (
+        render_ambient(
+            view, room, light, settings, ambient.cells_per_pixel, pose.seed + k, None, ROUNDS, budget, surfaces
+        )
+        for k in range(seeds)
+    )
+    levels, variances = (
+        np.array(a) for a in zip(*((v.electrons_per_s, v.variance_per_s2) for v in drawn), strict=True)
+    )
+    truth = truth_layer(view, room_geometry(room, view), surfaces.first_patch, TRUTH_PLANES)
+    mean = levels.mean(axis=0)
+    counts = np.isfinite(truth["path_m"]) & ~is_full(mean)
+    scatter = levels.var(axis=0, ddof=1)
+    found, stated = scatter[counts], variances.mean(axis=0)[counts]
+    over = np.where(counts, scatter, 0.0) > allowed_per_s2(mean, view.rig.camera.blur_sigma_px, budget)
+    step = (levels[1] - levels[0])[counts] / np.sqrt((variances[0] + variances[1])[counts])
+    print(
+        f"{seeds} seeds, values in the mirror: stated over true variance {stated.sum() / found.sum():.3f}; "
+        f"pixels above the budget {100 * over.any(axis=0).sum() / counts.any(axis=0).sum():.3f} %; "
+        f"two seeds differ by more than 5 stated sigma in {100 * np.mean(np.abs(step) > 5.0):.2f} % of the values, "
+        f"in the mean by {(levels[1] - levels[0])[counts].sum() / mean[counts].sum():.1e}"
+    )
+
+
 def _parts(work: Any) -> Counter[str]:
     """CPU seconds of parts of some work, and of all of it."""
     spent: Counter[str] = Counter()
@@ -180,11 +224,11 @@ def main() -> None:
         os.execve(sys.executable, [sys.executable, *sys.argv], {**os.environ, **ONE_THREAD})
     keep_memory()
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("which", choices=("bake", "view", "film"))
+    parser.add_argument("which", choices=("bake", "view", "noise", "film"))
     parser.add_argument("what", help="a recipe; bakes also of `lab` at its own noise")
     parser.add_argument("--rooms", type=int, default=5, help="bakes")
     parser.add_argument("--only", nargs="+", default=[], metavar="ROOM", help="bakes of these rooms")
-    parser.add_argument("--repeat", type=int, default=5, help="renderings of a view")
+    parser.add_argument("--repeat", type=int, default=5, help="renderings of a view; seeds of its noise")
     parser.add_argument("--quality", choices=tuple(BUDGETS), help="of a view, over the recipe's")
     options = parser.parse_args()
     activate()
@@ -192,6 +236,8 @@ def main() -> None:
         measure_bakes(options.what, options.rooms, options.only)
     elif options.which == "film":
         measure_film(options.what)
+    elif options.which == "noise":
+        measure_noise(options.what, options.quality, options.repeat)
     else:
         measure_views(options.what, options.quality, options.repeat)
 
