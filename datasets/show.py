@@ -109,13 +109,15 @@ def _console() -> Console:
 def table(dataset: Dataset) -> Table:
     """Table of all samples; each one's room takes the place of its experiment where there are several.
 
-    Places, phi and D are those of the centre of the light, which scores refer to.
+    Places, phi and D are those of the centre of the light, which scores refer to. The least sigma is that of phi_ray
+    from one raw frame at the nominal exposure: "visible" is geometry alone, and a faint spot has a large one.
     """
     result = Table(title=_title(dataset), box=box.SIMPLE)
     several = len({row.room for row in dataset.rows}) > 1
     for heading in ("sample", "room" if several else "experiment"):
         result.add_column(heading, no_wrap=True)
-    for heading in ("D (m)", "h (m)", "down u, v (px)", "up u, v (px)", "phi_ray (deg)", "visible", "certificate"):
+    pixels = ("down u, v (px)", "up u, v (px)")
+    for heading in ("D (m)", "h (m)", *pixels, "phi_ray (deg)", "least sigma (deg)", "visible"):
         result.add_column(heading, justify="right", no_wrap=True)
     for row in dataset.rows:
         result.add_row(*_cells(row, row.room if several else row.experiment))
@@ -123,17 +125,16 @@ def table(dataset: Dataset) -> Table:
 
 
 def narrow_table(dataset: Dataset) -> Table:
-    """Table of all samples for terminals of 80 columns: a line for each image, without phi and certificate."""
+    """Table of all samples for terminals of 80 columns: a line for each image, without phi."""
     result = Table(title=_title(dataset), box=None, padding=(0, 1, 0, 0))
-    for heading in ("sample", "D (m)", "h (m)", "image", "u, v (px)", "visible"):
-        result.add_column(
-            heading, justify="right" if heading in ("D (m)", "h (m)", "u, v (px)") else "left", no_wrap=True
-        )
+    for heading in ("sample", "D (m)", "h (m)", "image", "u, v (px)", "sigma (deg)", "visible"):
+        words = heading in ("sample", "image", "visible")
+        result.add_column(heading, justify="left" if words else "right", no_wrap=True)
     for row in dataset.rows:
         numbers = (row.sample_id, f"{row.centre_depth_m:.3f}", f"{row.stroke_m:.3f}")
         for position, cells in zip(POSITIONS, (numbers, ("", "", "")), strict=True):
             spot = row.position(position)
-            result.add_row(*cells, position, _pixel(spot), "yes" if spot.visible else spot.cause)
+            result.add_row(*cells, position, _pixel(spot), _least_sigma(spot), "yes" if spot.visible else spot.cause)
     return result
 
 
@@ -165,17 +166,20 @@ def contact_sheet(dataset: Dataset, console: Console) -> Picture:
 
 
 def _title(dataset: Dataset) -> str:
-    return f"{dataset.info.name}: {len(dataset)} stroke pairs, {len(dataset.info.poses)} mirror poses"
+    checks = [spot.certificate.passed for row in dataset.rows for spot in (row.down, row.up) if spot.certificate]
+    return (
+        f"{dataset.info.name}: {len(dataset)} stroke pairs, {len(dataset.info.poses)} mirror poses; "
+        f"certificates passed: {sum(checks)} of {len(checks)}"
+    )
 
 
 def _pixel(spot: SpotRow) -> str:
     return f"{spot.centre.u_px:.2f}, {spot.centre.v_px:.2f}" if np.isfinite(spot.u_px) else "-"
 
 
-def _certificate(spot: SpotRow) -> str:
-    if spot.certificate is None:
-        return "-"
-    return "passed" if spot.certificate.passed else "failed"
+def _least_sigma(spot: SpotRow) -> str:
+    """Sigma of phi_ray that the sensor's noise leaves at best, degrees: to two digits."""
+    return f"{np.degrees(spot.noise.phi_sensor_rad):.2g}" if spot.noise else "-"
 
 
 def _cells(row: ManifestRow, group: str) -> tuple[str, ...]:
@@ -187,8 +191,8 @@ def _cells(row: ManifestRow, group: str) -> tuple[str, ...]:
         f"{row.stroke_m:.3f}",
         *(_pixel(spot) for spot in spots),
         " / ".join(f"{np.degrees(spot.centre.phi_ray_rad):.3f}" for spot in spots),
+        " / ".join(_least_sigma(spot) for spot in spots),
         " / ".join("yes" if spot.visible else spot.cause for spot in spots),
-        " / ".join(_certificate(spot) for spot in spots),
     )
 
 

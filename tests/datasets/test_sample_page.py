@@ -22,6 +22,7 @@ from phibench.datasets.read import Sample, open_dataset
 from phibench.datasets.sample_page import STEPS, epipolar_line, page_data, sample_of, sample_page, write_sample_page
 from phibench.datasets.show import _cells
 from phibench.datasets.store.layers import SpotWindow
+from phibench.datasets.store.schema import NoiseRow
 from phibench.render.optics.ray_tracer import trace_pixels
 from phibench.render.optics.room_tracer import room_geometry
 from phibench.render.optics.truth import spot_truth
@@ -80,6 +81,16 @@ def test_the_page_and_the_table_show_the_light_that_scores_refer_to(sample: Samp
     assert shown in _cells(torn.row, "")
     assert f"({shown}) px" in repr(torn)
     assert "D = 2.500 m" in repr(torn)
+
+
+def test_the_table_tells_a_faint_spot_from_a_bright_one(sample: Sample) -> None:
+    """A spot that sees the camera is visible, however faint: its least sigma of phi stands beside it, or no number."""
+    row, faint, bright = sample.row, NoiseRow(phi_sensor_rad=0.02, phi_render_rad=0.0), sample.row.up.noise
+    assert bright is not None
+    dim = row.model_copy(update={"down": row.down.model_copy(update={"noise": faint})})
+    assert f"1.1 / {np.degrees(bright.phi_sensor_rad):.2g}" in _cells(dim, "")
+    hidden = row.model_copy(update={"down": row.down.model_copy(update={"noise": None})})
+    assert f"- / {np.degrees(bright.phi_sensor_rad):.2g}" in _cells(hidden, "")
 
 
 def test_crosses_of_previews_are_on_the_light(sample: Sample) -> None:
