@@ -16,8 +16,8 @@ from phibench.scenes.frames import Array
 _FLAT = 1e-12  # of the polygon's area: turns below it are straight
 
 
-MOST_CUTTING = 30_000_000
-"""Corners that are looked at for all concave polygons of a file together, one for each ear; some 10 s."""
+MOST_CUTTING = 15_000_000
+"""Corners that are looked at for all concave polygons of a file together, one for each ear; some 3 to 7 s."""
 _TURN_COST = 20  # corners that could be looked at in the time of one turn
 
 
