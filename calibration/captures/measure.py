@@ -14,7 +14,7 @@ rays over its standard deviation, rig included, is chi^2 of one degree of freedo
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -47,7 +47,7 @@ from phibench.calibration.captures.spot_shape import (
     seen_through,
     spot_images,
 )
-from phibench.calibration.captures.tested_chain import ChainTest, chain_test
+from phibench.calibration.captures.tested_chain import PATTERNS, ChainTest, chain_test
 from phibench.calibration.outline.outline import find_outline
 from phibench.calibration.outline.outline_result import Outline
 from phibench.calibration.rig.bundle import calibrate
@@ -170,7 +170,12 @@ class Measurement:
         return float(self.depth.sigma_m)
 
 
-def measure(photos: PairPhotos, stroke_m: float, setting: KnownNumbers) -> Measurement:
+Told = Callable[[str], None]
+"""Given each stage in words."""
+_LOOKING = "no pair of spots: looking for the mistake"
+
+
+def measure(photos: PairPhotos, stroke_m: float, setting: KnownNumbers, told: Told = lambda stage: None) -> Measurement:
     """Measure D.
 
     Parameters
@@ -179,6 +184,8 @@ def measure(photos: PairPhotos, stroke_m: float, setting: KnownNumbers) -> Measu
     stroke_m : float
         As the person read it.
     setting : KnownNumbers
+    told : callable
+        Given each stage in words, before it begins: all together take some seconds.
 
     Raises
     ------
@@ -192,27 +199,29 @@ def measure(photos: PairPhotos, stroke_m: float, setting: KnownNumbers) -> Measu
         require_colour(photo)
         require_camera_size(setting.known.rig, photo.size_px, str(photo.path))
         sensor_choice(photo, setting.sensor)
+    told("trying what the files stand for")
     test = chain_test(
         photos,
         lambda photo: sensor_choice(photo, setting.sensor).card,
         lambda group, card: pair_of_photos(group, stroke_m, setting.known, card),
     )
     if photos.down.on[0].kind == "raw" and (corner := next(iter(test.phases))) != (0, 0):
-        return _shifted(measure(*_without(corner, photos, stroke_m, setting)), corner, photos, setting, test.note)
-    return _measured(test, stroke_m, setting)
+        return _shifted(measure(*_without(corner, photos, stroke_m, setting), told), corner, photos, setting, test.note)
+    return _measured(test, stroke_m, setting, told)
 
 
-def _measured(test: ChainTest, stroke_m: float, setting: KnownNumbers) -> Measurement:
+def _measured(test: ChainTest, stroke_m: float, setting: KnownNumbers, told: Told) -> Measurement:
     """Measurement with the phases of a test, which are in sigma where they are several."""
     photos, chosen = test.photos, sensor_choice(test.photos.down.on[0], setting.sensor)
     parts: list[tuple[_Fitted, float]] = []
     faults: list[DatasetError] = []
     for phase, chance in test.phases.items():
+        stages = told if len(test.phases) == 1 else _told_of(PATTERNS[phase], told)
         try:
             card = replace(chosen.card, mosaic_phase=phase)
             # the outline hardly knows of the phase: that of the first is every other's
             seen = parts[0][0].limb if parts else None
-            parts.append((_fitted(photos, stroke_m, setting, card, seen), chance))
+            parts.append((_fitted(photos, stroke_m, setting, card, stages, seen), chance))
         except DatasetError as error:
             faults.append(error)
     if not parts:
@@ -232,6 +241,7 @@ def _measured(test: ChainTest, stroke_m: float, setting: KnownNumbers) -> Measur
         setting.stroke_sigma_m,
     )
     if int(depth.status) != Status.OK:
+        told(_LOOKING)
         raise contradiction(found.pair, photos, describe(int(depth.status)))
     if test.doubt and (fault := exchanged_colours(found.pair, photos)):
         raise fault
@@ -240,9 +250,13 @@ def _measured(test: ChainTest, stroke_m: float, setting: KnownNumbers) -> Measur
     faults_of_spots += (found.doubt, apart(found.limb[0]))
     notes = chosen.note, test.note, *found.notes, frames_note(photos), gap, *faults_of_spots
     doubts = "" if is_one else gap, *faults_of_spots
-    told, doubted = (tuple(text for text in texts if text) for texts in (notes, doubts))
+    said, doubted = (tuple(text for text in texts if text) for texts in (notes, doubts))
     rig, limb, nominal = found.rig, found.limb[0], setting.known.rig
-    return Measurement(depth, down, up, rig, found.stroke_m, limb, nominal, found.pair, chosen, told, doubted)
+    return Measurement(depth, down, up, rig, found.stroke_m, limb, nominal, found.pair, chosen, said, doubted)
+
+
+def _told_of(pattern: str, told: Told) -> Told:
+    return lambda stage: told(f"{stage}, as {pattern}")
 
 
 _Limb = tuple[tuple[Outline, ...], str]
@@ -264,19 +278,28 @@ class _Fitted:
 
 
 def _fitted(
-    photos: PairPhotos, stroke_m: float, setting: KnownNumbers, card: SensorCard, limb: _Limb | None = None
+    photos: PairPhotos,
+    stroke_m: float,
+    setting: KnownNumbers,
+    card: SensorCard,
+    told: Told,
+    limb: _Limb | None = None,
 ) -> _Fitted:
     """Fit both spots; outlines are looked for, or are those of `limb`, with why there are none."""
     pair = pair_of_photos(photos, stroke_m, setting.known, card)
-    outlines, missing = limb = limb or _outlines(pair, setting.calibration is not None)
+    if limb is None:
+        told("looking for the mirror's outline")
+        limb = _outlines(pair, setting.calibration is not None)
+    outlines, missing = limb
     rig, covariance, values, note, doubt = _corrected(setting, outlines, missing)
     stroke = float(stroke_of(np.array(stroke_m), values))
+    told("fitting the spots")
     seen = replace(pair, rig=with_blur_of(rig, outlines), stroke_m=stroke)
     images = seen_images(seen)
     shape = _shape(setting, seen, images, outlines)
     rig = shape.rig(rig)
     ready = replace(pair, rig=rig, stroke_m=stroke)
-    spots = seen_spots(_answer(ready, photos))
+    spots = seen_spots(_answer(ready, photos, told))
     wide = {name: widened_by_shape(spots[name], images.get(name), shape) for name in POSITIONS}
     return _Fitted(ready, wide, rig, covariance, stroke, limb, (note, _shape_note(shape, setting)), doubt)
 
@@ -427,10 +450,11 @@ def _shape_note(shape: SpotShape, setting: KnownNumbers) -> str:
     return f"spots: blur {blur:.2f} +- {blur_sigma:.2f} px, filters 1 : {green:.2f} : {blue:.2f}, {source}"
 
 
-def _answer(pair: Pair, photos: PairPhotos) -> Answer:
+def _answer(pair: Pair, photos: PairPhotos, told: Told) -> Answer:
     pair = SharedPair.of(pair)
     answer = method_for(pair.card)(pair)
     if any(spot.uv_px is None or spot.covariance_px2 is None for spot in (answer.down, answer.up)):
+        told(_LOOKING)
         raise nothing_found(pair, photos, answer)
     return kept(pair, answer, with_posteriors(pair, answer))
 

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from types import TracebackType
 
 from rich.console import Console
@@ -113,6 +114,18 @@ class Steps:
         if self._forecast_s is not None:
             return self._forecast_s()
         return (time.monotonic() - self._started) / self._done * (self._total - self._done)
+
+
+@contextmanager
+def stages(console: Console, title: str) -> Iterator[Callable[[str], None]]:
+    """Line with the stage of what takes some seconds, on a terminal alone; gives what each stage is told to."""
+    if not console.is_terminal:
+        yield lambda stage: None
+        return
+    now = [""]
+    with Steps(console, title, 1, running=lambda: now[0]) as steps:
+        yield lambda stage: now.__setitem__(0, stage)
+        steps.advance()
 
 
 class StillRunning:

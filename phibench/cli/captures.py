@@ -90,11 +90,13 @@ def _measure_pair(pair: PairPictures, setting: KnownNumbers, out: Path | None) -
     from phibench.calibration.captures.measure_picture import write_measure_picture
     from phibench.calibration.captures.pair_photos import PairPhotos, PositionPhotos
     from phibench.calibration.captures.picture_files import read_photo
+    from phibench.datasets.common.progress import progress_console, stages
 
     files = (pair.down, pair.up, pair.down_off, pair.up_off)
-    groups = [tuple(read_photo(path, setting.known.rig, setting.sensor) for path in paths) for paths in files]
-    photos = PairPhotos(PositionPhotos(groups[0], groups[2]), PositionPhotos(groups[1], groups[3]))
-    measurement = measured(photos, pair.stroke_m or 0.0, setting)
+    with stages(progress_console(), "measure") as told:
+        groups = [tuple(read_photo(path, setting.known.rig, setting.sensor) for path in paths) for paths in files]
+        photos = PairPhotos(PositionPhotos(groups[0], groups[2]), PositionPhotos(groups[1], groups[3]))
+        measurement = measured(photos, pair.stroke_m or 0.0, setting, told)
     print(f"D = {measurement.depth_m:.4f} m, sigma {measurement.sigma_m:.4f} m")
     spot_m, rig_m = float(measurement.depth.sigma_spot_m), float(measurement.depth.sigma_calibration_m)
     print(

@@ -283,6 +283,17 @@ def test_progress_on_a_terminal_goes_by_time_and_says_what_runs(
     assert 7 <= len(bar.rstrip("╺")) <= 9  # of 16
 
 
+def test_stages_are_told_on_a_terminal_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(progress, "_BAR_EVERY_S", 0.02)
+    console = Console(file=io.StringIO(), width=80, force_terminal=True, color_system=None, legacy_windows=False)
+    with progress.stages(console, "measure") as told:
+        told("fitting the spots")
+        wait_until(lambda: "fitting the spots" in said(console), "the stage")
+    with progress.stages(silent := quiet(), "measure") as told:
+        told("fitting the spots")
+    assert said(silent) == ""
+
+
 @pytest.mark.usefixtures("inline")
 def test_a_long_bake_is_not_silent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     console = quiet()

@@ -89,7 +89,9 @@ def test_the_outline_corrects_the_rig_and_the_spots_say_their_blur(case: Case, m
     monkeypatch.setattr("phibench.calibration.captures.measure.find_outline", lambda *_: outline)
     read = {name: (read_photo(paths[0], setting.known.rig),) for name, paths in case.raw.items()}
     photos = PairPhotos(PositionPhotos(read["down"], read["down_off"]), PositionPhotos(read["up"], read["up_off"]))
-    found = measure(photos, case.sample.row.stroke_m, setting)
+    stages: list[str] = []
+    found = measure(photos, case.sample.row.stroke_m, setting, stages.append)
+    assert stages == ["trying what the files stand for", "looking for the mirror's outline", "fitting the spots"]
     # the outline says |s| / R only: most of it goes into the distance, whose ruler is the worst
     assert 1e-3 < found.rig.sphere_in_camera_m[2] - setting.known.rig.sphere_in_camera_m[2] < 2e-3
     # two bright spots against an outline's 0.90 px: theirs is 0.70 px, to some 0.03 px; 2 sigma
