@@ -46,6 +46,7 @@ _PIXELS = 1000  # that must say something
 _CUT_CODES = 4.0  # of a residual: beyond it one counts no more
 _DIFFERENT = 1.02  # rms of the second phase's residual over the first's, from which on the first is the mosaic's
 _ROUNDED = 0.39  # codes: rms that rounding alone leaves, 0.34, or 0.38 through another curve
+_CHANGED = 0.5  # codes: rms from which on a picture is not one of those that rounding alone has changed
 
 
 # -- interpolation -----------------------------------------------------------------------------------------------------
@@ -138,16 +139,18 @@ def jpeg_behind(pixels: Image) -> tuple[int, Subsampling] | None:
     quality = comb_quality(pixels)
     if quality is None:
         return None
-    corner = _middle(pixels)[:512, :512]
-    corner = np.ascontiguousarray(corner[: corner.shape[0] // 16 * 16, : corner.shape[1] // 16 * 16])
-    off: dict[Subsampling, float] = {}
     samplings: tuple[Subsampling, ...] = ("4:2:0", "4:2:2", "4:4:4")
-    for sampling in samplings:
-        card = replace(sensor_card("mjpeg"), jpeg_quality=quality, jpeg_subsampling=sampling)
-        again = through_jpeg(corner, card)
-        off[sampling] = float(np.sqrt(np.mean((again.astype(float) - corner) ** 2)))
+    off = {sampling: _changed_codes(pixels, quality, sampling) for sampling in samplings}
     best = min(off, key=lambda sampling: off[sampling])
     return (quality, best) if off[best] < _SAME_CODES else None
+
+
+def _changed_codes(pixels: Image, quality: int, sampling: Subsampling) -> float:
+    """How much the same JPEG once more changes a picture, rms in codes."""
+    corner = _middle(pixels)[:512, :512]
+    corner = np.ascontiguousarray(corner[: corner.shape[0] // 16 * 16, : corner.shape[1] // 16 * 16])
+    again = through_jpeg(corner, replace(sensor_card("mjpeg"), jpeg_quality=quality, jpeg_subsampling=sampling))
+    return float(np.sqrt(np.mean((again.astype(float) - corner) ** 2)))
 
 
 def comb_quality(pixels: Image) -> int | None:
@@ -335,20 +338,52 @@ def chain_test(photos: PairPhotos, choice: Callable[[Photo], SensorCard], pair_o
     Raises
     ------
     ImageError
-        If DN have another mosaic than the card's; in one sentence.
+        If DN have another mosaic than the card's, or pictures were stored in different ways; in one sentence.
     """
     first = photos.down.on[0]
     if first.kind == "raw":
         return _of_raw(photos, choice(first), pair_of)
     if first.kind == "rgb":
-        behind = {jpeg_behind(photo.pixels) for photo in photos.all}
-        if len(behind) > 1 or None in behind:
+        found = _one_jpeg(photos.all, choice(first))
+        if found is None:
             return _of_codes(photos, choice(first))
-        ((quality, sampling),) = (found for found in behind if found is not None)
+        quality, sampling = found
         decoded = _as_jpeg(photos, quality, sampling)
         note = f"JPEG: the pixels are a decoded JPEG's of quality {quality}, {sampling}, and are fitted as such"
         return _of_outputs(decoded, choice(decoded.down.on[0]), pair_of, note)
     return _of_outputs(photos, choice(first), pair_of)
+
+
+def _one_jpeg(photos: Sequence[Photo], card: SensorCard) -> tuple[int, Subsampling] | None:
+    """JPEG that all pictures were decoded from; None if of none, or not of all for sure."""
+    behind = [jpeg_behind(photo.pixels) for photo in photos]
+    jpeg = next((found for found in behind if found is not None), None)
+    as_made: list[Photo] = []
+    changed: list[tuple[Photo, str]] = []
+    unknown = False
+    for photo, found in zip(photos, behind, strict=True):
+        # a dark picture has no comb, but stays as it is in its own JPEG
+        if jpeg is not None and (found == jpeg or _changed_codes(photo.pixels, *jpeg) < _SAME_CODES):
+            changed.append((photo, f"is a decoded JPEG of quality {jpeg[0]}, {jpeg[1]}"))
+            continue
+        unknown = True
+        residuals = interpolation([photo.pixels], card).residual_codes.values()
+        if found is not None:
+            raise _stored(photo, f"is a decoded JPEG of quality {found[0]}, {found[1]}", changed[0])
+        if residuals and min(residuals) > _CHANGED:
+            changed.append((photo, "was scaled, filtered or compressed since it was interpolated"))
+        elif residuals and min(residuals) < _ROUNDED:
+            as_made.append(photo)
+    if as_made and changed and is_plain(card):
+        raise _stored(as_made[0], "is as it was interpolated from its mosaic", changed[0])
+    return None if unknown else jpeg
+
+
+def _stored(photo: Photo, kind: str, other: tuple[Photo, str]) -> ImageError:
+    return ImageError(
+        f"pictures were stored or processed in different ways: {photo.path} {kind}, {other[0].path} {other[1]}; give "
+        "all of them as the camera stores them"
+    )
 
 
 def _as_jpeg(photos: PairPhotos, quality: int, sampling: Subsampling) -> PairPhotos:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 from helpers.camera_files import NAMES, write_pictures
 from PIL import Image
+from scipy.ndimage import gaussian_filter
 
 from phibench.calibration.captures.imported_set import ImportedSet, import_pairs, open_imported
 from phibench.calibration.captures.measure import Measurement, measure, read_setting
@@ -20,6 +22,7 @@ from phibench.datasets.frames.sensor_card import sensor_card
 from phibench.datasets.read import Sample, open_dataset
 from phibench.estimator.spots.image_planes import ImageError
 
+Change = Callable[[np.ndarray], np.ndarray]
 CARD = sensor_card("srgb8")
 TURNS = {(1, 0): np.s_[:, ::-1], (0, 1): np.s_[::-1], (1, 1): np.s_[::-1, ::-1]}
 
@@ -137,6 +140,29 @@ def test_a_smoothed_picture_is_doubtful_and_a_drawn_one_is_not(case: Case, tmp_p
     found = case.measured({name: scaled(case.pixels("srgb8", name)) for name in NAMES}, tmp_path)
     assert any("sigma does not hold" in doubt for doubt in found.doubts)
     assert found.down.sigma_px > 0.25
+
+
+def recoded(image: np.ndarray, quality: int) -> np.ndarray:
+    """Pixels of a JPEG of chroma 4:2:2."""
+    Image.fromarray(image).save(file := io.BytesIO(), "JPEG", quality=quality, subsampling="4:2:2")
+    return np.array(Image.open(file))
+
+
+@pytest.mark.parametrize(
+    ("down", "up", "words"),
+    [
+        (lambda x: x, lambda x: recoded(x, 85), "as it was interpolated .*up.*png is a decoded JPEG of quality 85"),
+        (lambda x: recoded(x, 70), lambda x: recoded(x, 85), "up.*png is a decoded JPEG of quality 85.*quality 70"),
+        (lambda x: x, lambda x: gaussian_filter(x, (1.0, 1.0, 0.0)), "up.*png was scaled, filtered or compressed"),
+    ],
+)
+def test_pictures_that_were_stored_in_different_ways_are_refused(
+    case: Case, tmp_path: Path, down: Change, up: Change, words: str
+) -> None:
+    """The spot of the changed one was 5.3 of its sigmas off without a word, or "has not the shape of one"."""
+    changes = {"down": down, "up": up, "down_off": down, "up_off": up}
+    with pytest.raises(DatasetError, match=words):
+        case.measured({name: changes[name](case.pixels("srgb8", name)) for name in NAMES}, tmp_path)
 
 
 @pytest.mark.usefixtures("unaligned")
