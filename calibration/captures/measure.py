@@ -246,7 +246,9 @@ def _measured(test: ChainTest, stroke_m: float, setting: KnownNumbers, told: Tol
     if test.doubt and (fault := exchanged_colours(found.pair, photos)):
         raise fault
     gap, is_one = _gap(depth), float(depth.p_value) >= DOUBTFUL_P
-    faults_of_spots = _torn(down, "down"), _torn(up, "up"), *_moved(found.pair, photos), _foreign(test)
+    # through another chain a sound spot has another shape, too: the laser is not to blame
+    torn = () if test.doubt and not test.by_spots else (_torn(down, "down"), _torn(up, "up"))
+    faults_of_spots = *torn, *_moved(found.pair, photos), _foreign(test)
     faults_of_spots += (found.doubt, apart(found.limb[0]))
     notes = chosen.note, test.note, *found.notes, frames_note(photos), gap, *faults_of_spots
     doubts = "" if is_one else gap, *faults_of_spots

@@ -111,6 +111,8 @@ _LENS = "write k1, k2, p1, p2 and k3, of OpenCV's model, each in a line of its o
 _SIZE = "write width_px and height_px"
 _PLACE = "write cx_px and cy_px"
 _SPHERE = "the radius of a sphere, half its diameter, is radius_m of [rig], in metres"
+_FIELD = "fov_deg is the horizontal field of view: of the diagonal one, or the vertical one, write fx_px instead"
+_TAPE = "D is no part of the rig: it is measured, and that of a tape stands in pairs.csv"
 _STROKE = "the stroke is no part of the rig: give it with --stroke-m, or in pairs.csv"
 _ADVICE = {
     **dict.fromkeys(("resolution", "image_size", "size", "shape"), _SIZE),
@@ -120,9 +122,15 @@ _ADVICE = {
     **{f"{of}{what}": _SPHERE for of in ("mirror_", "sphere_", "ball_", "r_") for what in ("radius", "diameter")},
     **dict.fromkeys(("diameter", "r"), _SPHERE),
     **dict.fromkeys(("stroke", "stroke_length", "h"), _STROKE),
+    **dict.fromkeys(("vfov", "fov_v", "fov_y", "fovy", "vertical_fov", "dfov", "fov_d", "diagonal_fov"), _FIELD),
+    **dict.fromkeys(("depth", "depth_sigma", "tape"), _TAPE),
     **dict.fromkeys(("laser", "beam"), "the laser has a table of its own: begin it with a line [laser]"),
 }
-"""What to do with unknown keys of [rig], without their units, that no key of it resembles."""
+"""What to do with unknown keys of [rig], without their units, that no key resembles, or one of another meaning."""
+_UNITS = {
+    "_mm": {"_m": "metres", "_um": "micrometres"}, "_cm": {"_m": "metres"}, "_m": {"_um": "micrometres"},
+    "_deg": {"_rad": "radians"},
+}  # fmt: skip
 
 
 def _advised(fault: Fault) -> Fault:
@@ -134,6 +142,14 @@ def _advised(fault: Fault) -> Fault:
     advice = _ADVICE.get(stem, "") if table == "rig" else ""
     if table == "rig" and key.lower().endswith("_mm") and stem in ("f", "fx", "fy", "focal", "focal_length"):
         advice = "the focal length is given in pixels: write millimetres over the pixel pitch as fx_px"
+    for unit, names in _UNITS.items():
+        for other, name in names.items():
+            if (
+                table == "rig"
+                and key.endswith(unit)
+                and key.removesuffix(unit) + other in MeasuredRigTable.model_fields
+            ):
+                advice = f"write {key.removesuffix(unit) + other}, in {name}"
     if table == "rig.mirror" and stem in ("radius", "diameter", "r"):
         advice = f"{_SPHERE}, and needs no [rig.mirror]"
     if not table and stem in ("camera", "sphere", "lens", "intrinsics"):

@@ -315,6 +315,8 @@ class ChainTest:
         Standard deviation to add to each coordinate of a spot.
     note, doubt : str
         Sentences; empty if there is none.
+    by_spots : bool
+        The doubt is of the spots alone, and a beam that is torn gives it, too.
     """
 
     photos: PairPhotos
@@ -322,6 +324,7 @@ class ChainTest:
     added_px: float = 0.0
     note: str = ""
     doubt: str = ""
+    by_spots: bool = False
 
 
 def chain_test(photos: PairPhotos, choice: Callable[[Photo], SensorCard], pair_of: PairOf) -> ChainTest:
@@ -441,18 +444,19 @@ def _of_codes(photos: PairPhotos, card: SensorCard) -> ChainTest:
 
 def _of_outputs(photos: PairPhotos, card: SensorCard, pair_of: PairOf, note: str = "") -> ChainTest:
     chances, surprise = phase_weights(pair_of(photos, card))
-    doubts = []
+    doubts, by_spots = [], False
     quality = comb_quality(photos.down.on[0].pixels) if card.output == "mjpeg" else None
     if quality is not None and quality < card.jpeg_quality - 1:
         doubts.append(f"the JPEG holds another one, of quality {quality}, and sigma does not hold; {_OWN_FILE}")
     elif surprise > _MOST_SURPRISE:
+        by_spots = True
         doubts.append(
             f"the spots' codes are not such as the assumed processing gives, by {surprise:.0f} sigma: they were "
             f"scaled, sharpened or smoothed before; {_OWN_FILE}"
         )
     added = _LOST_PX if doubts else 0.0
     notes = "; ".join(text for text in (note, _phase_note(chances)) if text)
-    return ChainTest(photos, chances, added, notes, "; ".join(doubts))
+    return ChainTest(photos, chances, added, notes, "; ".join(doubts), by_spots)
 
 
 def _phase_note(chances: Mapping[Phase, float]) -> str:

@@ -77,6 +77,7 @@ def below(folder: Path, name: str) -> Path:
 
 
 _PART = r"""(?:[\w-]+|"[^"\n]*"|'[^'\n]*')"""
+_COMMA = re.compile(r"(?m)^[ \t]*\w+[ \t]*=[ \t]*[-+]?\d+,\d+[ \t]*(?:#.*)?$")
 _LONG_KEY = re.compile(rf"(?<![\w-]){_PART}(?:[ \t]*\.[ \t]*{_PART}){{{KEY_PARTS},}}")
 
 M = TypeVar("M", bound=BaseModel)
@@ -228,7 +229,8 @@ class InputFile:
         except RecursionError as error:
             raise self.fault(f"is not valid TOML: it is nested deeper than {DEPTH} levels") from error
         except ValueError as error:  # tomllib lets a number of 5000 digits end in Python's own words
-            raise self.fault(f"is not valid TOML: {printable_line(str(error), 200)}") from error
+            comma = "; numbers have a decimal point, no comma" if _COMMA.search(text) else ""
+            raise self.fault(f"is not valid TOML: {printable_line(str(error), 200)}{comma}") from error
         if fault := bounds_fault(document, finite=False):
             raise self.fault(f"is not valid here: {fault}")
         return document

@@ -185,6 +185,12 @@ def test_a_model_of_mirror_and_camera_cannot_be_split(tmp_path: Path, program: s
         ("[rig]\nstroke_m = 0.4\n", "--stroke-m"),
         ("[rig.laser]\ndiameter_m = 0.003\n", "a line [laser]"),
         ("[rig]\ndistortion = [0.1, 0.0]\n", "write k1, k2, p1, p2 and k3"),
+        ("[rig]\nz_c_mm = 262.0\n", "write z_c_m, in metres"),
+        ("[rig]\nstroke_tilt_x_deg = 0.5\n", "write stroke_tilt_x_rad, in radians"),
+        ("[rig]\npixel_pitch_mm = 0.0028\n", "write pixel_pitch_um, in micrometres"),
+        ("[rig]\nz_c_m = 0,262\n", "numbers have a decimal point, no comma"),
+        ("[rig]\ndiagonal_fov_deg = 60.0\n", "fov_deg is the horizontal field of view"),
+        ("[rig]\ndepth_m = 2.1\n", "that of a tape stands in pairs.csv"),
     ],
 )
 def test_another_file_or_key_is_told_what_it_is(tmp_path: Path, text: str, words: str) -> None:

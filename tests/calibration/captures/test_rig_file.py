@@ -47,7 +47,7 @@ def test_the_field_of_view_gives_the_focal_length(tmp_path: Path) -> None:
         ("[rig]\nfx = 1432.5", "did you mean 'fx_px'"),
         ("[rig]\nfy = 1432.5", "did you mean 'fy_px'"),
         ("[rig]\nradius = 0.06", "did you mean 'radius_m'"),
-        ("[rig]\nradius_mm = 60", "did you mean 'radius_m'"),
+        ("[rig]\nradius_mm = 60", "write radius_m, in metres"),
         ("[rig]\nfocal_px = 1430", "did you mean 'fx_px'"),
         ("[rig]\ndistance_mm = 260", "did you mean 'z_c_m'"),
         ("[rig]\npixel_size_um = 3", "did you mean 'pixel_pitch_um'"),
