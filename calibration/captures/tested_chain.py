@@ -23,6 +23,7 @@ from scipy.special import log_ndtr
 
 from phibench.calibration.captures.pair_photos import PairPhotos, PositionPhotos
 from phibench.calibration.captures.picture_files import Photo
+from phibench.calibration.captures.stored_colours import stored_with_less
 from phibench.datasets.common.camera_pictures import Subsampling
 from phibench.datasets.frames.sensor_card import SensorCard, sensor_card
 from phibench.estimator.interface import Image, Pair
@@ -417,8 +418,13 @@ def _of_raw(photos: PairPhotos, card: SensorCard, pair_of: PairOf) -> ChainTest:
 
 
 def _of_codes(photos: PairPhotos, card: SensorCard) -> ChainTest:
-    tested = interpolation([photo.pixels for photo in photos.all], card)
+    images = [photo.pixels for photo in photos.all]
+    tested = interpolation(images, card)
     phase = tested.phase
+    if not tested.exact and (less := stored_with_less(images)):
+        return ChainTest(
+            photos, dict.fromkeys(PATTERNS, 0.25), _LOST_PX, doubt=f"{less}; sigma does not hold; {_OWN_FILE}"
+        )
     if phase is not None:
         exact = tested.exact or not is_plain(card)
         least = min(tested.residual_codes.values())
