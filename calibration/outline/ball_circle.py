@@ -111,7 +111,7 @@ class BallCircle:
         if self.sigma_px.max() > MOST_SIGMA * self.circle_px[2]:
             raise ImageError(
                 f"no outline of a ball was found: the clearest circle is uncertain by {self.sigma_px.max():.1f} px; "
-                f"{MOST_SIGMA * self.circle_px[2]:.1f} px are allowed"
+                f"{MOST_SIGMA * self.circle_px[2]:.1f} px are allowed; light what is behind the ball evenly"
             )
 
     @property
@@ -166,6 +166,7 @@ def beside_limb(light: NDArray[Any], found: BallCircle) -> BallCircle:
     if limb.gain < _NO_GAIN:  # the room in the ball is not smooth: its edges are what there is
         shared = (0.0 if found.contrast >= _SURE_CONTRAST else _OF_FALL * most) ** 2 * np.eye(3)
         return replace(found, covariance_px2=(own + shared) * block**2)
+    floor += (_MODEL * near[2]) ** 2 * limb.leverage
     if limb.gain < _LEAST_GAIN:
         u, v, radius = np.array(near) + 0.5 * apart
         covariance = (own + limb.covariance_px2) / 4.0 + floor + _BETWEEN * most**2 * np.eye(3)

@@ -29,6 +29,8 @@ _BLUR_PX = (0.4, 8.0)  # a pixel's own blur, and that of a limb far out of focus
 _ROUNDS, _STEPS = 3, 30
 _ROBUST = 2.0  # of the usual residual
 _LEAST_SHARE = 0.5  # of the sectors, in the picture
+_STRAY = 0.02  # of the bend of the brightest sectors
+_NOISE = 2.0  # mean squares that the fit leaves: the bend of a sector's light must be more to tell a place
 _RIDGE = 1e-9  # of the normal equations: a sector of even light does not tell its five terms apart
 
 
@@ -43,11 +45,14 @@ class LimbCircle:
         The jackknife's over twelve parts of the turn.
     gain : float
         Mean over the sectors of the logarithm of what is left at the circle by edges over what is left here.
+    leverage : array, shape (3, 3), of u, v, radius
+        What the dark parts of the turn add to the variances of an error that each part has for itself; 0 for none.
     """
 
     circle_px: Circle
     covariance_px2: Array = field(repr=False)
     gain: float
+    leverage: Array = field(default_factory=lambda: np.zeros((3, 3)), repr=False)
 
 
 @dataclass(frozen=True)
@@ -77,7 +82,25 @@ def limb_circle(light: Array, near: Circle, ellipse_px: tuple[float, float]) -> 
     theta = best.theta
     circle = (near[0] + float(theta[1]), near[1] + float(theta[2]), near[2] + float(theta[0]))
     gain = float(np.mean(_left_at(polar, near[2]) - best.left(polar)))
-    return LimbCircle(circle, best.covariance(), gain)
+    return LimbCircle(circle, best.covariance(), gain, _leverage(polar, best))
+
+
+def _leverage(polar: _Polar, fit: _Fit) -> Array:
+    """Inverse of the mean of c c^T over the sectors by what their light tells, less that of a whole turn.
+
+    Half a turn gives centre and radius only together: what the model errs there is several times as large in each.
+    """
+    window = np.abs(polar.d_px) <= _HALF_PX
+    straight = np.stack([np.ones(int(window.sum())), polar.d_px[window]], axis=1)
+    y = polar.light[:, window].T
+    bent = np.square(y - straight @ np.linalg.lstsq(straight, y)[0]).mean(axis=0)
+    # codes and JPEG round dark parts, and the light of bright ones strays into them
+    left = np.square(fit.residual).mean(axis=1) + _STRAY**2 * float(np.quantile(bent, 0.9))
+    told = polar.inside * np.clip(1.0 - _NOISE * left / np.maximum(bent, 1e-30), 0.0, 1.0)
+    told = np.minimum(told / max(float(np.quantile(told, 0.8)), 1e-9), 1.0)
+    C = np.stack([np.cos(polar.turn_rad), np.sin(polar.turn_rad), np.ones(_SECTORS)], axis=1)
+    lit = np.linalg.inv((C.T * told) @ C / _SECTORS + 1e-6 * np.eye(3))
+    return np.asarray(lit - np.diag([2.0, 2.0, 1.0]))
 
 
 def _polar(light: Array, circle: Circle, ellipse_px: tuple[float, float]) -> _Polar:
@@ -98,8 +121,9 @@ def _polar(light: Array, circle: Circle, ellipse_px: tuple[float, float]) -> _Po
 
 def _basis(x: Array, radius_px: float, blur_px: float) -> Array:
     """Blurred 1, d outside, step, T and T^2 at distances from the limb, shape (..., 5)."""
-    reach = float(np.abs(x).max()) + 6.0 * blur_px
-    d = np.arange(-reach, reach + _FINE_PX / 2.0, _FINE_PX)
+    # whole steps from 0: a table that moved with x would have a jump in place of a derivative
+    steps = math.ceil((float(np.abs(x).max()) + 6.0 * blur_px) / _FINE_PX)
+    d = np.arange(-steps, steps + 1) * _FINE_PX
     T = 2.0 * np.arccos(np.clip(1.0 + d / radius_px, 0.0, 1.0))
     sharp = np.stack([np.ones_like(d), np.maximum(d, 0.0), (d < 0.0).astype(float), T, T * T])
     soft = ndimage.gaussian_filter1d(sharp, blur_px / _FINE_PX, axis=1, mode="nearest")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy import ndimage
@@ -63,7 +65,21 @@ def test_the_fall_of_the_light_tells_the_limb() -> None:
     assert limb is not None
     assert np.abs(np.subtract(limb.circle_px, true)).max() < 0.7
     assert limb.gain > 0.35
+    assert np.diag(limb.leverage).max() < 10.0
     assert limb_circle(light, (10.0, 10.0, 227.0), (0.0, 0.0)) is None  # most of it is outside
+
+
+def test_a_ball_that_is_dark_on_one_side_claims_less(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Light on a third of the turn: centre and radius are told only together; one such ball was 10 sigma off."""
+    light = np.maximum(ball((300.3, 295.6, 230.0), (0.0, -1.2, 0.45), 1.0, 4) - 0.02, 0.0)
+    limb = limb_circle(light, (300.0, 296.0, 230.5), (0.0, 0.0))
+    assert limb is not None
+    assert np.diag(limb.leverage)[1] > 20.0  # of v: the light comes from above
+    assert np.diag(limb.leverage).min() > 0.0
+    monkeypatch.setattr("phibench.calibration.outline.ball_circle.limb_circle", lambda *_: replace(limb, gain=0.5))
+    edges = BallCircle((300.0, 296.0, 226.0), (0.0, 0.0), 0.25 * np.eye(3), 20.0, 3.0, np.zeros(360))
+    # 0.3 % of the radius is what the model errs
+    assert beside_limb(np.zeros((600, 600)), edges).sigma_px[1] > 0.003 * 226.0 * np.sqrt(20.0)
 
 
 def test_a_clear_edge_stays_where_it_is() -> None:
