@@ -26,8 +26,9 @@ from phibench.calibration.captures.measure import KnownNumbers, read_setting
 from phibench.calibration.captures.pair_list import ListedPair, photos_of, read_pair_list
 from phibench.calibration.captures.pair_photos import PairPhotos, pair_of_photos
 from phibench.calibration.captures.picture_files import Photo, SensorChoice, require_colour, sensor_choice
+from phibench.calibration.captures.raw_frames import PATTERNS
 from phibench.calibration.captures.rig_file import require_camera_size
-from phibench.calibration.captures.tested_chain import PATTERNS, ChainTest, chain_test
+from phibench.calibration.captures.tested_chain import ChainTest, chain_test
 from phibench.datasets.common.camera_pictures import read_camera_picture
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import SETTINGS_BYTES, FileName, InputFile, Name, below

@@ -34,6 +34,7 @@ from phibench.calibration.captures.pair_photos import (
     pair_of_photos,
 )
 from phibench.calibration.captures.picture_files import Photo, SensorChoice, require_colour, sensor_choice
+from phibench.calibration.captures.raw_frames import PATTERNS
 from phibench.calibration.captures.rig_doubts import apart, calibration_note, contradicted, outlines_as_one
 from phibench.calibration.captures.rig_file import MeasuredRig, read_rig_file, require_camera_size
 from phibench.calibration.captures.spot_shape import (
@@ -47,7 +48,7 @@ from phibench.calibration.captures.spot_shape import (
     seen_through,
     spot_images,
 )
-from phibench.calibration.captures.tested_chain import PATTERNS, ChainTest, chain_test
+from phibench.calibration.captures.tested_chain import ChainTest, chain_test
 from phibench.calibration.outline.outline import find_outline
 from phibench.calibration.outline.outline_result import Outline
 from phibench.calibration.rig.bundle import calibrate

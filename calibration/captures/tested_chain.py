@@ -7,7 +7,7 @@ A kind of file says little of what a camera did. Three questions are put to the 
 * JPEG: coefficients of 8 x 8 blocks of a decoded JPEG lie on a comb of its quantiser's steps.
 * Phase of what is compressed: the likelihood of both spots' outputs under the four phases.
 
-A phase (du, dv) puts red where u + du and v + dv are even: 1 for 0 in a sensor that is read out mirrored.
+DN are asked for their mosaic and for the likeness of their noise (`raw_frames`).
 """
 
 from __future__ import annotations
@@ -18,11 +18,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.fft import dctn
-from scipy.ndimage import gaussian_filter, minimum_filter
+from scipy.ndimage import minimum_filter
 from scipy.special import log_ndtr
 
 from phibench.calibration.captures.pair_photos import PairPhotos, PositionPhotos
 from phibench.calibration.captures.picture_files import Photo
+from phibench.calibration.captures.raw_frames import MOST_LIKENESS, PATTERNS, Phase, noise_likeness, raw_phase
 from phibench.calibration.captures.stored_colours import stored_with_less
 from phibench.datasets.common.camera_pictures import Subsampling
 from phibench.datasets.frames.sensor_card import SensorCard, sensor_card
@@ -35,12 +36,8 @@ from phibench.estimator.spots.detect import detect
 from phibench.estimator.spots.fit_raw import SpotData
 from phibench.estimator.spots.image_planes import ImageError, through_jpeg
 from phibench.scenes.frames import Array
-from phibench.scenes.rig import POSITIONS
 
-Phase = tuple[int, int]
 PairOf = Callable[[PairPhotos, SensorCard], Pair]
-PATTERNS: Mapping[Phase, str] = {(0, 0): "RGGB", (1, 0): "GRBG", (0, 1): "GBRG", (1, 1): "BGGR"}
-"""Colours of the first two rows of two pixels, by the phase."""
 
 _SIDE_PX = 1024  # of the middle of a picture that is looked at
 _PIXELS = 1000  # that must say something
@@ -250,52 +247,6 @@ def _log_chance(z: Array, mean: Array, sigma: Array, step: Array) -> Array:
     return np.maximum(larger + np.log1p(-np.exp(np.minimum(smaller - larger, -1e-12))), _LEAST_LOG)
 
 
-# -- mosaic of DN ------------------------------------------------------------------------------------------------------
-
-_RED_RATIO = 2.5  # of a spot's light on the brightest of four places over the next, from which on that is red
-_NO_FILTERS = 2.0  # of the brightest over the faintest, below which there are no filters
-_SPOT_SIGMAS = 12.0  # a spot that tells its filter is far beyond what a map of a million places has by chance
-
-
-def raw_phase(images: Mapping[str, Image]) -> Phase | str | None:
-    """Phase of a mosaic by the colour of its spots; "mono" where there are no filters; None where it cannot be told.
-
-    Parameters
-    ----------
-    images : mapping of "down", "up" and, where they are there, "down_off", "up_off" to DN, shape (H, W)
-    """
-    told = set()
-    for position in POSITIONS:
-        off = images.get(f"{position}_off")
-        if off is None:
-            return None
-        told.add(_spot_phase(np.asarray(images[position], float), np.asarray(off, float)))
-    return told.pop() if len(told) == 1 else None
-
-
-def _spot_phase(on: Array, off: Array) -> Phase | str | None:
-    light = on - off
-    h, w = (size // 2 * 2 for size in light.shape)
-    sums = light[:h, :w].reshape(h // 2, 2, w // 2, 2).sum(axis=(1, 3))
-    match = gaussian_filter(sums, 1.0) - gaussian_filter(sums, 4.0)
-    scatter = 1.4826 * float(np.median(np.abs(match)))
-    v, u = np.unravel_index(int(np.argmax(match)), match.shape)
-    if match[v, u] < _SPOT_SIGMAS * max(scatter, 1e-9):  # noise-free pictures scatter by nothing
-        return None
-    v0, u0 = (max(2 * int(x) - 4, 0) for x in (v, u))
-    window = light[v0 : v0 + 10, u0 : u0 + 10]
-    wide = light[max(v0 - 10, 0) : v0 + 20, max(u0 - 10, 0) : u0 + 20]
-    places = {}
-    for du, dv in PATTERNS:  # red at (u + du, v + dv) even; v0 and u0 are even
-        places[du, dv] = float((window[dv::2, du::2] - np.median(wide[dv::2, du::2])).sum())
-    first, second, *_, last = sorted(places, key=lambda place: -places[place])
-    if places[first] > _RED_RATIO * places[second]:
-        return first
-    # pixels at the converter's end are as bright behind any filter
-    cut = np.count_nonzero(on[v0 : v0 + 10, u0 : u0 + 10] == on.max()) > 2
-    return "mono" if places[first] < _NO_FILTERS * places[last] and not cut else None
-
-
 # -- all of it ---------------------------------------------------------------------------------------------------------
 
 _UNKNOWN_PX = 0.05  # what another interpolation than the bilinear one adds to a place, standard deviation
@@ -401,7 +352,8 @@ def _as_jpeg(photos: PairPhotos, quality: int, sampling: Subsampling) -> PairPho
 
 
 def _of_raw(photos: PairPhotos, card: SensorCard, pair_of: PairOf) -> ChainTest:
-    told = raw_phase(pair_of(photos, card).images)
+    images = pair_of(photos, card).images
+    told = raw_phase(images)
     path = photos.down.on[0].path
     if told == "mono" and card.mosaic != "mono":
         raise ImageError(
@@ -414,7 +366,14 @@ def _of_raw(photos: PairPhotos, card: SensorCard, pair_of: PairOf) -> ChainTest:
             "says mono-raw"
         )
     phase = told if isinstance(told, tuple) else (0, 0)
-    return ChainTest(photos, {phase: 1.0}, note=_phase_note({phase: 1.0}))
+    note = _phase_note({phase: 1.0})
+    if (likeness := noise_likeness(images)) > MOST_LIKENESS:
+        doubt = (
+            f"the noise of neighbouring pixels is alike (correlation {likeness:.2f}): the DN were smoothed, sharpened, "
+            f"scaled or compressed, and sigma does not hold; {_OWN_FILE}"
+        )
+        return ChainTest(photos, {phase: 1.0}, _LOST_PX, note, doubt)
+    return ChainTest(photos, {phase: 1.0}, note=note)
 
 
 def _of_codes(photos: PairPhotos, card: SensorCard) -> ChainTest:
