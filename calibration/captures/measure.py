@@ -14,7 +14,7 @@ rays over its standard deviation, rig included, is chi^2 of one degree of freedo
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -28,8 +28,6 @@ from phibench.calibration.captures.pair_photos import (
     contradiction,
     exchanged_colours,
     frames_note,
-    moved_between,
-    moved_note,
     nothing_found,
     pair_of_photos,
 )
@@ -37,11 +35,18 @@ from phibench.calibration.captures.picture_files import Photo, SensorChoice, req
 from phibench.calibration.captures.raw_frames import PATTERNS
 from phibench.calibration.captures.rig_doubts import apart, calibration_note, contradicted, outlines_as_one
 from phibench.calibration.captures.rig_file import MeasuredRig, read_rig_file, require_camera_size
+from phibench.calibration.captures.spot_doubts import (
+    DOUBTFUL_P,
+    SeenSpot,
+    moved_offs,
+    rays_gap,
+    too_far,
+    unlike_spots,
+)
 from phibench.calibration.captures.spot_shape import (
     OUTLINE_SIGMA_PX,
     PRIOR_SIGMA,
     SHAPE,
-    UNLIKE,
     SpotPicture,
     SpotShape,
     fit_shape,
@@ -67,9 +72,6 @@ from phibench.estimator.spots.detect import detect
 from phibench.estimator.spots.image_planes import ImageError
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import POSITIONS, Rig
-
-DOUBTFUL_P = 1e-3
-"""Probability of the two rays' gap below which the two spots are not taken for one point."""
 
 
 @dataclass(frozen=True)
@@ -106,20 +108,6 @@ def read_setting(
     if not 0.0 <= stroke_sigma_m <= MOST_STROKE_M:
         raise DatasetError(f"the stroke's standard deviation is {stroke_sigma_m:g} m: must be 0 or above")
     return KnownNumbers(known, held, None if sensor is None else read_sensor_file(sensor), stroke_sigma_m)
-
-
-@dataclass(frozen=True)
-class SeenSpot:
-    """Position of a spot in one image; pixels, covariance of (u, v), and how unlike a spot its light is (0 to 1)."""
-
-    uv_px: Array
-    covariance_px2: Array = field(repr=False)
-    unlike: float = 0.0
-
-    @property
-    def sigma_px(self) -> float:
-        """Root mean square of both coordinates' standard deviations."""
-        return math.sqrt(0.5 * float(np.trace(self.covariance_px2)))
 
 
 @dataclass(frozen=True)
@@ -246,11 +234,11 @@ def _measured(test: ChainTest, stroke_m: float, setting: KnownNumbers, told: Tol
         raise contradiction(found.pair, photos, describe(int(depth.status)))
     if test.doubt and (fault := exchanged_colours(found.pair, photos)):
         raise fault
-    gap, is_one = _gap(depth), float(depth.p_value) >= DOUBTFUL_P
+    gap, is_one = rays_gap(depth), float(depth.p_value) >= DOUBTFUL_P
     # through another chain a sound spot has another shape, too: the laser is not to blame
-    torn = () if test.doubt and not test.by_spots else (_torn(down, "down"), _torn(up, "up"))
-    faults_of_spots = *torn, *_moved(found.pair, photos), _foreign(test)
-    faults_of_spots += (found.doubt, apart(found.limb[0]))
+    torn = [] if test.doubt and not test.by_spots else unlike_spots(found.pair, photos, {"down": down, "up": up})
+    faults_of_spots = *torn, *moved_offs(found.pair, photos), _foreign(test)
+    faults_of_spots += (found.doubt, apart(found.limb[0]), too_far(depth))
     notes = chosen.note, test.note, *found.notes, frames_note(photos), gap, *faults_of_spots
     doubts = "" if is_one else gap, *faults_of_spots
     said, doubted = (tuple(text for text in texts if text) for texts in (notes, doubts))
@@ -466,31 +454,3 @@ def seen_spots(answer: Answer) -> dict[str, SeenSpot]:
     """Positions of an answer that has both, by position."""
     both = dict(zip(POSITIONS, (answer.down, answer.up), strict=True))
     return {name: SeenSpot(np.array(spot.uv_px), np.array(spot.covariance_px2)) for name, spot in both.items()}
-
-
-def _moved(pair: Pair, photos: PairPhotos) -> Iterator[str]:
-    """Sentences on laser-off pictures that are shifted: edges of the room then count as light of the spot."""
-    for position, shift in moved_between(pair):
-        yield f"doubtful: the spot {position} lies on edges: {moved_note(photos, position, shift)}"
-
-
-def _torn(spot: SeenSpot, position: str) -> str:
-    """Sentence on a light that is no spot."""
-    if spot.unlike < UNLIKE:
-        return ""
-    (u, v), percent = spot.uv_px, 100.0 * min(spot.unlike, 1.0)
-    return (
-        f"doubtful: the spot {position} at ({u:.0f}, {v:.0f}) px has not the shape of one, {percent:.0f} % "
-        "of its light do not fit; the beam may meet an edge or graze a surface, turn the laser a little"
-    )
-
-
-def _gap(depth: GeneralDepth) -> str:
-    """Sentence on the test."""
-    p, chi2 = float(depth.p_value), float(depth.chi2)
-    if p >= DOUBTFUL_P:
-        return f"one point: chi^2 {chi2:.2f} for one degree of freedom (p = {p:.2g})"
-    return (
-        f"doubtful: the spots are not images of one point, chi^2 {chi2:.1f} for one degree of freedom (p = {p:.1e}); "
-        "one may be a reflection, the rig may have turned between the pictures, or the calibration is another rig's"
-    )

@@ -150,11 +150,7 @@ def known_fault(pair: Pair, photos: PairPhotos) -> DatasetError | None:
             "change places; give them to --down and --up the other way round"
         )
     if (relit := next(relit_between(pair), None)) is not None:
-        name, ratio = relit
-        return DatasetError(
-            f"the light changed between laser on and off: {getattr(photos, name).off[0].path} has {ratio:.2f} times "
-            "the codes of the picture with the laser on; fix exposure and white balance, and leave the lamps alone"
-        )
+        return DatasetError(relit_note(photos, *relit))
     if fault := exchanged_colours(pair, photos):
         return fault
     for place in POSITIONS:
@@ -308,11 +304,24 @@ def _turned_px(one: Image, other: Image) -> float:
 def relit_between(pair: Pair) -> Iterator[tuple[str, float]]:
     """Positions whose laser-off picture is brighter or darker, with its codes over those with the laser on."""
     for position in POSITIONS:
-        if f"{position}_off" in pair.images:
-            on, off = (np.asarray(pair.images[name], float) for name in (position, f"{position}_off"))
-            ratio = float(np.median(off) / max(np.median(on), 1e-9))
-            if abs(ratio - 1.0) > _RELIT:
-                yield position, ratio
+        if (ratio := light_ratio(pair, position)) is not None and abs(ratio - 1.0) > _RELIT:
+            yield position, ratio
+
+
+def light_ratio(pair: Pair, position: str) -> float | None:
+    """Median code with the laser off over that with the laser on; None without such a picture."""
+    if f"{position}_off" not in pair.images:
+        return None
+    on, off = (np.asarray(pair.images[name], float) for name in (position, f"{position}_off"))
+    return float(np.median(off) / max(np.median(on), 1e-9))
+
+
+def relit_note(photos: PairPhotos, position: str, ratio: float) -> str:
+    """Sentence on light that changed between laser on and off."""
+    return (
+        f"the light changed between laser on and off: {getattr(photos, position).off[0].path} has {ratio:.2f} times "
+        "the codes of the picture with the laser on; fix exposure and white balance, and leave the lamps alone"
+    )
 
 
 def _detail(image: Image) -> tuple[Array, int]:
