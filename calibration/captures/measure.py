@@ -290,7 +290,12 @@ def _fitted(
     shape = _shape(setting, seen, images, outlines)
     rig = shape.rig(rig)
     ready = replace(pair, rig=rig, stroke_m=stroke)
-    spots = seen_spots(_answer(ready, photos, told))
+    shared = SharedPair.of(ready)
+    answer = method_for(card)(shared)
+    if any(spot.uv_px is None or spot.covariance_px2 is None for spot in (answer.down, answer.up)):
+        told(_LOOKING)
+        raise nothing_found(ready, photos, answer, apart(outlines) or doubt)
+    spots = seen_spots(kept(shared, answer, with_posteriors(shared, answer)))
     wide = {name: widened_by_shape(spots[name], images.get(name), shape) for name in POSITIONS}
     return _Fitted(ready, wide, rig, covariance, stroke, limb, (note, _shape_note(shape, setting)), doubt)
 
@@ -439,15 +444,6 @@ def _shape_note(shape: SpotShape, setting: KnownNumbers) -> str:
     held = setting.calibration is not None and SHAPE in setting.calibration.made_from
     source = "of the calibration" if held else "of these spots" if shape.images else "of the rig file"
     return f"spots: blur {blur:.2f} +- {blur_sigma:.2f} px, filters 1 : {green:.2f} : {blue:.2f}, {source}"
-
-
-def _answer(pair: Pair, photos: PairPhotos, told: Told) -> Answer:
-    pair = SharedPair.of(pair)
-    answer = method_for(pair.card)(pair)
-    if any(spot.uv_px is None or spot.covariance_px2 is None for spot in (answer.down, answer.up)):
-        told(_LOOKING)
-        raise nothing_found(pair, photos, answer)
-    return kept(pair, answer, with_posteriors(pair, answer))
 
 
 def seen_spots(answer: Answer) -> dict[str, SeenSpot]:

@@ -93,8 +93,11 @@ def frames_note(photos: PairPhotos) -> str:
 # -- mistakes ----------------------------------------------------------------------------------------------------------
 
 
-def nothing_found(pair: Pair, photos: PairPhotos, answer: Answer) -> DatasetError:
-    """Error of a pair in which a spot lacks or cannot be fitted."""
+def nothing_found(pair: Pair, photos: PairPhotos, answer: Answer, of_outline: str = "") -> DatasetError:
+    """Error of a pair in which a spot lacks or cannot be fitted; `of_outline` is what the mirror's outline contradicts.
+
+    Spots are looked for where the rig lets a point of the room be seen: a wrong rig hides them.
+    """
     if known := known_fault(pair, photos):
         return known
     lacking = [p for p in POSITIONS if getattr(answer, p).uv_px is None]
@@ -107,6 +110,11 @@ def nothing_found(pair: Pair, photos: PairPhotos, answer: Answer) -> DatasetErro
             "or more of the laser"
         )
     where = " and ".join(f"{p} ({getattr(photos, p).on[0].path})" for p in lacking)
+    if of_outline:
+        return DatasetError(
+            f"no laser spot in the picture {where}: {getattr(answer, lacking[0]).status}, where this rig allows one; "
+            f"{of_outline.removeprefix('doubtful: ')}"
+        )
     advice = "" if pair.down_off is not None else "; give pictures with the laser off, too"
     return DatasetError(
         f"no laser spot in the picture {where}: {getattr(answer, lacking[0]).status}; look whether the laser is on and "

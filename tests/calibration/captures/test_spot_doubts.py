@@ -9,7 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from phibench.calibration.captures.pair_photos import nothing_found
 from phibench.calibration.captures.spot_doubts import SeenSpot, too_far, unlike_spots
+from phibench.scenes.rig import Rig
 
 
 @pytest.mark.parametrize(
@@ -33,3 +35,16 @@ def test_a_distance_beyond_all_spots_is_doubtful() -> None:
     near: Any = SimpleNamespace(depth_m=np.array(11.0))
     assert "beyond 12 m" in too_far(far)
     assert too_far(near) == ""
+
+
+def test_a_mirror_that_moved_is_the_reason_why_no_spot_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a picture that was shifted by 12 px: not the laser and not the stroke."""
+    monkeypatch.setattr("phibench.calibration.captures.pair_photos.known_fault", lambda *_: None)
+    lacking = SimpleNamespace(uv_px=None, status="no spot found")
+    answer: Any = SimpleNamespace(down=SimpleNamespace(uv_px=np.zeros(2)), up=lacking)
+    photos: Any = SimpleNamespace(up=SimpleNamespace(on=[SimpleNamespace(path="up.png")]))
+    pair: Any = SimpleNamespace(down_off=None, rig=Rig())
+    text = str(nothing_found(pair, photos, answer, "doubtful: the mirror has moved by 2 mm"))
+    assert text.startswith("no laser spot in the picture up (up.png): no spot found")
+    assert text.endswith("; the mirror has moved by 2 mm")
+    assert "whether the laser is on" in str(nothing_found(pair, photos, answer))
