@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from phibench.estimator.interface import Image
-from phibench.scenes.frames import Array
+from phibench.scenes.frames import Array, BoolArray
 
 _CHROMA = np.array([[-0.168736, -0.331264, 0.5], [0.5, -0.418688, -0.081312]])  # Cb and Cr of JFIF (BT.601)
 _FEWEST = 1000  # pairs of pixels that must say so
@@ -45,10 +45,10 @@ def _is_halved(images: Sequence[Image]) -> bool:
     return bool(high > _LEAST and low < _HALVED * high)
 
 
-def _steps(image: Image) -> tuple[Array, Array]:
+def _steps(image: Image) -> tuple[Array, BoolArray]:
     """Squares of differences of the chroma to the next column, and where no code is cut; shape (H, W - 1)."""
     chroma = image.astype(np.float32) @ _CHROMA.T.astype(np.float32)
-    uncut = ((image > 2) & (image < 253)).all(axis=-1)
+    uncut: BoolArray = np.all((image > 2) & (image < 253), axis=-1)
     return np.asarray((np.diff(chroma, axis=1) ** 2).sum(axis=-1)), uncut[:, 1:] & uncut[:, :-1]
 
 

@@ -109,6 +109,7 @@ def calibrate(
     from phibench.calibration.rig.from_dataset import calibrate_dataset
     from phibench.calibration.rig.known_spots import Ruler
     from phibench.datasets.common.errors import DatasetError
+    from phibench.datasets.common.progress import progress_console, stages
     from phibench.datasets.store.files import require_writable
     from phibench.datasets.store.pair_files import is_imported
     from phibench.estimator.geometry.rig_parameters import PARAMETERS, has_effect
@@ -117,15 +118,18 @@ def calibrate(
     sources, ruler = given.sources, given.ruler
     require_writable(out)  # a folder such as "." has no name to which an ending could be given
     picture = out.with_suffix(".png") if picture is None else picture
-    if is_imported(directory):
-        if ruler != Ruler() or preset not in (DEFAULT_PRESET, open_imported(directory).preset):
-            raise DatasetError(
-                f"{directory} holds pictures: their kind and the tape's standard deviation were imported with them; "
-                "leave --preset and the sigmas out"
-            )
-        result = calibrate_imported(directory, out, sample, sources)
-    else:
-        result = calibrate_dataset(directory, out, sample, preset, sources, ruler)
+    imported = is_imported(directory)
+    if imported and (ruler != Ruler() or preset not in (DEFAULT_PRESET, open_imported(directory).preset)):
+        raise DatasetError(
+            f"{directory} holds pictures: their kind and the tape's standard deviation were imported with them; "
+            "leave --preset and the sigmas out"
+        )
+    with stages(progress_console(), "calibrate") as told:
+        told("outlines" + " and spots" * given.spots)
+        if imported:
+            result = calibrate_imported(directory, out, sample, sources)
+        else:
+            result = calibrate_dataset(directory, out, sample, preset, sources, ruler)
     print(f"{result.verdict}.")
     print(f"{result.write_picture(picture)}: the outline on the frame that fits worst, residuals enlarged")
     print(_LAB)
@@ -140,7 +144,7 @@ def calibrate(
         for weak in result.bundle.undetermined:
             parts = ", ".join(f"{name} {share:+.2f}" for name, share in weak.parts.items())
             print(f"  {parts} ({100.0 * weak.remaining:.0f} % of the prior sigma is left)")
-    print(f"\n{out}: calibration; use it with `phibench score --calibration {out}`")
+    print(f"\n{out}: calibration; use it with `phibench measure` or `score`, --calibration {out}")
     return 0
 
 

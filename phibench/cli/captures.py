@@ -149,7 +149,7 @@ def import_(directory: Path, *, out: Path, rig: Path | None = None, sensor: Path
     from phibench.calibration.captures.imported_set import import_pairs
 
     made = import_pairs(directory, out, rig, sensor)
-    print(f"{made.folder}: {made.pairs} pairs, {made.with_depth} of them with a measured D")
+    print(f"{made.folder}: {made.pairs} pair{'s' * (made.pairs != 1)}, {made.with_depth} of them with a measured D")
     print(made.sensor)
     return 0
 
