@@ -144,7 +144,7 @@ def jpeg_behind(pixels: Image) -> tuple[int, Subsampling] | None:
 
 
 def _changed_codes(pixels: Image, quality: int, sampling: Subsampling) -> float:
-    """How much the same JPEG once more changes a picture, rms in codes."""
+    """Change of a picture by the same JPEG once more, rms in codes."""
     corner = _middle(pixels)[:512, :512]
     corner = np.ascontiguousarray(corner[: corner.shape[0] // 16 * 16, : corner.shape[1] // 16 * 16])
     again = through_jpeg(corner, replace(sensor_card("mjpeg"), jpeg_quality=quality, jpeg_subsampling=sampling))

@@ -61,9 +61,10 @@ def unaligned(monkeypatch: pytest.MonkeyPatch) -> None:
 def refused(capsys: pytest.CaptureFixture[str], arguments: list[str]) -> str:
     """The one sentence with which a command ends."""
     assert main(arguments) == 2
-    text = capsys.readouterr().err
-    assert len(text.strip().splitlines()) == 1
-    return text
+    # a slow machine says that it still runs
+    lines = [line for line in capsys.readouterr().err.strip().splitlines() if ": running for " not in line]
+    assert len(lines) == 1
+    return lines[0]
 
 
 @pytest.mark.usefixtures("unaligned")
