@@ -29,7 +29,8 @@ from phibench.datasets.recipe.recipe_scene import spot_albedo
 from phibench.datasets.recipe.tables import Recipe
 from phibench.datasets.store.checksums import check_documents
 from phibench.datasets.store.layers import SpotWindow, read_ambient, read_ambient_variance, read_spot, read_truth
-from phibench.datasets.store.metadata import Rigs, read_info, read_manifest, read_rigs, to_table
+from phibench.datasets.store.metadata import Rigs, read_info, read_manifest, read_rigs
+from phibench.datasets.store.parquet_tables import to_table
 from phibench.datasets.store.schema import INFO, RIGS, ROOMS, DatasetInfo, ManifestRow, SpotRow
 from phibench.datasets.store.sensitivity_file import read_sensitivities
 from phibench.datasets.store.stored_rooms import Rooms, read_rooms

@@ -23,7 +23,7 @@ from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import FileName, InputFile
 from phibench.datasets.common.progress import progress_console
 from phibench.datasets.store.files import require_writable, sha256, write_bytes, write_text
-from phibench.datasets.store.metadata import parquet_bytes
+from phibench.datasets.store.parquet_tables import parquet_bytes
 from phibench.datasets.store.provenance import provenance
 from phibench.datasets.store.schema import Document
 from phibench.scenes.validation import nearest, printable_line

@@ -16,7 +16,7 @@ import pytest
 import yaml
 
 import phibench
-from phibench.benchmark.isolation.method_references import MethodError
+from phibench.benchmark.isolation.run_limits import MethodError
 from phibench.benchmark.isolation.runner import asked_here
 from phibench.datasets.common.errors import DatasetError
 from phibench.estimator import interface

@@ -16,7 +16,8 @@ import numpy as np
 
 from phibench.benchmark.dense.dense_easy import EasyDensePairs, EasyTruth, points_of
 from phibench.benchmark.isolation.method_check import Check
-from phibench.benchmark.isolation.method_references import DENSE, RunLimits, resolve
+from phibench.benchmark.isolation.method_references import DENSE, resolve
+from phibench.benchmark.isolation.run_limits import RunLimits
 from phibench.benchmark.isolation.runner import Harness
 from phibench.estimator.dense.dense_interface import DensePair
 from phibench.estimator.geometry.reflection import image_of

@@ -24,7 +24,8 @@ from phibench.datasets.frames.sensor_card import card_of
 from phibench.datasets.read import Dataset
 from phibench.datasets.store.schema import ManifestRow
 from phibench.estimator.dense.dense_interface import DensePair
-from phibench.estimator.geometry.reflection import image_of, up_image
+from phibench.estimator.geometry.epipolar_line import up_image
+from phibench.estimator.geometry.reflection import image_of
 from phibench.estimator.geometry.rig_parameters import stroke_of
 from phibench.estimator.interface import Image
 from phibench.estimator.methods.simulated_pairs import DrawnPairs

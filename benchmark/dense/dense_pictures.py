@@ -15,14 +15,16 @@ from numpy.typing import NDArray
 
 from phibench.benchmark.dense.dense_pairs import DensePairs, DenseTruth
 from phibench.benchmark.dense.dense_records import depths_of
-from phibench.benchmark.isolation.method_references import DENSE, RunLimits, resolve
+from phibench.benchmark.isolation.method_references import DENSE, resolve
+from phibench.benchmark.isolation.run_limits import RunLimits
 from phibench.benchmark.isolation.runner import Harness
 from phibench.benchmark.reports.figures import encoded, styled
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.read import place_of
 from phibench.estimator.dense.dense_interface import DensePair
 from phibench.estimator.dense.unrolled_pair import PanoramaMaps, luma_codes, maps_of
-from phibench.estimator.geometry.reflection import range_at, room_rays
+from phibench.estimator.geometry.epipolar_line import range_at
+from phibench.estimator.geometry.reflection import room_rays
 from phibench.scenes.frames import Array, BoolArray
 
 if TYPE_CHECKING:

@@ -27,7 +27,8 @@ from phibench.benchmark.dense.dense_pairs import DenseTruth
 from phibench.benchmark.scores.intervals import NORMAL_95
 from phibench.benchmark.scores.record_columns import THRESHOLDS
 from phibench.estimator.dense.dense_interface import DenseAnswer
-from phibench.estimator.geometry.reflection import range_at, room_rays
+from phibench.estimator.geometry.epipolar_line import range_at
+from phibench.estimator.geometry.reflection import room_rays
 from phibench.estimator.geometry.status import keep
 from phibench.estimator.geometry.triangulate import approx_estimator, meeting
 from phibench.scenes.frames import Array, BoolArray

@@ -31,7 +31,8 @@ from phibench.benchmark.dense.dense_document import (
 )
 from phibench.benchmark.dense.dense_pairs import DensePairs, DensePairSet, DenseTruth, dense_pairs
 from phibench.benchmark.dense.dense_records import COLUMN_TYPES, TruthErrors, pair_records
-from phibench.benchmark.isolation.method_references import DENSE, MethodError, RunLimits, code_of_function, resolve
+from phibench.benchmark.isolation.method_references import DENSE, code_of_function, resolve
+from phibench.benchmark.isolation.run_limits import MethodError, RunLimits
 from phibench.benchmark.isolation.runner import Harness, Ran, asked_here, function_name, ran_here
 from phibench.benchmark.pair_sets.wanted_pairs import open_scored
 from phibench.benchmark.scores.answer_errors import Rules
@@ -44,7 +45,7 @@ from phibench.datasets.common.input_files import InputFile
 from phibench.datasets.common.progress import Steps, progress_console
 from phibench.datasets.read import Dataset
 from phibench.datasets.store.files import require_writable, write_bytes
-from phibench.datasets.store.metadata import parquet_bytes
+from phibench.datasets.store.parquet_tables import parquet_bytes
 from phibench.datasets.store.provenance import code_behind
 from phibench.datasets.store.schema import RECORDS_SO_FAR
 from phibench.estimator.dense.dense_interface import DenseMethod, DensePair

@@ -15,7 +15,7 @@ from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter, map_coordinates, uniform_filter
 
 from phibench.estimator.dense.dense_interface import DenseAnswer, DensePair
-from phibench.estimator.geometry.reflection import up_image
+from phibench.estimator.geometry.epipolar_line import up_image
 
 STEP_PX = 4  # of the pixels that are looked at
 NEAREST_M, FARTHEST_M = 0.5, 8.0

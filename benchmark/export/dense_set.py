@@ -40,7 +40,8 @@ from phibench.datasets.store.layers import read_exr, write_exr
 from phibench.datasets.store.pair_files import FRAMES, MOST_PAIRS, PAIRS, PairFiles, PublicPair
 from phibench.datasets.store.schema import CHECKSUMS, SEALED_TRUTH, Document, TruthFolder
 from phibench.estimator.dense.dense_interface import DensePair
-from phibench.estimator.geometry.reflection import image_of, range_at, room_rays
+from phibench.estimator.geometry.epipolar_line import range_at
+from phibench.estimator.geometry.reflection import image_of, room_rays
 from phibench.render.optics.correspondence import Correspondence
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import Rig

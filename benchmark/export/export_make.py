@@ -52,7 +52,7 @@ from phibench.datasets.store.checksums import (
 )
 from phibench.datasets.store.croissant import LICENSE_TEXT
 from phibench.datasets.store.files import sha256, write_text
-from phibench.datasets.store.metadata import parquet_bytes
+from phibench.datasets.store.parquet_tables import parquet_bytes
 from phibench.datasets.store.provenance import code_behind
 from phibench.scenes.rig import POSITIONS
 

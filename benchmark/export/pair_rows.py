@@ -16,7 +16,7 @@ from phibench.datasets.frames.frame_files import png_bytes, suffix
 from phibench.datasets.frames.frame_request import FrameOptions
 from phibench.datasets.frames.frame_source import Frames, FrameSource
 from phibench.datasets.read import Dataset
-from phibench.datasets.store.metadata import to_table
+from phibench.datasets.store.parquet_tables import to_table
 from phibench.datasets.store.schema import ManifestRow, TruthFile
 from phibench.render.sensor.settings import Sensor
 from phibench.scenes.random_streams import generator

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from phibench.benchmark.isolation.method_references import MethodError
+from phibench.benchmark.isolation.run_limits import MethodError
 from phibench.datasets.common.shown_text import ShortForm
 from phibench.datasets.exposures.expected_electrons import ExpectedRegion
 from phibench.datasets.frames.sensor_card import SensorCard, sensor_card

@@ -28,7 +28,7 @@ from typing import Any
 from phibench.benchmark.isolation.answers import MESSAGE_LENGTH, most_bytes, outcome_of
 from phibench.benchmark.isolation.isolation import Access, Isolation
 from phibench.benchmark.isolation.method_provenance import MOST_NAMES, OpenedFiles
-from phibench.benchmark.isolation.method_references import MethodError, Reference, RunLimits
+from phibench.benchmark.isolation.method_references import Reference
 from phibench.benchmark.isolation.method_worker import lacks_memory
 from phibench.benchmark.isolation.pair_transport import (
     LEAST_BYTES,
@@ -42,6 +42,7 @@ from phibench.benchmark.isolation.pair_transport import (
 )
 from phibench.benchmark.isolation.printed_output import OutputTail, advised, last_lines, stack_place
 from phibench.benchmark.isolation.readable_files import access_of
+from phibench.benchmark.isolation.run_limits import MethodError, RunLimits
 from phibench.benchmark.isolation.supervisor import HUNG_UP, KILL_SECONDS, processes_in
 from phibench.datasets.common.parallel import ONE_THREAD
 from phibench.datasets.store.temporary_folders import OwnedFolder

@@ -14,7 +14,7 @@ from textwrap import indent
 import numpy as np
 
 from phibench.benchmark.isolation.easy_pairs import EasyPairs
-from phibench.benchmark.isolation.method_references import RunLimits
+from phibench.benchmark.isolation.run_limits import RunLimits
 from phibench.benchmark.isolation.runner import Harness
 from phibench.estimator.interface import OK, Outcome, Spot
 from phibench.estimator.pair_set import ImageTruth, PairTruth

@@ -1,4 +1,4 @@
-"""Methods by reference, looked up and hashed but not run; limits under which they run; writer of the example method.
+"""Methods by reference, looked up and hashed but not run; and the tasks (`Seat`) that they are written for.
 
 A reference is ``my_phi.py:extract`` (a file and a function in it), the name of a built-in method, or the name under
 which an installed package registers a method (entry-point group ``phibench.methods``). It is resolved without running
@@ -14,7 +14,6 @@ import ast
 import hashlib
 import importlib
 import inspect
-import math
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from importlib.metadata import EntryPoint, entry_points
@@ -22,14 +21,11 @@ from pathlib import Path
 from typing import Any, Literal
 
 from phibench.benchmark.isolation.method_provenance import package_sha256
+from phibench.benchmark.isolation.run_limits import MethodError
 from phibench.datasets.common.input_files import MIB, InputFile
 from phibench.datasets.store.files import sha256, write_text
 from phibench.datasets.store.provenance import code_behind
 from phibench.scenes.validation import close_names, printable_line
-
-
-class MethodError(ValueError):
-    """A method that cannot be found, loaded or started; one sentence."""
 
 
 @dataclass(frozen=True)
@@ -286,47 +282,6 @@ def _unknown(name: str, built_in: list[str], seat: Seat) -> str:
     advice = f"did you mean '{guess[0]}'?" if guess else f"`{seat.command} list` lists what there is."
     own = f"{seat.file}:{seat.function}"
     return f"no method '{name}': {advice} A method of your own is given as file and function, {own}"
-
-
-@dataclass(frozen=True)
-class RunLimits:
-    """Limits of one method; the same wherever methods run.
-
-    Parameters
-    ----------
-    seconds : float
-        Wall clock for one pair.
-    memory_mb : float
-        Address space (RLIMIT_AS) on top of what the process has after the method was imported, 1e6 bytes; each process
-        that the method starts has its own. Linux only: elsewhere the system does not keep it.
-    start_seconds : float
-        Wall clock for starting Python and importing the method.
-    fresh : bool
-        A process for each pair, instead of one for all.
-    allow : tuple of str
-        Files and folders that the method may read, besides the folder of its file.
-    """
-
-    seconds: float = 30.0
-    memory_mb: float = 4096.0
-    start_seconds: float = 120.0
-    fresh: bool = False
-    allow: tuple[str, ...] = ()
-
-    def __post_init__(self) -> None:
-        for name in ("seconds", "memory_mb", "start_seconds"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0.0):
-                raise MethodError(f"limit {name} = {value}: must be a finite number above 0")
-
-    def document(self) -> dict[str, Any]:
-        """For the record; of what is allowed the last part of the path, not where it lies."""
-        return {**asdict(self), "allow": [Path(path).absolute().name for path in self.allow]}
-
-    def memory_sentence(self, detail: str) -> str:
-        """A failure for want of memory in one sentence, with the limit."""
-        limit = f"the limit of {self.memory_mb:g} MB of address space on top of the imports (--memory-mb)"
-        return f"more memory than {limit}: {detail}"
 
 
 def write_example(path: Path, seat: Seat = SPOTS) -> Path:

@@ -32,8 +32,9 @@ from typing import TYPE_CHECKING, Any
 
 from phibench.benchmark.isolation.answers import answer_text, planes_text, to_bytes
 from phibench.benchmark.isolation.method_provenance import loaded_names
-from phibench.benchmark.isolation.method_references import MethodError, Reference, RunLimits
+from phibench.benchmark.isolation.method_references import Reference
 from phibench.benchmark.isolation.pair_transport import Connection, ReceivedPair, SharedPages, TransportError, unpack
+from phibench.benchmark.isolation.run_limits import MethodError, RunLimits
 from phibench.estimator.dense.dense_interface import DensePair
 from phibench.estimator.interface import Method
 from phibench.scenes.validation import close_names

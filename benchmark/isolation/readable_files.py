@@ -15,7 +15,8 @@ from contextlib import suppress
 from pathlib import Path
 
 from phibench.benchmark.isolation.isolation import Access
-from phibench.benchmark.isolation.method_references import MethodError, Reference, RunLimits
+from phibench.benchmark.isolation.method_references import Reference
+from phibench.benchmark.isolation.run_limits import MethodError, RunLimits
 from phibench.datasets.store.schema import RECORDS_SO_FAR, SEALED_TRUTH, TruthFile, TruthFolder
 
 

@@ -22,9 +22,10 @@ from phibench.benchmark.isolation.answers import outcome_of
 from phibench.benchmark.isolation.guest_process import MethodProcess
 from phibench.benchmark.isolation.isolation import Isolation
 from phibench.benchmark.isolation.method_provenance import loaded_names, packages_of
-from phibench.benchmark.isolation.method_references import MethodError, Reference, RunLimits, resolve
+from phibench.benchmark.isolation.method_references import Reference, resolve
 from phibench.benchmark.isolation.method_worker import reply_of, require_method, text_of
 from phibench.benchmark.isolation.pair_transport import AnyPair
+from phibench.benchmark.isolation.run_limits import MethodError, RunLimits
 from phibench.estimator.interface import Outcome
 from phibench.estimator.pair_set import PairSet, tell_answered, truth_folders
 

@@ -19,7 +19,8 @@ from typing import TYPE_CHECKING
 
 from rich.console import Console
 
-from phibench.benchmark.isolation.method_references import RunLimits, installed, write_example
+from phibench.benchmark.isolation.method_references import installed, write_example
+from phibench.benchmark.isolation.run_limits import RunLimits
 from phibench.benchmark.pair_sets.dataset_pairs import TRACKS, Track, tracks_of
 from phibench.benchmark.pair_sets.frames_set import FramesSet
 from phibench.benchmark.pair_sets.wanted_pairs import PairChoice, open_scored, wanted_pairs

@@ -30,7 +30,7 @@ from phibench.benchmark.reports.report_sections import Section, tracks_section
 from phibench.benchmark.scores.compare import note_on_others, same_pairs
 from phibench.benchmark.scores.failure_causes import CAUSES, KINDS
 from phibench.benchmark.scores.metrics import METRICS, RANKS, applies
-from phibench.benchmark.scores.score_document import EncodedPicture, ScoreDocument
+from phibench.benchmark.scores.score_document import ScoreDocument
 from phibench.benchmark.scores.score_files import read_records, read_score
 from phibench.benchmark.scores.score_tables import (
     BY_WORD,
@@ -48,6 +48,7 @@ from phibench.benchmark.scores.score_tables import (
     refused,
     shown_parts,
 )
+from phibench.benchmark.scores.worst_images import EncodedPicture
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.store.files import write_text
 

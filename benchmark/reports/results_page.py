@@ -20,8 +20,14 @@ from phibench.benchmark.reports.report_page import report_html
 from phibench.benchmark.reports.report_sections import Section, tracks_section
 from phibench.benchmark.reports.track_tables import track_tables
 from phibench.benchmark.scores.answer_errors import Rules
-from phibench.benchmark.scores.compare import Difference, compare_records, note_on_code, note_on_others, same_pairs
-from phibench.benchmark.scores.comparison_tables import differences_json
+from phibench.benchmark.scores.compare import (
+    Difference,
+    compare_records,
+    differences_json,
+    note_on_code,
+    note_on_others,
+    same_pairs,
+)
 from phibench.benchmark.scores.metrics import METRICS, applies
 from phibench.benchmark.scores.score_document import ScoreDocument, StratumScore
 from phibench.benchmark.scores.score_files import read_records, read_score

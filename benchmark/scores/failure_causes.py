@@ -1,4 +1,4 @@
-"""Causes (`CAUSES`) of images without a right position, one each: the first along the light's path; and their counts.
+"""Causes (`CAUSES`) of images without a right position, one each; their counts; and what false positions lie on.
 
 An image that is not found is of one kind: *unseen* (no spot visible, and rightly no position), *missed* (a spot, no
 position: "no answer" in tables) or *false* (a position where there is no spot, or too far from it). Its cause is one
@@ -27,82 +27,22 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import polars as pl
 from scipy.ndimage import uniform_filter
 
 from phibench.benchmark.scores.answer_errors import Rules
-from phibench.estimator.interface import FAILURES, Answer, Box, Image, Pair
-from phibench.estimator.methods.chain_fit import chain_fit
-from phibench.estimator.methods.raw_likelihood import raw_likelihood
+from phibench.benchmark.scores.fit_at_truth import FitAtTruth, fit_at_truth, reaches_bound
+from phibench.estimator.interface import FAILURES, Answer, Pair
 from phibench.estimator.pair_set import ImageTruth, PairSet, PairTruth
 from phibench.estimator.spots.camera_codes import rgb_codes
 from phibench.estimator.spots.image_planes import PROCESSED
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import Rig
-
-# Fit of a spot that is told where to look: whether an image allows what a method did not do.
-#
-# The built-in fit of the image's kind searches a small box about the true place. Where it comes as near to the truth as
-# the bound says, the light was there, and neither saturation, noise, compression nor an edge is why another method has
-# no right position.
-
-
-_BOX_PX = 24
-_SIGMAS = 4.0  # of the bound: a fit at the bound is further off in 3e-4 of the cases
-
-
-class FitAtTruth(Protocol):
-    """Function that answers a pair as a fit at the truth does."""
-
-    def __call__(self, pair: Pair, truth: PairTruth) -> Answer | None:
-        """Answer; None where there is none."""
-
-
-def fit_at_truth(pair: Pair, truth: PairTruth) -> Answer:
-    """Answer of the built-in fit, which is shown boxes about the true places."""
-    shown = replace(pair, box_down=_box_about(truth.down, pair.down), box_up=_box_about(truth.up, pair.up))
-    return chain_fit(shown) if pair.card.output in PROCESSED else raw_likelihood(shown)
-
-
-class KeptFits:
-    """Fits at the truth, each made once: methods on the same pairs share them. Make a new one for other pairs."""
-
-    def __init__(self) -> None:
-        self._answers: dict[int, Answer] = {}
-
-    def __call__(self, pair: Pair, truth: PairTruth) -> Answer:
-        """Answer to a pair, by its number."""
-        if truth.number not in self._answers:
-            self._answers[truth.number] = fit_at_truth(pair, truth)
-        return self._answers[truth.number]
-
-
-def reaches_bound(answer: Answer | None, position: str, spot: ImageTruth, match_px: float) -> bool:
-    """Tell whether an answer is as near to the truth as the bound says.
-
-    Where the bound itself is so wide that four of its deviations exceed `match_px`, nothing is reached: an answer in
-    the box would be near by chance.
-    """
-    answered, bound = getattr(answer, position, None), spot.bound_px2
-    if answered is None or answered.uv_px is None or bound is None or not spot.visible:
-        return False
-    reach = _SIGMAS * float(np.sqrt(np.trace(bound) / 2.0))
-    return reach <= match_px and float(np.linalg.norm(np.subtract(answered.uv_px, spot.uv_px))) <= reach
-
-
-def _box_about(spot: ImageTruth, image: Image) -> Box | None:
-    if not (spot.visible and np.isfinite(spot.uv_px).all()):
-        return None
-    height, width = image.shape[:2]
-    u0, v0 = (round(x) - _BOX_PX // 2 for x in spot.uv_px)
-    left, top = max(min(u0, width - _BOX_PX), 0), max(min(v0, height - _BOX_PX), 0)
-    return Box(left, top, min(_BOX_PX, width - left), min(_BOX_PX, height - top))
-
 
 # Thresholds of the rules, derived in the text above.
 LEAST_SNR = 5.0

@@ -15,8 +15,9 @@ from typing import Any, Unpack
 import polars as pl
 from rich.console import Console
 
-from phibench.benchmark.isolation.method_references import MethodError, RunLimits, code_of_function, resolve
+from phibench.benchmark.isolation.method_references import code_of_function, resolve
 from phibench.benchmark.isolation.prefetched_pairs import PairsAhead
+from phibench.benchmark.isolation.run_limits import MethodError, RunLimits
 from phibench.benchmark.isolation.runner import Harness, Ran, asked_here, function_name, ran_here
 from phibench.benchmark.pair_sets.dataset_pairs import DatasetPairs
 from phibench.benchmark.pair_sets.frames_set import FramesSet
@@ -28,12 +29,13 @@ from phibench.benchmark.pair_sets.wanted_pairs import (
     wanted_pairs,
 )
 from phibench.benchmark.scores.answer_errors import Rules
-from phibench.benchmark.scores.failure_causes import KeptFits, with_causes
+from phibench.benchmark.scores.failure_causes import with_causes
+from phibench.benchmark.scores.fit_at_truth import KeptFits
 from phibench.benchmark.scores.records import in_order, missed_relative, record_table, with_missed
-from phibench.benchmark.scores.score_document import Declared, Division, MethodCard, ScoreDocument, Worst, document_of
+from phibench.benchmark.scores.score_document import Declared, Division, MethodCard, ScoreDocument, document_of
 from phibench.benchmark.scores.score_files import UnfinishedError, records_kept, write_score
 from phibench.benchmark.scores.score_tables import score_table
-from phibench.benchmark.scores.worst_images import worst, worst_of, worst_records
+from phibench.benchmark.scores.worst_images import Worst, worst, worst_of, worst_records
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.progress import Steps, progress_console
 from phibench.datasets.common.shown_text import ShortForm, text_of

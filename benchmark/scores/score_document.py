@@ -22,7 +22,16 @@ from phibench.benchmark.scores.beyond_images import excesses
 from phibench.benchmark.scores.failure_causes import count, count_failures
 from phibench.benchmark.scores.intervals import Estimate
 from phibench.benchmark.scores.metrics import METRICS, MetricEstimate
-from phibench.benchmark.scores.strata import Stratum, count_pairs, light_shift, measured, strata
+from phibench.benchmark.scores.strata import (
+    PairRange,
+    Stratum,
+    count_pairs,
+    frame_numbers,
+    light_distances,
+    measured,
+    strata,
+)
+from phibench.benchmark.scores.worst_images import Worst
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import Name
 from phibench.datasets.store.provenance import code_behind, program_version, provenance
@@ -190,81 +199,6 @@ class Flag(Document):
         chance = f"below {1e-6:g}" if self.chance < 1e-6 else f"{self.chance:.1g}"
         where = f"{self.part}, {self.pairs}"
         return f"knows more than the images: {self.quantity} {times} ({where}; by chance {chance})"
-
-
-class PairRange(Document):
-    """Least, median and greatest of a number over the pairs."""
-
-    low: float
-    median: float
-    high: float
-
-    @classmethod
-    def of(cls, values: pl.Series) -> PairRange | None:
-        """Of the values that are known; None where there are none."""
-        known = values.drop_nulls().cast(pl.Float64)
-        if not len(known):
-            return None
-        return cls.model_validate({"low": known.min(), "median": known.median(), "high": known.max()})
-
-    def text(self, factor: float = 1.0, unit: str = "") -> str:
-        """Median, with the range where there is one."""
-        low, median, high = (f"{factor * x:.3g}" for x in (self.low, self.median, self.high))
-        end = f" {unit}" if unit else ""
-        return f"{median}{end}" if low == high else f"{median}{end} ({low} to {high})"
-
-
-FRAME_COLUMNS = ("exposure_s", "analogue_gain", "jpeg_quality", "laser_level", "lamp_level")
-"""Columns of the records that say how frames were taken."""
-
-
-def frame_numbers(records: pl.DataFrame) -> dict[str, PairRange | None]:
-    """Numbers of a score's frames: each of `FRAME_COLUMNS` over its pairs."""
-    pairs = records.filter(pl.col("image") == "down")
-    return {name: PairRange.of(pairs[name]) for name in FRAME_COLUMNS}
-
-
-def light_distances(records: pl.DataFrame) -> dict[str, PairRange | None]:
-    """Distances of the light from the beam's axis: in visible images, pixels; of D, metres."""
-    seen = records.filter("visible").select(shift=light_shift())["shift"]
-    pairs = records.filter((pl.col("image") == "down") & pl.col("pair_visible"))
-    return {"shift_px": PairRange.of(seen), "depth_m": PairRange.of((pairs["depth_m"] - pairs["axis_depth_m"]).abs())}
-
-
-class EncodedPicture(Document):
-    """Part of a frame as a picture: (u, v) lies at ((u - first_u + 0.5) / step, ...) from its upper left corner."""
-
-    kind: Literal["png", "jpeg"]
-    first_px: Annotated[tuple[int, int], Field(strict=False)]
-    step_px: int = Field(description="pixels of the frame along a side of one of the picture")
-    size: Annotated[tuple[int, int], Field(strict=False)]
-    base64: str
-
-    def place(self, uv_px: tuple[float, float]) -> tuple[float, float]:
-        """Position in the picture, from its upper left corner."""
-        u, v = ((x - first + 0.5) / self.step_px for x, first in zip(uv_px, self.first_px, strict=True))
-        return u, v
-
-    def holds(self, uv_px: tuple[float, float]) -> bool:
-        """Tell whether a position of the frame lies in the picture."""
-        return all(0.0 <= x <= size for x, size in zip(self.place(uv_px), self.size, strict=True))
-
-
-class Worst(Document):
-    """One of the worst images; positions are those of the whole frame."""
-
-    number: int
-    sample_id: str
-    image: Literal["down", "up"]
-    depth_m: float
-    electrons: float
-    distance_px: float | None
-    status: str
-    cause: str | None
-    true_px: Annotated[tuple[float, float], Field(strict=False)]
-    answer_px: Annotated[tuple[float, float] | None, Field(strict=False)]
-    crop: EncodedPicture | None = Field(description="around the spot, stretched to its own range")
-    frame: EncodedPicture | None = Field(description="the whole; of the first ones only")
 
 
 def _beside(name: str) -> str:

@@ -20,7 +20,8 @@ from phibench.benchmark.pair_sets.dataset_pairs import Track, tracks_of
 from phibench.benchmark.scores.failure_causes import CAUSES, KINDS, NOISE, TAKEN_FOR
 from phibench.benchmark.scores.intervals import Estimate
 from phibench.benchmark.scores.metrics import CHOSEN, METRICS, RANKS, applies
-from phibench.benchmark.scores.score_document import PairRange, ScoreDocument, Value
+from phibench.benchmark.scores.score_document import ScoreDocument, Value
+from phibench.benchmark.scores.strata import PairRange
 from phibench.datasets.common.shown_text import TextTable, csv_table, latex, markdown, show_grid, table_console
 from phibench.estimator.methods.registry import REFUSED
 

@@ -16,6 +16,7 @@ import polars as pl
 
 from phibench.benchmark.scores.answer_errors import Rules
 from phibench.benchmark.scores.metrics import METRICS, OF_PAIRS, MetricEstimate, measure, prepared
+from phibench.datasets.store.schema import Document
 from phibench.scenes.random_streams import Name
 
 _EDGES: dict[str, tuple[str, tuple[float, ...], str]] = {
@@ -145,3 +146,42 @@ def _label(low: float, high: float, unit: str) -> str:
     if math.isinf(high):
         return f"from {low:g} {unit}"
     return f"{low:g} to {high:g} {unit}"
+
+
+class PairRange(Document):
+    """Least, median and greatest of a number over the pairs."""
+
+    low: float
+    median: float
+    high: float
+
+    @classmethod
+    def of(cls, values: pl.Series) -> PairRange | None:
+        """Of the values that are known; None where there are none."""
+        known = values.drop_nulls().cast(pl.Float64)
+        if not len(known):
+            return None
+        return cls.model_validate({"low": known.min(), "median": known.median(), "high": known.max()})
+
+    def text(self, factor: float = 1.0, unit: str = "") -> str:
+        """Median, with the range where there is one."""
+        low, median, high = (f"{factor * x:.3g}" for x in (self.low, self.median, self.high))
+        end = f" {unit}" if unit else ""
+        return f"{median}{end}" if low == high else f"{median}{end} ({low} to {high})"
+
+
+FRAME_COLUMNS = ("exposure_s", "analogue_gain", "jpeg_quality", "laser_level", "lamp_level")
+"""Columns of the records that say how frames were taken."""
+
+
+def frame_numbers(records: pl.DataFrame) -> dict[str, PairRange | None]:
+    """Numbers of a score's frames: each of `FRAME_COLUMNS` over its pairs."""
+    pairs = records.filter(pl.col("image") == "down")
+    return {name: PairRange.of(pairs[name]) for name in FRAME_COLUMNS}
+
+
+def light_distances(records: pl.DataFrame) -> dict[str, PairRange | None]:
+    """Distances of the light from the beam's axis: in visible images, pixels; of D, metres."""
+    seen = records.filter("visible").select(shift=light_shift())["shift"]
+    pairs = records.filter((pl.col("image") == "down") & pl.col("pair_visible"))
+    return {"shift_px": PairRange.of(seen), "depth_m": PairRange.of((pairs["depth_m"] - pairs["axis_depth_m"]).abs())}

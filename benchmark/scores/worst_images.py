@@ -9,15 +9,16 @@ from __future__ import annotations
 import base64
 import io
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 from PIL import Image
+from pydantic import Field
 
-from phibench.benchmark.scores.score_document import EncodedPicture, Worst
 from phibench.datasets.frames.sensor_card import SensorCard
+from phibench.datasets.store.schema import Document
 from phibench.estimator.pair_set import Pairs
 from phibench.estimator.spots.camera_codes import rgb_picture
 from phibench.scenes.frames import Array
@@ -127,3 +128,39 @@ def _encoded(
         size=(pixels.shape[1], pixels.shape[0]),
         base64=base64.b64encode(buffer.getvalue()).decode("ascii"),
     )
+
+
+class EncodedPicture(Document):
+    """Part of a frame as a picture: (u, v) lies at ((u - first_u + 0.5) / step, ...) from its upper left corner."""
+
+    kind: Literal["png", "jpeg"]
+    first_px: Annotated[tuple[int, int], Field(strict=False)]
+    step_px: int = Field(description="pixels of the frame along a side of one of the picture")
+    size: Annotated[tuple[int, int], Field(strict=False)]
+    base64: str
+
+    def place(self, uv_px: tuple[float, float]) -> tuple[float, float]:
+        """Position in the picture, from its upper left corner."""
+        u, v = ((x - first + 0.5) / self.step_px for x, first in zip(uv_px, self.first_px, strict=True))
+        return u, v
+
+    def holds(self, uv_px: tuple[float, float]) -> bool:
+        """Tell whether a position of the frame lies in the picture."""
+        return all(0.0 <= x <= size for x, size in zip(self.place(uv_px), self.size, strict=True))
+
+
+class Worst(Document):
+    """One of the worst images; positions are those of the whole frame."""
+
+    number: int
+    sample_id: str
+    image: Literal["down", "up"]
+    depth_m: float
+    electrons: float
+    distance_px: float | None
+    status: str
+    cause: str | None
+    true_px: Annotated[tuple[float, float], Field(strict=False)]
+    answer_px: Annotated[tuple[float, float] | None, Field(strict=False)]
+    crop: EncodedPicture | None = Field(description="around the spot, stretched to its own range")
+    frame: EncodedPicture | None = Field(description="the whole; of the first ones only")

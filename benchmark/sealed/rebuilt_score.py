@@ -19,10 +19,12 @@ import numpy as np
 import polars as pl
 from rich.console import Console
 
-from phibench.benchmark.isolation.method_references import MethodError, Reference, RunLimits, resolve
+from phibench.benchmark.isolation.method_references import Reference, resolve
+from phibench.benchmark.isolation.run_limits import MethodError, RunLimits
 from phibench.benchmark.scores.answer_errors import Rules
 from phibench.benchmark.scores.score import Scored, run_and_score, score_outcomes
-from phibench.benchmark.scores.score_document import BUILT_IN, SCORER, EncodedPicture, MethodCard, ScoreDocument
+from phibench.benchmark.scores.score_document import BUILT_IN, SCORER, MethodCard, ScoreDocument
+from phibench.benchmark.scores.worst_images import EncodedPicture
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import InputFile
 from phibench.datasets.store.provenance import code_behind, program_version

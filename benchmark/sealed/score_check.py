@@ -18,15 +18,16 @@ import numpy as np
 import polars as pl
 from rich.console import Console
 
-from phibench.benchmark.isolation.method_references import RunLimits
+from phibench.benchmark.isolation.run_limits import RunLimits
 from phibench.benchmark.pair_sets.dataset_pairs import BOX_PX, TASK_VERSION, TRACKS
 from phibench.benchmark.pair_sets.wanted_pairs import PairChoice, wanted_pairs
 from phibench.benchmark.scores.answer_errors import Rules, usable_covariance, whitened
 from phibench.benchmark.scores.record_columns import COLUMN_TYPES
 from phibench.benchmark.scores.records import missed_relative, with_missed
-from phibench.benchmark.scores.score_document import ScoreDocument, Worst, document_of, results_sha256
+from phibench.benchmark.scores.score_document import ScoreDocument, document_of, results_sha256
 from phibench.benchmark.scores.score_files import read_records, read_score
 from phibench.benchmark.scores.score_tables import failure_line
+from phibench.benchmark.scores.worst_images import Worst
 from phibench.benchmark.sealed.rebuilt_score import (
     ABSOLUTE,
     GIVEN,

@@ -19,7 +19,8 @@ from typing import Annotated, Any
 from pydantic import Field
 
 from phibench.benchmark.isolation.answers import AnswerError, checked
-from phibench.benchmark.isolation.method_references import Reference, RunLimits, resolve
+from phibench.benchmark.isolation.method_references import Reference, resolve
+from phibench.benchmark.isolation.run_limits import RunLimits
 from phibench.benchmark.isolation.runner import Harness, Ran
 from phibench.benchmark.pair_sets.frames_set import pair_of_files, read_truth_file
 from phibench.benchmark.scores.score_document import Declared, MethodCard

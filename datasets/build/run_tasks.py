@@ -47,8 +47,8 @@ from phibench.datasets.store.metadata import (
     read_info,
     rigs_text,
     same_content,
-    to_table,
 )
+from phibench.datasets.store.parquet_tables import to_table
 from phibench.datasets.store.provenance import code_behind
 from phibench.datasets.store.schema import DatasetInfo, ManifestRow, RoomInfo
 from phibench.scenes.rig import POSITIONS

@@ -22,7 +22,7 @@ from phibench.datasets.common.input_files import FileName, InputFile
 from phibench.datasets.frames.frame_source import Frame
 from phibench.datasets.store.files import read_rows, write_bytes, write_text
 from phibench.datasets.store.layers import write_exr
-from phibench.datasets.store.metadata import model_table, parquet_bytes
+from phibench.datasets.store.parquet_tables import model_table, parquet_bytes
 from phibench.datasets.store.schema import Document, Number, Position, TruthFile, described
 from phibench.render.sensor import processing
 from phibench.render.sensor.settings import Sensor

@@ -11,6 +11,7 @@ import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from phibench.datasets.common.shown_text import counted
 from phibench.datasets.store import schema
 from phibench.datasets.store.schema import DatasetInfo, ManifestRow, columns
 
@@ -142,11 +143,6 @@ def described_field(field: Any) -> str:
     """Meaning of a field of a document, with its unit."""
     unit = (field.json_schema_extra or {}).get("unit", "-")
     return f"{field.description}{'' if unit == '-' else f' ({unit})'}"
-
-
-def counted(*counts: tuple[int, str]) -> str:
-    """Numbers with their nouns: "3 pairs, 1 rig"."""
-    return ", ".join(f"{count} {noun}{'' if count == 1 else 's'}" for count, noun in counts)
 
 
 def made_by(info: DatasetInfo) -> str:

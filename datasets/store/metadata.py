@@ -6,14 +6,13 @@ Doubles survive exactly. Numbers that do not exist are NaN in Python and null in
 from __future__ import annotations
 
 import hashlib
-import io
 import json
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, get_args, get_origin
+from typing import TYPE_CHECKING, Any
 
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import InputFile
@@ -22,25 +21,23 @@ from phibench.datasets.recipe.tables import Recipe
 from phibench.datasets.store import schema
 from phibench.datasets.store.files import read_rows
 from phibench.datasets.store.json_forms import from_json, to_json
+from phibench.datasets.store.parquet_tables import parquet_bytes, to_table
 from phibench.datasets.store.provenance import provenance
 from phibench.datasets.store.schema import (
     READABLE_VERSIONS,
     SCHEMA_VERSION,
     DatasetInfo,
-    Document,
     LeftOutInfo,
     ManifestRow,
     PoseInfo,
     RigInfo,
-    columns,
-    drawn_columns,
     row_line,
 )
 from phibench.scenes.rig import Rig
 from phibench.scenes.validation import nearest, printable_line
 
 if TYPE_CHECKING:
-    from polars import DataFrame
+    pass
 
 
 # dataset.json.
@@ -182,61 +179,6 @@ def read_manifest(folder: Path) -> list[ManifestRow]:
     return read_rows(folder / schema.MANIFEST, ManifestRow)
 
 
-def to_table(rows: Sequence[ManifestRow]) -> DataFrame:
-    """Rows as a polars table: one column per leaf, names joined by dots, null where a number does not exist."""
-    import polars
-
-    # keys of `drawn` depend on the recipe: a column for each that any row has
-    drawn = [
-        polars.Series(name, [row.drawn.get(name.removeprefix("drawn.")) for row in rows], _column_type(kind))
-        for name, kind in drawn_columns(rows).items()
-    ]
-    return model_table(ManifestRow, rows).with_columns(drawn)
-
-
-_LARGEST_INTEGER = 2**63 - 1  # of a column Int64
-
-
-def model_table(model: type[Document], rows: Sequence[Document]) -> DataFrame:
-    """Documents of one model as a polars table; free-form objects, such as a sensor's numbers, are JSON texts.
-
-    A column with a secret seed, of 128 bits, is one of texts.
-    """
-    import polars
-
-    documents = [row.model_dump(mode="json") for row in rows]
-    data, types = {}, {}
-    for name, field in columns(model):
-        types[name] = _column_type(field.annotation)
-        values = [_leaf(document, name) for document in documents]
-        data[name] = [json.dumps(value) if isinstance(value, dict) else value for value in values]
-        if types[name] == polars.Int64 and any(value is not None and value > _LARGEST_INTEGER for value in values):
-            types[name], data[name] = polars.String, [str(value) for value in values]
-    return polars.DataFrame(data, schema=types)
-
-
-def parquet_bytes(table: DataFrame) -> bytes:
-    """Parquet file of a table."""
-    buffer = io.BytesIO()
-    table.write_parquet(buffer, compression="zstd", statistics=False)
-    return buffer.getvalue()
-
-
-def _column_type(annotation: Any) -> Any:
-    """Column type of a field: of a union its known member, of a tuple a list of doubles."""
-    import polars
-
-    kinds = {str: polars.String, float: polars.Float64, bool: polars.Boolean, int: polars.Int64}
-    origin = get_origin(annotation)
-    if origin is tuple or any(
-        get_origin(get_args(kind)[0]) is tuple for kind in get_args(annotation) if get_args(kind)
-    ):
-        return polars.List(polars.Float64)
-    if origin in (dict, Literal):
-        return polars.String
-    return next((kinds[known] for known in kinds if known in (annotation, *get_args(annotation))), polars.Float64)
-
-
 def differences(folder: Path, rows: Sequence[ManifestRow]) -> list[str]:
     """One sentence per column in which the Parquet table differs from the rows."""
     expected = to_table(rows)
@@ -259,13 +201,6 @@ def _later_columns(columns: Sequence[str], rows: Sequence[ManifestRow]) -> list[
         for name, default in later.items()
         if name not in columns and all(getattr(row, name) == default for row in rows)
     ]
-
-
-def _leaf(document: dict[str, Any], name: str) -> Any:
-    value: Any = document
-    for key in name.split("."):
-        value = None if value is None else value[key]
-    return value
 
 
 # rigs.jsonl.

@@ -20,7 +20,7 @@ import numpy as np
 from scipy.ndimage import correlate1d, uniform_filter
 
 from phibench.datasets.frames.sensor_card import SensorCard
-from phibench.estimator.geometry.reflection import up_image
+from phibench.estimator.geometry.epipolar_line import up_image
 from phibench.estimator.spots.image_planes import variance_e2
 from phibench.estimator.spots.raw_pixels import bayer_filters
 from phibench.scenes.frames import Array

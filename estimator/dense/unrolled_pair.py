@@ -14,8 +14,9 @@ from scipy.ndimage import map_coordinates, spline_filter
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.estimator.dense.dense_interface import DenseAnswer, DensePair
+from phibench.estimator.geometry.epipolar_line import range_at
 from phibench.estimator.geometry.panorama import FAR_M, PanoramaGrid
-from phibench.estimator.geometry.reflection import image_of, range_at, room_rays
+from phibench.estimator.geometry.reflection import image_of, room_rays
 from phibench.estimator.geometry.triangulate import approx_estimator, meeting
 from phibench.estimator.spots.camera_codes import rgb_codes, tone_of
 from phibench.estimator.spots.image_planes import KINDS, kind_of, linear_planes

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates, spline_filter
 
-from phibench.estimator.geometry.reflection import up_image
+from phibench.estimator.geometry.epipolar_line import up_image
 from phibench.estimator.geometry.status import Status
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.scenes.frames import Array

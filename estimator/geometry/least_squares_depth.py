@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import special
 
-from phibench.estimator.geometry.reflection import up_image
+from phibench.estimator.geometry.epipolar_line import up_image
 from phibench.estimator.geometry.rig_parameters import PARAMETERS, changed, moves_rays, steps, stroke_of
 from phibench.estimator.geometry.status import DepthEstimate, Status, first_fault, flag, keep, stroke_status
 from phibench.estimator.geometry.triangulate import Meeting, depth_exact, meeting, meeting_gradients

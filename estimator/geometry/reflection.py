@@ -1,4 +1,4 @@
-"""Camera rays reflected at a mirror of any shape, with derivatives; images of points of the room; what blocks rays.
+"""Camera rays reflected at a mirror of any shape, with derivatives, and points of the room imaged in it.
 
 Estimators assume a perfect surface. The form error serves the true rig, whose errors `sensitivities` predicts.
 
@@ -11,19 +11,16 @@ A glass tube around the mirror bends the rays that leave it: `room_rays` follows
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from phibench.estimator.geometry.mirror_geometry import Hit, geometry_of
-from phibench.estimator.geometry.status import Status, StatusArray, first_fault, flag, keep, stroke_status
+from phibench.estimator.geometry.status import Status, StatusArray, first_fault, flag, keep
 from phibench.scenes.camera import Camera
-from phibench.scenes.frames import Array, BoolArray
+from phibench.scenes.frames import Array
 from phibench.scenes.glass_tube import GlassTube
-from phibench.scenes.rig import Rig, View
-from phibench.scenes.shapes import Cuboid
+from phibench.scenes.rig import View
 
 # cos i = 1e-3 is 2e-4 px inside the outline of the default rig; the error of theta per pixel grows as 1 / cos i.
 GRAZING_COSINE = 1e-3
@@ -212,15 +209,10 @@ def _through_glass(tube: GlassTube, ray: Reflection, J: ReflectionJacobian | Non
     return X[..., 0] + tube.origin_m, d[..., 0], dX, dd
 
 
-# Image of a world point in the mirror: the inverse of `reflection.room_rays`; and the epipolar line of a pixel.
+# Image of a world point in the mirror: the inverse of `room_rays`.
 #
 # The pixel is the one whose reflected ray P + t r goes through the point X. Newton's method brings the ray's miss
 # e = w - (w . r) r, w = X - P, to 0, with the analytic derivatives of `room_rays_jacobian`.
-#
-# Epipolar line: the down pixel's ray is X(t) = P + t r. t follows from |X_h - S_h| = D, h the horizontal part and S the
-# sphere centre at the down position. `up_image` gives the pixel of X in the up image, with derivatives.
-#
-# Line of sight: segments against boxes, by clipping (`blocked`).
 
 
 _NEWTON_STEPS = 12
@@ -288,110 +280,3 @@ def _safe(matrix: Array) -> Array:
     with np.errstate(invalid="ignore"):
         good = np.isfinite(matrix).all(axis=(-1, -2)) & (np.abs(np.linalg.det(matrix)) > 0.0)
     return np.where(good[..., None, None], matrix, np.eye(2))
-
-
-# -- epipolar line -----------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class UpImage:
-    """Pixels of the up image, shape (...).
-
-    Parameters
-    ----------
-    uv_px : shape (..., 2)
-    jacobian : shape (..., 2, 3)
-        Derivatives by u and v of the down image, and by 1 / D in 1 / m, in which the images move nearly evenly.
-    point_world_m : shape (..., 3)
-    status : shape (...), values of `Status`
-    """
-
-    uv_px: Array
-    jacobian: Array
-    point_world_m: Array
-    status: StatusArray
-
-
-def up_image(rig: Rig, stroke_m: ArrayLike, uv_down_px: Array, inverse_depth_per_m: ArrayLike) -> UpImage:
-    """Image in the up frame of the point at 1 / D on the ray of a down pixel.
-
-    Parameters
-    ----------
-    rig : Rig
-    stroke_m : shape (...), h
-    uv_down_px : shape (..., 2)
-    inverse_depth_per_m : shape (...), 1 / D, above 0
-    """
-    view, uv = rig.at(0.0), np.asarray(uv_down_px, float)
-    q, h = np.asarray(inverse_depth_per_m, float), np.asarray(stroke_m, float)
-    ray, J = room_rays(view, uv), room_rays_jacobian(view, uv)
-    with np.errstate(all="ignore"):
-        D = 1.0 / q
-        t = range_at(ray.origin_world_m - view.sphere_centre_m, ray.direction_world, D)
-        X = ray.origin_world_m + t[..., None] * ray.direction_world
-        dX = _tangents(X - view.sphere_centre_m, ray.direction_world, t, D, J.origin_m_per_px, J.direction_per_px)
-        # the stroke moves the rig along the axis and turns nothing: move the point against it instead
-        image = image_of(view, X - h[..., None] * np.array(rig.stroke_axis_world))
-        jacobian = image.px_per_m @ dX
-    range_status = flag((~(q > 0.0), Status.OUT_OF_RANGE), (~(t > 0.0), Status.DIVERGING))
-    status = first_fault(ray.status, stroke_status(h), range_status, image.status)
-    return UpImage(keep(image.uv_px, status), keep(jacobian, status), keep(X, status), status)
-
-
-def range_at(origin_m: Array, direction: Array, D: Array) -> Array:
-    """Length along rays at which the horizontal distance from the vertical through the origin is D, shape (...).
-
-    Parameters
-    ----------
-    origin_m, direction : shape (..., 3)
-    D : shape (...)
-    """
-    a = np.sum(direction[..., :2] ** 2, axis=-1)
-    b = np.sum(origin_m[..., :2] * direction[..., :2], axis=-1)
-    c = np.sum(origin_m[..., :2] ** 2, axis=-1) - D * D
-    return np.asarray((np.sqrt(b * b - a * c) - b) / a)
-
-
-def _tangents(radial: Array, r: Array, t: Array, D: Array, dP: Array, dr: Array) -> Array:
-    """Derivatives of X by u, v, 1 / D, shape (..., 3, 3): those of t keep rho . drho = D dD."""
-    fixed = dP + t[..., None, None] * dr
-    rho = radial[..., :2]
-    outward = np.sum(rho * r[..., :2], axis=-1)
-    dt_px = -np.einsum("...i,...ij->...j", rho, fixed[..., :2, :]) / outward[..., None]
-    dt_q = -(D**3) / outward  # dD = -D^2 d(1/D)
-    pixel = fixed + r[..., :, None] * dt_px[..., None, :]
-    return np.concatenate([pixel, (r * dt_q[..., None])[..., None]], axis=-1)
-
-
-# -- line of sight -----------------------------------------------------------------------------------------------------
-
-_END_M = 1e-6  # a segment may touch the surface that it ends on
-
-
-def blocked(solid: Cuboid, start_m: Array, end_m: Array) -> BoolArray:
-    """Segments, shape (..., 3), that pass through a box: bool, shape (...).
-
-    The part of the segment inside each pair of planes is an interval of its parameter; the box is hit where the three
-    have more than a point in common.
-    """
-    into = solid.T_world_shape.inverse()
-    a, b = into.points(np.asarray(start_m, float)), into.points(np.asarray(end_m, float))
-    half = 0.5 * np.array(solid.size_m)
-    along = b - a
-    length = np.linalg.norm(along, axis=-1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        one, two = (-half - a) / along, (half - a) / along
-        parallel = along == 0.0
-        inside = np.abs(a) < half
-        low = np.where(parallel, np.where(inside, -np.inf, np.inf), np.minimum(one, two)).max(axis=-1)
-        high = np.where(parallel, np.where(inside, np.inf, -np.inf), np.maximum(one, two)).min(axis=-1)
-        end = _END_M / length
-    return np.asarray(np.minimum(high, 1.0 - end) > np.maximum(low, end))
-
-
-def first_blocker(solids: Sequence[Cuboid], legs: Sequence[tuple[Array, Array]]) -> str | None:
-    """Name of the first solid that stands in any leg (start, end), shapes (..., 3), of any ray; None if none does."""
-    for solid in solids:
-        if any(np.any(blocked(solid, start, end)) for start, end in legs):
-            return solid.name
-    return None

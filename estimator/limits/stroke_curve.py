@@ -23,7 +23,8 @@ import scipy
 from numpy.typing import NDArray
 
 from phibench.estimator.geometry.least_squares_depth import depth_general
-from phibench.estimator.geometry.reflection import MirrorImage, first_blocker, image_of, reflect
+from phibench.estimator.geometry.line_of_sight import first_blocker
+from phibench.estimator.geometry.reflection import MirrorImage, image_of, reflect
 from phibench.estimator.geometry.rig_parameters import PARAMETERS, changed, stroke_of
 from phibench.estimator.geometry.status import Status
 from phibench.estimator.limits.processed_bound import SpotSigma

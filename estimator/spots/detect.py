@@ -24,7 +24,7 @@ from PIL import ImageDraw
 from scipy.ndimage import label, maximum_filter
 
 from phibench.datasets.frames.sensor_card import SensorCard
-from phibench.estimator.geometry.reflection import up_image
+from phibench.estimator.geometry.epipolar_line import up_image
 from phibench.estimator.interface import Box, Pair
 from phibench.estimator.spots.candidates import Candidates, candidate_noise, candidates_at, peaks
 from phibench.estimator.spots.image_planes import ColourPlanes, blur_of, colour_planes

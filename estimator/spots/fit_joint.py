@@ -15,8 +15,8 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from phibench.estimator.geometry.epipolar_line import up_image
 from phibench.estimator.geometry.least_squares_depth import combine
-from phibench.estimator.geometry.reflection import up_image
 from phibench.estimator.geometry.status import DepthEstimate, Status, StatusArray, first_fault, flag, keep
 from phibench.estimator.spots.fit_raw import AT_ONCE, DAMPING, DECREMENT, LEAST_SNR, START_PX, SpotData
 from phibench.estimator.spots.gaussian_spot import covariance_bound, limited, scoring_step

@@ -136,7 +136,7 @@ def run(
     out
         Parquet file for the rows.
     """
-    from phibench.benchmark.isolation.method_references import RunLimits
+    from phibench.benchmark.isolation.run_limits import RunLimits
     from phibench.datasets.common.errors import whole_number
     from phibench.datasets.common.progress import Steps, progress_console
     from phibench.datasets.store.files import require_writable, write_atomic
@@ -195,7 +195,7 @@ def show_loop(
     seconds
         Time that a policy of yours has for one answer.
     """
-    from phibench.benchmark.isolation.method_references import RunLimits
+    from phibench.benchmark.isolation.run_limits import RunLimits
     from phibench.datasets.common.errors import whole_number
     from phibench.datasets.common.progress import Steps, progress_console
     from phibench.datasets.store.files import require_writable

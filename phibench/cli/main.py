@@ -283,7 +283,7 @@ def _is_incomplete(error: Exception) -> bool:
 
 
 def _is_users(error: Exception) -> bool:
-    from phibench.benchmark.isolation.method_references import MethodError
+    from phibench.benchmark.isolation.run_limits import MethodError
     from phibench.datasets.common.errors import DatasetError
     from phibench.scenes.validation import SceneError
 

@@ -22,7 +22,7 @@ from cyclopts import Group, Parameter, Token
 if TYPE_CHECKING:
     from cyclopts.completion import CompletionContext
 
-    from phibench.benchmark.isolation.method_references import RunLimits
+    from phibench.benchmark.isolation.run_limits import RunLimits
     from phibench.benchmark.scores.score_document import Declared
 
 START, DATA, METHODS, SENSOR, KEEPERS, INSTALLATION = (
@@ -30,7 +30,7 @@ START, DATA, METHODS, SENSOR, KEEPERS, INSTALLATION = (
     for name in ("Start with", "Data sets", "Methods", "Sensor and paper", "Publish and study", "Installation")
 )
 DEFAULT_PRESET = "mjpeg"  # what the C310 delivers; a data set's own presets go before it
-SECONDS = 30.0  # of one pair; those of `method_references.RunLimits`, slow to import
+SECONDS = 30.0  # of one pair; those of `run_limits.RunLimits`, slow to import
 MEMORY_MB = 4096.0  # of a method; a network and its arrays fit
 
 
@@ -226,7 +226,7 @@ class Limits:
         MethodError
             If a number is out of its range.
         """
-        from phibench.benchmark.isolation.method_references import RunLimits
+        from phibench.benchmark.isolation.run_limits import RunLimits
 
         return RunLimits(self.seconds, self.memory_mb, fresh=self.fresh, allow=self.allow)
 

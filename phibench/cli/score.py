@@ -186,8 +186,7 @@ def compare(first: Path, second: Path, *, bootstrap_seed: BootstrapSeed = 0, out
         Another one, of the same pairs.
     """
     from phibench.benchmark.scores.compare import compare as compare_scores
-    from phibench.benchmark.scores.compare import note_on_code, note_on_pairs, note_on_size
-    from phibench.benchmark.scores.comparison_tables import print_comparison
+    from phibench.benchmark.scores.compare import note_on_code, note_on_pairs, note_on_size, print_comparison
     from phibench.benchmark.scores.score_files import read_records, read_score
     from phibench.benchmark.scores.score_tables import failure_line
 

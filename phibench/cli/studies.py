@@ -150,7 +150,7 @@ def _experiments(directory: Path, procedure: Procedure, rig: tuple[str, ...], wi
     from phibench.datasets.common.shown_text import show_grid, table_console
     from phibench.datasets.read import open_finished
     from phibench.datasets.store.files import require_writable, write_bytes
-    from phibench.datasets.store.metadata import parquet_bytes
+    from phibench.datasets.store.parquet_tables import parquet_bytes
     from phibench.studies.paper.experiment_bounds import budget_table
     from phibench.studies.paper.experiment_tables import run_experiments
 

@@ -19,8 +19,9 @@ from importlib import metadata
 from pathlib import Path
 from typing import Literal
 
+from phibench.render.setup.child_program import GET_LIBRARY, MISSING_LIBRARY, fault_of
 from phibench.render.setup.llvm import find_llvm
-from phibench.render.setup.llvm_library import GET_LIBRARY, MISSING_LIBRARY, LlvmError, fault_of, prove
+from phibench.render.setup.llvm_library import LlvmError, prove
 from phibench.render.setup.variant import asked_variant
 
 State = Literal["ok", "optional", "warning", "fault"]

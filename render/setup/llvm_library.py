@@ -1,9 +1,7 @@
-"""One LLVM shared library: version, loading, proof that Dr.Jit can compile with it; and the user's cache folders.
+"""One LLVM shared library: version, loading, proof that Dr.Jit can compile with it; where those that were fetched lie.
 
 The version is read out of the library itself, in a child process. A file name proves nothing (``libLLVM.so``), and a
 library that crashes while it is loaded must not take this process with it. Only the standard library is used here.
-
-Also the user's cache folder, and programs that run in a process of their own because they may abort or hang.
 """
 
 from __future__ import annotations
@@ -15,9 +13,11 @@ import re
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+
+from phibench.render.setup.child_program import fault_of
 
 
 def cache_root() -> Path:
@@ -29,57 +29,6 @@ def cache_root() -> Path:
     home = os.path.expanduser("~")  # noqa: PTH111
     return Path(base or f"{home}/.cache").absolute() / "phibench"
 
-
-def fault_of(module: str, *arguments: str, timeout_s: float, environment: Mapping[str, str] | None = None) -> str:
-    """Run ``python -m module arguments`` and return what went wrong in one line; empty if it exits with 0.
-
-    Parameters
-    ----------
-    module : str
-        The full name of a module.
-    *arguments : str
-        Its command line.
-    timeout_s : float
-        The child is killed after this many seconds.
-    environment : mapping of str to str, optional
-        Set on top of this process's environment.
-    """
-    command = [sys.executable, "-m", module, *arguments]
-    merged = {**os.environ, **(environment or {})}
-    try:
-        child = subprocess.run(
-            command,
-            env=merged,
-            stdin=subprocess.DEVNULL,
-            capture_output=True,
-            text=True,
-            errors="replace",
-            timeout=timeout_s,
-            check=False,
-        )
-    except subprocess.TimeoutExpired:
-        return f"not done after {timeout_s:g} s"
-    return "" if child.returncode == 0 else f"{_complaint(child.stderr)} ({_ending(child.returncode)})"
-
-
-def _complaint(stderr: str) -> str:
-    """Return the line that matters: LLVM prints its fatal error before a stack, Python prints its own last.
-
-    A library of the system that Dr.Jit misses is named by an error in the middle.
-    """
-    lines = [line.strip() for line in stderr.splitlines() if line.strip()]
-    fatal = [line for line in lines if line.startswith("LLVM ERROR") or MISSING_LIBRARY in line]
-    return (fatal or lines[-1:] or ["no message"])[0]
-
-
-def _ending(returncode: int) -> str:
-    return f"killed by signal {-returncode}" if returncode < 0 else f"exit status {returncode}"
-
-
-MISSING_LIBRARY = "cannot open shared object file"
-"""What the loader of Linux says of a library that is not there."""
-GET_LIBRARY = "install the library that it misses (Debian, Ubuntu: `apt-get install libatomic1`)"
-"""What to do then: Dr.Jit needs libatomic, which comes with a compiler and with little else."""
 
 Version = tuple[int, int, int]
 

@@ -12,9 +12,9 @@ import os
 import sys
 from types import ModuleType
 
+from phibench.render.setup.child_program import GET_LIBRARY, MISSING_LIBRARY
 from phibench.render.setup.llvm import ENVIRONMENT as LLVM_ENVIRONMENT
 from phibench.render.setup.llvm import find_llvm, use_llvm
-from phibench.render.setup.llvm_library import GET_LIBRARY, MISSING_LIBRARY
 
 _DRIVER = {"linux": "libcuda.so.1", "win32": "nvcuda.dll"}
 _OPTIX = {"linux": "libnvoptix.so.1", "win32": "nvoptix.dll"}

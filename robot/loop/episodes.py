@@ -12,7 +12,7 @@ from typing import Literal, get_args
 import numpy as np
 import polars as pl
 
-from phibench.benchmark.isolation.method_references import RunLimits
+from phibench.benchmark.isolation.run_limits import RunLimits
 from phibench.benchmark.scores.intervals import clopper_pearson
 from phibench.estimator.geometry.rig_parameters import prior_sigmas
 from phibench.robot.loop.arena import generated_arena

@@ -19,11 +19,12 @@ from typing import Any, cast
 from phibench.benchmark.isolation.answers import plain, to_bytes
 from phibench.benchmark.isolation.guest_process import GuestProcess
 from phibench.benchmark.isolation.isolation import Isolation
-from phibench.benchmark.isolation.method_references import MethodError, Reference, RunLimits, parsed, resolve
+from phibench.benchmark.isolation.method_references import Reference, parsed, resolve
 from phibench.benchmark.isolation.method_worker import function_of_file, limited, sentence_of, size_bytes
 from phibench.benchmark.isolation.pair_transport import Connection, TransportError
 from phibench.benchmark.isolation.printed_output import advised
 from phibench.benchmark.isolation.readable_files import access_of
+from phibench.benchmark.isolation.run_limits import MethodError, RunLimits
 from phibench.robot.loop.policies import Policy
 from phibench.robot.loop.simulator import Action, Known, Observation
 from phibench.scenes.validation import SceneError, nearest, printable_line

@@ -20,8 +20,9 @@ from phibench.scenes.validation import SceneError
 from phibench.scenes.worlds import fixtures, furniture, graphics, small_objects, standing_objects, tabletop
 from phibench.scenes.worlds.assembly import Assembly, AssemblyShape, Footprint, footprint_of, moved
 from phibench.scenes.worlds.floor_plan import FREE_DISC_M, FloorPlan, Layout, Wall, floor_plan, patch_count, shell
+from phibench.scenes.worlds.graphics import radiance_bitmap
 from phibench.scenes.worlds.lamps import EFFICACY_LM_W, band_radiance, hang_lamps
-from phibench.scenes.worlds.materials import MaterialSet, Surface, radiance_bitmap
+from phibench.scenes.worlds.materials import MaterialSet, Surface
 from phibench.scenes.worlds.room_properties import RoomProperties
 from phibench.scenes.worlds.tabletop import Piece
 

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from phibench.scenes.frames import Array
+from phibench.scenes.frames import Array, Vector
+from phibench.scenes.shapes import Bitmap
 from phibench.scenes.worlds.patterns import Shape2, fractal, mixed, shaded
 
 _INK, _PAPER = np.array([0.04, 0.04, 0.05, 0.04]), np.array([0.78, 0.77, 0.72, 0.80])
@@ -356,3 +357,15 @@ def outdoors(rng: np.random.Generator, shape: Shape2) -> Array:
     trees = fractal(rng, shape, 1.1) > 2.6 * (y - rng.uniform(0.2, 0.5)) + 0.2
     leaves = mixed(green, 0, 1, 0.4 + 0.5 * fractal(rng, shape, 0.5))
     return np.asarray(np.where(trees[..., None], leaves, values) * 0.6)
+
+
+def radiance_bitmap(values: Array, size_m: Vector, white_w_m2_sr: Array) -> Bitmap:
+    """Shining picture that fills a rectangle once; `white_w_m2_sr` (3,) is the radiance of 1 in each band."""
+    rows, columns = values.shape[:2]
+    scale = np.append(white_w_m2_sr, 0.0)  # the laser meets what reflects nothing
+    return Bitmap(
+        np.maximum(values, 0.0) * scale,
+        (size_m[0] / columns, size_m[1] / rows),
+        (-0.5 * size_m[0], -0.5 * size_m[1]),
+        is_radiance=True,
+    )

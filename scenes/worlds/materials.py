@@ -284,18 +284,6 @@ def albedo_bitmap(values: Array, texel_m: float, contrast: float) -> Bitmap:
     return Bitmap(np.clip(mean + contrast * (values - mean), _DARKEST, _BRIGHTEST), (texel_m, texel_m))
 
 
-def radiance_bitmap(values: Array, size_m: Vector, white_w_m2_sr: Array) -> Bitmap:
-    """Shining picture that fills a rectangle once; `white_w_m2_sr` (3,) is the radiance of 1 in each band."""
-    rows, columns = values.shape[:2]
-    scale = np.append(white_w_m2_sr, 0.0)  # the laser meets what reflects nothing
-    return Bitmap(
-        np.maximum(values, 0.0) * scale,
-        (size_m[0] / columns, size_m[1] / rows),
-        (-0.5 * size_m[0], -0.5 * size_m[1]),
-        is_radiance=True,
-    )
-
-
 def _turned(surface: Surface) -> Surface:
     texture = surface.texture
     if not isinstance(texture, Bitmap):

@@ -18,7 +18,7 @@ import numpy as np
 from phibench.datasets.recipe.mirror_tables import MirrorTable
 from phibench.datasets.recipe.recipe_scene import build_rig
 from phibench.datasets.recipe.tables import RigTable
-from phibench.estimator.geometry.reflection import up_image
+from phibench.estimator.geometry.epipolar_line import up_image
 from phibench.estimator.geometry.rig_parameters import drawn_deviation
 from phibench.estimator.geometry.status import keep
 from phibench.estimator.geometry.triangulate import approx_estimator, meeting

@@ -30,7 +30,8 @@ from phibench.estimator.dense.dense_bound import (
 )
 from phibench.estimator.dense.dense_interface import DensePair
 from phibench.estimator.dense.dense_methods import DENSE_METHODS
-from phibench.estimator.geometry.reflection import range_at, room_rays, up_image
+from phibench.estimator.geometry.epipolar_line import range_at, up_image
+from phibench.estimator.geometry.reflection import room_rays
 from phibench.render.optics.correspondence import Correspondence, correspondence
 from phibench.render.optics.faces import IntArray
 from phibench.scenes.frames import Array, BoolArray

@@ -14,9 +14,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 import polars as pl
 
+from phibench.estimator.geometry.epipolar_line import range_at
 from phibench.estimator.geometry.panorama import PanoramaGrid
 from phibench.estimator.geometry.phi import outline_circle
-from phibench.estimator.geometry.reflection import image_of, range_at, reflect
+from phibench.estimator.geometry.reflection import image_of, reflect
 from phibench.render.optics.room_tracer import blocked_by
 from phibench.scenes.frames import Array, Pose, as_vector
 from phibench.scenes.rig import Rig, View

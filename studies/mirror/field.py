@@ -16,7 +16,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from phibench.estimator.geometry.reflection import blocked, reflect, reflect_jacobian
+from phibench.estimator.geometry.line_of_sight import blocked
+from phibench.estimator.geometry.reflection import reflect, reflect_jacobian
 from phibench.estimator.geometry.status import Status
 from phibench.scenes.frames import Array, BoolArray
 from phibench.scenes.rig import Rig

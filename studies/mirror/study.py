@@ -27,7 +27,7 @@ from phibench.studies.framework import (
     canvas,
     drawn,
 )
-from phibench.studies.mirror import place_bounds, tables
+from phibench.studies.mirror import misalignment_costs, place_bounds, tables, visible_places
 from phibench.studies.mirror.field import disc_shares, meridian, outline_radius_px
 
 if TYPE_CHECKING:
@@ -121,12 +121,15 @@ def compare(
         for h in heights
         for d in (depths if h == settings.spot_height_m else settings.depths_m)
     }
-    nothing = dict.fromkeys(place_bounds.DIRECTIONS, math.nan)
+    nothing = dict.fromkeys(misalignment_costs.DIRECTIONS, math.nan)
     at, h = settings.spot_height_m, settings.stroke_m
     wrong = [d for d in settings.misaligned_m if seen[d, at]]
     spots = np.array([(d, 0.0, at) for d in wrong])
     costs = (
-        {kind: place_bounds.errors(rig, kind, place_bounds.usual(kind), spots, h) for kind in place_bounds.DIRECTIONS}
+        {
+            kind: misalignment_costs.errors(rig, kind, misalignment_costs.usual(kind), spots, h)
+            for kind in misalignment_costs.DIRECTIONS
+        }
         if wrong
         else {}
     )
@@ -141,12 +144,12 @@ def compare(
         up=disc_shares(rig, rays, settings.stroke_m, settings.azimuths_rad),
         places=places,
         bounds=bounds,
-        floor_m=tuple(place_bounds.floor_from_m(rig, h, settings.edge_px, a, settings.curve_m[1]) for a in sides),
+        floor_m=tuple(visible_places.floor_from_m(rig, h, settings.edge_px, a, settings.curve_m[1]) for a in sides),
         costs=dict.fromkeys(settings.misaligned_m, nothing)
         | {d: {kind: float(column[i]) for kind, column in costs.items()} for i, d in enumerate(wrong)},
         tolerances={
-            k: place_bounds.tolerance(rig, k, spots, h, settings.cost) if wrong else math.nan
-            for k in place_bounds.DIRECTIONS
+            k: misalignment_costs.tolerance(rig, k, spots, h, settings.cost) if wrong else math.nan
+            for k in misalignment_costs.DIRECTIONS
         },
     )
 
@@ -156,7 +159,7 @@ def _seen(
 ) -> dict[tuple[float, float], bool]:
     """Distances and heights that a pair measures, from all azimuths."""
     points = np.array([(d, 0.0, h) for d, h in places])
-    fine = place_bounds.measured(rig, points, settings.stroke_m, settings.edge_px, settings.azimuths_rad)
+    fine = visible_places.measured(rig, points, settings.stroke_m, settings.edge_px, settings.azimuths_rad)
     return dict(zip(places, fine.tolist(), strict=True))
 
 
@@ -166,7 +169,7 @@ def place_map(settings: tables.MirrorSettings, rig: Rig) -> tables.PlaceMap:
     heights = np.arange(0.0, settings.map_height_m + 0.5 * settings.map_step_m, settings.map_step_m)
     D, Z = np.meshgrid(depths, heights)
     points = np.stack([D.ravel(), np.zeros(D.size), Z.ravel()], axis=-1)
-    fine = place_bounds.measured(rig, points, settings.stroke_m, settings.edge_px, settings.azimuths_rad)
+    fine = visible_places.measured(rig, points, settings.stroke_m, settings.edge_px, settings.azimuths_rad)
     return tables.PlaceMap(depths, heights, fine.reshape(D.shape))
 
 
@@ -217,8 +220,8 @@ def cost_frame(found: Mapping[str, tables.Compared]) -> pl.DataFrame:
             "mirror": name,
             "depth_m": d,
             "deviation": kind,
-            "parameters": ", ".join(place_bounds.DIRECTIONS[kind]),
-            "usual": place_bounds.usual(kind),
+            "parameters": ", ".join(misalignment_costs.DIRECTIONS[kind]),
+            "usual": misalignment_costs.usual(kind),
             "error_relative": error,
             "tolerance": compared.tolerances[kind],
         }
@@ -318,7 +321,7 @@ def _places(ax: Axes, found: Mapping[str, tables.Compared]) -> None:
 
 def _costs(ax: Axes, found: Mapping[str, tables.Compared], settings: tables.MirrorSettings) -> None:
     middle = settings.misaligned_m[len(settings.misaligned_m) // 2]
-    kinds = list(place_bounds.DIRECTIONS)
+    kinds = list(misalignment_costs.DIRECTIONS)
     for i, c in enumerate(found.values()):
         cost = np.array([100.0 * c.costs[middle][kind] for kind in kinds])
         cost = np.where((cost >= _LEAST) & np.isfinite(cost), cost, np.nan)

@@ -18,7 +18,8 @@ from phibench.scenes.rig import Rig
 from phibench.scenes.validation import SceneError
 from phibench.studies.framework import Finding, Heights, Metres, Presets, Row, Settings, number, text_table
 from phibench.studies.mirror.field import DiscShares, Meridian
-from phibench.studies.mirror.place_bounds import DIRECTIONS, UNCALIBRATED, PlaceBound, together, unit, usual
+from phibench.studies.mirror.misalignment_costs import DIRECTIONS, UNCALIBRATED, together, unit, usual
+from phibench.studies.mirror.place_bounds import PlaceBound
 
 ALL_KINDS = tuple(DIRECTIONS)
 _NONE, _LOST = "-", "lost"

@@ -16,7 +16,8 @@ import pytest
 from helpers.bench_cases import cases, outcomes, truth_itself
 from helpers.valid_files import NASTY_TEXTS, compact, digest, nested, png, public_rows, read_sealed, write_sealed
 
-from phibench.benchmark.isolation.method_references import MethodError, Reference, resolve
+from phibench.benchmark.isolation.method_references import Reference, resolve
+from phibench.benchmark.isolation.run_limits import MethodError
 from phibench.benchmark.sealed.sealed_set import read_seal
 from phibench.benchmark.sealed.submission import SealedPairs, outcomes_of, read_submission, submission
 from phibench.calibration.captures.picture_files import read_picture

@@ -20,7 +20,7 @@ from helpers.hostile_methods import ALL, BAD, HEADER
 from helpers.processes import processes_under
 from helpers.sandbox_pairs import SmallPairs, method_file
 
-from phibench.benchmark.isolation.method_references import RunLimits
+from phibench.benchmark.isolation.run_limits import RunLimits
 from phibench.benchmark.isolation.runner import run_method
 from phibench.benchmark.reports.report_page import write_report
 from phibench.benchmark.scores.answer_errors import Rules

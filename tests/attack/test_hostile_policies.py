@@ -15,7 +15,8 @@ from helpers.hostile_policies import DEEDS, HEADER, REACHES, deeds
 from helpers.listeners import accepting
 from helpers.processes import processes_under
 
-from phibench.benchmark.isolation.method_references import MethodError, RunLimits, resolve
+from phibench.benchmark.isolation.method_references import resolve
+from phibench.benchmark.isolation.run_limits import MethodError, RunLimits
 from phibench.robot.loop.episodes import LOST, Episode, run_foreign
 from phibench.robot.loop.foreign_policies import PolicyFile, _action
 from phibench.robot.loop.simulator import Action, Setup, Simulator, Task

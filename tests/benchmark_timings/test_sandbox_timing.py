@@ -15,8 +15,9 @@ import pytest
 from helpers.sandbox_pairs import GOOD, SmallPairs, method_file
 
 from phibench.benchmark.isolation.guest_process import MethodProcess
-from phibench.benchmark.isolation.method_references import RunLimits, resolve
+from phibench.benchmark.isolation.method_references import resolve
 from phibench.benchmark.isolation.pair_transport import Connection, MemoryFile, SharedPages, pack, unpack
+from phibench.benchmark.isolation.run_limits import RunLimits
 from phibench.estimator.interface import Pair
 
 

@@ -12,7 +12,7 @@ import pytest
 from cyclopts import App
 from helpers.districts import DISTRICTS
 
-from phibench.benchmark.isolation.method_references import RunLimits
+from phibench.benchmark.isolation.run_limits import RunLimits
 from phibench.cli import main as cli
 from phibench.cli.options import LIMITS, MEMORY_MB, OLD_COMMANDS, OLD_OPTIONS, OLD_POSITIONS, SECONDS
 from phibench.cli.studies import study_sentences

@@ -17,7 +17,7 @@ from phibench.datasets.rooms.room_sources import room_of
 from phibench.datasets.store import schema
 from phibench.datasets.store.json_forms import to_json
 from phibench.datasets.store.layers import SpotWindow
-from phibench.datasets.store.metadata import parquet_bytes
+from phibench.datasets.store.parquet_tables import parquet_bytes
 from phibench.datasets.verify import plan_faults, verify
 from phibench.render.optics.spot_layer import spot_layer
 from phibench.render.optics.truth import TRUTH_PLANES, truth_layer

@@ -32,7 +32,8 @@ from phibench.benchmark.release import release_make
 from phibench.benchmark.release.release_make import ReleaseRequest
 from phibench.benchmark.release.release_parts import PARTS
 from phibench.benchmark.reports.bench import SHIPPED
-from phibench.benchmark.scores.score_document import EncodedPicture, ScoreDocument
+from phibench.benchmark.scores.score_document import ScoreDocument
+from phibench.benchmark.scores.worst_images import EncodedPicture
 from phibench.benchmark.sealed import rebuilt_score, score_check
 from phibench.calibration.captures import imported_set
 from phibench.calibration.sensor_fit import fit_sensor

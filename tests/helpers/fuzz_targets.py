@@ -23,7 +23,8 @@ from PIL import Image
 from phibench.benchmark.dense.dense_export import read_dense_index
 from phibench.benchmark.dense.dense_records import COLUMN_TYPES
 from phibench.benchmark.dense.dense_score import records_so_far
-from phibench.benchmark.isolation.method_references import MethodError, resolve
+from phibench.benchmark.isolation.method_references import resolve
+from phibench.benchmark.isolation.run_limits import MethodError
 from phibench.benchmark.release import fetch
 from phibench.benchmark.release.release_parts import read_manifest_file
 from phibench.benchmark.sealed.sealed_set import secret_seed
@@ -41,7 +42,7 @@ from phibench.datasets.frames.sensor_file import SensorFile, read_sensor_file
 from phibench.datasets.rooms.panorama_files import is_linear
 from phibench.datasets.rooms.room_files import RoomFiles
 from phibench.datasets.store.checksums import read_checksums
-from phibench.datasets.store.metadata import parquet_bytes
+from phibench.datasets.store.parquet_tables import parquet_bytes
 from phibench.estimator.learned.network_graphs import CROP
 from phibench.estimator.learned.networks import Network
 from phibench.render.film.moving_rows import RowsImage

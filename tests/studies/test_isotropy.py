@@ -17,8 +17,8 @@ from scipy.optimize import brentq
 from phibench.benchmark.scores.intervals import Estimate
 from phibench.datasets.read import Dataset, open_dataset
 from phibench.datasets.recipe.load import find_recipe, load_recipe
+from phibench.estimator.geometry.epipolar_line import up_image
 from phibench.estimator.geometry.panorama import PanoramaGrid
-from phibench.estimator.geometry.reflection import up_image
 from phibench.render.sensor.settings import sensor
 from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.random_streams import generator

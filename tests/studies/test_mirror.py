@@ -13,6 +13,7 @@ from rich.console import Console
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.recipe.recipe_scene import build_rig
 from phibench.datasets.recipe.tables import RigTable
+from phibench.estimator.geometry.line_of_sight import unhidden
 from phibench.estimator.geometry.reflection import image_of
 from phibench.estimator.geometry.sensitivities import PARAMETERS, sensitivity
 from phibench.estimator.geometry.triangulate import depth_exact
@@ -30,20 +31,11 @@ from phibench.scenes.rig import Rig
 from phibench.scenes.room import escalade360
 from phibench.studies.framework import StudyDatasets, StudyResult, read_settings
 from phibench.studies.mirror.field import disc_shares, meridian, outline_radius_px
-from phibench.studies.mirror.place_bounds import (
-    DIRECTIONS,
-    UNCALIBRATED,
-    BlurBounds,
-    errors,
-    floor_from_m,
-    measured,
-    place_bound,
-    tolerance,
-    unhidden,
-    usual,
-)
+from phibench.studies.mirror.misalignment_costs import DIRECTIONS, UNCALIBRATED, errors, tolerance, usual
+from phibench.studies.mirror.place_bounds import BlurBounds, place_bound
 from phibench.studies.mirror.study import STUDY
 from phibench.studies.mirror.tables import MirrorSettings, PlaceMap, pick_table
+from phibench.studies.mirror.visible_places import floor_from_m, measured
 
 SHAPES = ("sphere", "ellipsoid", "paraboloid", "hyperboloid", "cone")
 STROKE_M = 0.425

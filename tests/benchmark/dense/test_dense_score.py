@@ -28,7 +28,8 @@ from phibench.benchmark.dense.dense_score import (
 )
 from phibench.benchmark.dense.dense_tables import dense_board, dense_metrics_table, dense_strata_table
 from phibench.benchmark.isolation.answers import AnswerError, checked_planes, most_bytes, planes_text
-from phibench.benchmark.isolation.method_references import DENSE, MethodError, RunLimits, resolve
+from phibench.benchmark.isolation.method_references import DENSE, resolve
+from phibench.benchmark.isolation.run_limits import MethodError, RunLimits
 from phibench.benchmark.scored_dataset import open_dataset
 from phibench.cli.main import main
 from phibench.datasets.common.errors import DatasetError

@@ -9,8 +9,8 @@ from helpers.hostile_methods import ANSWERS, CHANNEL, FOLDER, HEADER, MESSAGES, 
 from helpers.processes import processes_under
 from helpers.sandbox_pairs import GOOD, SmallPairs, method_file
 
-from phibench.benchmark.isolation.method_references import RunLimits
 from phibench.benchmark.isolation.printed_output import last_lines
+from phibench.benchmark.isolation.run_limits import RunLimits
 from phibench.benchmark.isolation.runner import run_method
 from phibench.estimator.interface import Outcome
 from phibench.scenes.validation import printable_line

@@ -16,7 +16,7 @@ from helpers.listeners import as_nobody
 from helpers.sandbox_pairs import GOOD, HEADER, SmallPairs, method_file
 
 from phibench.benchmark.isolation.isolation import _NUMBERS, Isolation
-from phibench.benchmark.isolation.method_references import RunLimits
+from phibench.benchmark.isolation.run_limits import RunLimits
 from phibench.benchmark.isolation.runner import run_method
 from phibench.benchmark.scores.score import score
 from phibench.estimator.interface import Answer, Spot

@@ -23,7 +23,7 @@ from phibench.benchmark.isolation.method_check import (
     judged,
     position_fault,
 )
-from phibench.benchmark.isolation.method_references import MethodError, RunLimits
+from phibench.benchmark.isolation.run_limits import MethodError, RunLimits
 from phibench.cli import main as cli
 from phibench.estimator.geometry.phi import phi_normal, phi_ray
 from phibench.estimator.geometry.triangulate import depth_exact

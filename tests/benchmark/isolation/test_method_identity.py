@@ -11,7 +11,8 @@ import pytest
 from helpers.sandbox_pairs import GOOD, HEADER, SmallPairs, method_file
 
 from phibench.benchmark.isolation.method_provenance import OpenedFiles, package_sha256, packages_of
-from phibench.benchmark.isolation.method_references import RunLimits, code_of_function
+from phibench.benchmark.isolation.method_references import code_of_function
+from phibench.benchmark.isolation.run_limits import RunLimits
 from phibench.benchmark.isolation.runner import Harness, ran_here
 
 LIMITS = RunLimits(seconds=60.0)

@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 from helpers.sandbox_pairs import GOOD, HEADER, SmallPairs, method_file
 
-from phibench.benchmark.isolation.method_references import MethodError, RunLimits, resolve
+from phibench.benchmark.isolation.method_references import resolve
+from phibench.benchmark.isolation.run_limits import MethodError, RunLimits
 from phibench.benchmark.isolation.runner import run_method
 
 LIMITS = RunLimits(seconds=60.0)  # the machine may do other things: no test here is about time

@@ -17,8 +17,9 @@ from helpers.sandbox_pairs import GOOD, HEADER, SmallPairs, method_file
 
 from phibench.benchmark.isolation import readable_files
 from phibench.benchmark.isolation.isolation import Access, Isolation
-from phibench.benchmark.isolation.method_references import MethodError, RunLimits, resolve
+from phibench.benchmark.isolation.method_references import resolve
 from phibench.benchmark.isolation.readable_files import access_of, truth_near
+from phibench.benchmark.isolation.run_limits import MethodError, RunLimits
 from phibench.benchmark.isolation.runner import Harness, run_method
 from phibench.datasets.store.schema import RECORDS_SO_FAR, SEALED_TRUTH, TruthFile, TruthFolder
 

@@ -20,7 +20,7 @@ from helpers.processes import processes_under, wait_until
 from helpers.sandbox_pairs import GOOD, HEADER, SHAPE, SmallPairs, method_file
 
 from phibench.benchmark.isolation.guest_process import MethodProcess, environment
-from phibench.benchmark.isolation.method_references import MethodError, RunLimits, resolve
+from phibench.benchmark.isolation.method_references import resolve
 from phibench.benchmark.isolation.pair_transport import (
     LARGEST,
     LEAST_BYTES,
@@ -33,6 +33,7 @@ from phibench.benchmark.isolation.pair_transport import (
     unpack,
 )
 from phibench.benchmark.isolation.printed_output import stack_place
+from phibench.benchmark.isolation.run_limits import MethodError, RunLimits
 from phibench.benchmark.isolation.runner import Harness, outcomes, run_method
 from phibench.estimator.dense.dense_interface import DensePair
 from phibench.estimator.interface import FAILURES, Outcome, Pair

@@ -11,8 +11,9 @@ import pytest
 from helpers.sandbox_pairs import GOOD, SmallPairs, method_file
 
 from phibench.benchmark.isolation import method_references as resolving
-from phibench.benchmark.isolation.method_references import MethodError, resolve
+from phibench.benchmark.isolation.method_references import resolve
 from phibench.benchmark.isolation.method_worker import load
+from phibench.benchmark.isolation.run_limits import MethodError
 
 
 @pytest.fixture(autouse=True)

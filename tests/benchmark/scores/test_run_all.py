@@ -15,7 +15,8 @@ from helpers.sandbox_pairs import HEADER, method_file
 
 from phibench.benchmark.isolation import method_references as resolving
 from phibench.benchmark.isolation.guest_process import MethodProcess
-from phibench.benchmark.isolation.method_references import GROUP, MethodError, RunLimits, resolve
+from phibench.benchmark.isolation.method_references import GROUP, resolve
+from phibench.benchmark.isolation.run_limits import MethodError, RunLimits
 from phibench.benchmark.isolation.runner import Harness
 from phibench.benchmark.pair_sets.dataset_pairs import TRACKS, dataset_pairs, tracks_of
 from phibench.benchmark.reports import bench as benching

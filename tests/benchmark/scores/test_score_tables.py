@@ -12,8 +12,7 @@ from helpers.bench_cases import cases, constant, outcomes, sampler, shifted, sil
 from phibench.benchmark.reports import figures
 from phibench.benchmark.reports.report_page import report_html, verdict
 from phibench.benchmark.scores.answer_errors import Rules
-from phibench.benchmark.scores.compare import compare_records
-from phibench.benchmark.scores.comparison_tables import print_comparison
+from phibench.benchmark.scores.compare import compare_records, print_comparison
 from phibench.benchmark.scores.failure_causes import KINDS
 from phibench.benchmark.scores.intervals import Estimate
 from phibench.benchmark.scores.metrics import METRICS

@@ -18,7 +18,8 @@ from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.plan.plan import make_plan
 from phibench.datasets.recipe.load import load_recipe
 from phibench.datasets.store.json_forms import from_json, to_json
-from phibench.datasets.store.metadata import differences, read_manifest, to_table
+from phibench.datasets.store.metadata import differences, read_manifest
+from phibench.datasets.store.parquet_tables import to_table
 from phibench.datasets.store.schema import ManifestRow, columns, flat, row_line
 from phibench.scenes.rig import Rig
 from phibench.scenes.room import Room, c310_rig, lab

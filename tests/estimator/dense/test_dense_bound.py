@@ -14,7 +14,7 @@ import pytest
 
 from phibench.datasets.frames.sensor_card import sensor_card
 from phibench.estimator.dense.dense_bound import EpipolarMotion, dense_bound, matching_information, motion_of
-from phibench.estimator.geometry.reflection import up_image
+from phibench.estimator.geometry.epipolar_line import up_image
 from phibench.estimator.spots.image_planes import variance_e2
 from phibench.scenes.frames import Array
 from phibench.scenes.room import default_rig

@@ -21,7 +21,8 @@ from phibench.estimator.dense.panorama_matchers import (
 )
 from phibench.estimator.dense.sweep import dense_stroke, dense_sweep, hidden
 from phibench.estimator.dense.unrolled_pair import luma_codes, maps_of
-from phibench.estimator.geometry.reflection import image_of, up_image
+from phibench.estimator.geometry.epipolar_line import up_image
+from phibench.estimator.geometry.reflection import image_of
 from phibench.scenes.frames import Array
 
 WIDTH_PX = 320  # a third of the default's, as the small rig's pixels

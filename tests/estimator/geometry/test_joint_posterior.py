@@ -8,9 +8,10 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from phibench.estimator.geometry.epipolar_line import up_image
 from phibench.estimator.geometry.joint_posterior import LikelihoodMap, joint_posterior, single_posterior
 from phibench.estimator.geometry.least_squares_depth import combine
-from phibench.estimator.geometry.reflection import image_of, up_image
+from phibench.estimator.geometry.reflection import image_of
 from phibench.estimator.geometry.status import Status
 from phibench.estimator.methods.likelihood_maps import SpotLikelihood, likelihood_map
 from phibench.scenes.rig import Rig

@@ -15,7 +15,8 @@ from scipy.special import erf
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.frames.sensor_card import sensor_card
 from phibench.estimator.geometry.least_squares_depth import depth_general
-from phibench.estimator.geometry.reflection import blocked, first_blocker, image_of
+from phibench.estimator.geometry.line_of_sight import blocked, first_blocker
+from phibench.estimator.geometry.reflection import image_of
 from phibench.estimator.geometry.rig_parameters import PARAMETERS, changed, prior_sigmas, stroke_of
 from phibench.estimator.limits import best_stroke as best_stroke_module
 from phibench.estimator.limits.best_stroke import (

@@ -10,7 +10,8 @@ from helpers.bench_cases import cases
 
 from phibench.benchmark.isolation.easy_pairs import EasyPairs
 from phibench.benchmark.scores.answer_errors import MATCH_PX, Rules
-from phibench.benchmark.scores.failure_causes import Case, KeptFits, cause_of, fit_at_truth, reaches_bound
+from phibench.benchmark.scores.failure_causes import Case, cause_of
+from phibench.benchmark.scores.fit_at_truth import KeptFits, fit_at_truth, reaches_bound
 from phibench.estimator.interface import Answer, Spot
 
 PAIRS = cases(2)
@@ -53,7 +54,7 @@ def test_an_image_is_no_cause_where_a_fit_reaches_its_bound(why: str) -> None:
 
 def test_fits_are_made_once_for_all_methods(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[int] = []
-    name = "phibench.benchmark.scores.failure_causes.fit_at_truth"
+    name = "phibench.benchmark.scores.fit_at_truth.fit_at_truth"
     monkeypatch.setattr(name, lambda pair, truth: asked.append(truth.number) or ANSWER)
     fits = KeptFits()
     for _ in range(3):

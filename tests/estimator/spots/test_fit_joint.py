@@ -12,8 +12,9 @@ import pytest
 from helpers.joint_pairs import BAYER, MONO, RIG, Pairs, drawn_pairs
 from helpers.oracles import random_rig, random_spot, true_pixel
 
+from phibench.estimator.geometry.epipolar_line import up_image
 from phibench.estimator.geometry.least_squares_depth import combine, joint_bound
-from phibench.estimator.geometry.reflection import image_of, up_image
+from phibench.estimator.geometry.reflection import image_of
 from phibench.estimator.geometry.status import Status
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.estimator.spots.fit_joint import fit_joint

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from phibench.render.setup import doctor, selftest
+from phibench.render.setup.child_program import fault_of
 from phibench.render.setup.doctor import Diagnosis
-from phibench.render.setup.llvm_library import fault_of
 
 Python = Callable[..., subprocess.CompletedProcess[str]]
 DOCTOR = "import sys; from phibench.render.setup.doctor import main; sys.exit(main())"

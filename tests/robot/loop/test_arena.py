@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from phibench.estimator.geometry.reflection import blocked
+from phibench.estimator.geometry.line_of_sight import blocked
 from phibench.robot.loop.arena import Boxes, arena_of, boxes_of, generated_arena, plain_arena
 from phibench.scenes.frames import Array, rotation_xyz
 from phibench.scenes.random_streams import generator

@@ -12,7 +12,7 @@ import pytest
 import scipy
 from helpers.target_approach import rig_covariance
 
-from phibench.benchmark.isolation.method_references import RunLimits
+from phibench.benchmark.isolation.run_limits import RunLimits
 from phibench.cli import loop
 from phibench.cli import main as cli
 from phibench.robot.loop.arena import generated_arena
