@@ -19,8 +19,8 @@ from phibench.estimator.geometry.reflection import image_of
 from phibench.estimator.geometry.sensitivities import PARAMETERS as GEOMETRIC
 from phibench.estimator.geometry.sensitivities import sensitivity
 from phibench.estimator.geometry.triangulate import depth_exact
+from phibench.scenes.form_error import HARMONICS
 from phibench.scenes.frames import Pose
-from phibench.scenes.mirror import HARMONICS
 from phibench.scenes.misalignment import PARAMETERS, Misalignment
 from phibench.scenes.rig import Rig
 from phibench.scenes.room import default_rig

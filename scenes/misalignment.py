@@ -20,8 +20,9 @@ from typing import Any, Protocol, Self, TypeVar
 import numpy as np
 
 from phibench.scenes.camera import Camera
+from phibench.scenes.form_error import HARMONICS, Form
 from phibench.scenes.frames import IDENTITY, Array, Matrix, Pose, Vector, as_matrix, as_vector, rotation_xyz
-from phibench.scenes.mirror import HARMONICS, Form, Mirror
+from phibench.scenes.mirror import Mirror
 from phibench.scenes.validation import SceneError, within
 
 

@@ -13,10 +13,10 @@ from typing import ClassVar, Self
 import numpy as np
 
 from phibench.scenes.camera import Camera
+from phibench.scenes.form_error import Form, Level, added
 from phibench.scenes.frames import Array, Pose
 from phibench.scenes.holder import Extent
 from phibench.scenes.metals import MetalName, MetalSurface, ReflectanceTable, known_metal
-from phibench.scenes.mirror import Form, Level, added
 from phibench.scenes.revolved_profile import LARGEST_M, FormedProfile, Profile, Shape, rim_points
 from phibench.scenes.validation import SceneError, within
 

@@ -51,8 +51,8 @@ from typing import ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from phibench.scenes.form_error import HARMONICS, Form, Level
 from phibench.scenes.frames import Array
-from phibench.scenes.mirror import HARMONICS, Form, Level
 from phibench.scenes.validation import SceneError, finite, positive
 
 ComplexArray = NDArray[np.complexfloating]

@@ -19,16 +19,8 @@ from typing import Any
 import polars as pl
 from rich.console import Console
 
-from phibench.benchmark.dense.dense_document import (
-    COMMAND,
-    DENSE_METRICS,
-    KIND,
-    SCORER,
-    VERSION,
-    DenseScore,
-    dense_document,
-    statistic_of_dense,
-)
+from phibench.benchmark.dense.dense_document import COMMAND, KIND, SCORER, VERSION, DenseScore, dense_document
+from phibench.benchmark.dense.dense_metrics import DENSE_METRICS, statistic_of_dense
 from phibench.benchmark.dense.dense_pairs import DensePairs, DensePairSet, DenseTruth, dense_pairs
 from phibench.benchmark.dense.dense_records import COLUMN_TYPES, TruthErrors, pair_records
 from phibench.benchmark.isolation.method_references import DENSE, code_of_function, resolve

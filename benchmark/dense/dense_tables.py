@@ -6,7 +6,8 @@ from collections.abc import Sequence
 
 import polars as pl
 
-from phibench.benchmark.dense.dense_document import DENSE_METRICS, DenseScore
+from phibench.benchmark.dense.dense_document import DenseScore
+from phibench.benchmark.dense.dense_metrics import DENSE_METRICS
 from phibench.benchmark.scores.compare import Difference
 from phibench.benchmark.scores.score_document import Value
 from phibench.benchmark.scores.score_tables import cell_parts

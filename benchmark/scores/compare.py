@@ -1,10 +1,10 @@
-"""Comparison of two scores of the same pairs: paired differences with intervals over samples; notes on what differs.
+"""Comparison of two scores of the same pairs: paired differences with intervals and tests; their tables; notes.
 
 Errors are compared over the images (or pairs) that both methods found. A method that skips the hard ones gains nothing
 from it. Rates, and figures that count missed spots, are compared over all visible spots.
 
 Both scores are resampled together, and every metric has its own interval. The verdict does not come from the intervals.
-It comes from an exact test (`intervals.exchange_chance`), corrected for the number of metrics (`intervals.holm`). Of
+It comes from an exact test (`exchange_chance`), corrected for the number of metrics (`holm`). Of
 two methods of the same law, any metric at all is called different in at most 1 - `confidence` of the comparisons.
 """
 
@@ -23,7 +23,7 @@ import polars as pl
 
 from phibench.benchmark.pair_sets.dataset_pairs import tracks_of
 from phibench.benchmark.scores.answer_errors import Rules
-from phibench.benchmark.scores.intervals import Clusters, Estimate, Statistic, estimates, exchange_chance, holm, mean_of
+from phibench.benchmark.scores.intervals import AT_ONCE, NO_SPREAD, Clusters, Estimate, Statistic, estimates, mean_of
 from phibench.benchmark.scores.metrics import FAMILIES, METRICS, Metric, prepared, statistic_of, trusted
 from phibench.benchmark.scores.records import missed_relative, with_missed
 from phibench.benchmark.scores.score_document import ScoreDocument
@@ -385,3 +385,53 @@ def _difference_fields(d: Difference) -> dict[str, str | float | int | None]:
         "chance": d.chance if math.isfinite(d.chance) else None,
         "better": d.better,
     }
+
+
+def exchange_chance(statistic: Statistic, n: int, rules: Rules, rng: np.random.Generator) -> float:
+    """Chance of a difference as large as that of two methods if nothing tells them apart; NaN where there is none.
+
+    The methods' answers on each of n samples are exchanged with a chance of one half, `Rules.resamples` times. The
+    share of differences at least as large, the observed one included, is the p-value of an exact test of the hypothesis
+    that both methods have the same law. It is below alpha with a chance of at most alpha, for every n and statistic
+    (E. J. G. Pitman, Suppl. J. R. Stat. Soc. 4, 119, 1937).
+
+    Parameters
+    ----------
+    statistic : of 2 n samples, the first method's n, then the second's
+    n : int
+    rules : Rules
+    """
+    stay = np.zeros((1, n))
+    first, second = _exchanged(statistic, stay)
+    observed = abs(float(second[0] - first[0]))
+    if not math.isfinite(observed):
+        return math.nan
+    # what differs by the rounding of sums alone is as large
+    least = observed - NO_SPREAD * max(abs(float(first[0])), abs(float(second[0])))
+    rows, larger = max(1, AT_ONCE // (2 * n)), 0
+    for start in range(0, rules.resamples, rows):
+        flips = rng.integers(0, 2, (min(rows, rules.resamples - start), n)).astype(float)
+        one, other = _exchanged(statistic, flips)
+        larger += int(np.count_nonzero(~(np.abs(other - one) < least)))  # one without a value counts as larger
+    # the order as it is counts as one of all: never a chance of 0
+    return (1.0 + larger) / (1.0 + rules.resamples)
+
+
+def _exchanged(statistic: Statistic, flips: Array) -> tuple[Array, Array]:
+    """Values of both methods where the answers of samples, `flips` of shape (b, n), are exchanged."""
+    return statistic(np.hstack([1.0 - flips, flips])), statistic(np.hstack([flips, 1.0 - flips]))
+
+
+def holm(chances: Sequence[float], alpha: float) -> list[bool]:
+    """Rejections of several hypotheses, with a chance of at most alpha that any true one is rejected; NaN never is.
+
+    S. Holm, Scand. J. Stat. 6, 65 (1979): the smallest p-value against alpha / m, the next against alpha / (m - 1), and
+    so on until one is larger. The tests may depend on each other.
+    """
+    order = sorted((k for k, chance in enumerate(chances) if not math.isnan(chance)), key=lambda k: chances[k])
+    rejected = [False] * len(chances)
+    for left, k in zip(range(len(order), 0, -1), order, strict=True):
+        if chances[k] > alpha / left:
+            break  # Holm: what comes later is larger
+        rejected[k] = True
+    return rejected

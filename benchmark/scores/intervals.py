@@ -1,4 +1,4 @@
-"""Statistics over samples with confidence intervals, by BCa bootstrap or Clopper-Pearson, and tests of differences.
+"""Statistics over samples with confidence intervals, by BCa bootstrap or Clopper-Pearson.
 
 Images of one sample share its errors. All noise realisations and both images of a sample are therefore resampled
 together. A resample is a weight per sample, its number of occurrences. Statistics take weights, shape (b, n), so that
@@ -42,8 +42,8 @@ EQUAL = "all resamples equal"
 FEW = "under {} samples"
 PERCENTILE = "BCa undefined: percentile interval"
 NOTHING = "nothing to compute it from"
-_AT_ONCE = 2**21  # weights held at a time: 16 MiB
-_NO_SPREAD = 1e-12  # of the value: rounding of sums
+AT_ONCE = 2**21  # weights held at a time: 16 MiB
+NO_SPREAD = 1e-12  # of the value: rounding of sums
 
 
 @dataclass(frozen=True)
@@ -147,63 +147,13 @@ def quantile_of(clusters: Clusters, values: Array, share: Fraction) -> Statistic
     ordered, index = values[order], clusters.index[order]
 
     def quantile(weights: Array) -> Array:
-        rows = max(1, _AT_ONCE // len(ordered))
+        rows = max(1, AT_ONCE // len(ordered))
         # records first, resamples last: running sums of whole rows are quick; counts are exact in 32 bits up to 2^24
         counts = np.ascontiguousarray(weights.T, dtype=np.float32)
         parts = [_quantile(counts[:, i : i + rows][index], ordered, share) for i in range(0, len(weights), rows)]
         return np.concatenate(parts)
 
     return quantile
-
-
-def exchange_chance(statistic: Statistic, n: int, rules: Rules, rng: np.random.Generator) -> float:
-    """Chance of a difference as large as that of two methods if nothing tells them apart; NaN where there is none.
-
-    The methods' answers on each of n samples are exchanged with a chance of one half, `Rules.resamples` times. The
-    share of differences at least as large, the observed one included, is the p-value of an exact test of the hypothesis
-    that both methods have the same law. It is below alpha with a chance of at most alpha, for every n and statistic
-    (E. J. G. Pitman, Suppl. J. R. Stat. Soc. 4, 119, 1937).
-
-    Parameters
-    ----------
-    statistic : of 2 n samples, the first method's n, then the second's
-    n : int
-    rules : Rules
-    """
-    stay = np.zeros((1, n))
-    first, second = _exchanged(statistic, stay)
-    observed = abs(float(second[0] - first[0]))
-    if not math.isfinite(observed):
-        return math.nan
-    # what differs by the rounding of sums alone is as large
-    least = observed - _NO_SPREAD * max(abs(float(first[0])), abs(float(second[0])))
-    rows, larger = max(1, _AT_ONCE // (2 * n)), 0
-    for start in range(0, rules.resamples, rows):
-        flips = rng.integers(0, 2, (min(rows, rules.resamples - start), n)).astype(float)
-        one, other = _exchanged(statistic, flips)
-        larger += int(np.count_nonzero(~(np.abs(other - one) < least)))  # one without a value counts as larger
-    # the order as it is counts as one of all: never a chance of 0
-    return (1.0 + larger) / (1.0 + rules.resamples)
-
-
-def _exchanged(statistic: Statistic, flips: Array) -> tuple[Array, Array]:
-    """Values of both methods where the answers of samples, `flips` of shape (b, n), are exchanged."""
-    return statistic(np.hstack([1.0 - flips, flips])), statistic(np.hstack([flips, 1.0 - flips]))
-
-
-def holm(chances: Sequence[float], alpha: float) -> list[bool]:
-    """Rejections of several hypotheses, with a chance of at most alpha that any true one is rejected; NaN never is.
-
-    S. Holm, Scand. J. Stat. 6, 65 (1979): the smallest p-value against alpha / m, the next against alpha / (m - 1), and
-    so on until one is larger. The tests may depend on each other.
-    """
-    order = sorted((k for k, chance in enumerate(chances) if not math.isnan(chance)), key=lambda k: chances[k])
-    rejected = [False] * len(chances)
-    for left, k in zip(range(len(order), 0, -1), order, strict=True):
-        if chances[k] > alpha / left:
-            break  # Holm: what comes later is larger
-        rejected[k] = True
-    return rejected
 
 
 def estimates(statistics: Sequence[Statistic], n: int, rules: Rules, rng: np.random.Generator) -> list[Estimate]:
@@ -237,7 +187,7 @@ def _bootstrap(statistics: Sequence[Statistic], n: int, rules: Rules, rng: np.ra
             (np.arange(n),),
             all_of,
             n_resamples=rules.resamples,
-            batch=max(1, _AT_ONCE // n),
+            batch=max(1, AT_ONCE // n),
             confidence_level=rules.confidence,
             method="BCa",
             vectorized=True,
@@ -263,7 +213,7 @@ def _estimate(value: float, low: float, high: float, drawn: Array, confidence: f
     if not math.isfinite(value):
         return Estimate(value, math.nan, math.nan, "infinite" if math.isinf(value) else NOTHING)
     drawn = drawn[np.isfinite(drawn)]
-    if drawn.size == 0 or np.ptp(drawn) <= _NO_SPREAD * max(abs(value), np.finfo(float).tiny):
+    if drawn.size == 0 or np.ptp(drawn) <= NO_SPREAD * max(abs(value), np.finfo(float).tiny):
         return Estimate(value, value, value, EQUAL)
     if math.isfinite(low) and math.isfinite(high):
         return Estimate(value, float(low), float(high))

@@ -20,8 +20,9 @@ import numpy as np
 from phibench.datasets.common.errors import DatasetError
 from phibench.estimator.geometry.paper_depth import depth_paper, depth_revolved, paper_gradient, revolved_gradient
 from phibench.estimator.geometry.status import DepthEstimate
+from phibench.scenes.form_error import HARMONICS, Form, Level, gradients_by_parameter, level
 from phibench.scenes.frames import Array, Pose
-from phibench.scenes.mirror import HARMONICS, Form, Level, Mirror, SphereMirror, gradients_by_parameter, level
+from phibench.scenes.mirror import Mirror, SphereMirror
 from phibench.scenes.revolved_mirror import RevolvedMirror
 from phibench.scenes.revolved_profile import FormedProfile, Heights, Profile, height_level, lengthening
 from phibench.scenes.rig import Rig, View

@@ -20,8 +20,8 @@ from phibench.estimator.geometry.phi import CONVENTIONS, GRADIENTS
 from phibench.estimator.geometry.reflection import image_of, ray_basis, ray_slope, reflect
 from phibench.estimator.geometry.triangulate import ESTIMATORS, exact_gradient
 from phibench.scenes.camera import Camera
+from phibench.scenes.form_error import Level
 from phibench.scenes.frames import Array
-from phibench.scenes.mirror import Level
 from phibench.scenes.misalignment import PARAMETERS as MISALIGNMENT
 from phibench.scenes.rig import POSITIONS, Rig, Stroke, View
 

@@ -118,12 +118,6 @@ def _median(values: Array) -> float:
     return float(np.median(values)) if values.size else 0.0
 
 
-def place_covariance(one: SpotLikelihood) -> Array:
-    """Covariance of the place, shape (2, 2), pixels squared, by the curvature at the best hypothesis."""
-    _, _, fisher = one.scores(one.theta[None], 0)
-    return covariance_bound(fisher[0]) * one.excess
-
-
 def claimed_px2(uv_px: Array, covariance_px2: Array, likelihood: Callable[[], SpotLikelihood | None]) -> Array | None:
     """Covariance that a fit may claim, shape (2, 2): that at its place, or the posterior's of a faint spot.
 

@@ -30,14 +30,7 @@ from phibench.estimator.geometry.least_squares_depth import CombinedEstimate, co
 from phibench.estimator.geometry.status import Status, describe
 from phibench.estimator.interface import Answer, Image, Matrix2, Pair, Spot
 from phibench.estimator.methods.chain_fit import chain_fit, spot_likelihood
-from phibench.estimator.methods.likelihood_maps import (
-    FAINT_PX,
-    SpotLikelihood,
-    claimed_px2,
-    likelihood_map,
-    of_pixels,
-    place_covariance,
-)
+from phibench.estimator.methods.likelihood_maps import FAINT_PX, SpotLikelihood, claimed_px2, likelihood_map, of_pixels
 from phibench.estimator.methods.spot_search import (
     SearchRegion,
     SharedPair,
@@ -50,7 +43,7 @@ from phibench.estimator.methods.spot_search import (
 )
 from phibench.estimator.spots.fit_joint import JointFit, fit_joint
 from phibench.estimator.spots.fit_raw import MISFIT_SIGMAS, SpotData, SpotFit, fit_law, spot_data
-from phibench.estimator.spots.gaussian_spot import SpotModel
+from phibench.estimator.spots.gaussian_spot import SpotModel, covariance_bound
 from phibench.estimator.spots.raw_pixels import (
     Background,
     GaussLaw,
@@ -338,3 +331,9 @@ def _joint_spot(uv_px: Array, covariance_px2: Array) -> Spot:
     (a, b), (c, d) = covariance_px2.tolist()
     matrix: Matrix2 = ((a, b), (c, d))
     return Spot((float(uv_px[0]), float(uv_px[1])), matrix)
+
+
+def place_covariance(one: SpotLikelihood) -> Array:
+    """Covariance of the place, shape (2, 2), pixels squared, by the curvature at the best hypothesis."""
+    _, _, fisher = one.scores(one.theta[None], 0)
+    return covariance_bound(fisher[0]) * one.excess

@@ -1,4 +1,4 @@
-"""The command line `phibench`: all commands put together; `cache`, `completion` and `doctor`; exit codes of errors.
+"""The command line `phibench`: all commands put together; `cache`, `completion`, `doctor`; exit codes; old spellings.
 
 Exit codes: 0 done, 1 checked and found wanting, 2 a mistake of the user or the machine in one sentence, 3 a fault of
 phibench, 130 Ctrl-C, 129 SIGHUP, 143 SIGTERM.
@@ -29,7 +29,7 @@ from phibench.cli.dataset import dataset
 from phibench.cli.dense import dense
 from phibench.cli.film import film
 from phibench.cli.loop import loop
-from phibench.cli.options import DATA, INSTALLATION, KEEPERS, METHODS, SENSOR, START, answer_to_old_spelling
+from phibench.cli.options import DATA, INSTALLATION, KEEPERS, METHODS, SENSOR, START
 from phibench.cli.publish import export, fetch, release, seal, submission
 from phibench.cli.room import room, scene
 from phibench.cli.score import bench, compare, report, results, score
@@ -331,3 +331,50 @@ def _confession(error: Exception) -> str:
 
 if __name__ == "__main__":
     sys.exit(main())
+
+
+OLD_COMMANDS = {
+    "new-method": "method new",
+    "methods": "method list",
+    "check": "method check",
+    "dataset seal": "seal make",
+    "submit": "seal submit",
+    "unseal": "seal open",
+    "experiments": "paper --misaligned",
+    "panorama": "dataset panorama",
+    "sensitivities": "dataset sensitivities",
+}
+"""New spelling of every command that had another one."""
+
+
+OLD_OPTIONS = {
+    ("score", "--seed"): "--bootstrap-seed",
+    ("compare", "--seed"): "--bootstrap-seed",
+    ("bench", "--methods"): "--method, once for each method",
+    ("dataset frames", "--samples"): "--sample, once for each",
+}
+"""New spelling of every option that had another one, by command and option."""
+
+
+OLD_POSITIONS = {("dataset merge", "--out"): "phibench dataset merge SHARD ... --out FOLDER"}
+"""Whole new spelling of every command in which an option was a position, by command and option."""
+
+
+def answer_to_old_spelling(tokens: Sequence[str]) -> str:
+    """One sentence with the new spelling of a command line; "" if nothing in it is old."""
+    for old, new in OLD_COMMANDS.items():
+        if _begins(tokens, old):
+            return f"`phibench {old}` is now `phibench {new}`; `phibench {new.split(' --')[0]} --help` has its options"
+    given = {token.partition("=")[0] for token in tokens}  # --option=value
+    for (command, option), new in OLD_OPTIONS.items():
+        if _begins(tokens, command) and option in given:
+            return f"`phibench {command} {option}` is now {new}"
+    for (command, option), new in OLD_POSITIONS.items():
+        if _begins(tokens, command) and not given & {option, "--help", "-h"}:
+            return f"`phibench {command}` needs {option}: `{new}`"
+    return ""
+
+
+def _begins(tokens: Sequence[str], command: str) -> bool:
+    words = command.split()
+    return list(tokens[: len(words)]) == words

@@ -1,4 +1,4 @@
-"""Options that mean the same in every command, values that the Tab key completes, and old spellings.
+"""Options that mean the same in every command, and values that the Tab key completes.
 
 `--method` is repeated, `--sample` names one sample by its number or id, `--samples` is a count, `--out` is the file or
 folder to write. Wherever a method runs, `Limits` are its options.
@@ -277,48 +277,3 @@ def _require_own(references: Sequence[str]) -> None:
 
 
 OWN_WORD = OwnWord()
-
-
-OLD_COMMANDS = {
-    "new-method": "method new",
-    "methods": "method list",
-    "check": "method check",
-    "dataset seal": "seal make",
-    "submit": "seal submit",
-    "unseal": "seal open",
-    "experiments": "paper --misaligned",
-    "panorama": "dataset panorama",
-    "sensitivities": "dataset sensitivities",
-}
-"""New spelling of every command that had another one."""
-
-OLD_OPTIONS = {
-    ("score", "--seed"): "--bootstrap-seed",
-    ("compare", "--seed"): "--bootstrap-seed",
-    ("bench", "--methods"): "--method, once for each method",
-    ("dataset frames", "--samples"): "--sample, once for each",
-}
-"""New spelling of every option that had another one, by command and option."""
-
-OLD_POSITIONS = {("dataset merge", "--out"): "phibench dataset merge SHARD ... --out FOLDER"}
-"""Whole new spelling of every command in which an option was a position, by command and option."""
-
-
-def answer_to_old_spelling(tokens: Sequence[str]) -> str:
-    """One sentence with the new spelling of a command line; "" if nothing in it is old."""
-    for old, new in OLD_COMMANDS.items():
-        if _begins(tokens, old):
-            return f"`phibench {old}` is now `phibench {new}`; `phibench {new.split(' --')[0]} --help` has its options"
-    given = {token.partition("=")[0] for token in tokens}  # --option=value
-    for (command, option), new in OLD_OPTIONS.items():
-        if _begins(tokens, command) and option in given:
-            return f"`phibench {command} {option}` is now {new}"
-    for (command, option), new in OLD_POSITIONS.items():
-        if _begins(tokens, command) and not given & {option, "--help", "-h"}:
-            return f"`phibench {command}` needs {option}: `{new}`"
-    return ""
-
-
-def _begins(tokens: Sequence[str], command: str) -> bool:
-    words = command.split()
-    return list(tokens[: len(words)]) == words

@@ -19,9 +19,10 @@ from functools import partial
 import numpy as np
 
 from phibench.render.optics.faces import IntArray
+from phibench.scenes.form_error import Form
 from phibench.scenes.frames import Array
 from phibench.scenes.glass_tube import GlassTube
-from phibench.scenes.mirror import Form, Mirror, SphereMirror
+from phibench.scenes.mirror import Mirror, SphereMirror
 from phibench.scenes.revolved_mirror import RevolvedMirror
 from phibench.scenes.revolved_profile import FormedProfile, Profile
 from phibench.scenes.rig import View

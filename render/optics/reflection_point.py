@@ -42,9 +42,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phibench.render.optics.revolved_reflection import revolved_determinant, revolved_points, rising_root
+from phibench.scenes.form_error import Form, Level, deviation, level
 from phibench.scenes.frames import Array, BoolArray
 from phibench.scenes.glass_tube import GlassTube, across
-from phibench.scenes.mirror import Form, Level, Mirror, SphereMirror, deviation, level
+from phibench.scenes.mirror import Mirror, SphereMirror
 from phibench.scenes.revolved_mirror import RevolvedMirror
 from phibench.scenes.rig import View
 

@@ -26,9 +26,9 @@ from phibench.render.optics.room_tracer import (
     blocked_by,
     into_room,
 )
+from phibench.scenes.form_error import limb_points
 from phibench.scenes.frames import Array, BoolArray
 from phibench.scenes.laser import LaserSpot
-from phibench.scenes.mirror import limb_points
 from phibench.scenes.rig import View
 
 

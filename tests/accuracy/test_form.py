@@ -16,8 +16,8 @@ from phibench.render.optics.certificate import certify
 from phibench.render.optics.spot_layer import spot_layer
 from phibench.render.optics.traced_spot import trace_spot
 from phibench.render.optics.truth import spot_truth
+from phibench.scenes.form_error import HARMONICS, Form
 from phibench.scenes.laser import LaserSpot
-from phibench.scenes.mirror import HARMONICS, Form
 from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.rig import POSITIONS
 from phibench.scenes.room import Room, default_rig

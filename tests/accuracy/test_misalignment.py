@@ -15,7 +15,8 @@ from scipy.spatial.transform import Rotation
 from phibench.render.optics.certificate import CENTROID_TOLERANCE_PX, CHIEF_TOLERANCE_PX
 from phibench.render.optics.truth import SpotTruth, depth_m, spot_truth
 from phibench.scenes.camera import Camera
-from phibench.scenes.mirror import HARMONICS, OF_REVOLVED
+from phibench.scenes.form_error import HARMONICS
+from phibench.scenes.mirror import OF_REVOLVED
 from phibench.scenes.misalignment import PARAMETERS, Misalignment
 from phibench.scenes.rig import POSITIONS
 

@@ -25,9 +25,9 @@ from phibench.render.optics.spot_layer import spot_layer
 from phibench.render.optics.truth import spot_truth
 from phibench.render.room.mirror_intersection import mirror_intersection
 from phibench.render.setup.variant import activate
+from phibench.scenes.form_error import HARMONICS, Form
 from phibench.scenes.frames import Array
 from phibench.scenes.laser import LaserSpot
-from phibench.scenes.mirror import HARMONICS, Form
 from phibench.scenes.misalignment import PARAMETERS as MISALIGNMENT
 from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.revolved_mirror import RevolvedMirror

@@ -19,8 +19,8 @@ from phibench.render.optics.spot_layer import spot_layer
 from phibench.render.room.ambient_layer import render_ambient
 from phibench.render.room.light_map import BakeSettings, bake
 from phibench.render.sensor.settings import sensor
+from phibench.scenes.form_error import Form
 from phibench.scenes.laser import Beam, LaserSpot, beam_diameter_m
-from phibench.scenes.mirror import Form
 from phibench.scenes.rig import Rig
 from phibench.scenes.room import default_rig, lab
 

@@ -14,7 +14,8 @@ from helpers.districts import DISTRICTS
 
 from phibench.benchmark.isolation.run_limits import RunLimits
 from phibench.cli import main as cli
-from phibench.cli.options import LIMITS, MEMORY_MB, OLD_COMMANDS, OLD_OPTIONS, OLD_POSITIONS, SECONDS
+from phibench.cli.main import OLD_COMMANDS, OLD_OPTIONS, OLD_POSITIONS
+from phibench.cli.options import LIMITS, MEMORY_MB, SECONDS
 from phibench.cli.studies import study_sentences
 from phibench.studies.run import NAMES
 

@@ -12,7 +12,7 @@ import numpy as np
 from helpers.oracles import camera_at, project_cv2
 from scipy import optimize
 
-from phibench.scenes.mirror import HARMONICS, Form
+from phibench.scenes.form_error import HARMONICS, Form
 from phibench.scenes.revolved_profile import FormedProfile
 from phibench.scenes.rig import Rig
 

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from phibench.scenes.mirror import (
-    HARMONICS,
-    Form,
-)
+from phibench.scenes.form_error import HARMONICS, Form
 from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.rig import Rig
 from phibench.scenes.room import default_rig

@@ -11,9 +11,9 @@ from phibench.render.optics.certificate import certify
 from phibench.render.optics.spot_layer import spot_layer
 from phibench.render.optics.truth import spot_truth
 from phibench.scenes.camera import Camera
+from phibench.scenes.form_error import HARMONICS
 from phibench.scenes.frames import Pose
 from phibench.scenes.laser import LaserSpot, beam_diameter_m
-from phibench.scenes.mirror import HARMONICS
 from phibench.scenes.misalignment import PARAMETERS, Misalignment
 from phibench.scenes.rig import POSITIONS, Rig, View
 from phibench.scenes.room import c310_camera

@@ -347,7 +347,7 @@ def test_a_ray_that_meets_a_plate_within_the_wall() -> None:
 @pytest.mark.skipif(find_spec("mitsuba") is None, reason="needs Mitsuba")
 def test_accuracy_of_the_look_through_glass() -> None:
     """The kernel's closed form against the other one: 1e-16 of 0.1 m, times 10 for rays along the axis."""
-    from phibench.render.room.shading import Tube
+    from phibench.render.room.glass_refraction import Tube
 
     mi = activate()
     view, rng = rig(CROOKED).at(0.3), np.random.default_rng(0)

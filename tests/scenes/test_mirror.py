@@ -18,18 +18,10 @@ from phibench.render.optics.ray_tracer import lens_rays, meet, reflect, trace_pi
 from phibench.render.optics.reflection_point import bundle_spread, fermat_points, mirror_points
 from phibench.render.optics.spot_layer import spot_layer
 from phibench.render.optics.truth import spot_truth, truth_layer
+from phibench.scenes.form_error import HARMONICS, Form, curvatures, deviation, directions, gradients_by_parameter, level
 from phibench.scenes.frames import Pose, rotation_xyz
 from phibench.scenes.laser import LaserSpot
-from phibench.scenes.mirror import (
-    HARMONICS,
-    Form,
-    SphereMirror,
-    curvatures,
-    deviation,
-    directions,
-    gradients_by_parameter,
-    level,
-)
+from phibench.scenes.mirror import SphereMirror
 from phibench.scenes.misalignment import PARAMETERS, Misalignment
 from phibench.scenes.rig import Rig, View
 from phibench.scenes.room import default_rig

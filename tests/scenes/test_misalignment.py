@@ -27,9 +27,10 @@ from phibench.datasets.store.layers import read_ambient, read_truth
 from phibench.datasets.verify import verify
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.render.sensor.light import spot_velocity_px_per_s
+from phibench.scenes.form_error import HARMONICS, Form
 from phibench.scenes.frames import Pose
 from phibench.scenes.laser import LaserSpot
-from phibench.scenes.mirror import HARMONICS, OF_REVOLVED, Form
+from phibench.scenes.mirror import OF_REVOLVED
 from phibench.scenes.misalignment import PARAMETERS, Misalignment, Motion
 from phibench.scenes.rig import Rig
 from phibench.scenes.room import c310_rig, carriage, default_rig

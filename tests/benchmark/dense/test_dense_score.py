@@ -15,7 +15,7 @@ import pytest
 from helpers.processes import quiet
 from rich.console import Console
 
-from phibench.benchmark.dense.dense_document import DENSE_METRICS
+from phibench.benchmark.dense.dense_metrics import DENSE_METRICS
 from phibench.benchmark.dense.dense_pairs import dense_pairs, require_curve
 from phibench.benchmark.dense.dense_records import COLUMN_TYPES
 from phibench.benchmark.dense.dense_score import (

@@ -14,13 +14,12 @@ from helpers.bench_cases import cases, outcomes, sampler
 
 from phibench.benchmark.scores import intervals as ours
 from phibench.benchmark.scores.answer_errors import Rules
+from phibench.benchmark.scores.compare import exchange_chance, holm
 from phibench.benchmark.scores.intervals import (
     Clusters,
     clopper_pearson,
     deviation_of,
     estimates,
-    exchange_chance,
-    holm,
     mean_of,
     quantile_of,
     rate,

@@ -22,8 +22,9 @@ from scipy import optimize
 from phibench.render.optics.ray_tracer import meet_profile, trace_pixels
 from phibench.render.optics.reflection_point import bundle_spread, mirror_points, reflection_points
 from phibench.render.optics.revolved_reflection import revolved_points
+from phibench.scenes.form_error import Form
 from phibench.scenes.frames import Array, Pose
-from phibench.scenes.mirror import Form, SphereMirror
+from phibench.scenes.mirror import SphereMirror
 from phibench.scenes.revolved_mirror import RevolvedMirror
 from phibench.scenes.revolved_profile import Profile, cone, hyperboloid, paraboloid, sphere_cap
 from phibench.scenes.rig import Rig, View
