@@ -88,7 +88,6 @@ def filled_page(body: Path, title: str, data: dict[str, Any]) -> str:
     Parameters
     ----------
     body : HTML; the script has the same name with .js, the style, if there is one, with .css
-    title : str
     data : what the script finds as JSON
     """
     here = Path(__file__)

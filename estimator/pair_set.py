@@ -38,8 +38,6 @@ class ImageTruth:
     uv_px : (u, v), the centre of the light; NaN where there is none, or a visible spot's place is not known: of a real
         pair
     phi_rad : dict of "ray", "normal", "incidence" to float
-    azimuth_rad : float
-    visible : bool
     cause : str
         Reason why it is not visible, as in the manifest; "none" if it is.
     electrons : float
@@ -83,9 +81,6 @@ class PairTruth(ShortForm):
     ----------
     number : int
         `Pair.number`.
-    sample_id : str
-    draw : int
-    preset : str
     jpeg_quality : int or None
         None unless the output is MJPEG.
     hinted : bool
@@ -194,7 +189,6 @@ class CachedPairs:
 
     Parameters
     ----------
-    pairs : PairSet
     before : CachedPairs, optional
         The part before, of the same set. Threads may ask both.
 

@@ -175,7 +175,6 @@ def fitted(kind: HolderKind, wide_m: float, depth_m: float | None = None, **give
 
     Parameters
     ----------
-    kind, wide_m
     depth_m : float or None
         Of the rim over the vertex; None is a ball.
     """
@@ -205,7 +204,6 @@ def holder_shapes(holder: Holder, T_world_camera: Pose, sphere_centre_m: Array, 
 
     Parameters
     ----------
-    T_world_camera : Pose
     sphere_centre_m : array, shape (3,)
         Or the vertex, in the world.
     back_m : float

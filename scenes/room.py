@@ -130,7 +130,6 @@ class Room:
 
     Parameters
     ----------
-    name : str
     surfaces : rectangles; those that emit are the lamps
     furniture : shapes of any kind
     robot : bool
@@ -203,7 +202,6 @@ class TargetBoard:
 
     Parameters
     ----------
-    name : str
     depth_m : float
         Horizontal distance of the board's face from the world's z axis.
     azimuth_rad : float

@@ -174,8 +174,6 @@ class Rectangle:
 
     Parameters
     ----------
-    name : str
-    T_world_shape : Pose
     size_m : 2 floats
         Full extent along the local x and y.
     texture : Texture
@@ -253,12 +251,10 @@ class Prism:
 
     Parameters
     ----------
-    name : str
     T_world_shape : Pose
         Of the middle of the axis.
     radius_m : float
         Of the corners.
-    height_m : float
     sides : int, from 3
     """
 
@@ -302,18 +298,15 @@ class Mesh:
 
     Parameters
     ----------
-    name : str
     vertices_m : array, shape (N, 3)
         World frame.
     triangles : int array, shape (M, 3)
         Corners, against the clock seen from outside.
-    texture : Texture
     corner_texels : array, shape (M, 3, 2), or None
         Place of each triangle's corners on the bitmap, in texels (column, row) from its first texel's lower left
         corner; None for a uniform texture.
     two_sided : bool
         Both sides are surfaces; else the back of a triangle is black.
-    coat : float
     """
 
     name: str

@@ -65,7 +65,6 @@ class Finding:
         In `unit`; None where there is no number.
     low, high : float or None
         Ends of its interval of 95 %; None without one.
-    unit : str
     relation, threshold
         Statement that the number decides, such as "<=" 1.0.
     verdict : str
@@ -250,7 +249,6 @@ class Drawing:
     ----------
     name : str
         File name without its ending.
-    data : bytes
     alt : str
         Text alternative with the main numbers.
     kind : "svg" or "png"

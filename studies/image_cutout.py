@@ -86,7 +86,6 @@ class SpotPair:
     ----------
     rig : Rig
         True one, cut.
-    stroke_m, depth_m : float
     views : down and up
     name : str
         Place of the spot; intervals resample these.
@@ -124,7 +123,6 @@ class Shot:
 
     Attributes
     ----------
-    sensor : Sensor
     laser_level : float
         Factor of the spot's light.
     """
@@ -146,9 +144,6 @@ def drawn_pair(
 
     Parameters
     ----------
-    number : int
-    shot : Shot
-    pair : SpotPair
     nominal : nominal rig, cut, and nominal stroke
     names : of the noise's stream, the draw last; the camera's pattern is that of the draw, too
     box_px : side of the boxes around the spots

@@ -52,7 +52,6 @@ class Places:
     depths_m : shape (d,)
     azimuths_rad : shape (a,)
     height_m : float, above the floor
-    stroke_m : float
     """
 
     depths_m: Array
@@ -227,8 +226,6 @@ class Rendered:
 
     Attributes
     ----------
-    parameter : str
-    value : float
     change : shape (estimators, d, a), relative change of D from rendered spots
     predicted : same, from the chief rays
     centroid_px : float

@@ -86,7 +86,6 @@ class EasyTruth:
 
     Attributes
     ----------
-    rig, stroke_m, room
     uv_px : shape (n, 2)
         The pixels.
     point_world_m : shape (n, 3)
@@ -116,8 +115,6 @@ class EasyDensePairs:
     Parameters
     ----------
     preset : "bayer-raw", "mono-raw", "srgb8", "yuyv" or "mjpeg"
-    count : int
-    rig : Rig
 
     Raises
     ------

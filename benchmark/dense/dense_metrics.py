@@ -25,9 +25,7 @@ class DenseMetric:
     ----------
     column : str
         Of the records.
-    unit : str
     better : "lower", "higher" or "none"
-    text : str
     root : bool
         Of the mean of squares.
     """

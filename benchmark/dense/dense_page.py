@@ -61,7 +61,6 @@ class DensePage:
 
     Parameters
     ----------
-    picture : DensePicture
     pairs : DensePairs
         That the picture is of.
     """

@@ -60,7 +60,6 @@ class DenseTruth:
         True h.
     true_rig, given_rig : Rig
         The rig that was rendered, and the one in the pair.
-    given_stroke_m : float
     found : Correspondence
         Of the down image's pixels.
     texture : array, shape (H, W)
@@ -120,7 +119,6 @@ class DensePairs:
 
     Parameters
     ----------
-    dataset : Dataset
     pair_draws : tuple of PairDraw
         Numbered from 0.
     count : int

@@ -52,8 +52,6 @@ class DensePicture:
 
     Parameters
     ----------
-    pair : DensePair
-    truth : DenseTruth
     depth_m : array, shape (H, W)
         The answer's D.
     name : str
@@ -205,7 +203,6 @@ def picture_of(
     Parameters
     ----------
     reference : as for `run_dense`
-    pairs : DensePairs
     sample : str, optional
         Id or number of a sample; the first by default.
     limits : RunLimits, optional

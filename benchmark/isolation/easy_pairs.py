@@ -55,13 +55,7 @@ class EasySpot:
 
 @dataclass(frozen=True)
 class EasyScene:
-    """Scene of one pair of images (down, up).
-
-    Attributes
-    ----------
-    depth_m, stroke_m, flux_e : float
-    down, up : EasySpot
-    """
+    """Scene of one pair of images (down, up)."""
 
     depth_m: float
     stroke_m: float
@@ -103,13 +97,7 @@ _WINDOW_PX = 41  # side of the window that a spot is computed in: its edges are 
 
 @dataclass(frozen=True)
 class EasyCamera:
-    """A camera with a fixed pattern.
-
-    Parameters
-    ----------
-    camera : Camera
-    card : SensorCard
-    """
+    """A camera with a fixed pattern."""
 
     camera: Camera
     card: SensorCard
@@ -225,7 +213,6 @@ class EasyPairs(ShortForm):
     Parameters
     ----------
     preset : "bayer-raw", "mono-raw", "srgb8", "yuyv" or "mjpeg"
-    count : int
     rig : Rig
         Its whole mirror should be in the image.
     laser_off, hinted : bool

@@ -95,8 +95,6 @@ class MethodProcess:
 
     Parameters
     ----------
-    reference : Reference
-    limits : RunLimits
     hidden : sequence of Path
         Folders with the truth, which the method cannot read.
     others : sequence of Reference

@@ -281,7 +281,6 @@ def position_fault(answer_px: Array, truth_px: Array, views: Views) -> str:
     Parameters
     ----------
     answer_px, truth_px : shape (n, 2, 2)
-    views : Views
     """
     error = _median_distance(answer_px, truth_px)
     if not np.isfinite(error):

@@ -103,7 +103,6 @@ class Seat:
         Module whose `KNOWN` holds the built-in ones by name.
     example : str
         File beside this one that `command` new writes, in which the user's file is called as `file`.
-    file : str
     """
 
     command: str

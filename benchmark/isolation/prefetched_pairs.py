@@ -45,7 +45,6 @@ class PairsAhead:
     ----------
     pairs : PairSet
         Picklable.
-    processes : int
 
     Attributes
     ----------

@@ -25,8 +25,6 @@ def access_of(reference: Reference, limits: RunLimits, hidden: Sequence[Path] = 
 
     Parameters
     ----------
-    reference : Reference
-    limits : RunLimits
     hidden : sequence of Path
         Folders that hold the truth; they stay unreadable inside what is allowed.
 

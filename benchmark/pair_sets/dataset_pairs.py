@@ -71,7 +71,6 @@ class DatasetPairs(DrawnPairs, ShortForm):
 
     Parameters
     ----------
-    dataset : Dataset
     pair_draws : tuple of PairDraw
         Numbered from 0.
     boxes_px : int, optional
@@ -226,7 +225,6 @@ def dataset_pairs(
 
     Parameters
     ----------
-    dataset : Dataset
     preset : str, optional
         Sensor preset; those of the recipe's `[frames]` if not given.
     draws : int, optional
@@ -347,8 +345,6 @@ def spot_bounds(
     ----------
     side : Side
         Light and sensor; its region is not used.
-    rig : Rig
-    spot : SpotInImage
     pattern_known : bool
         Whether the camera's PRNU and DSNU are calibrated; otherwise the bounds count them as noise.
     frames : FrameCounts, optional

@@ -168,7 +168,6 @@ class CalibratedPairs:
     ----------
     pairs : PairSet
         All of one true rig: see `of_calibration`.
-    calibration : Calibration
     """
 
     def __init__(self, pairs: PairSet, calibration: Calibration) -> None:

@@ -63,7 +63,6 @@ class TransferPace:
 
     Parameters
     ----------
-    patience : Patience
     most : int
         Bytes that the body may have, as they lie on the disk.
     is_document : bool

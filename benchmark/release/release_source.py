@@ -41,7 +41,6 @@ class Source:
     ----------
     name : as it is printed, without name and password
     place : folder, or address with all that it holds
-    is_folder : bool
     tries : attempts at a file
     patience : bounds of time, or None for those of `Patience`
     """
@@ -202,7 +201,6 @@ class Partial:
 
     Parameters
     ----------
-    folder : Path
     archive : Archive
         Name, size in bytes and SHA-256, as the manifest has them.
 

@@ -76,7 +76,6 @@ class Ranking:
 
     Attributes
     ----------
-    title : str
     verdict : str
         Which method is best, and what fails.
     frames : dict of str to EncodedPicture

@@ -16,7 +16,6 @@ class Section:
 
     Attributes
     ----------
-    title : str
     paragraphs : plain text
     pictures : tuple of Picture
     tables : rows of cells, the first row being heads

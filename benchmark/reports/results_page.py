@@ -67,7 +67,6 @@ class ScoreGroup:
 
     Attributes
     ----------
-    title : str
     scores : tuple of ScoreDocument
     against : str
         Name of the method that the others are compared with.

@@ -73,8 +73,6 @@ class Difference:
     name : key of `METRICS`
     first, second : float
         Values over the records that count for both.
-    difference : Estimate
-    n, samples : int
     chance : float
         Of a difference as large between two methods of the same law; not corrected for the number of metrics.
     better : "first", "second", "no difference shown" or "too few samples"
@@ -398,8 +396,6 @@ def exchange_chance(statistic: Statistic, n: int, rules: Rules, rng: np.random.G
     Parameters
     ----------
     statistic : of 2 n samples, the first method's n, then the second's
-    n : int
-    rules : Rules
     """
     stay = np.zeros((1, n))
     first, second = _exchanged(statistic, stay)

@@ -127,7 +127,6 @@ def with_causes(records: pl.DataFrame, pairs: PairSet, rules: Rules, fit: FitAtT
     records : as of `records.records`
     pairs : PairSet
         Images are asked for only where a rule looks at them, those of a pair twice at most: give `CachedPairs`.
-    rules : Rules
     fit : Reference
         Fit that knows where to look.
     """

@@ -250,7 +250,6 @@ def rate(clusters: Clusters, hits: Array, rules: Rules) -> Estimate:
     ----------
     clusters : samples of the records
     hits : shape (r,), 0 or 1
-    rules : Rules
     """
     if clusters.n == 0:
         return Estimate(math.nan, math.nan, math.nan, NOTHING)

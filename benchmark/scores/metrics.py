@@ -148,7 +148,6 @@ class Metric:
         mean, "efficiency" divides: variances, then errors; "rank" is the root of a sum of squares by a number of spots;
         "constant" is the relative rms error of the best constant, of inverse values; "geometric" is the exponential of
         the mean of a logarithm, "ratio" that of two sums
-    unit : str
     better : "lower", "higher" or "none"
     text : what it is
     """
@@ -362,7 +361,6 @@ def measure(
     Parameters
     ----------
     records : `prepared`
-    rules : Rules
     *stream : names of the random stream of the resamples
     """
     wanted = {name: METRICS[name] for name in names or METRICS}

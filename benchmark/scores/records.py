@@ -52,7 +52,6 @@ def records(pairs: PairSet, outcomes: Iterable[Outcome], rules: Rules) -> pl.Dat
     pairs : PairSet
         Truths are taken of the pairs that have an outcome.
     outcomes : one per pair
-    rules : Rules
 
     Raises
     ------

@@ -93,8 +93,6 @@ def score_methods(
     Parameters
     ----------
     methods : MethodCards, in the order in which `ask` answers
-    pairs : PairSet
-    ask : Ask
     rules : Rules, by default the usual ones
     seed : int
         Of the bootstrap; 0 or above.
@@ -213,9 +211,7 @@ def examine(
 
     Parameters
     ----------
-    pairs : PairSet
     outcomes : of some of the pairs
-    rules : Rules
     before : optional
         `Examined.leading` of the pairs before.
     fits : KeptFits, optional

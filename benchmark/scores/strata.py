@@ -46,7 +46,6 @@ class Stratum:
     Attributes
     ----------
     by : one of `STRATA`
-    label : str
     low, high : float or None
         Edges, low <= x < high; None where the stratum is a value; high may be infinite.
     mean : float or None

@@ -187,7 +187,6 @@ def check_card(document: ScoreDocument, method: str | None = None) -> Told:
 
     Parameters
     ----------
-    document : ScoreDocument
     method : the method itself, as `phibench score` takes it
 
     Raises

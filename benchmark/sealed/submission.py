@@ -46,10 +46,6 @@ Matrix = Annotated[tuple[Vector2, Vector2], Field(strict=False)]
 class SealedPairs:
     """Pairs of a sealed set by number; every file is checked against its hash when it is read.
 
-    Parameters
-    ----------
-    folder : Path
-
     Raises
     ------
     DatasetError

@@ -229,7 +229,6 @@ class Pace:
     ----------
     expected : dict
         Seconds by kind, on the idle machine of the constants.
-    slowdown : float
     workers : int
         The first task of a kind compiles kernels in every worker, and counts only until there are others.
     """

@@ -67,7 +67,6 @@ class Journal:
 
     Attributes
     ----------
-    folder : Path
     head : FolderHead or None
     entries : dict of Entry by task
     refusals : dict of Refusal by task

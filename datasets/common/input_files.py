@@ -115,7 +115,6 @@ class InputFile:
 
     Parameters
     ----------
-    path : Path
     remedy : str
         End of every sentence about a fault: what to do.
     error : type of the error

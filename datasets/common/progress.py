@@ -32,9 +32,6 @@ class Steps:
 
     Parameters
     ----------
-    console : Console
-    title : str
-    total : int
     left_s : callable, optional
         Seconds left; by default the steps are taken to be equal.
     running : callable, optional
@@ -135,7 +132,6 @@ class StillRunning:
 
     Parameters
     ----------
-    console : Console
     title : str
         What runs.
     every_s : float

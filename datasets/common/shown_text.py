@@ -154,7 +154,6 @@ class TextTable:
 
     Attributes
     ----------
-    title : str
     heads : tuple of str
         A line break parts a head from its unit.
     rows : tuple of rows, each a tuple of str

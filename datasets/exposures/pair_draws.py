@@ -60,8 +60,6 @@ class PairDraw:
     ----------
     number : int
         Its place in the drawn order, from 0.
-    sample_id : str
-    preset : str
     draw : int
         As in `FrameSource.frames`.
     request : FrameRequest
@@ -94,7 +92,6 @@ def pair_draws(
 
     Parameters
     ----------
-    dataset : Dataset
     preset : str, optional
         This one instead of the recipe's; needed where the recipe has no `[frames]`, whose defaults then hold.
     draws : int, optional
@@ -172,7 +169,6 @@ def search_box(
     names : data set, its seed, sample id
     position : "down" or "up"
     light_px : (u, v), or None where there is none in the image: the box is anywhere
-    camera : Camera
     side_px, margin_px : int
         Side of the box, and how far the light is from its edges at least.
     """

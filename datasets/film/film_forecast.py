@@ -43,7 +43,6 @@ class FilmsForecast:
         `views` are the key views to begin with.
     size : int
         Bytes on the disk.
-    cpu_s : float
     bakes : tuple of float
         Seconds of each light map that no cache has.
     """

@@ -45,10 +45,8 @@ class FilmPlan:
     ----------
     film_id : str
         That of its pair.
-    pair : PairPlan
     scene, nominal : FilmScene
         True one, and what an estimator may know: nominal rig, stroke and carriage, no vibration.
-    encoder : Encoder
     names : tuple
         Data set, seed, film: the beginning of its random streams.
     region : Region

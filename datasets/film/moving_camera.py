@@ -73,10 +73,8 @@ class BakedRoom:
 
     Parameters
     ----------
-    name : str
     room : Room
         Without the robot.
-    texel_m : float
     irradiance_w_m2 : array, shape (texels, 3)
     """
 
@@ -244,10 +242,8 @@ class MovingCamera:
 
         Parameters
         ----------
-        room : BakedRoom
         placement : (3, 3) and (3,)
             Rotation and origin of the rig's frame in the world.
-        stroke_m : float
         spots : sequence of LaserSpot
             In the rig's frame; those that are seen.
         regions : sequence of Region

@@ -15,16 +15,11 @@ class SensorCard:
 
     Attributes
     ----------
-    name : str
     mosaic : "bayer" (RGGB, red at even row and even column) or "mono"
-    exposure_s : float
-    shot_noise : bool
     full_well_e, read_noise_e, row_noise_e, dsnu_e : float, electrons
     prnu : float, relative
-    dark_e_per_s : float
     dn_per_e : float
         Overall system gain K, analogue gain included.
-    black_level_dn : float
     top_dn : int
         Largest code.
     output : "electrons", "raw", "srgb8", "yuyv" or "mjpeg"

@@ -244,7 +244,6 @@ class DrawnRig:
         Number of the first draw that was possible.
     drawn : tuple of (parameter, value)
         Parameters as in `PARAMETERS`.
-    misalignment : Misalignment
     rig : Rig, the true one
     """
 

@@ -71,7 +71,6 @@ class ViewComparison:
 
     Attributes
     ----------
-    sample_id, position : str
     differences : dict of str to RendererDifference
     left_out : tuple of str
         What was not compared, and why.

@@ -15,7 +15,6 @@ from phibench.datasets.common.shown_text import counted
 from phibench.datasets.store import schema
 from phibench.datasets.store.schema import DatasetInfo, ManifestRow, columns
 
-NAME = schema.CROISSANT
 LICENSE_URL = "https://creativecommons.org/licenses/by/4.0/"
 LICENSE_TEXT = f"""Creative Commons Attribution 4.0 International (CC BY 4.0)
 

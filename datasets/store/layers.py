@@ -71,7 +71,6 @@ def write_exr(
 
     Parameters
     ----------
-    path : Path
     planes : mapping of str to array, shape (H, W)
         Any memory order, byte order and real type; rounded to float32. A finite value beyond float32 is refused.
     header : mapping
@@ -340,7 +339,6 @@ def read_layer(path: Path, kind: str, planes: tuple[str, ...], **owner: str) -> 
 
     Parameters
     ----------
-    path : Path
     kind : "ambient", "truth" or "spot"
     planes : names of the planes that must be there
     **owner : str

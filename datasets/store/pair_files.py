@@ -191,7 +191,6 @@ class PairFiles(Generic[Row]):
 
     Parameters
     ----------
-    folder : Path
     kind : type
         Of its lines: `PublicPair`, or a kind of it.
     count : int, optional

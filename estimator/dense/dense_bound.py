@@ -76,8 +76,6 @@ def matching_information(planes_e: Array, card: SensorCard, motion: EpipolarMoti
     ----------
     planes_e : shape (3, H, W), or (1, H, W) of a sensor without filters
         Expected electrons of the down image behind each filter.
-    card : SensorCard
-    motion : EpipolarMotion
     window_px : int
         Side, odd.
     """
@@ -104,11 +102,9 @@ def dense_bound(
     Parameters
     ----------
     rig, stroke_m : the true ones
-    card : SensorCard
     planes_e : as in `matching_information`
     depth_m : shape (H, W)
         True D.
-    window_px : int
     """
     return sigma_of(matching_information(planes_e, card, epipolar_motion(rig, stroke_m, depth_m), window_px), depth_m)
 

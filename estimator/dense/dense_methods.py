@@ -25,8 +25,6 @@ class DenseBuiltIn:
 
     Parameters
     ----------
-    name : str
-    function : DenseMethod
     description : str
         One line.
     source : str

@@ -87,7 +87,6 @@ class SweepParts:
         Costs, and their sums along paths.
     start : array, shape (H, W)
         1 / D of the least sum.
-    fit : PlaneFit
     """
 
     heights: Heights

@@ -77,9 +77,6 @@ class PanoramaMaps:
 
     Parameters
     ----------
-    rig : Rig
-    stroke_m : float
-    grid : PanoramaGrid
     nearest_m : float
         Least D of `up_px` and `up_px_of`.
     """
@@ -189,13 +186,7 @@ def at_places(coefficients: Float32, uv_px: Array, order: int = 3) -> Float32:
 
 @dataclass(frozen=True)
 class UnrolledPair:
-    """Panoramas of a pair.
-
-    Parameters
-    ----------
-    pair : DensePair
-    maps : PanoramaMaps
-    """
+    """Panoramas of a pair."""
 
     pair: DensePair
     maps: PanoramaMaps

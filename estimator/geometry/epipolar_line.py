@@ -41,7 +41,6 @@ def up_image(rig: Rig, stroke_m: ArrayLike, uv_down_px: Array, inverse_depth_per
 
     Parameters
     ----------
-    rig : Rig
     stroke_m : shape (...), h
     uv_down_px : shape (..., 2)
     inverse_depth_per_m : shape (...), 1 / D, above 0

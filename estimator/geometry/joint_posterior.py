@@ -84,7 +84,6 @@ def joint_posterior(rig: Rig, stroke_m: float, down: LikelihoodMap, up: Likeliho
 
     Parameters
     ----------
-    rig : Rig
     stroke_m : float, h
     down, up : LikelihoodMap
         That hold the positions with all that has a likelihood worth counting.

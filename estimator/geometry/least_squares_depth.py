@@ -66,7 +66,6 @@ def depth_general(
 
     Parameters
     ----------
-    rig : Rig
     stroke_m : shape (...)
     uv_down_px, uv_up_px : shape (..., 2)
     covariance_down_px2, covariance_up_px2 : shape (..., 2, 2)
@@ -279,7 +278,6 @@ def combine(
 
     Parameters
     ----------
-    rig : Rig
     stroke_m : shape (...), h
     uv_down_px, uv_up_px : shape (..., 2)
     covariance_down_px2, covariance_up_px2 : shape (..., 2, 2), independent of each other

@@ -43,7 +43,6 @@ class PanoramaGrid:
 
     Parameters
     ----------
-    width_px : int
     low_rad, high_rad : float
         Elevations above the horizon of the lower and the upper edge; the lower moves to a whole number of rows.
 
@@ -275,7 +274,6 @@ def frame(sample: Sample, position: str, preset: str = LAYERS) -> NDArray[Any]:
 
     Parameters
     ----------
-    sample : Sample
     position : "down" or "up"
     preset : "layers" (noise-free), "srgb8" or "mjpeg"
 

@@ -145,7 +145,6 @@ def estimate_phi(convention: str, view: View, uv_px: Array, covariance_px2: Arra
     Parameters
     ----------
     convention : key of `CONVENTIONS`
-    view : View
     uv_px : shape (..., 2), pixels
     covariance_px2 : shape (..., 2, 2), covariance of (u, v), optional
 

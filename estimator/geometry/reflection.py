@@ -63,7 +63,6 @@ def reflect(view: View, uv_px: Array) -> Reflection:
 
     Parameters
     ----------
-    view : View
     uv_px : shape (..., 2), pixels
 
     Returns
@@ -90,7 +89,6 @@ def reflect_jacobian(view: View, uv_px: Array) -> ReflectionJacobian:
 
     Parameters
     ----------
-    view : View
     uv_px : shape (..., 2), pixels
     """
     geometry, pose = geometry_of(view.rig.mirror), view.rig.T_camera_sphere
@@ -240,7 +238,6 @@ def image_of(view: View, points_world_m: Array) -> MirrorImage:
 
     Parameters
     ----------
-    view : View
     points_world_m : shape (..., 3), outside the sphere
     """
     X, geometry = np.asarray(points_world_m, float), geometry_of(view.rig.mirror)

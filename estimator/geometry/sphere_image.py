@@ -36,7 +36,6 @@ class SphereImage(NamedTuple):
 
     Attributes
     ----------
-    u_px, v_px : float
     cos_incidence : float
         At the mirror.
     ray : 3 floats

@@ -126,7 +126,6 @@ def crop_input(on: Image, off: Image | None, card: SensorCard, response: Sequenc
     ----------
     on, off : shape (33, 33, ...)
         Pixels with the laser on, and off where there are such; without them the border's median is the background.
-    card : SensorCard
     response : 3 floats
         Of the filters R, G, B at the laser's line: `Detector.laser_filter_response`.
 
@@ -187,7 +186,6 @@ def frame_input(on: Image, off: Image, card: SensorCard) -> tuple[NDArray[np.flo
     ----------
     on, off : shape (H, W, ...), H and W even
         Frame or a part of it that begins at an even row and column.
-    card : SensorCard
 
     Returns
     -------

@@ -95,7 +95,6 @@ class Network:
 
     Parameters
     ----------
-    path : Path
     name : `CROP` or `DETECT`
     sha256 : str, optional
         That the file must state.
@@ -261,9 +260,7 @@ def write_network(path: Path, name: str, weights: Weights, metadata: Mapping[str
 
     Parameters
     ----------
-    path : Path
     name : `CROP` or `DETECT`
-    weights : Weights
     metadata : entries besides name and version, such as "covariance_scale"
 
     Raises
@@ -320,7 +317,6 @@ def refined(
     found : Network, of `CROP`
     image, dark : shape (H, W, ...)
         With the laser on, and off where there is such a frame.
-    card : SensorCard
     response : 3 floats
         Of the filters R, G, B at the laser's line.
     uv_px : (u, v)

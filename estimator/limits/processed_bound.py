@@ -86,7 +86,6 @@ def chain_limit(
     card : SensorCard
         Of the output "srgb8", "yuyv" or "mjpeg".
     uv_px : shape (2,), in the image
-    blur : SpotBlur
     flux_e : float
         Electrons of the whole spot in pixels of response 1, as `SpotFit.flux_e`.
     background_e : shape (3,)
@@ -283,9 +282,6 @@ def on_off_limit(
 
     Parameters
     ----------
-    region : ExpectedRegion
-    card : SensorCard
-    frames : FrameCounts
     pattern_known : bool
         PRNU is calibrated and taken out.
     """
@@ -310,7 +306,6 @@ def processed_on_off_limit(
     ----------
     card : SensorCard
         Of the output "srgb8", "yuyv" or "mjpeg"; with `prnu` 0 where the pattern is calibrated and taken out.
-    frames : FrameCounts
     uv_px, blur, flux_e, background_e, response
         As for `processed_bound.chain_limit`; `background_e` says how bright the room is, a method does not know it.
     steps : bool
@@ -348,7 +343,6 @@ class _Readings:
 
     Attributes
     ----------
-    at : Codes
     slope : shape (r,), of the raw pixels' means below the full well
     factor : shape (r, n), F of which F^T F is the covariance by the raw pixels
     rest : shape (n,), variance by roundings

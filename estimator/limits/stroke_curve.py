@@ -107,7 +107,6 @@ class StrokeCurve:
 
     Attributes
     ----------
-    strokes_m
     sigma_spot_m, sigma_calibration_m, sigma_stroke_m
         From the pixels' noise, the rig's parameters and the single stroke, to first order; NaN where the spot has no
         image.
@@ -282,7 +281,6 @@ def beyond_first_order_m(
     points_m : shape (m, 3)
     covariance_down_px2, covariance_up_px2 : shapes (1 or n, m, 2, 2)
     covariance_rig : shape (p, p)
-    stroke_sigma_m : float
     """
     if not np.any(covariance_rig):
         return np.zeros(len(strokes_m))

@@ -129,8 +129,6 @@ def phi_shift_sigma(first: ExpectedRegion, second: ExpectedRegion, card: SensorC
 
     Parameters
     ----------
-    first, second : ExpectedRegion
-    card : SensorCard
     gradient : array, shape (2,)
         Of phi by (u, v).
     """

@@ -54,7 +54,6 @@ class SpotLikelihood:
 
     Attributes
     ----------
-    scores : Scores
     theta : shape (k,), the best hypothesis found, position from `corner_px`
     corner_px : shape (2,), image pixel (u, v) of the position's origin
     excess : float

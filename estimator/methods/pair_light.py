@@ -39,7 +39,6 @@ def mirror_mask(pair: Pair, position: str | None = None) -> BoolArray:
 
     Parameters
     ----------
-    pair : Pair
     position : "down" or "up", optional
         Image whose box narrows the mask, where the pair has boxes. Without it the mask is that of both images: camera
         and mirror move together.

@@ -254,8 +254,6 @@ class BuiltIn:
 
     Parameters
     ----------
-    name : str
-    function : Method
     description : str
         One line.
     source : str

@@ -26,7 +26,6 @@ class DrawnPairs:
 
     Parameters
     ----------
-    dataset : Dataset
     pair_draws : tuple of PairDraw
         Numbered from 0.
     """
@@ -127,9 +126,7 @@ def pairs_of(
 
     Parameters
     ----------
-    dataset : Dataset
     samples : of the data set
-    preset : str
     draws : int
         Noise realisations of each sample.
     laser_off : bool

@@ -231,7 +231,6 @@ class SearchRegion:
 
     Attributes
     ----------
-    pair : Pair
     position : "down" or "up"
     box : Box
         In the image; from the hint, or from `locate`.

@@ -54,7 +54,6 @@ class ChainModel:
 
     Attributes
     ----------
-    card : SensorCard
     noise : PixelNoise
         Without the converter's rounding.
     shape : (h, w) of the window, whole units of JPEG or pairs of rows and columns
@@ -131,7 +130,6 @@ def chain_model(card: SensorCard, noise: PixelNoise) -> ChainModel:
 
     Parameters
     ----------
-    card : SensorCard
     noise : PixelNoise
         Without the converter's rounding.
     """

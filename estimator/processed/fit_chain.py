@@ -54,7 +54,6 @@ def fit_srgb(
     images : shape (n, h, w, 3), uint8; (n, f, h, w, 3) of f frames of each
     origin_px : shape (2,) or (n, 2)
         Image pixel (u, v) of the first column and row.
-    card : SensorCard
     blur, model
         As for `fit_law`.
     extra_e2 : float
@@ -361,7 +360,6 @@ def undone(images: NDArray[Any], origin: NDArray[np.int64], card: SensorCard) ->
     images : shape (n, h, w, 3), codes 0 to 255, whole or not; (n, h, w, 2) of "yuyv"
     origin : shape (n, 2)
         Image pixel (u, v) of the first column and row.
-    card : SensorCard
     """
     filters = bayer_filters(origin + card.mosaic_phase, images.shape[1:3])
     rgb = np.stack([rgb_codes(image, card, corner) for image, corner in zip(images, origin, strict=True)])

@@ -79,10 +79,8 @@ def fit_region(
     Parameters
     ----------
     region : Region
-    chain : ChainModel
     starts : shape (s, 6) or (s, 7)
         u, v in the region, flux, levels on top of the background, width if it is free.
-    blur : SpotBlur
     model : SpotModel
         Its background is not looked at; the region's is.
 

@@ -67,7 +67,6 @@ class QuantiserSteps:
     step : shape (n,)
     first : shape (n,), lower edge of the lowest step
     counts : shape (l, n), frames in the lowest step and in those above it
-    frames : int
     """
 
     step: Array
@@ -309,7 +308,6 @@ class IntervalPosterior:
     covariance : shape (k, k)
     index : shape (l,), outputs that tell something
     sites : of these, shape (l,)
-    settled : bool
     """
 
     window: CoefficientWindow

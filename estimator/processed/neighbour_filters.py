@@ -113,7 +113,6 @@ class EdgeSparing:
     centre : shape (q,), places of the window's pixels in s
     near : shape (k, q), places of their neighbours
     weights : shape (k,)
-    threshold_codes : float
     """
 
     luma: sparse.csr_array
@@ -210,7 +209,6 @@ def regained(seen_e: Array, origin: NDArray[np.int64], card: SensorCard) -> Arra
         Electrons behind each pixel's own colour in the image.
     origin : shape (n, 2)
         Image pixel (u, v) of the first column and row.
-    card : SensorCard
     """
     if chroma_step(card) == (1, 1):
         return seen_e

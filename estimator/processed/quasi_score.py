@@ -93,7 +93,6 @@ class Noise:
 
     Attributes
     ----------
-    rows : Rows
     sigma : shape (l,), of the quantiser's input
     factor : shape (l, l), Cholesky factor of the output's covariance
     """
@@ -142,7 +141,6 @@ class WindowFit:
     theta : shape (k,), as `SpotPixels`
     fisher : shape (k, k), J^T C^-1 J, or the inverse covariance of a posterior
     chi2 : float, r^T C^-1 r per degree of freedom
-    converged : bool
     """
 
     theta: Array
@@ -158,7 +156,6 @@ class CoefficientWindow:
     Attributes
     ----------
     z : shape (n,), quantised coefficients in the order of `camera_codes.coefficients`, mean of the frames
-    model : ChainModel
     pixels : SpotPixels
         Of the one window and the raw pixels around it, r in all.
     extra_e2 : shape (r,) or float

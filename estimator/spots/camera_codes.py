@@ -329,7 +329,6 @@ def noisy_code(mean: Array, sigma: Array, card: SensorCard) -> NoisyCode:
     Parameters
     ----------
     mean, sigma : arrays of the same shape, full scale 1; sigma above 0
-    card : SensorCard
     """
     f = tone_of(mean[..., None] + sigma[..., None] * _NODES, card)
     first = f @ _WEIGHTS
@@ -357,7 +356,6 @@ def rgb_codes(image: NDArray[Any], card: SensorCard, origin_px: ArrayLike = (0, 
     Parameters
     ----------
     image : shape (..., H, W, 3), or (..., H, W, 2) of "yuyv"
-    card : SensorCard
     origin_px : (u, v)
         Of the first column and row in the whole image: where the pairs begin.
     """

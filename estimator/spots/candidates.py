@@ -60,14 +60,12 @@ def peaks(
     ----------
     on, off : ColourPlanes
         Laser on and, if there is one, off.
-    card : SensorCard
     sigma_px : float
         Blur in the planes.
     inside : shape (h, w)
         Where to look.
     least_z : float
         In standard deviations of the noise; of processed images, of the map's.
-    most : int
     """
     light, variance = _above_background(on, off, card)
     z, phase = _highest_phase(light, variance, on, sigma_px)
@@ -231,11 +229,9 @@ def candidates_at(
     Parameters
     ----------
     on, off : ColourPlanes
-    card : SensorCard
     uv_px : shape (n, 2), relative to the part
     sigma_px : float
         Blur in the planes.
-    noise : CandidateNoise
     """
     reach = _PATCH_REACH_PX[on.mosaic]
     corner = np.rint(uv_px).astype(int) - reach

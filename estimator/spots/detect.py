@@ -94,11 +94,8 @@ def choose(rig: Rig, stroke_m: float, down: Candidates, up: Candidates, least: T
 
     Parameters
     ----------
-    rig : Rig
-    stroke_m : float
     down, up : Candidates
         Candidates, pixels of the whole image, strongest first.
-    least : Thresholds
     sure : bool
         The candidates are known to be red or the laser's; otherwise a pair is always preferred.
     """

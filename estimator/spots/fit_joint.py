@@ -65,7 +65,6 @@ def fit_joint(
 
     Parameters
     ----------
-    rig : Rig
     stroke_m : float or shape (n,), h
     down, up : SpotData, n each
         Of `spot_data`, with Gaussian laws, unknown levels and known widths.

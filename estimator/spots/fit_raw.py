@@ -114,7 +114,6 @@ def fit_raw(
     ----------
     regions_e, origin_px
         As for `spot_regions`.
-    noise : PixelNoise
     blur, model
         As for `fit_law`.
     saturation_e : float
@@ -137,7 +136,6 @@ def fit_law(
 
     Parameters
     ----------
-    regions : SpotRegions
     law : PixelLaw
         Of all regions.
     blur : SpotBlur

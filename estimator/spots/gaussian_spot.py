@@ -126,7 +126,6 @@ def profile(centre_px: Array, sigma_px: Array, count: int) -> GaussianProfile:
     Parameters
     ----------
     centre_px, sigma_px : shape (m,)
-    count : int
     """
     edges = (np.arange(count + 1) - 0.5 - centre_px[:, None]) / sigma_px[:, None]
     density = np.exp(-0.5 * edges * edges) / _ROOT_2PI
@@ -154,7 +153,6 @@ def spot_images(place_px: Array, flux: Array, blur: SpotBlur, shape: tuple[int, 
         Of m spots; the mixed moment kappa enters as kappa d^2/du dv of the upright Gaussian. A free width knows no
         parts.
     shape : (h, w)
-    by_width : bool
     """
     if blur.parts is not None and not by_width:
         return _images_of_parts(place_px, flux, blur.parts, shape)
@@ -215,7 +213,6 @@ class SpotPixels:
     background_e : shape (n, h, w), known
     levels : shape (n, c, h, w), 1 where a pixel has that level
     blur : SpotBlur, of n spots
-    free_width : bool
     """
 
     response: Array

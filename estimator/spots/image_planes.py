@@ -74,7 +74,6 @@ def linear_planes(image: NDArray[Any], card: SensorCard, origin_px: tuple[int, i
     ----------
     image : shape (h, w) DN, (h, w, 3) 8-bit R, G, B, or (h, w, 2) of "yuyv"
         An image or a part of one.
-    card : SensorCard
     origin_px : (u, v)
         Image pixel of the first column and row: where the mosaic's red pixels are, and pairs of "yuyv" begin.
     """
@@ -203,7 +202,6 @@ def variance_e2(mean_e: Array, card: SensorCard, alike: bool) -> Array:
     Parameters
     ----------
     mean_e : array of any shape
-    card : SensorCard
     alike : bool
         The fixed pattern cancels, as in the difference of two frames of one camera.
     """

@@ -160,7 +160,6 @@ def code_law(
     codes : shape (n, h, w), uint8
         Of each pixel's own colour.
     filters : shape (n, h, w), 0, 1, 2
-    card : SensorCard
     noise : PixelNoise
         Without rounding.
     table : CodeTable
@@ -246,8 +245,6 @@ class MeanCodes:
 
     Parameters
     ----------
-    card : SensorCard
-    noise : PixelNoise
     curve : shape (3, d), codes at every DN and the quarters between
     """
 

@@ -49,7 +49,6 @@ def noise_of(card: SensorCard, pattern_known: bool = False) -> PixelNoise:
 
     Parameters
     ----------
-    card : SensorCard
     pattern_known : bool
         PRNU and DSNU of the camera were calibrated and taken out; otherwise they count as noise.
 

@@ -202,8 +202,6 @@ class SpotPosition(ShortForm):
     ----------
     uv_px : shape (2,), NaN unless status is OK
     flux : float, sum of the window, in the unit of the frame
-    window : Region
-    status : Status
     """
 
     uv_px: Array

@@ -44,7 +44,6 @@ def spot_blur(rig: Rig, uv_px: ArrayLike, depth_m: float | None = None, beam: Be
 
     Parameters
     ----------
-    rig : Rig
     uv_px : shape (2,)
     depth_m : float, optional
         Horizontal distance of the spot from the mirror's axis; without it the spot is far away.
@@ -174,9 +173,7 @@ class Laser:
 
     Parameters
     ----------
-    power_w : float
     albedo : float, of the wall at the wavelength; the wall scatters like a Lambertian one
-    wavelength_nm : float
     """
 
     power_w: float = 1e-3
@@ -191,7 +188,6 @@ def spot_electrons_per_s(rig: Rig, laser: Laser, image: MirrorImage, wall_normal
     ----------
     rig : Rig
         At the down position, from which `image` is seen; a raised rig sees a lowered point.
-    laser : Laser
     image : MirrorImage, shape (...)
     wall_normals : shape (..., 3), unit vectors
     """

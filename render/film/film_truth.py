@@ -47,7 +47,6 @@ class InstantTruth:
         the robot stands now.
     laser_level : float
         Part of the exposure about this instant during which the laser is on.
-    spot : SpotTruth
     rates : dict
         Derivative by the time of each of `RATES`, per second; NaN where there is no reflection point.
     """
@@ -75,7 +74,6 @@ def instant_truth(scene: FilmScene, room: Room, time_s: float, visible: bool = T
 
     Parameters
     ----------
-    scene, room, time_s
     visible : bool
         False leaves out what stands in the way: `spot.visible` and `spot.cause` then know nothing of the room.
     """

@@ -97,7 +97,6 @@ def rows_image(scene: FilmScene, frame: int, layer: SpotLayer, time_s: float) ->
 
     Parameters
     ----------
-    scene, frame
     layer : SpotLayer
         Of the still at `time_s`.
     time_s : float

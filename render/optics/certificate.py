@@ -43,7 +43,6 @@ class Certificate:
         Relative difference of the electrons per second of the same two.
     place_difference_m, place_tolerance_m : float
         Place of the light on the surfaces, of the same two.
-    passed : bool
     """
 
     chief_difference_px: float

@@ -291,7 +291,6 @@ class TexelGrid:
 
     Attributes
     ----------
-    table : FaceTable
     columns, rows : int arrays, shape (P,)
         Along local x and y; 0 where there is no grid.
     start : int array, shape (P,)

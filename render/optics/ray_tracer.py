@@ -174,7 +174,6 @@ def meet(origins_m: Array, directions: Array, radius_m: float, form: Form) -> tu
     Parameters
     ----------
     origins_m, directions : arrays, shape (N, 3); directions of unit length
-    radius_m, form
 
     Returns
     -------

@@ -281,7 +281,6 @@ def reflection_points(
     ----------
     points_m, eyes_m : arrays, shape (N, 3)
         The two points, metres, relative to the sphere centre.
-    radius_m : float
     rest : float
         Of the angle between the points: the step that ends the search.
 
@@ -341,7 +340,6 @@ def fermat_points(
     ----------
     points_m, eyes_m : arrays, shape (N, 3)
         The two points, metres, relative to the sphere centre.
-    radius_m, form
 
     Returns
     -------

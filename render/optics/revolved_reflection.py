@@ -55,7 +55,6 @@ def revolved_points(points_m: Array, eyes_m: Array, surface: Surface) -> tuple[A
     ----------
     points_m, eyes_m : arrays, shape (N, 3)
         The two points, metres, relative to the vertex.
-    surface
 
     Returns
     -------

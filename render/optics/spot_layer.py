@@ -117,8 +117,6 @@ def splat(cloud: FilmCloud, sigma_px: float, electrons_per_joule: Array) -> Spot
 
     Parameters
     ----------
-    cloud : FilmCloud
-    sigma_px : float
     electrons_per_joule : array, shape (3,)
     """
     bright = cloud.watts > 0.0

@@ -88,7 +88,6 @@ def streak_nodes(profile: Profile, along: float, across: float) -> tuple[Array, 
 
     Parameters
     ----------
-    profile
     along, across : float
         Extents of the image in units of the blur.
     """

@@ -98,8 +98,6 @@ class SpotTruth:
     phi_ray_rad, phi_normal_rad, phi_incidence_rad, azimuth_rad : float
         See `angles`.
     reflection_point_world_m, camera_centre_world_m, sphere_centre_world_m : 3 floats
-    path_spot_mirror_m, path_mirror_camera_m : float
-    visible : bool
     cause : str
         "none", "no_reflection", "mirror_edge", "faces_away", "outside_image" or "occluded:<object>".
     """
@@ -222,7 +220,6 @@ def truth_layer(
 
     Parameters
     ----------
-    view
     room : RoomGeometry or sequence of shapes
     finder : callable (origins, directions) -> faces, or None
         Guesses the face of each ray: index in the geometry's `table`, -1 for none. `RoomGeometry.resolve` checks the

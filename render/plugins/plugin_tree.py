@@ -59,7 +59,6 @@ class Triangles:
 
     Attributes
     ----------
-    name : str
     corners_mm : array, shape (N, 3)
     triangles : int array, shape (M, 3)
     normals, uv : arrays, shapes (N, 3) and (N, 2), or None
@@ -127,7 +126,6 @@ def mitsuba_dict(mi: ModuleType, scene: Plugin) -> dict[str, Any]:
     ----------
     mi : module
         Mitsuba with its variant set.
-    scene : Plugin
     """
     return {"type": scene.type} | {name: _taken(mi, value) for name, value in scene.values.items()}
 

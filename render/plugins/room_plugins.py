@@ -97,7 +97,6 @@ def grid_plugin(view: View, points_m: Array, normals: Array, bsdf: Plugin, *, cl
     ----------
     points_m, normals : arrays, shape (rings, spokes, 3)
         Outside is where spokes times rings point: the side that mirrors.
-    bsdf
     closed : bool
         Whether the last spoke has the first beside it.
     """

@@ -252,7 +252,6 @@ def standard_scene(view: View, room: Room, spot: LaserSpot | None = None, light:
 
     Parameters
     ----------
-    view, room
     spot : LaserSpot, or None
     light : "all", "ambient" or "spot"
         Of the room and the spot, of the room, or of the spot, whose scene has no other light.

@@ -32,7 +32,6 @@ def sensor_dict(mi: ModuleType, view: View, crop: tuple[int, int, int, int] | No
     ----------
     mi : module
         Mitsuba with its variant set.
-    view : View
     crop : (u0, v0, width, height), or None
         Image window in pixels; None is the whole image.
     """

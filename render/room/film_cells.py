@@ -35,7 +35,6 @@ class Cells:
 
     Attributes
     ----------
-    grid : FilmGrid
     squares : uint32
         Numbers of whole pixels.
     mirrored : bool array

@@ -51,11 +51,6 @@ class LampOutlines:
 
     Of the map's second order the mean is taken into account; docs/model.md has what was measured of the rest. Cells in
     which the map bends too much are left to chance.
-
-    Parameters
-    ----------
-    look : Look
-    surfaces : Surfaces
     """
 
     def __init__(self, mi: ModuleType, look: Look, surfaces: Surfaces) -> None:

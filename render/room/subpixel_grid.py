@@ -45,7 +45,6 @@ class FilmGrid:
     ----------
     width_px, height_px : int
         Image size.
-    blur_sigma_px : float
     wanted : int
         Cells per pixel side; `cells` may be more, where the blur is narrower than a cell.
     """

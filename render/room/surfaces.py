@@ -86,7 +86,6 @@ class Surfaces:
         Mitsuba with its variant set.
     view : View
         The scene's origin is its sphere centre.
-    table : FaceTable
 
     Attributes
     ----------

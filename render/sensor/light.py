@@ -250,7 +250,6 @@ def moved_spot(
     ----------
     spot : spot layer
     velocity_px_per_s : 2 floats, (u, v)
-    exposure_s, readout_s : float
     height : int
         Rows of the image.
 

@@ -50,8 +50,6 @@ class TargetCode:
 
     Parameters
     ----------
-    name : str
-    code : BlinkCode
     phase_known : bool
         The code begins at `code.start_s`, as of a laser that the robot itself switches; otherwise at any time.
     """
@@ -141,7 +139,6 @@ def evidence(electrons: Array, sigma_e: Array, exposures: Sequence[Exposures], b
     electrons, sigma_e : shape (N,)
     exposures : sequence of Exposures
         For each phase that the code may have.
-    bits : str
     """
     best = Evidence(-math.inf)
     for phase, exposure in enumerate(exposures):
@@ -207,8 +204,6 @@ class Hold:
 
     Attributes
     ----------
-    target : str
-    track : SpotTrack
     locked, lost : int
         Frame of the lock, and of the loss; -1 where it is known to the end.
     log_odds : float
@@ -240,7 +235,6 @@ class TargetTracker:
     ----------
     rig : Rig
         Nominal.
-    card : SensorCard
     times : FilmTimes
         When each row of each frame is exposed.
     codes : sequence of TargetCode

@@ -49,7 +49,6 @@ class RobotWay:
 
     Attributes
     ----------
-    vehicle : Vehicle
     tracks_m : array, shape (N, 2)
         Readings of both tracks since the start.
     flippers_rad : array, shape (N,)
@@ -111,7 +110,6 @@ class DrivingDepth:
     covariance_m2 : array, shape (3, 3)
     depth_m, sigma_m : arrays, shape (N,)
         D from where the robot stands in each frame, and its standard deviation.
-    slip, skid : float
     chi2 : float
         Of positions and priors together, with 2 n - 3 degrees of freedom of n frames with a position.
     uv_px : array, shape (N, 2)
@@ -304,7 +302,6 @@ def driving_film_depth(
 
     Parameters
     ----------
-    film, draw, camera_seed
     rig : Rig, optional
         Calibrated; the nominal one by default.
     covariance_rig : array, shape (p, p), optional

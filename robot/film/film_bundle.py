@@ -88,7 +88,6 @@ def film_depth(
     ----------
     rig : Rig
         Nominal, or calibrated.
-    positions : FilmPositions
     encoder_m : array, shape (N,)
         Reading of the carriage at the time at which the spot's row was exposed.
     encoder_sigma_m : float, or array of shape (N,)

@@ -58,13 +58,10 @@ class FilmFrames:
     ----------
     rig : Rig
         Nominal, or calibrated.
-    card : SensorCard
-    times : FilmTimes
     carriage : Carriage
         As it was told to go.
     encoder_m : array, shape (frames,)
         Readings at the frames' times.
-    encoder_sigma_m : float
     on, off : arrays of int, shape (N,) and (M,)
         Numbers of the frames.
     on_e, off_e : arrays, shape (N, h, w) and (M, h, w)
@@ -75,7 +72,6 @@ class FilmFrames:
         Places within `reach_px` of the spots.
     stroke_scale : float
         Of a calibrated stroke, over the nominal one.
-    reach_px : int
     """
 
     rig: Rig
@@ -159,7 +155,6 @@ def film_frames(
 
     Parameters
     ----------
-    film, draw, camera_seed, preset
     frames : array of int, optional
         Frames to take; all by default.
     rig : Rig, optional

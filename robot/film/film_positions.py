@@ -140,10 +140,8 @@ def fit_positions(frames: FilmFrames, blur: SpotBlur, room: RoomWeights) -> Film
 
     Parameters
     ----------
-    frames : FilmFrames
     blur : SpotBlur
         Of one spot, or of each.
-    room : RoomWeights
     """
     windows = _windows(frames, _most_outstanding(frames, room) + frames.origin_px, room)
     model = _model(frames, windows)

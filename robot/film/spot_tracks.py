@@ -86,7 +86,6 @@ class FrameSearch:
     ----------
     rig : Rig
         Nominal: its mirror's outline and its blur.
-    card : SensorCard
     box : Box, optional
         Part of the image to search, which begins at an even row and column; all that holds the mirror by default.
 
@@ -225,7 +224,6 @@ class SpotTrack:
 
     Attributes
     ----------
-    number, first : int
     uv_px : list of (u, v)
         Place by the filter: after the spot, where one was detected, otherwise as predicted.
     electrons, sigma_e : list of float
@@ -296,7 +294,6 @@ class SpotTracker:
 
     Parameters
     ----------
-    search : FrameSearch
     patience : int
         Frames without a spot after which a track ends.
     tentative : int

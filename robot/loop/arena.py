@@ -130,7 +130,6 @@ class Arena:
 
     Parameters
     ----------
-    name : str
     sight : Boxes
         What stands in lines of sight.
     floor : Boxes

@@ -98,8 +98,6 @@ class Belief(abc.ABC):
     ----------
     rig : Rig
         The nominal one.
-    vehicle : Vehicle
-    prior : TargetPrior
     """
 
     def __init__(self, rig: Rig, vehicle: Vehicle, prior: TargetPrior) -> None:
@@ -232,11 +230,8 @@ class TargetBelief(Belief):
     ----------
     rig : Rig
         The nominal one.
-    vehicle : Vehicle
     first : Direction
         Of the target, seen with the mirror raised by `stroke_m` and the robot level.
-    stroke_m : float
-    prior : TargetPrior
 
     Raises
     ------

@@ -138,13 +138,10 @@ class Episode:
 
     Attributes
     ----------
-    number : int
     outcome : str
         Of `simulator`, or `LOST` where the policy failed.
     cause : str
         One sentence for an episode that was not reached; empty for one that was.
-    time_s, driven_m : float
-    strokes : int
     shortest_m : float
         Straight way from the start to the stand-off distance.
     distance_m, stated_m, sigma_m : float
@@ -153,7 +150,6 @@ class Episode:
         Time of the first lock; NaN without one.
     pull : float
         Error of the inverse distance over its standard deviation, at the end; NaN without a belief.
-    nees : float
     refused : str
         First command that was refused, in one sentence; empty where none was.
     """
@@ -243,9 +239,6 @@ def episodes_of(setup: Setup, policy: str, count: int, *stream: Name) -> Iterato
 
     Parameters
     ----------
-    setup : Setup
-    policy : str
-    count : int
     *stream : names
 
     Raises
@@ -304,7 +297,6 @@ def run_foreign(
     Parameters
     ----------
     setup, count, *stream : as for `episodes_of`
-    file : PolicyFile
     limits : RunLimits, optional
         `seconds` are those of one answer.
     hidden : sequence of Path

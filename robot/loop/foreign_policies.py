@@ -37,13 +37,7 @@ _MESSAGE_LENGTH = 200  # of a policy's fault: two lines
 
 @dataclass(frozen=True)
 class PolicyFile:
-    """Function of a Python file that makes a policy of what is known.
-
-    Parameters
-    ----------
-    path : Path
-    name : str
-    """
+    """Function of a Python file that makes a policy of what is known."""
 
     path: Path
     name: str
@@ -108,8 +102,6 @@ class PolicyProcess:
 
     Parameters
     ----------
-    file : PolicyFile
-    known : Known
     limits : RunLimits
         `seconds` are those of one answer.
     hidden : sequence of Path

@@ -113,7 +113,6 @@ class TrackSteps:
 
     Attributes
     ----------
-    vehicle : Vehicle
     tracks_m : shape (S, 2)
         As the encoders count them.
     noise : shape (S, 2, 2)

@@ -86,12 +86,7 @@ class Identifier:
 
 
 class SearchingPolicy(abc.ABC):
-    """Identification, tracking and servoing; what follows the first lock is `plan`, a generator of actions.
-
-    Parameters
-    ----------
-    known : Known
-    """
+    """Identification, tracking and servoing; what follows the first lock is `plan`, a generator of actions."""
 
     def __init__(self, known: Known) -> None:
         self.known = known
@@ -349,7 +344,6 @@ class RandomPolicy:
 
     Parameters
     ----------
-    known : Known
     rng : Generator
     """
 
@@ -367,13 +361,7 @@ class RandomPolicy:
 
 
 class Oracle:
-    """Knows the truth: no time goes into finding out, so that no policy can be much quicker.
-
-    Parameters
-    ----------
-    known : Known
-    simulator : Simulator
-    """
+    """Knows the truth: no time goes into finding out, so that no policy can be much quicker."""
 
     def __init__(self, known: Known, simulator: Simulator) -> None:
         self.known, self.simulator = known, simulator

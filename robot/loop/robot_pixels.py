@@ -79,8 +79,6 @@ class RobotCamera:
     ----------
     rig : Rig
         The true one.
-    preset : str
-    laser : Laser
     fidelity : "windows" or "frames"
     """
 
@@ -103,10 +101,8 @@ class RobotCamera:
 
         Parameters
         ----------
-        room : BakedRoom
         lights : sequence of (light, u_px, v_px)
             Those that nothing hides, world frame, and the pixels of their images.
-        placement, stroke_m
         exposure : int
             Index of `EXPOSURES_S`.
         rng : Generator
@@ -155,7 +151,6 @@ class SpotReader:
     ----------
     rig : Rig
         The nominal one.
-    preset : str
     fidelity : "windows" or "frames"
 
     Raises

@@ -164,7 +164,6 @@ class Sensing:
         lights : sequence of Light
         placement : (3, 3) and (3,)
             Rotation and origin of the rig's frame in the world, `vehicle.rig_placement`.
-        stroke_m : float
         exposure : int
             Index of `EXPOSURES_S`.
         arena : Arena or None

@@ -374,7 +374,6 @@ def film_beliefs(
         or of `film.spot_tracks.fitted_positions`; frames without one are left out.
     times_s, strokes_m : shape (N,)
         Time at which the spot's row was exposed, and the encoder's reading then.
-    prior : TargetPrior
     encoder_sigma_m : float
         Standard deviation of a reading: the rise is k - h q, and errs by as much as q times that.
     rig_covariance : shape (p, p), or None

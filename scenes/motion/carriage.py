@@ -30,7 +30,6 @@ class Leg:
 
     Parameters
     ----------
-    start_s : float
     start_m, end_m : float
         Offsets along the stroke axis; equal for a pause.
     speed_m_per_s, acceleration_m_per_s2 : float

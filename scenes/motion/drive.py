@@ -37,7 +37,6 @@ class DriveLeg:
 
     Parameters
     ----------
-    start_s : float
     length_m, turn_rad : float
         Of the arc of the base; ahead and to the left count.
     flipper_rad : float or None

@@ -90,11 +90,8 @@ class FilmLight:
 
     Parameters
     ----------
-    name : str
     spot : LaserSpot
         At the start of its path; a disc.
-    path : SpotPath
-    code : BlinkCode
     colour : 3 floats or None
         Electrons behind R, G, B over those of the laser behind red; None is the laser's own colour.
     follows_laser : bool
@@ -118,14 +115,9 @@ class FilmScene:
 
     Parameters
     ----------
-    rig : Rig
     spot : LaserSpot
         At the start of its path.
-    times : FilmTimes
-    carriage : Carriage
     vibrations : tuple of Vibration
-    path : SpotPath
-    code : BlinkCode
     lights : tuple of FilmLight
         Other lights.
     drive : Drive or None

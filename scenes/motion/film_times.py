@@ -21,12 +21,10 @@ class FilmTimes:
 
     Parameters
     ----------
-    frames : int
     rate_hz : float
         Frames per second.
     exposure_s, readout_s : float
         Of each row; from the first row's to the last row's. 0 is a global shutter.
-    height_px : int
     first_s : float
         Middle of the exposure of the image's centre, of frame 0.
     """

@@ -127,7 +127,6 @@ class Footprint:
     ----------
     x, y : float
         Centre, metres.
-    yaw_rad : float
     half_m : 2 floats
     z : 2 floats
         Lowest and highest.

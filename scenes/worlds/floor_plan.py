@@ -31,7 +31,6 @@ class Wall:
 
     Parameters
     ----------
-    name : str
     start, end : 2 floats
     """
 
@@ -71,12 +70,10 @@ class FloorPlan:
 
     Parameters
     ----------
-    length_m, width_m, height_m : float
     cut_m : 2 floats
         Size of the corner that is missing; (0, 0) for a plain rectangle.
     robot : 2 floats
         Place on the plan.
-    heading_rad : float
     """
 
     length_m: float

@@ -50,7 +50,6 @@ class Material:
         None: one albedo everywhere.
     shape : 2 ints
         Rows and columns of the bitmap.
-    texel_m : float
     second : 2 floats
         Range of the second colour's brightness relative to the first.
     third : 2 floats

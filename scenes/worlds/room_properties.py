@@ -32,7 +32,6 @@ class Property:
         As in a recipe; ends in the unit.
     low, high : float
         Allowed range; both 0 for names.
-    meaning : str
     default : mapping
         Distribution, worded as in a recipe: ``{"uniform": (low, high)}``, ``"log_uniform"`` or ``"choice"``.
     whole : bool

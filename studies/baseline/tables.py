@@ -69,7 +69,6 @@ def fit_power_law(y: Array, bases: Array, random: np.random.Generator, resamples
     y : shape (n,), above 0; other values are left out
     bases : shape (k, n), above 0
     random : Generator
-    resamples : int
     """
     good = np.isfinite(y) & (y > 0.0)
     logs = [np.log(x[good]) for x in (*bases, y)]
@@ -105,7 +104,6 @@ class Curve:
 
     Attributes
     ----------
-    experiment : str
     signs : int
         Changes of sign along h.
     rms_m, inverse_m, line_m, offset_m : float
@@ -229,7 +227,6 @@ class FoundSpots:
 
     Attributes
     ----------
-    sample_id : str
     uv_px : dict of method to array, shape (draws, 2, 2)
         Pixels by draw and position (down, up); NaN where a method has none.
     bounds_px2 : shape (2, 2, 2)
@@ -248,8 +245,6 @@ def found_spots(
 
     Parameters
     ----------
-    dataset : Dataset
-    preset : str
     draws : dict of method to int
         How many draws of the noise each method reads; draw k is the same frame for all.
     workers : int, optional
@@ -302,8 +297,6 @@ class Experiment:
 
     Attributes
     ----------
-    sample_id : str
-    published : Published
     point_m : shape (3,), world point of the spot
     true_px : shape (2, 2), exact pixels, down and up
     """

@@ -131,9 +131,7 @@ class DepthModel:
 
     Parameters
     ----------
-    explanation : Explanation
     priors : Prior by parameter
-    experiments : Experiments
     rig : Rig
         Focal length and mirror that the paper's user takes as nominal.
     depth_sigma_m : float

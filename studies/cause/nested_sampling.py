@@ -82,7 +82,6 @@ def sample(model: DepthModel, live_points: int, stop: float, *names: Name) -> Po
     Parameters
     ----------
     model : Model
-    live_points : int
     stop : float
         Remaining log evidence at which it ends.
     *names
@@ -219,8 +218,6 @@ class Run:
     key : tuple
         What it is for; also the names of its random stream.
     model : Model
-    live_points : int
-    stop : float
     """
 
     key: tuple[Name, ...]

@@ -130,8 +130,6 @@ def read(parameters: Parameters, experiments: Experiments, reader: Reader, rig: 
     parameters : by name, each a scalar or shape (m, 1) for m rigs
         Of the true rig: `z_c_m`, `height_1_m` to `height_4_m` (spot above the sphere centre, down, by table), and what
         `PARAMETERS` and `AZIMUTHS` list, 0 where missing.
-    experiments : Experiments
-    reader : Reader
     rig : Rig
         Focal length and radius that the reader takes as nominal.
 

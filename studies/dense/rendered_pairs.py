@@ -76,7 +76,6 @@ class FreeFloor:
         Rays from the mirror, from the sphere's centre.
     centre_m : float
         Height of that centre above the floor.
-    near : Near
     true_m : array
         True radius of the free floor in each sector; NaN where no ray tells.
     """
@@ -125,7 +124,6 @@ class BoundAtStroke:
 
     Attributes
     ----------
-    stroke_m : float
     twice : float
         Share of the room's pixels that both images show.
     median, p90 : float

@@ -58,10 +58,8 @@ class BaselinePair:
 
     Parameters
     ----------
-    name : str
     rig : Rig
         What the estimator knows; its stroke axis is the direction of the baseline.
-    baseline_m : float
     point_m : shape (3,)
     lights : of the first and the second image
     uv_px : shape (2, 2), true pixels
@@ -180,14 +178,11 @@ class AzimuthNoise:
 
     Attributes
     ----------
-    azimuth_deg, depth_m : float
-    bound_m : float
     scatter_m : Estimate
         Standard deviation about the mean, with its interval over draws.
     bias_m, bias_sigma_m : float
         Mean error and its standard error.
     errors_m : shape (draws,), those that were found
-    missing : int
     """
 
     azimuth_deg: float

@@ -124,7 +124,6 @@ class Gain:
 
     Attributes
     ----------
-    depth_m, apart_m : float
     scatter_m, scatter_px : float
         Standard deviations of D, and of the fitted pixels, all four coordinates together, over places in a mosaic cell.
     draws : int

@@ -66,12 +66,10 @@ def epipolar_line(
     ----------
     nominal : Rig
         Nominal: centre of the mirror's image, and the panorama.
-    true : Rig
     stroke_m : float, true
     down_point_m : shape (3,)
     depths_m : shape (n,), of the points on the ray
     grid : Grid
-    render : bool
     """
     down, up = true.at(0.0), true.at(stroke_m)
     down_px = seen_px(down, down_point_m)

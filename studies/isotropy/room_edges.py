@@ -37,9 +37,6 @@ class SeenEdge:
 
     Attributes
     ----------
-    name : str
-    azimuth_deg : float
-    rows : int
     lean_px, lean_sigma_px : float
         Columns by which the line through the measured places moves from its lowest to its highest row, to the left
         positive (towards larger azimuths), and the standard error from the scatter about the line.
@@ -95,7 +92,6 @@ def seen_edge(panorama: Array, grid: PanoramaGrid, name: str, expected_px: Array
     ----------
     panorama : shape (H, W), linear in the light
     grid : Grid
-    name : str
     expected_px : shape (n, 2), see `track`
     """
     (bottom, top), trim = expected_px[[0, -1], 1], _TRIMMED * float(expected_px[0, 1] - expected_px[-1, 1])

@@ -114,9 +114,7 @@ def disc_shares(rig: Rig, rays: Meridian, offset_m: float, azimuths_rad: Array) 
 
     Parameters
     ----------
-    rig : Rig
     rays : its meridian
-    offset_m : float
     azimuths_rad : shape (a,), even steps over the half circle or the circle; first and last count half
     """
     hidden = np.stack([_robot_seen(rig, rays, offset_m, float(a)) for a in azimuths_rad])

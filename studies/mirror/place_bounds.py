@@ -45,7 +45,6 @@ class BlurBounds:
     blurs_px : tuple of float
         Sigma of round spots, rising.
     bounds : tuple of SpotSigma, one per blur
-    exposure_s : float
     """
 
     blurs_px: tuple[float, ...]

@@ -135,13 +135,10 @@ class Compared:
 
     Attributes
     ----------
-    rays : Meridian
     field_deg : (least, largest) theta, up to the margin inside the outline
     rim_deg : largest theta, at the outline
     outline_px : radius of the mirror's image
     spread_m : of the viewpoints
-    down, up : DiscShares
-    places : PlaceMap
     floor_m : least distance from which on the floor is measured: before, beside and behind the robot
     bounds : by preset, height and distance
     costs : by distance and kind of deviation, relative error of D at the usual size; infinite where the pair is lost
@@ -293,7 +290,6 @@ class Criterion:
 
     Attributes
     ----------
-    label, unit : str
     value : callable
         Of a mirror; NaN where it has none.
     small : bool

@@ -22,7 +22,6 @@ def measured(rig: Rig, points_m: Array, stroke_m: float, edge_px: float, azimuth
     ----------
     rig : Rig, aligned
     points_m : shape (n, 3), in the upright plane through world x
-    stroke_m : float
     edge_px : float
         Least distance from the outline of the mirror and from the edge of the image.
     azimuths_rad : shape (a,)

@@ -33,7 +33,6 @@ class Refocus:
 
     Attributes
     ----------
-    focus_m, focal_px : float
     relative : float
         Focal length over the old one, less 1: the misalignment `focal_relative`.
     errors : dict

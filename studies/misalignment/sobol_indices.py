@@ -36,7 +36,6 @@ class Interactions:
     Attributes
     ----------
     output : "error" or "square"
-    depth_m : float
     parameters : tuple of str
     indices, low, high : shape (2 p + 2,)
         First-order ones, total ones, the sum of the first-order ones, and the rms relative error over the draws, with
@@ -93,7 +92,6 @@ def interactions(
     ----------
     nominal, places
         The first azimuth is the one of the signed error.
-    estimator : str
     n : int
         Base sample, a power of two; n (parameters + 2) rigs are computed.
     resamples : int

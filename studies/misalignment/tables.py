@@ -64,7 +64,6 @@ def tolerance_rows(
 
     Parameters
     ----------
-    nominal, places, calibrate
     search : for the estimators with the nominal rig
     coarse : for the calibrated one, which takes a second a value
     parameters : names

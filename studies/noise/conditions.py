@@ -142,9 +142,6 @@ class Cell:
     ----------
     folder : Path of the data set
     sample : id of the base case
-    preset, factor : str
-    level : float
-    places, draws : int
     methods : names
     box_px : side of the boxes
     """

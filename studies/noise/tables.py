@@ -43,9 +43,7 @@ class Elasticity:
 
     Attributes
     ----------
-    sample, preset, factor, method : str
     low, high : levels
-    estimate : Estimate
     bound : the same of the bound, which has no noise
     """
 

@@ -45,8 +45,6 @@ def spot_bounds(
 
     Parameters
     ----------
-    dataset : Dataset
-    preset : str
     samples : of the data set; all by default
     laser_level : float
         Factor of the laser's light.

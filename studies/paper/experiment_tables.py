@@ -116,8 +116,6 @@ def run_experiments(
 
     Parameters
     ----------
-    dataset : Dataset
-    procedure : Procedure
     rigs : ids of true rigs; all of the data set by default
     told : called with the id of each rig when it is done
 

@@ -171,7 +171,6 @@ class Bursts:
     seen_px : array, shape (2, 2)
         The same; of a spot that was seen and gave no fit, where it was seen.
     offsets_m : array, shape (2,)
-    frames : int
     """
 
     depth: FilmDepth | None

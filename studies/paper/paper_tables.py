@@ -38,7 +38,6 @@ class Score:
 
     Parameters
     ----------
-    sample_id, experiment : str
     depth_m, stroke_m : float, truth
     estimator : key of `ESTIMATORS`
     source : "truth" or "frame", where the pixels come from
@@ -107,7 +106,6 @@ def score(dataset: Dataset, calibration: Calibration | None = None) -> tuple[Sco
 
     Parameters
     ----------
-    dataset : Dataset
     calibration : Calibration, optional
         Every estimator gets its rig and its strokes, and `GENERAL` its covariance, too.
 

@@ -53,7 +53,6 @@ class Loss:
 
     Attributes
     ----------
-    stroke_m : float
     sigma_m : float
         NaN where the stroke cannot be taken.
     times : float

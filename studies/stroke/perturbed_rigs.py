@@ -42,16 +42,11 @@ class RenderedCheck:
 
     Attributes
     ----------
-    tolerance : str
     depth_m, stroke_m, factor : float
         The stroke is `factor` times the best.
     predicted_m : float
         Standard deviation of D.
     covariance : shape (p, p), of the rig's parameters; rows
-    height_m : float
-    preset : str
-    power_mw : float
-    draws : int
     """
 
     tolerance: str
