@@ -21,7 +21,9 @@ _BLOCKS = 8  # along each side; sigma of sigma is 1 / sqrt(2 x 63) = 9 %
 _BOX = 5  # pixels of one filter
 _FULL_SHARE = 1e-3  # of values at the last code, from which on they take 0.1 % of the noise
 _PART, _BRIGHTER, _FALLEN = 8, 1.1, 0.8  # blocks, their signal over the median ones', and the noise of full ones
+_DEFECT_SPREADS, _LEAST_SPREAD_DN = 7.0, 0.1  # a Gaussian pixel is so far off once in 4e11
 _ROW_SIGMAS = 4.0  # below it row noise is not told from none, and is left out
+_DRIFT_FRAMES, _DRIFT_SHARE = 6, 0.75  # of the frames' variance by a line: jitter of 6 frames has it once in 40
 _FRAME_SIGMAS = 8.0  # chi-square with 1 degree of freedom exceeds 1 + 8 sqrt 2 once in 2e3, with 15 once in 1e6
 
 
@@ -116,8 +118,8 @@ class BlockSums:
         return spread**2 - counted, 0.3 * counted  # of a median absolute deviation of 64: 13 % of sigma
 
 
-def block_sums(frames: NDArray[Any], top_dn: int) -> BlockSums:
-    """Sums of one filter's pixels, shape (n, h, w), n >= 2."""
+def block_sums(frames: NDArray[Any], top_dn: int, defects: NDArray[np.bool_] | None = None) -> BlockSums:
+    """Sums of one filter's pixels, shape (n, h, w), n >= 2, without `defects`, shape (h, w), and this level's own."""
     n = len(frames)
     # flicker of the lamp moves all pixels of a frame
     levels = np.array([float(frame.mean()) for frame in frames])
@@ -128,19 +130,48 @@ def block_sums(frames: NDArray[Any], top_dn: int) -> BlockSums:
         square += change * change
     pixel_mean = total / n + levels.mean()
     temporal = (square - total * total / n) / (n - 1)
+    own, mended = outliers(pixel_mean, float(np.median(temporal)) / n)
+    kept = ~own if defects is None else ~(own | defects)
+    pixel_mean = np.where(own, mended, pixel_mean)
     shade = uniform_filter(pixel_mean, _BOX, mode="reflect")
     rough = pixel_mean - shade
     half = _BOX // 2
     inner = (slice(half, -half),) * 2
     rough -= rough[inner].mean()  # shading that bends as much everywhere is no pattern
-    spatial = rough[inner] ** 2 / (1.0 - 1.0 / _BOX**2)
-    pixels, mean, noise = (_by_blocks(x[inner]) for x in (np.ones_like(pixel_mean), pixel_mean, temporal))
-    full = sum(int((frame >= top_dn).sum()) for frame in frames) / frames.size
-    lowest = int(frames.min())
-    at_lowest = int((frames == lowest).sum()) / frames.size
+    spatial = rough[inner] ** 2 / (1.0 - 1.0 / _BOX**2) * kept[inner]
+    pixels, mean, noise = (_by_blocks((x * kept)[inner]) for x in (np.ones_like(pixel_mean), pixel_mean, temporal))
+    values = max(int(kept.sum()) * n, 1)
+    full = sum(int((frame[kept] >= top_dn).sum()) for frame in frames) / values
+    lowest = int(frames.min(axis=0)[kept].min(initial=top_dn))
+    at_lowest = sum(int((frame[kept] == lowest).sum()) for frame in frames) / values
     flicker = float(levels.var(ddof=1)) / n
-    squares = _by_blocks(spatial), _by_blocks(shade[inner] ** 2)
+    squares = _by_blocks(spatial), _by_blocks((shade**2 * kept)[inner])
     return BlockSums(pixels, mean, noise, *squares, n, full, lowest, at_lowest, flicker)
+
+
+def outliers(pixel_mean: Array, noise_dn2: float) -> tuple[NDArray[np.bool_], Array]:
+    """Hot and dead pixels, and the image with the median of their neighbours in their place.
+
+    Parameters
+    ----------
+    pixel_mean : array, shape (h, w)
+        Means of one filter's pixels.
+    noise_dn2 : float
+        Variance of a mean by temporal noise.
+    """
+    rough = pixel_mean - uniform_filter(pixel_mean, _BOX, mode="reflect")
+    spread = 1.4826 * float(np.median(np.abs(rough - np.median(rough))))
+    least = max(spread, float(np.sqrt(noise_dn2)), _LEAST_SPREAD_DN)
+    found, mended = np.zeros(pixel_mean.shape, bool), pixel_mean.copy()
+    rows, columns = np.nonzero(np.abs(rough) > _DEFECT_SPREADS / 2 * least)
+    reach = np.arange(-(_BOX // 2), _BOX // 2 + 1)
+    for at in np.array_split(np.arange(len(rows)), len(rows) // 100_000 + 1):
+        v = np.clip(rows[at, None, None] + reach[:, None], 0, pixel_mean.shape[0] - 1)
+        u = np.clip(columns[at, None, None] + reach, 0, pixel_mean.shape[1] - 1)
+        usual = np.median(pixel_mean[v, u].reshape(len(at), _BOX**2), axis=1)
+        bad = np.abs(pixel_mean[rows[at], columns[at]] - usual) > _DEFECT_SPREADS * least
+        found[rows[at][bad], columns[at][bad]], mended[rows[at][bad], columns[at][bad]] = True, usual[bad]
+    return found, mended
 
 
 def _by_blocks(values: Array) -> Array:
@@ -158,25 +189,35 @@ def jackknife_sigma(replicates: Array) -> float:
 
 @dataclass(frozen=True)
 class CommonNoise:
-    """Noise that rows or whole frames of dark frames have in common.
+    """Noise that rows, columns or whole frames of dark frames have in common.
 
     Attributes
     ----------
     row_dn2, row_sigma_dn2 : variance of row noise, with its sigma
+    column_dn2, column_sigma_dn2 : the same of columns that jump from frame to frame
     frame_dn2, frame_sigma_dn2 : variance of whole frames' levels, with its sigma if nothing moved them
+    drift_dn : half of what their level moves in one direction, from the first to the last frame; 0 where it jitters
     rows : number of rows
     """
 
     row_dn2: float
     row_sigma_dn2: float
+    column_dn2: float
+    column_sigma_dn2: float
     frame_dn2: float
     frame_sigma_dn2: float
+    drift_dn: float
     rows: int
 
     @property
     def seen_row_dn2(self) -> float:
         """Variance of row noise, or 0 where it does not stand out."""
         return self.row_dn2 if self.row_dn2 > _ROW_SIGMAS * self.row_sigma_dn2 else 0.0
+
+    @property
+    def seen_column_dn2(self) -> float:
+        """Variance of column noise, or 0 where it does not stand out."""
+        return self.column_dn2 if self.column_dn2 > _ROW_SIGMAS * self.column_sigma_dn2 else 0.0
 
     @property
     def seen_frame_dn2(self) -> float:
@@ -195,21 +236,28 @@ def common_noise(frames: NDArray[Any]) -> CommonNoise:
     mean = np.zeros((h, w))
     for frame in frames:
         mean += frame / n
-    rows = square = 0.0
+    rows = columns = square = 0.0
     for frame in frames:
         change = frame - mean
         change -= change.mean()
         rows += float((change.mean(axis=1) ** 2).mean()) / n
+        columns += float((change.mean(axis=0) ** 2).mean()) / n
         square += float((change * change).mean()) / n
-    freedom = n / (n - 1) * h / (h - 1)
-    rows, white = rows * freedom, square * freedom / w
-    levels = float(np.var([float(frame.mean()) for frame in frames], ddof=1))
-    own = rows / h  # of a frame's mean, where nothing moves whole frames
+    own = rows * n / (n - 1) / (h - 1)  # of a frame's mean, where nothing moves whole frames
+    rows, columns, square = rows * n / (n - 1) * h / (h - 1), columns * n / (n - 1) * w / (w - 1), square * n / (n - 1)
+    levels = np.array([float(frame.mean()) for frame in frames])
+    frame_dn2, own_sigma = float(levels.var(ddof=1)) - own, own * float(np.sqrt(2.0 / (n - 1)))
+    at = np.arange(n) - (n - 1) / 2.0
+    slope = float(at @ levels) / float(at @ at)
+    steady = n >= _DRIFT_FRAMES and (slope * at).var() > _DRIFT_SHARE * levels.var()
     return CommonNoise(
-        rows - white,
+        rows - square / w * h / (h - 1),
         rows * float(np.sqrt(2.0 / ((n - 1) * (h - 1)))),
-        levels - own,
-        own * float(np.sqrt(2.0 / (n - 1))),
+        columns - square / h * w / (w - 1),
+        columns * float(np.sqrt(2.0 / ((n - 1) * (w - 1)))),
+        frame_dn2,
+        own_sigma,
+        abs(slope) * (n - 1) / 2.0 if steady and frame_dn2 > _FRAME_SIGMAS * own_sigma else 0.0,
         h,
     )
 

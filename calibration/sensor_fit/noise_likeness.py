@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.fft import dctn
 
 from phibench.scenes.frames import Array
 
@@ -28,6 +29,9 @@ _LEAST = 0.01  # of a likeness, 2 % of the gain
 _BESIDE, _BESIDE_SIGMAS = 0.004, 5.0  # of the mean of both sides, 1.6 % of the gain
 MOST = 0.2  # from which on frames are no raw ones
 _BROAD = 0.5  # of the largest likeness: what reaches so far is light
+_JPEG_PX, _JPEG_FRAMES, _JPEG_STEPS = 256, 4, range(1, 13)
+_JPEG_SIGMAS, _JPEG_TERMS = 9.0, 3  # of one of 63 terms; so many of them
+_STEP_NOISE = 0.67  # noise over step, from which on 2e-4 of a step is left in the mean cosine
 _UNEVEN = 0.05  # rms of noise over signal, from block to block
 _BANDS = 0.05  # of the noise
 
@@ -44,6 +48,7 @@ class NoiseLikeness:
     after, after_sigma : correlation of a pixel's noise in one frame and the next
     bands_dn2, bands_sigma_dn2 : variance that whole rows have in common
     noise_dn2 : variance of the noise
+    jpeg : terms of the cosine transform of 8 x 8 pixels lie on steps, as JPEG leaves them
     """
 
     near: Array
@@ -54,6 +59,7 @@ class NoiseLikeness:
     bands_dn2: float
     bands_sigma_dn2: float
     noise_dn2: float
+    jpeg: bool
 
 
 def noise_likeness(frames: NDArray[Any], filters: int) -> NoiseLikeness:
@@ -83,7 +89,8 @@ def noise_likeness(frames: NDArray[Any], filters: int) -> NoiseLikeness:
     near = np.array([_product(z, *lag) - way for lag, way in zip(_NEAR, ways, strict=True)])
     sigma = ((n - 1) * h * w) ** -0.5
     after = float(np.mean(z[1:] * z[:-1])) + 1.0 / (n - 1)  # about their own mean, white frames have -1 / (n - 1)
-    return NoiseLikeness(near, 2.0**0.5 * sigma, max(far.values()), after, sigma, bands, bands_sigma, noise_dn2)
+    near_sigma, jpeg = 2.0**0.5 * sigma, lies_on_jpeg_steps(frames)
+    return NoiseLikeness(near, near_sigma, max(far.values()), after, sigma, bands, bands_sigma, noise_dn2, jpeg)
 
 
 @dataclass(frozen=True)
@@ -155,6 +162,26 @@ def raw_noise(levels: Sequence[NoiseLikeness], uneven: Sequence[tuple[float, flo
     if max(one.far for one in levels) > _BROAD * most > _BROAD * MOST:
         said = ["light moves over the picture from frame to frame: fix lamp, camera and surface"]
     return RawNoise(float(np.hypot.reduce(doubts)) if doubts else 0.0, "; ".join(said), most > MOST)
+
+
+def lies_on_jpeg_steps(frames: NDArray[Any]) -> bool:
+    """Tell whether frames, shape (n, h, w), passed through a JPEG whose blocks begin at their corner.
+
+    A term on multiples of q, rounded to codes behind it, has the mean cosine exp(-pi^2 / 6 q^2) of its angle 2 pi / q;
+    a raw one has none.
+    """
+    v, u = (max((size - _JPEG_PX) // 16 * 8, 0) for size in frames.shape[1:])
+    x = frames[:_JPEG_FRAMES, v : v + _JPEG_PX, u : u + _JPEG_PX].astype(float)
+    n, h, w = len(x), x.shape[1] // 8, x.shape[2] // 8
+    blocks = x[:, : 8 * h, : 8 * w].reshape(n, h, 8, w, 8).swapaxes(2, 3).reshape(n, h * w, 8, 8)
+    terms = dctn(blocks, axes=(2, 3), norm="ortho").reshape(n, h * w, 64)[..., 1:]
+    noise = np.sqrt(terms.var(axis=0, ddof=1).mean(axis=0))
+    for step in _JPEG_STEPS:
+        free = noise > _STEP_NOISE * step
+        sigmas = np.cos(2.0 * np.pi / step * terms[..., free]).mean(axis=(0, 1)) * np.sqrt(2.0 * n * h * w)
+        if (sigmas > _JPEG_SIGMAS).sum() >= _JPEG_TERMS or sigmas.sum() > _JPEG_SIGMAS * np.sqrt(max(free.sum(), 1)):
+            return True
+    return False
 
 
 def _product(z: Array, rows: int, columns: int) -> float:

@@ -16,6 +16,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from phibench.calibration.sensor_fit.block_sums import (
@@ -25,8 +26,18 @@ from phibench.calibration.sensor_fit.block_sums import (
     block_sums,
     common_noise,
     jackknife_sigma,
+    outliers,
 )
 from phibench.calibration.sensor_fit.capture_folder import Capture, CaptureError, FrameGroup, of_filters, raw_frames
+from phibench.calibration.sensor_fit.code_widths import CodeWidths
+from phibench.calibration.sensor_fit.dark_frames import (
+    DarkImage,
+    LitPattern,
+    dark_image,
+    light_by_noise,
+    light_by_pattern,
+    pattern,
+)
 from phibench.calibration.sensor_fit.noise_likeness import NoiseLikeness, noise_likeness, raw_noise
 from phibench.calibration.sensor_fit.response_fit import (
     LightLevel,
@@ -47,6 +58,8 @@ _ROUNDING_DN = 12.0**-0.5  # of a level that rounding hides
 _CUT = 1e-3  # of dark values at the converter's lower end: below, their variance lacks less than 1 %
 _DARKER, _DARKER_DN = 0.005, 1.0  # of the range: dark levels move by less
 _FAINT = 0.02  # of the range: below, a level's noise over its signal says nothing
+_LAW = 0.5  # of what rounding moves the mean of a Gaussian noise
+_STRONG = 0.2  # change of the response's slope that polynomials of three terms still follow
 _BY_GAIN = ("gain_dn_per_e", "dark_e_per_s", "read_noise_e", "row_noise_e", "dsnu_e", "full_well_e")
 
 
@@ -93,9 +106,11 @@ class _Level:
     name: str
     site: str
     sums: BlockSums
+    codes: Array  # shares
     light: tuple[float, str] | None = None  # photons or seconds
     seconds: float | None = None
     likeness: NoiseLikeness | None = None
+    image: Array | None = None  # of all filters
 
 
 def fit_transfer(capture: Capture) -> TransferFit:
@@ -110,57 +125,69 @@ def fit_transfer(capture: Capture) -> TransferFit:
         raise CaptureError(f"{capture.folder} has no dark frames: cap the lens and put 16 frames or more into dark/")
     if not capture.flats:
         raise CaptureError(f"{capture.folder} has no flat frames: put frames of an even surface into flat/LEVEL/")
-    top = (1 << capture.notes.bits) - 1
-    dark_frames = raw_frames(capture, capture.dark)
-    levels = [level for group in capture.flats for level in _levels(capture, group, top)]
-    exposures = [level for group in capture.exposures if len(group.files) > 1 for level in _levels(capture, group, top)]
-    timed = [
-        (float(group.seconds or 0.0), block_sums(raw_frames(capture, group), top).jackknife())
-        for group in capture.dark_exposures
-    ]
-    dark = block_sums(dark_frames, top).jackknife()
-    return _Fit(capture, dark, levels, exposures, timed, common_noise(dark_frames), top).result()
+    return _Fit(_Frames(capture)).result()
 
 
-def _levels(capture: Capture, group: FrameGroup, top: int) -> list[_Level]:
-    """One level for each filter."""
-    light = (group.photons, "photons") if group.photons is not None else None
-    if group.name.startswith("exposure/"):
-        light = (group.seconds or 0.0, "seconds")
-    frames = raw_frames(capture, group)
-    likeness = noise_likeness(frames, 1 if capture.kind == "mono-raw" else 2)
-    return [
-        _Level(group.name, site, block_sums(pixels, top).jackknife(), light, group.seconds, likeness)
-        for site, pixels in of_filters(frames, capture.kind)
-    ]
+class _Frames:
+    """What is summed up of the frames, read group by group."""
+
+    def __init__(self, capture: Capture) -> None:
+        assert capture.dark is not None
+        self.capture, self.top = capture, (1 << capture.notes.bits) - 1
+        self.filters = 1 if capture.kind == "mono-raw" else 2
+        self.widths = CodeWidths(self.top)
+        frames = raw_frames(capture, capture.dark)
+        self.dark_image, self.common = dark_image(frames), common_noise(frames)
+        self.defects = outliers(self.dark_image.mean, float(np.median(self.dark_image.variance)) / len(frames))[0]
+        self.dark = block_sums(frames, self.top, self.defects).jackknife()
+        self.dark_codes = self.widths.add(frames, float(self.dark.temporal_dn2[0]))
+        self.levels = [level for group in capture.flats for level in self._levels(group)]
+        exposures = [group for group in capture.exposures if len(group.files) > 1]
+        self.exposures = [level for group in exposures for level in self._levels(group)]
+        self.timed = [
+            (float(group.seconds or 0.0), block_sums(raw_frames(capture, group), self.top, self.defects).jackknife())
+            for group in capture.dark_exposures
+        ]
+
+    def _levels(self, group: FrameGroup) -> list[_Level]:
+        """One level for each filter."""
+        light = (group.photons, "photons") if group.photons is not None else None
+        if group.name.startswith("exposure/"):
+            light = (group.seconds or 0.0, "seconds")
+        frames = raw_frames(self.capture, group)
+        likeness, levels = noise_likeness(frames, self.filters), []
+        image = frames.mean(axis=0, dtype=np.float32)
+        defects = of_filters(self.defects[None], self.capture.kind)
+        for (site, pixels), (_, bad) in zip(of_filters(frames, self.capture.kind), defects, strict=True):
+            sums = block_sums(pixels, self.top, bad[0]).jackknife()
+            codes = self.widths.add(pixels, float(sums.temporal_dn2[0]))
+            levels.append(_Level(group.name, site, sums, codes, light, group.seconds, likeness, image))
+        return levels
 
 
 class _Fit:
     """One fit; arrays have one entry for the whole and one for each block left out."""
 
-    def __init__(
-        self,
-        capture: Capture,
-        dark: BlockSums,
-        levels: list[_Level],
-        exposures: list[_Level],
-        timed: list[tuple[float, BlockSums]],
-        common: CommonNoise,
-        top: int,
-    ) -> None:
-        self.notes, self.folder, self.top = capture.notes, capture.folder, top
-        self.dark, self.levels, self.exposures = dark, levels, exposures
-        self.timed, self.common = timed, common
-        moments = before_rounding(dark, common.seen_frame_dn2)
+    def __init__(self, seen: _Frames) -> None:
+        self.seen = seen
+        self.notes, self.folder, self.top = seen.capture.notes, seen.capture.folder, seen.top
+        self.dark, self.levels, self.exposures = seen.dark, seen.levels, seen.exposures
+        self.timed, self.common, self.widths = seen.timed, seen.common, seen.widths
+        moments = before_rounding(self.dark, self.common.seen_frame_dn2)
         self.black, self.dark_dn2, self.offset_dn2 = moments.T
         self.is_hidden = self._is_hidden()
+        # the law of a noise narrower than a code is not known to be Gauss's
+        self.black_doubt = _LAW * abs(float(self.black[0] - self.dark.mean_dn[0]))
         if self.is_hidden:  # one or two codes fit to any narrow noise
-            self.black, self.offset_dn2 = dark.mean_dn, np.zeros_like(self.black)
-            self.dark_dn2 = np.maximum(dark.temporal_dn2 - 1.0 / 12.0, 0.0)
+            self.black, self.offset_dn2 = self.dark.mean_dn, np.zeros_like(self.black)
+            self.dark_dn2 = np.maximum(self.dark.temporal_dn2 - 1.0 / 12.0, 0.0)
+        shift, self.dark_doubt_dn2 = self.widths.doubt(seen.dark_codes)
+        self.black_doubt = float(np.hypot.reduce([self.black_doubt, shift, seen.dark_image.lopsided_dn]))
         self.values: dict[str, Array] = {}
         self.extra: dict[str, float] = {}
         # relative standard deviations, beside that of the response: of the gain, and of it by the noise's likeness
         self.gain_doubt, self.noise_doubt = 0.0, 0.0
+        self.dark_light = self.bend_doubt = 0.0
         self.reasons: dict[str, str] = {}
         self.measured: dict[str, tuple[float | list[float], float | list[float], str]] = {}
         self.findings: dict[str, str] = {}
@@ -170,6 +197,7 @@ class _Fit:
         response = self._response(used)
         self._raw_noise(used)
         self.values["gain_dn_per_e"] = response.gain / self.notes.analogue_gain
+        self._light_in_the_dark(used, float(response.gain[0]))
         dark_dn_per_s = self._dark_current(response.gain)
         self._noise(response.gain, dark_dn_per_s / response.gain)
         self._prnu(used, response)
@@ -269,6 +297,7 @@ class _Fit:
                 float(level.sums.mean_dn[0]),
                 float(np.sqrt(max(level.sums.spatial_dn2[0], 0.0))),
                 float(level.sums.pixels[0] * (level.sums.frames - 1)),
+                self.widths.doubt(level.codes)[1],
             )
             for level in used
         ]
@@ -288,7 +317,11 @@ class _Fit:
         if no_dark and response.is_bent:  # a line through levels that bend has another intercept
             other = fit_response(levels, self.dark_dn2, self._range)
             unknown = float(np.hypot(unknown, other.gain[0] - response.gain[0]))
-        self.gain_doubt = unknown / float(response.gain[0])
+        # D moves the gain by its own error; strong bends are not those of polynomials of three terms
+        unknown = float(np.hypot(unknown, self.dark_doubt_dn2 * float(signal.sum() / np.sum(signal**2))))
+        bend = abs(float(response.slope(np.asarray(signal.max()))) - 1.0) * response.is_bent
+        self.bend_doubt = bend if self.seen.dark_image.lopsided_dn else max(bend - _STRONG, 0.0)
+        self.gain_doubt = float(np.hypot(unknown / float(response.gain[0]), self.bend_doubt))
         if (said := response.finding()) is not None:
             self.findings["photon_transfer"] = said
         if response.is_bent:
@@ -309,13 +342,58 @@ class _Fit:
         likeness = {one.name: one.likeness for one in used if one.likeness is not None and one.name not in partly}
         if not likeness:
             return
+        if any(one.jpeg for one in likeness.values()):
+            raise CaptureError(
+                f"{self.folder}: terms of 8 x 8 pixels lie on steps: the frames passed through a JPEG, which changes "
+                "noise and black; give raw frames as the converter wrote them"
+            )
         uneven = [level.sums.uneven(self.dark) for level in used]
         told = raw_noise(list(likeness.values()), uneven, self.common.seen_row_dn2)
         if told.not_raw:
             raise CaptureError(f"{self.folder}: {told.finding}; give raw frames as the converter wrote them")
         self.noise_doubt, self.gain_doubt = told.doubt, float(np.hypot(self.gain_doubt, told.doubt))
+        if told.doubt:
+            self.black_doubt = float(np.hypot(self.black_doubt, _ROUNDING_DN))  # of a program that rounds again
         if told.finding:
             self.findings["noise"] = f"{told.finding}; the sigma of the gain is widened by it"
+
+    def _light_in_the_dark(self, used: list[_Level], gain: float) -> None:
+        """Light, a drift or a curve in the dark frames, which the black level's sigma then holds."""
+        said, dark = [], self.seen.dark_image
+        lit = {level.name: level for level in used}
+        whole = [one for name, one in lit.items() if all(x in used for x in self.levels if x.name == name)]
+        light = light_by_noise(dark, gain)
+        if len(whole) > 1:
+            whole.sort(key=lambda one: float(self._signal(one)[0]))
+            bright, faint = self._lit_pattern(whole[-1].name), self._lit_pattern(whole[0].name)
+            light = max(light, light_by_pattern(dark, bright, faint, self.seen.filters))
+        if light:
+            said.append(f"dark frames hold light, {light:.2g} DN or more: cap the lens and darken the room")
+        if dark.lopsided_dn:
+            said.append(
+                f"the noise of dark frames is lopsided, its mean {dark.lopsided_dn:+.2g} DN off its median: a curve or "
+                "a cut about black, or few electrons of light"
+            )
+        if self.common.drift_dn:
+            said.append(f"the level of dark frames drifts by {2.0 * self.common.drift_dn:.2g} DN: warm the camera up")
+        self.dark_light = light
+        self.black_doubt = float(np.hypot.reduce([self.black_doubt, light, self.common.drift_dn]))
+        # slopes above and below black that differ by s move the mean by 0.4 s of the noise, and its variance by s of it
+        lopsided = 2.5 * abs(dark.lopsided_dn) * float(np.sqrt(max(self.dark_dn2[0], 0.0)))
+        uneven = self.widths.unevenness * max(float(self.dark_dn2[0]), 0.0)
+        self.dark_doubt_dn2 = float(np.hypot.reduce([self.dark_doubt_dn2, light * gain, lopsided, uneven]))
+        if (codes := self.widths.finding()) is not None:
+            self.findings["codes"] = codes
+        if said:
+            self.findings["dark"] = "; ".join(said)
+
+    def _lit_pattern(self, name: str) -> LitPattern:
+        levels = [level for level in self.levels if level.name == name]
+        image = levels[0].image
+        assert image is not None
+        noise = float(np.mean([level.sums.temporal_dn2[0] / level.sums.frames for level in levels]))
+        signal = float(np.mean([self._signal(level)[0] for level in levels]))
+        return LitPattern(pattern(image, self.seen.filters), signal, noise)
 
     def _no_growth(self) -> CaptureError:
         return CaptureError(
@@ -344,7 +422,7 @@ class _Fit:
         """Growth of the dark level, DN per second; 0 where no series tells."""
         at = self.notes.exposure_s
         self.values["black_level_dn"] = self.black
-        unknown = self._unknown_black()
+        unknown = float(np.hypot(self._unknown_black(), self.black_doubt))
         self.extra["black_level_dn"] = float(np.hypot(unknown, np.sqrt(self.common.level_dn2 / self.dark.frames)))
         times = [seconds for seconds, _ in self.timed] + ([at] if at is not None else [])
         if len(set(times)) < 2:
@@ -392,6 +470,10 @@ class _Fit:
             self.reasons |= {"read_noise_e": reason, "dsnu_e": reason, "row_noise_e": reason}
             return
         share, row_sigma = self.common.seen_row_dn2, self.common.row_sigma_dn2
+        columns = self.common.seen_column_dn2
+        if columns:
+            own = 0.5 * self.common.column_sigma_dn2 / float(np.sqrt(columns)) / float(gain[0])
+            self.measured["column_noise_e"] = (float(np.sqrt(columns) / gain[0]), own, "electrons, of whole columns")
         if self.common.seen_frame_dn2:
             value = float(np.sqrt(self.common.seen_frame_dn2)) / float(gain[0])
             freedom = 2.0 * (self.dark.frames - 1)
@@ -400,12 +482,16 @@ class _Fit:
             self.values["row_noise_e"] = np.sqrt(share) / gain
             self.extra["row_noise_e"] = 0.5 * row_sigma / float(np.sqrt(share)) / float(gain[0])
         seconds = self.notes.exposure_s or 0.0
-        # what rows share and the shot noise of the dark current are not the reading's
-        square = (self.dark_dn2 - share) / gain**2 - dark_rate * seconds
+        # what rows and columns share and the shot noise of the dark current are not the reading's
+        square = (self.dark_dn2 - share - columns) / gain**2 - dark_rate * seconds
         self.values["read_noise_e"] = np.sqrt(np.maximum(square, 0.0))
+        less = max(float(square[0]) - self.dark_doubt_dn2 / float(gain[0]) ** 2, 0.0)
+        self.extra["read_noise_e"] = float(self.values["read_noise_e"][0] - np.sqrt(less))
         pattern = self.offset_dn2 / gain**2
         if pattern[0] > 3.0 * jackknife_sigma(pattern):
             self.values["dsnu_e"] = np.sqrt(np.maximum(pattern, 0.0))
+            share = 1.0 if self.dark_light else self.dark_doubt_dn2 / float(self.dark_dn2[0])
+            self.extra["dsnu_e"] = float(self.values["dsnu_e"][0]) * share
         else:
             self.reasons["dsnu_e"] = "lost in temporal noise and rounding: take more dark frames, at a higher gain"
 
@@ -443,7 +529,12 @@ class _Fit:
             # x / x' of a bend a_1 differs by a_1 u
             bend = response.unseen_bend * response.reach_dn / response.range_dn
             apart *= 0.5 / float(square[0]) if response.is_bent or response.refused else 0.0
-            doubt = float(np.hypot.reduce([bend, self.noise_doubt, apart]))
+            # light in the dark is missing in the signal, and its pattern in the levels'
+            by_light = self.dark_light / float(shown[:, 0].mean())
+            by_pattern = 0.5 * self.dark.spatial_dn2[0] / np.maximum(pattern[:, 0], 1e-9).mean()
+            dark = float(by_light + by_pattern) if self.dark_light else 0.0
+            uneven = 0.5 * self.widths.unevenness
+            doubt = float(np.hypot.reduce([bend, self.noise_doubt, apart, dark, self.bend_doubt, uneven]))
             self.extra["prnu"] = float(self.values["prnu"][0]) * doubt
         else:
             self.reasons["prnu"] = "lost in temporal noise: take more frames of the brighter levels"

@@ -5,8 +5,8 @@ the variance from frame to frame
 
     v(y) = (K x(y) + D) / x'(y)^2,     x(y) = y (1 + a_1 u + a_2 u^2 + a_3 u^3),     u = y / (code range)
 
-with D the variance of dark frames. K is the gain of the smallest signals. Eight sets of terms are fitted, from none
-(the straight line of EMVA 1288) to all three. Each has the weight of its Bayes factor in Schwarz's approximation,
+with D the variance of dark frames. K is the gain of the smallest signals. Nine sets of terms are fitted, from none
+(the straight line of EMVA 1288) to all three, and a power of the codes, black included (gamma). Each has the weight of its Bayes factor in Schwarz's approximation,
 the straight line's prior being 0.5. The result is the weighted mean; its sigma holds the spread of the sets. Where no
 set fits within counting noise, all sigmas grow by the root of the least mean square (Birge's ratio). A straight line
 has a bend of 0 +- 0.3 % at full range, as far as the noise leaves it open: 0.3 % move K by 0.5 %. One level shows no
@@ -31,7 +31,8 @@ from phibench.calibration.sensor_fit.block_sums import jackknife_sigma, rounding
 from phibench.scenes.frames import Array
 
 _TERMS = (1, 2, 3)
-_STRAIGHT_PRIOR = 0.5  # the seven bends share the other half
+_POWER = (0,)  # a power of the codes, black included: gamma
+_STRAIGHT_PRIOR = 0.5  # the eight bends share the other half
 _BENT = 0.95  # posterior share of the bent sets from which on the response is said to bend
 _UNSEEN = 0.003  # standard deviation of the bend at u = 1 that a response has which is taken for straight
 _UNSEEN_BY_ONE = 0.03  # the same where one level cannot show a bend: sensors of the EMVA sets bend by 2 to 5 %
@@ -51,6 +52,7 @@ class NoiseOfLevel:
     temporal_dn2 : variance from frame to frame, rounding included
     mean_dn, spread_dn : mean, and its spread from pixel to pixel
     freedom : degrees of freedom of the variance
+    doubt_dn2 : of the variance, by uneven codes
     """
 
     name: str
@@ -59,6 +61,7 @@ class NoiseOfLevel:
     mean_dn: float
     spread_dn: float
     freedom: float
+    doubt_dn2: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -174,9 +177,14 @@ def fit_response(levels: Sequence[NoiseOfLevel], dark_dn2: Array, range_dn: floa
             ]
         )
         unknown = np.array(
-            [rounding_doubt(float(np.sqrt(v)), one.spread_dn) for one, v in zip(levels, model, strict=True)]
+            [
+                float(np.hypot(rounding_doubt(float(np.sqrt(v)), one.spread_dn), one.doubt_dn2))
+                for one, v in zip(levels, model, strict=True)
+            ]
         )
-        fitter = _Fitter(signal / range_dn, signal, seen - rounding[:, None], dark_dn2, np.hypot(sigma, unknown))
+        weights = np.hypot(sigma, unknown)
+        black_u = max(float(levels[0].mean_dn - signal[0, 0]), 1.0) / range_dn
+        fitter = _Fitter(signal / range_dn, signal, seen - rounding[:, None], dark_dn2, weights, black_u)
         sets = [one for terms in _sets(names, len(levels)) if (one := fitter.fit(terms)) is not None]
         if not sets or sets[0].terms or sets[0].x[0, 0] <= 0.0:
             raise ValueError
@@ -199,28 +207,35 @@ def intercept(levels: list[NoiseOfLevel]) -> Array:
 
 
 def _sets(names: int, count: int) -> list[tuple[int, ...]]:
-    return [
+    sets = [
         terms
         for size in range(len(_TERMS) + 1)
         for terms in combinations(_TERMS, size)
         if size < min(names, count - 1) or size == 0
     ]
+    return [*sets, _POWER] if len(sets) > 1 else sets
 
 
 class _Fitter:
     """Levels with their weights: u and signal of shape (levels, replicates), variance less rounding, dark variance."""
 
-    def __init__(self, u: Array, signal: Array, variance: Array, dark: Array, sigma: Array) -> None:
+    def __init__(self, u: Array, signal: Array, variance: Array, dark: Array, sigma: Array, black_u: float) -> None:
         self.u, self.signal, self.seen, self.dark, self.sigma = u, signal, variance, dark, sigma
+        self.black_u = black_u
 
     def variance(self, terms: tuple[int, ...], x: Array, k: int) -> Array:
         """v(y) of replicate k, shape (levels,)."""
         u = self.u[:, k]
-        linear = self.signal[:, k] * (1.0 + sum(x[1 + i] * u**p for i, p in enumerate(terms)))
+        if terms == _POWER:
+            linear = self.signal[:, k] * _power_over_line(u / self.black_u, x[1])
+        else:
+            linear = self.signal[:, k] * (1.0 + sum(x[1 + i] * u**p for i, p in enumerate(terms)))
         return np.asarray((x[0] * linear + self.dark[k]) / self._slope(terms, x, k) ** 2)
 
     def _slope(self, terms: tuple[int, ...], x: Array, k: int) -> Array:
         u = self.u[:, k]
+        if terms == _POWER:
+            return np.asarray((1.0 + u / self.black_u) ** x[1])
         return np.asarray(np.ones_like(u) + sum((p + 1) * x[1 + i] * u**p for i, p in enumerate(terms)))
 
     def _residuals(self, terms: tuple[int, ...], x: Array, k: int) -> Array:
@@ -240,7 +255,16 @@ class _Fitter:
         columns = range(self.seen.shape[1])
         shifts = np.stack([self._residuals(terms, done.x, k) - done.fun for k in columns])
         x = done.x - shifts @ change.T
+        if terms == _POWER:
+            x = self._as_polynomial(x)
         return _Set(terms, x, float(np.sum(done.fun**2)), 0.0 if terms else self._gain_by_bend(float(done.x[0])))
+
+    def _as_polynomial(self, x: Array) -> Array:
+        """K, a_1, a_2, a_3 that are nearest to a power of the codes, shape (replicates, 4)."""
+        u = np.linspace(0.0, float(self.u.max()), 33)[1:]
+        bends = np.stack([_power_over_line(u / self.black_u, power) - 1.0 for power in x[:, 1]])
+        design = np.stack([u**p for p in _TERMS], axis=1)
+        return np.concatenate([x[:, :1], bends @ np.linalg.pinv(design).T], axis=1)
 
     def _gain_by_bend(self, gain: float) -> float:
         """dK/da_1 of the straight line: how K moves where the response has a small a_1."""
@@ -250,13 +274,18 @@ class _Fitter:
         return -float(by_gain @ by_bend) / float(by_gain @ by_gain)
 
 
+def _power_over_line(t: Array, power: float) -> Array:
+    """x / y of a power of the codes, ((1 + t)^(power + 1) - 1) / (power + 1) t, at the signal of t black levels."""
+    return np.asarray(np.expm1((power + 1.0) * np.log1p(t)) / ((power + 1.0) * t))
+
+
 def _mean(sets: list[_Set], count: int, names: int, range_dn: float, reach_dn: float, by_rounding: float) -> Response:
     """Mean of the sets by their weights; `by_rounding` is a standard deviation of the gain."""
     freedom = [max(count - 1 - len(fitted.terms), 1) for fitted in sets]
     misfits = [fitted.chi2 / n for fitted, n in zip(sets, freedom, strict=True)]
     least = min(misfits)
     birge = max(least, 1.0)
-    prior = np.array([(1.0 - _STRAIGHT_PRIOR) / 7.0 if fitted.terms else _STRAIGHT_PRIOR for fitted in sets])
+    prior = np.array([(1.0 - _STRAIGHT_PRIOR) / 8.0 if fitted.terms else _STRAIGHT_PRIOR for fitted in sets])
     evidence = np.array([-0.5 * (fitted.chi2 / birge + len(fitted.terms) * np.log(count)) for fitted in sets])
     weight = prior * np.exp(evidence - evidence.max())
     weight /= weight.sum()
@@ -298,7 +327,7 @@ def _padded(one: _Set) -> Array:
     """K, a_1, a_2, a_3, shape (replicates, 4)."""
     whole = np.zeros((len(one.x), 1 + len(_TERMS)))
     whole[:, 0] = one.x[:, 0]
-    for i, power in enumerate(one.terms):
+    for i, power in enumerate(_TERMS if one.terms == _POWER else one.terms):
         whole[:, power] = one.x[:, 1 + i]
     return whole
 

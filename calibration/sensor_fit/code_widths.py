@@ -1,0 +1,124 @@
+"""Widths of the converter's codes, by how often each comes: codes that are missing, doubled, or of uneven width.
+
+The values of a level have a smooth distribution where its noise is about a code or more: that of the pixels' means,
+widened by the noise. A code that comes w times as often as its neighbours let expect is w codes wide. Wide codes add
+(w^2 - 1) / 12 DN^2 to the variance and move the mean by up to half of what they are too wide. Both go into sigma: a
+table after the converter, a digital gain and a converter's own steps look alike.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter1d
+
+from phibench.scenes.frames import Array
+
+_LEAST_DN, _MOST_DN = 0.75, 40.0  # noise: below, codes are not smooth by themselves; above, no width matters
+_FINE = 8  # places in a code
+_LOCAL = 1.5  # of the noise: what is uneven over more codes is light
+_EXPECTED = 50.0  # counts, below which a code is not judged
+_TAIL = 0.005  # of the values: at the ends of a level no code is judged
+_EMPTY = 30.0  # counts that are to be expected of a code that is said to be missing
+_SEEN, _SAID = 0.03, 0.1  # rms of the widths: that sigma takes, that is a finding
+_SIGMAS = 6.0
+
+
+@dataclass
+class CodeWidths:
+    """Counts of codes of all levels, added one by one.
+
+    Attributes
+    ----------
+    top : last code
+    seen, expected : counts, and those of codes of one width, shape (top + 1,)
+    """
+
+    top: int
+    seen: Array = field(init=False, repr=False)
+    expected: Array = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        self.seen, self.expected = np.zeros(self.top + 1), np.zeros(self.top + 1)
+
+    def add(self, frames: NDArray[Any], temporal_dn2: float) -> Array:
+        """Add one filter's frames, shape (n, h, w), and give the shares of its codes, shape (top + 1,)."""
+        counts = np.bincount(frames.ravel(), minlength=self.top + 1).astype(float)
+        moved = np.var([float(frame.mean()) for frame in frames])  # whole frames that jitter
+        noise = float(np.sqrt(max(temporal_dn2 + moved - 1.0 / 12.0, 0.0)))
+        shares = counts / counts.sum()
+        low, high = np.flatnonzero(counts)[[0, -1]]
+        if _LEAST_DN < noise < _MOST_DN and max(shares[low], shares[high]) < _TAIL:  # not cut
+            below = np.cumsum(shares)
+            inner = (below > _TAIL) & (below < 1.0 - _TAIL)
+            expected = _smooth(frames, noise, self.top)
+            width = _LOCAL * max(noise, 1.0)
+            local = gaussian_filter1d(counts, width) / np.maximum(gaussian_filter1d(expected, width), 1e-12)
+            self.seen[inner] += counts[inner]
+            self.expected[inner] += (expected * local)[inner]
+        return shares
+
+    @property
+    def _judged(self) -> Array:
+        return np.asarray(self.expected > _EXPECTED)
+
+    @property
+    def widths(self) -> Array:
+        """Width of each code, shape (top + 1,); 1 where the frames do not tell another one."""
+        widths = np.ones(self.top + 1)
+        if self.rms > _SEEN:
+            judged = self._judged
+            widths[judged] = self.seen[judged] / self.expected[judged]
+        return widths
+
+    @property
+    def rms(self) -> float:
+        """Spread of the widths less that of counting, 0 where it is not above that."""
+        expected, seen = self.expected[self._judged], self.seen[self._judged]
+        if not len(expected):
+            return 0.0
+        excess = float(np.sum((seen - expected) ** 2 / expected - 1.0))
+        return float(np.sqrt(excess / expected.sum())) if excess > _SIGMAS * np.sqrt(2.0 * len(expected)) else 0.0
+
+    def doubt(self, shares: Array) -> tuple[float, float]:
+        """What uneven widths may do to a level: shift of its mean, DN, and of its variance, DN^2."""
+        widths = self.widths
+        return 0.5 * float(shares @ np.abs(widths - 1.0)), max(float(shares @ (widths**2 - 1.0)) / 12.0, 0.0)
+
+    def finding(self) -> str | None:
+        """Sentence about codes of other width than one."""
+        missing = np.flatnonzero((self.expected > _EMPTY) & (self.seen < 0.02 * self.expected))
+        if not len(missing) and self.rms < _SAID:
+            return None
+        judged = np.flatnonzero(self._judged)
+        if len(missing):
+            others = f" and {len(missing) - 1} others never come" if len(missing) > 1 else " never comes"
+            said = f"the code {missing[0]}{others}"
+        else:
+            widest = int(judged[np.argmax(self.seen[judged] / self.expected[judged])])
+            said = (
+                f"codes differ in width by {100.0 * self.rms:.0f} % rms, and {widest} is "
+                f"{self.seen[widest] / self.expected[widest]:.2g} wide"
+            )
+        return (
+            f"{said}: a table, a digital gain or the converter's steps; sigma holds what they do to mean and noise; "
+            "give the converter's own codes"
+        )
+
+    @property
+    def unevenness(self) -> float:
+        """Mean absolute deviation of the judged codes' widths from 1: what a local gain may differ by."""
+        return float(np.abs(self.widths[self._judged] - 1.0).mean()) if self._judged.any() else 0.0
+
+
+def _smooth(frames: NDArray[Any], noise_dn: float, top: int) -> Array:
+    """Counts of codes of one width, of the pixels' means and the noise about them."""
+    n = len(frames)
+    total = frames.sum(axis=0, dtype=np.int64)
+    places = np.bincount(np.rint((total / n + 0.5) * _FINE).astype(int).ravel(), minlength=(top + 1) * _FINE)
+    places = places[: (top + 1) * _FINE].astype(float)
+    dense = gaussian_filter1d(places, float(_FINE * noise_dn * np.sqrt((n - 1) / n)), mode="constant")
+    return np.asarray(n * dense.reshape(top + 1, _FINE).sum(axis=1))
