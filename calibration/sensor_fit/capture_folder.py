@@ -244,6 +244,13 @@ def read_frame(path: Path, notes: CaptureNotes) -> tuple[Kind, NDArray[Any]]:
     if picture.kind == "jpeg":
         return "mjpeg", picture.pixels
     if picture.kind == "yuyv":
+        second = picture.pixels[..., 1]
+        if notes.format not in (None, "yuyv"):
+            raise file.fault(f"has two planes, and {MANIFEST} says {notes.format}: save it without opacity")
+        if int(second.min()) == int(second.max()) and (second.flat[0] != 128 or picture.pixels[..., 0].std() > 0.0):
+            raise file.fault(
+                f"has a second plane of {int(second.flat[0])} alone: chroma has noise, so this is opacity; save grey alone"
+            )
         return "yuyv", picture.pixels
     if picture.kind == "raw" or picture.mode == "L":
         values = picture.pixels if picture.kind == "raw" else picture.pixels[..., 0].astype(np.uint16)

@@ -59,7 +59,8 @@ def dark_image(frames: NDArray[Any]) -> DarkImage:
     values = np.stack(change) + np.random.default_rng(0).uniform(-0.5, 0.5, (len(change), *mean.shape))
     median = float(np.median(values))
     chance = 1.25 * float(np.sqrt(noise2 / (len(change) * mean.size)))
-    seen = abs(median) > max(_LOPSIDED * np.sqrt(noise2), _SIGMAS * chance)
+    of_codes = 1.0 / (16.0 * noise2)  # of the density's slope within a code
+    seen = abs(median) > max(_LOPSIDED * np.sqrt(noise2), _SIGMAS * chance, of_codes)
     return DarkImage(mean, variance, n, -median * n / (n - 2) if seen else 0.0)
 
 

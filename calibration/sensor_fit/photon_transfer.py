@@ -45,14 +45,15 @@ from phibench.calibration.sensor_fit.response_fit import (
     Response,
     fit_linearity,
     fit_response,
-    intercept,
 )
 from phibench.scenes.frames import Array
 
 _MARGIN_SIGMAS = 6.0  # a level is used if so many deviations of its noise lie below saturation
 _ONE_CODE = 0.999  # of the dark values
 _HIDDEN_DN = 0.15  # noise below it leaves too few codes to be told from rounding
+_MOST_HIDDEN_DN, _HIDDEN_DOUBT_DN2 = 0.2, 0.005  # of such a noise, and of its variance by the levels' line
 _NARROW_DN = 0.4  # noise below it does not smooth the steps of codes: 1 % of a code is left of them
+_WHITE_DN = 0.7  # noise behind which rounding adds 1/12 DN^2 wherever a level lies
 _THIRD_CODE = 30.0  # values of a third code, below which the noise is that of any width
 _ROUNDING_DN = 12.0**-0.5  # of a level that rounding hides
 _CUT = 1e-3  # of dark values at the converter's lower end: below, their variance lacks less than 1 %
@@ -297,14 +298,14 @@ class _Fit:
                 float(level.sums.mean_dn[0]),
                 float(np.sqrt(max(level.sums.spatial_dn2[0], 0.0))),
                 float(level.sums.pixels[0] * (level.sums.frames - 1)),
-                self.widths.doubt(level.codes)[1],
+                float(np.hypot(self.widths.doubt(level.codes)[1], _HIDDEN_DOUBT_DN2 * self.is_hidden)),
             )
             for level in used
         ]
         no_dark = self._is_cut or self.is_hidden  # the dark frames' own variance says nothing
-        dark_dn2 = intercept(levels) if no_dark and len({level.name for level in used}) > 1 else self.dark_dn2
+        most_dn2 = _MOST_HIDDEN_DN**2 if self.is_hidden and not self._is_cut else np.inf
         try:
-            response = fit_response(levels, dark_dn2, self._range)
+            response = fit_response(levels, self.dark_dn2, self._range, most_dn2 if no_dark else 0.0)
         except ValueError:
             raise self._no_growth() from None
         if response.sigma > float(response.gain[0]):
@@ -347,7 +348,8 @@ class _Fit:
                 f"{self.folder}: terms of 8 x 8 pixels lie on steps: the frames passed through a JPEG, which changes "
                 "noise and black; give raw frames as the converter wrote them"
             )
-        uneven = [level.sums.uneven(self.dark) for level in used]
+        white = [level for level in used if level.sums.temporal_dn2[0] > _WHITE_DN**2 + 1.0 / 12.0]
+        uneven = [level.sums.uneven(self.dark) for level in white] or [(0.0, 1.0)]
         told = raw_noise(list(likeness.values()), uneven, self.common.seen_row_dn2)
         if told.not_raw:
             raise CaptureError(f"{self.folder}: {told.finding}; give raw frames as the converter wrote them")

@@ -154,8 +154,12 @@ class _Set:
     gain_by_bend: float = 0.0
 
 
-def fit_response(levels: Sequence[NoiseOfLevel], dark_dn2: Array, range_dn: float) -> Response:
+def fit_response(
+    levels: Sequence[NoiseOfLevel], dark_dn2: Array, range_dn: float, free_dark_dn2: float = 0.0
+) -> Response:
     """Fit levels that are not saturated; `dark_dn2`, shape (replicates,), is the dark variance before rounding.
+
+    Where dark frames say nothing of it, the levels of two names or more do, up to `free_dark_dn2`.
 
     Raises
     ------
@@ -184,6 +188,8 @@ def fit_response(levels: Sequence[NoiseOfLevel], dark_dn2: Array, range_dn: floa
         )
         weights = np.hypot(sigma, unknown)
         black_u = max(float(levels[0].mean_dn - signal[0, 0]), 1.0) / range_dn
+        if free_dark_dn2 and names > 1:
+            dark_dn2 = _intercept(signal, seen - rounding[:, None], weights, free_dark_dn2)
         fitter = _Fitter(signal / range_dn, signal, seen - rounding[:, None], dark_dn2, weights, black_u)
         sets = [one for terms in _sets(names, len(levels)) if (one := fitter.fit(terms)) is not None]
         if not sets or sets[0].terms or sets[0].x[0, 0] <= 0.0:
@@ -196,14 +202,12 @@ def fit_response(levels: Sequence[NoiseOfLevel], dark_dn2: Array, range_dn: floa
     return _mean(sets, len(levels), names, range_dn, float(signal[:, 0].max()), by_rounding)
 
 
-def intercept(levels: list[NoiseOfLevel]) -> Array:
-    """Variance at no light by the line through the levels alone, DN^2, at least 0, shape (replicates,)."""
-    y = np.stack([level.signal_dn for level in levels])
-    v = np.stack([level.temporal_dn2 for level in levels]) - 1.0 / 12.0
-    weight = v[:, :1] ** -2.0
+def _intercept(y: Array, v: Array, sigma: Array, most_dn2: float) -> Array:
+    """Variance at no light by the line through the levels alone, DN^2, from 0 to `most_dn2`, shape (replicates,)."""
+    weight = sigma[:, None] ** -2.0
     y0, v0 = ((weight * x).sum(axis=0) / weight.sum() for x in (y, v))
     slope = np.sum(weight * (y - y0) * (v - v0), axis=0) / np.sum(weight * (y - y0) ** 2, axis=0)
-    return np.asarray(np.maximum(v0 - slope * y0, 0.0))
+    return np.asarray(np.clip(v0 - slope * y0, 0.0, most_dn2))
 
 
 def _sets(names: int, count: int) -> list[tuple[int, ...]]:
