@@ -247,9 +247,11 @@ def read_frame(path: Path, notes: CaptureNotes) -> tuple[Kind, NDArray[Any]]:
         second = picture.pixels[..., 1]
         if notes.format not in (None, "yuyv"):
             raise file.fault(f"has two planes, and {MANIFEST} says {notes.format}: save it without opacity")
-        if int(second.min()) == int(second.max()) and (second.flat[0] != 128 or picture.pixels[..., 0].std() > 0.0):
+        is_even = notes.format is None and int(second.min()) == int(second.max())
+        if is_even and (second.flat[0] != 128 or picture.pixels[..., 0].std() > 0.0):
             raise file.fault(
-                f"has a second plane of {int(second.flat[0])} alone: chroma has noise, so this is opacity; save grey alone"
+                f"has a second plane of {int(second.flat[0])} alone, as opacity is: save grey alone, or write "
+                f'format = "yuyv" into {MANIFEST} if it is chroma'
             )
         return "yuyv", picture.pixels
     if picture.kind == "raw" or picture.mode == "L":

@@ -59,7 +59,9 @@ _ROUNDING_DN = 12.0**-0.5  # of a level that rounding hides
 _CUT = 1e-3  # of dark values at the converter's lower end: below, their variance lacks less than 1 %
 _DARKER, _DARKER_DN = 0.005, 1.0  # of the range: dark levels move by less
 _FAINT = 0.02  # of the range: below, a level's noise over its signal says nothing
+_SAME_DN, _UNEVEN_TIMES = 0.02, 25.0  # dark levels that are equal; mean square of what is left of their line
 _LAW = 0.5  # of what rounding moves the mean of a Gaussian noise
+_OTHER = 2.0  # factor of the dark variance, beyond which dark and flat frames are not of one setting
 _STRONG = 0.2  # change of the response's slope that polynomials of three terms still follow
 _BY_GAIN = ("gain_dn_per_e", "dark_e_per_s", "read_noise_e", "row_noise_e", "dsnu_e", "full_well_e")
 
@@ -203,7 +205,7 @@ class _Fit:
         self._noise(response.gain, dark_dn_per_s / response.gain)
         self._prnu(used, response)
         self._full_well(response)
-        self._linearity(float(dark_dn_per_s[0]))
+        self._linearity(float(dark_dn_per_s[0]), response.gain)
         points = tuple(
             TransferPoint(one.name, one.site, float(self._signal(one)[0]), self._excess(one), one in used)
             for one in self.levels
@@ -313,6 +315,8 @@ class _Fit:
                 f"{self.folder}: no response explains the noise of flat/, a straight line leaves "
                 f"{response.straight_misfit:.3g} times its variance: take all levels with one gain and one setting"
             )
+        if response.is_bent and not no_dark:
+            self._refuse_other_settings(fit_response(levels, self.dark_dn2, self._range, np.inf))
         signal = np.array([float(level.signal_dn[0]) for level in levels])
         unknown = float(response.gain[0]) * self._unknown_black() * float(signal.sum() / np.sum(signal**2))
         if no_dark and response.is_bent:  # a line through levels that bend has another intercept
@@ -335,6 +339,16 @@ class _Fit:
                 "DN per electron, of a straight line",
             )
         return response
+
+    def _refuse_other_settings(self, free: Response) -> None:
+        """Refuse levels on a line that starts far from the dark frames' noise: a sensor that bends leaves it."""
+        dark_dn2 = float(self.dark_dn2[0])
+        if free.is_bent or free.refused or _OTHER**-1.0 < free.dark_dn2 / max(dark_dn2, 1e-9) < _OTHER:
+            return
+        raise CaptureError(
+            f"{self.folder}: the levels' noise lies on a straight line that starts at {free.dark_dn2:.3g} DN^2, and dark "
+            f"frames have {dark_dn2:.3g}: take both with one gain, and give single frames for both, not means"
+        )
 
     def _raw_noise(self, used: list[_Level]) -> None:
         """Weigh the likeness of the levels' noise."""
@@ -445,6 +459,19 @@ class _Fit:
         jitter2 = self.common.level_dn2 / frames  # of each level as a whole
         slope_sigma = float(np.sqrt(np.sum((weights * slope_share) ** 2 * jitter2)))
         jitter = float(np.sqrt(np.sum((weights * black_share) ** 2 * jitter2)))
+        # three times or more tell whether the dark level grows evenly
+        rest = (means - slope * (t - centre))[:, :1]
+        rest = rest - (weights * rest).sum() / weights.sum()
+        own = 1.0 / weights + jitter2 + _SAME_DN**2
+        excess = float(np.sum(rest**2 / own)) / max(len(t) - 2, 1)
+        if len(t) > 2 and excess > _UNEVEN_TIMES:
+            worst = float(np.abs(rest).max())
+            self.findings["dark-exposure"] = (
+                f"the dark level does not grow evenly with the stated times, up to {worst:.2g} DN off: look at the times"
+            )
+            blurred = np.sqrt(np.sum(rest**2) / (len(t) - 2))
+            jitter += float(blurred) * float(np.sqrt(np.sum((weights * black_share) ** 2)))
+            slope_sigma += float(blurred) * float(np.sqrt(np.sum((weights * slope_share) ** 2)))
         self.extra["black_level_dn"] = float(np.hypot(unknown, jitter))
         self.values["black_level_dn"] = np.sum(weights * (means - slope * t), axis=0) / weights.sum()
         if slope[0] > 0.0:
@@ -556,7 +583,7 @@ class _Fit:
             else f"no level of flat/ is saturated; above {largest:.0f} electrons"
         )
 
-    def _linearity(self, dark_dn_per_s: float) -> None:
+    def _linearity(self, dark_dn_per_s: float, gain: Array) -> None:
         """Signal against stated light: of an exposure series, or of flat levels whose photons are known."""
         ceiling, start = self._ceiling(), self.notes.exposure_s or 0.0
         named = self.exposures or [level for level in self.levels if level.light is not None]
@@ -575,9 +602,24 @@ class _Fit:
         linearity = fit_linearity(lights, unit)
         if linearity is None:
             return
+        if unit == "photons":
+            self._quantum_efficiency([(one.light, one.signal_dn) for one in lights], gain)
         self.measured["linearity_error"] = (linearity.mean_percent, linearity.sigma_percent, f"percent, against {unit}")
         if (said := linearity.finding()) is not None:
             self.findings["linearity"] = said
+
+    def _quantum_efficiency(self, levels: list[tuple[float, float]], gain: Array) -> None:
+        """Electrons a photon: the mean of n frames, given as one, has n times the electrons."""
+        light, signal = np.array(levels).T
+        line = np.polynomial.Polynomial.fit(light, signal, 1, w=1.0 / signal).convert().coef[1]
+        value = float(line / gain[0])
+        sigma = value * float(np.hypot(jackknife_sigma(gain) / gain[0], self.gain_doubt))
+        self.measured["quantum_efficiency"] = (value, sigma, "electrons per photon, on the mean of the filters")
+        if value - 3.0 * sigma > 1.0:
+            self.findings["quantum_efficiency"] = (
+                f"{value:.3g} electrons a photon: the stated photons are too few, or each frame is a mean of several; "
+                "the gain is then too small, and all numbers in electrons too large"
+            )
 
     def _ratios(self, used: list[_Level]) -> tuple[float, ...]:
         of_site = {

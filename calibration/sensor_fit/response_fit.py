@@ -20,7 +20,7 @@ holds the sensor's bend and the error of the stated light; the two cannot be tol
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
@@ -82,6 +82,7 @@ class Response:
     reach_dn : brightest signal used
     levels : number of levels of different names
     unseen_bend : standard deviation of a_1 that a straight line leaves open
+    dark_dn2 : variance at no light
     """
 
     gain: Array
@@ -98,6 +99,7 @@ class Response:
     reach_dn: float
     levels: int
     unseen_bend: float
+    dark_dn2: float = 0.0
 
     @property
     def sigma(self) -> float:
@@ -199,7 +201,8 @@ def fit_response(
     # what each level's rounding leaves open moves K of the straight line by so much
     share = fitter.sigma**-2.0 * signal[:, 0] / np.sum((signal[:, 0] / fitter.sigma) ** 2)
     by_rounding = float(np.linalg.norm(share * unknown))
-    return _mean(sets, len(levels), names, range_dn, float(signal[:, 0].max()), by_rounding)
+    fitted = _mean(sets, len(levels), names, range_dn, float(signal[:, 0].max()), by_rounding)
+    return replace(fitted, dark_dn2=float(dark_dn2[0]))
 
 
 def _intercept(y: Array, v: Array, sigma: Array, most_dn2: float) -> Array:
