@@ -46,9 +46,9 @@ class CodeWidths:
 
     def add(self, frames: NDArray[Any], temporal_dn2: float) -> Array:
         """Add one filter's frames, shape (n, h, w), and give the shares of its codes, shape (top + 1,)."""
-        counts = np.bincount(frames.ravel(), minlength=self.top + 1).astype(float)
-        moved = np.var([float(frame.mean()) for frame in frames])  # whole frames that jitter
-        noise = float(np.sqrt(max(temporal_dn2 + moved - 1.0 / 12.0, 0.0)))
+        counts = sum(np.bincount(frame.ravel(), minlength=self.top + 1) for frame in frames) + np.zeros(self.top + 1)
+        moved = float(np.var([float(frame.mean()) for frame in frames]))  # whole frames that jitter
+        noise = max(temporal_dn2 + moved - 1.0 / 12.0, 0.0) ** 0.5
         shares = counts / counts.sum()
         low, high = np.flatnonzero(counts)[[0, -1]]
         if _LEAST_DN < noise < _MOST_DN and max(shares[low], shares[high]) < _TAIL:  # not cut

@@ -23,6 +23,7 @@ _BOX = 5  # pixels of one filter
 _SIGMAS, _PATTERN_SIGMAS = 7.0, 5.0
 _LEAST_OF_NOISE = 0.02  # of the dark noise: light below it moves black by less than jitter does
 _PRNU_SHARE = 0.05  # of the variance of lit patterns: below, noise is all that they show
+_SIDE_PX, _FRAMES = 512, 8  # of the middle of as many frames, for the median
 _GROUPS, _TRIM = 24, 0.03  # of pixels by their means; the ends, where pixels that jump and hot ones lie
 _BLOCKS = 8
 _SLOPES = (0.4, 2.5)  # of K: slopes of variance over mean that are shot noise
@@ -49,16 +50,18 @@ class DarkImage:
 def dark_image(frames: NDArray[Any]) -> DarkImage:
     """Image of dark frames, shape (n, h, w), n >= 2."""
     n = len(frames)
-    mean, variance = frames.mean(axis=0), frames.var(axis=0, ddof=1)
+    mean = frames.mean(axis=0)
+    variance = sum((np.square(frame - mean) for frame in frames), np.zeros(mean.shape)) / (n - 1)
     noise2 = float(np.median(variance))
     if noise2 < _WIDE_DN2 or n < 3:
         return DarkImage(mean, variance, n, 0.0)
-    # whole frames that jitter are no shape of the pixels' noise
-    change = [frame - mean - float(np.mean(frame - mean)) for frame in frames[:8]]
+    v, u = (slice(max((size - _SIDE_PX) // 2, 0), max((size - _SIDE_PX) // 2, 0) + _SIDE_PX) for size in mean.shape)
+    change = frames[:_FRAMES, v, u] - mean[v, u]
+    change -= change.mean(axis=(1, 2), keepdims=True)  # whole frames that jitter are no shape of the pixels' noise
     # spread over their codes, values have a median between codes
-    values = np.stack(change) + np.random.default_rng(0).uniform(-0.5, 0.5, (len(change), *mean.shape))
+    values = change + np.random.default_rng(0).uniform(-0.5, 0.5, change.shape)
     median = float(np.median(values))
-    chance = 1.25 * float(np.sqrt(noise2 / (len(change) * mean.size)))
+    chance = 1.25 * float(np.sqrt(noise2 / change.size))
     of_codes = 1.0 / (16.0 * noise2)  # of the density's slope within a code
     seen = abs(median) > max(_LOPSIDED * np.sqrt(noise2), _SIGMAS * chance, of_codes)
     return DarkImage(mean, variance, n, -median * n / (n - 2) if seen else 0.0)

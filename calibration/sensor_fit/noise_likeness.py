@@ -27,6 +27,7 @@ _FAR = 7  # odd: to a pixel of another filter, as from one to its neighbour
 _SIGMAS = 6.0
 _LEAST = 0.01  # of a likeness, 2 % of the gain
 _BESIDE, _BESIDE_SIGMAS = 0.004, 5.0  # of the mean of both sides, 1.6 % of the gain
+_SUM_SIGMAS = 4.0
 MOST = 0.2  # from which on frames are no raw ones
 _BROAD = 0.5  # of the largest likeness: what reaches so far is light
 _JPEG_PX, _JPEG_FRAMES, _JPEG_STEPS = 256, 4, range(1, 13)
@@ -134,6 +135,9 @@ def raw_noise(levels: Sequence[NoiseLikeness], uneven: Sequence[tuple[float, flo
             f"the noise of neighbouring pixels is alike (correlation {near[np.argmax(np.abs(near))]:+.2f}): the frames "
             "were smoothed, sharpened, shrunk or compressed after the converter, which changes noise and gain"
         )
+    total = abs(float(near.sum()))
+    if not seen.any() and total > _SUM_SIGMAS * sigma * len(_NEAR) ** 0.5:
+        doubts.append(2.0 * total)  # too little to be said, too much for chance
     if abs(after) > max(_LEAST, _SIGMAS * after_sigma):
         doubts.append(2.0 * abs(after) / max(1.0 - abs(after), MOST))
         said.append(

@@ -6,11 +6,11 @@ the variance from frame to frame
     v(y) = (K x(y) + D) / x'(y)^2,     x(y) = y (1 + a_1 u + a_2 u^2 + a_3 u^3),     u = y / (code range)
 
 with D the variance of dark frames. K is the gain of the smallest signals. Nine sets of terms are fitted, from none
-(the straight line of EMVA 1288) to all three, and a power of the codes, black included (gamma). Each has the weight of its Bayes factor in Schwarz's approximation,
-the straight line's prior being 0.5. The result is the weighted mean; its sigma holds the spread of the sets. Where no
-set fits within counting noise, all sigmas grow by the root of the least mean square (Birge's ratio). A straight line
-has a bend of 0 +- 0.3 % at full range, as far as the noise leaves it open: 0.3 % move K by 0.5 %. One level shows no
-bend at all, so that its own is 0 +- 3 %.
+(the straight line of EMVA 1288) to all three, and a power of the codes, black included (gamma). Each has the weight of
+its Bayes factor in Schwarz's approximation, the straight line's prior being 0.5. The result is the weighted mean; its
+sigma holds the spread of the sets. Where no set fits within counting noise, all sigmas grow by the root of the least
+mean square (Birge's ratio). A straight line has a bend of 0 +- 0.3 % at full range, as far as the noise leaves it open:
+0.3 % move K by 0.5 %. One level shows no bend at all, so that its own is 0 +- 3 %.
 
 Where light or exposure times are stated, the signal is compared with them: a straight line with an offset and the
 weights 1 / signal^2, over signals from 5 to 95 % of the brightest (EMVA 1288, release 4.0, section 6.7). A deviation
