@@ -55,6 +55,19 @@ def test_its_numbers_are_those_of_the_camera(descriptor: Path) -> None:
     assert 0.2 < tables.measured["linearity_error"].value < 1.0  # the stack's wrong light would make it 10 %
 
 
+def test_more_electrons_than_photons_are_said(descriptor: Path) -> None:
+    """Means of four frames, given as single ones, have four times the electrons: photons are stated so here."""
+    text = descriptor.read_text("latin-1").replace(",", ".")
+    lines = [line.split() for line in text.splitlines()]
+    fewer = [[*x[:2], f"{float(x[2]) / 4.0}"] if x[:1] == ["b"] else x for x in lines]
+    averaged = descriptor.with_name("averaged.txt")
+    averaged.write_text("\n".join(" ".join(x).replace("\\", "/") for x in fewer), encoding="latin-1")
+    said, right = fit_sensor(averaged).file.tables, fit_sensor(descriptor).file.tables.measured["quantum_efficiency"]
+    assert "electrons a photon" in said.findings["quantum_efficiency"]
+    assert said.measured["quantum_efficiency"].value == pytest.approx(4.0 * right.value, rel=1e-6)
+    assert abs(right.value - QUANTUM_EFFICIENCY) < 0.05 * QUANTUM_EFFICIENCY  # the response bends by 2 %
+
+
 def test_its_levels_are_read_as_they_stand(descriptor: Path) -> None:
     capture = open_descriptor(descriptor)
     assert len(capture.flats) == len(SHARES) + 1

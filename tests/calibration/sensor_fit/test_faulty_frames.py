@@ -47,6 +47,25 @@ def pull(found: SensorFile, name: str, truth: float) -> float:
     return abs(value - truth) / sigma
 
 
+@pytest.mark.slow
+def test_good_cameras_have_no_finding(tmp_path: Path) -> None:
+    """30 cameras of 8 to 14 bits, of noise from 0.3 codes on: no finding, and no number beyond 4.5 of its sigmas."""
+    alarms, largest = 0, 0.0
+    for k in range(30):
+        rng, bits = np.random.default_rng([k, 1288]), (8, 10, 12, 14)[k % 4]
+        top = (1 << bits) - 1
+        gain = rng.uniform(0.08, 0.2) * top / 4095.0
+        read = max(rng.uniform(6.0, 30.0), 0.3 / gain)
+        camera = BentCamera(gain, read, max(rng.uniform(0.02, 0.07) * top, 6.0 * read * gain), bits, size=(96, 96))
+        found = fitted(tmp_path / str(k), camera, as_taken, kind=("mono-raw", "bayer-raw")[k // 4 % 2])
+        alarms += bool(found.tables.findings)
+        truths = {"gain_dn_per_e": gain, "read_noise_e": read, "black_level_dn": camera.black, "prnu": camera.prnu}
+        largest = max(largest, *(pull(found, name, x) for name, x in truths.items() if name in found.tables.sigma))
+    print(f"{alarms} of 30 cameras with a finding, largest pull {largest:.2f}")
+    assert alarms == 0
+    assert largest < 4.5
+
+
 def without_every_fourth(_: str, __: int, frame: Frame) -> Frame:
     return (frame - (frame % 4 == 3)).astype(frame.dtype)
 
