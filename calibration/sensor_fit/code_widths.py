@@ -84,7 +84,7 @@ class CodeWidths:
         return float(np.sqrt(excess / expected.sum())) if excess > _SIGMAS * np.sqrt(2.0 * len(expected)) else 0.0
 
     def doubt(self, shares: Array) -> tuple[float, float]:
-        """What uneven widths may do to a level: shift of its mean, DN, and of its variance, DN^2."""
+        """Effect of uneven widths on a level at most: shift of its mean, DN, and of its variance, DN^2."""
         widths = self.widths
         return 0.5 * float(shares @ np.abs(widths - 1.0)), max(float(shares @ (widths**2 - 1.0)) / 12.0, 0.0)
 

@@ -68,7 +68,7 @@ def dark_image(frames: NDArray[Any]) -> DarkImage:
 
 
 def pattern(image: Array, filters: int) -> Array:
-    """What each pixel of an image differs from its surroundings of the same filter, shape (h, w), without outliers."""
+    """Difference of each pixel to its surroundings of the same filter, shape (h, w), without outliers."""
     rough = np.zeros(image.shape)
     for i, j in np.ndindex(filters, filters):
         site = image[i::filters, j::filters]

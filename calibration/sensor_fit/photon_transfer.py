@@ -28,7 +28,7 @@ from phibench.calibration.sensor_fit.response_fit import (
     fit_response,
 )
 from phibench.calibration.sensor_fit.transfer_dark import ROUNDING_DN, DarkTransfer
-from phibench.calibration.sensor_fit.transfer_frames import Level, TransferFrames
+from phibench.calibration.sensor_fit.transfer_frames import FilterLevel, TransferFrames
 from phibench.scenes.frames import Array
 
 _MARGIN_SIGMAS = 6.0  # a level is used if so many deviations of its noise lie below saturation
@@ -134,7 +134,7 @@ class _Fit(DarkTransfer):
         by_gain = abs(float(x[0])) * doubt if name in _BY_GAIN else 0.0
         return float(np.sqrt(jackknife_sigma(x) ** 2 + own**2 + by_gain**2))
 
-    def _usable(self) -> list[Level]:
+    def _usable(self) -> list[FilterLevel]:
         darkest = min(self.levels, key=lambda level: float(self._signal(level)[0]))
         if self._signal(darkest)[0] < -max(_DARKER * self._range, _DARKER_DN):
             raise CaptureError(
@@ -157,17 +157,17 @@ class _Fit(DarkTransfer):
             )
         return used
 
-    def _reach(self, one: Level) -> float:
+    def _reach(self, one: FilterLevel) -> float:
         s = one.sums
         # brightest pixel that is to be expected: noise and fixed pattern together
         return float(s.mean_dn[0] + _MARGIN_SIGMAS * np.sqrt(s.temporal_dn2[0] + max(s.spatial_dn2[0], 0.0)))
 
     @staticmethod
-    def _is_wide(one: Level) -> bool:
+    def _is_wide(one: FilterLevel) -> bool:
         """Behind less noise, rounding hides or doubles small differences of pixels."""
         return bool(one.sums.temporal_dn2[0] > _NARROW_DN**2 + 1.0 / 12.0)
 
-    def _plateau(self) -> list[Level]:
+    def _plateau(self) -> list[FilterLevel]:
         """Levels at which the wells are full: hardly more noise than in the dark, below the last code."""
         if len(self.levels) < 2:
             return []
@@ -182,14 +182,14 @@ class _Fit(DarkTransfer):
         noisy = max((float(self._signal(level)[0]) for level in bright if level not in flat), default=0.0)
         return [level for level in flat if self._signal(level)[0] > noisy]
 
-    def _excess(self, one: Level) -> float:
+    def _excess(self, one: FilterLevel) -> float:
         return float(one.sums.temporal_dn2[0] - self.dark.temporal_dn2[0])
 
     def _ceiling(self) -> float:
         flat = [float(level.sums.mean_dn[0]) for level in self._plateau()]
         return min([float(self.top), *flat])
 
-    def _response(self, used: list[Level]) -> Response:
+    def _response(self, used: list[FilterLevel]) -> Response:
         """K with the response: the temporal variance against the mean, through the dark frames' point."""
         levels = [
             NoiseOfLevel(
@@ -249,7 +249,7 @@ class _Fit(DarkTransfer):
             f"dark frames have {dark_dn2:.3g}: take both with one gain, and give single frames for both, not means"
         )
 
-    def _raw_noise(self, used: list[Level]) -> None:
+    def _raw_noise(self, used: list[FilterLevel]) -> None:
         """Weigh the likeness of the levels' noise."""
         used = [level for level in used if self._is_wide(level)]
         partly = {level.name for level in self.levels if level not in used}  # some filters are saturated
@@ -277,7 +277,7 @@ class _Fit(DarkTransfer):
             f"{self.folder}: the noise of flat/ does not grow with its level; are these raw frames, without a curve?"
         )
 
-    def _prnu(self, used: list[Level], response: Response) -> None:
+    def _prnu(self, used: list[FilterLevel], response: Response) -> None:
         used = [level for level in used if self._is_wide(level)] or used
         shown = np.stack([self._signal(level) for level in used])
         signal = np.stack([response.linear(y) / response.slope(y) for y in shown])  # dy / y' is the change of x
@@ -327,7 +327,7 @@ class _Fit(DarkTransfer):
         """Signal against stated light: of an exposure series, or of flat levels whose photons are known."""
         ceiling, start = self._ceiling(), self.notes.exposure_s or 0.0
         named = self.exposures or [level for level in self.levels if level.light is not None]
-        levels: dict[str, list[Level]] = {}
+        levels: dict[str, list[FilterLevel]] = {}
         for level in named:
             levels.setdefault(level.name, []).append(level)
         lights, unit = [], "seconds"
@@ -361,7 +361,7 @@ class _Fit(DarkTransfer):
                 "the gain is then too small, and all numbers in electrons too large"
             )
 
-    def _ratios(self, used: list[Level]) -> tuple[float, ...]:
+    def _ratios(self, used: list[FilterLevel]) -> tuple[float, ...]:
         of_site = {
             site: [float(self._signal(one)[0]) for one in used if one.site == site] for site in ("R", "G1", "G2", "B")
         }

@@ -1,4 +1,4 @@
-"""What the dark frames of a photon transfer tell: black level, its growth, read noise, pattern, and their faults."""
+"""Dark frames of a photon transfer: black level, its growth, read noise, pattern, and faults that they show."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from scipy.special import ndtr
 
 from phibench.calibration.sensor_fit.block_sums import before_rounding, jackknife_sigma
 from phibench.calibration.sensor_fit.dark_frames import LitPattern, light_by_noise, light_by_pattern, pattern
-from phibench.calibration.sensor_fit.transfer_frames import Level, TransferFrames
+from phibench.calibration.sensor_fit.transfer_frames import FilterLevel, TransferFrames
 from phibench.scenes.frames import Array
 
 _ONE_CODE = 0.999  # of the dark values
@@ -46,7 +46,7 @@ class DarkTransfer:
         self.measured: dict[str, tuple[float | list[float], float | list[float], str]] = {}
         self.findings: dict[str, str] = {}
 
-    def _signal(self, one: Level) -> Array:
+    def _signal(self, one: FilterLevel) -> Array:
         return one.sums.mean_dn - self.dark.mean_dn
 
     @property
@@ -54,7 +54,7 @@ class DarkTransfer:
         """Codes from black to the last."""
         return self.top - float(self.black[0])
 
-    def _light_in_the_dark(self, used: list[Level], gain: float) -> None:
+    def _light_in_the_dark(self, used: list[FilterLevel], gain: float) -> None:
         """Light, a drift or a curve in the dark frames, which the black level's sigma then holds."""
         said, dark = [], self.seen.dark_image
         lit = {level.name: level for level in used}

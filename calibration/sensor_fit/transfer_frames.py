@@ -1,4 +1,4 @@
-"""Frames of a photon transfer, read group by group: what is summed up of dark, flat and timed ones."""
+"""Frames of a photon transfer, read group by group: sums, codes and images of dark, flat and timed ones."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from phibench.scenes.frames import Array
 
 
 @dataclass(frozen=True)
-class Level:
+class FilterLevel:
     """One filter of one level: its sums, the shares of its codes, light, and what all filters of it have in common."""
 
     name: str
@@ -29,7 +29,7 @@ class Level:
 
 
 class TransferFrames:
-    """What is summed up of the frames, read group by group."""
+    """Sums of all frames, read group by group."""
 
     def __init__(self, capture: Capture, capped: FrameGroup) -> None:
         self.capture, self.top = capture, (1 << capture.notes.bits) - 1
@@ -48,7 +48,7 @@ class TransferFrames:
             for group in capture.dark_exposures
         ]
 
-    def _levels(self, group: FrameGroup) -> list[Level]:
+    def _levels(self, group: FrameGroup) -> list[FilterLevel]:
         """One level for each filter."""
         light = (group.photons, "photons") if group.photons is not None else None
         if group.name.startswith("exposure/"):
@@ -60,5 +60,5 @@ class TransferFrames:
         for (site, pixels), (_, bad) in zip(of_filters(frames, self.capture.kind), defects, strict=True):
             sums = block_sums(pixels, self.top, bad[0]).jackknife()
             codes = self.widths.add(pixels, float(sums.temporal_dn2[0]))
-            levels.append(Level(group.name, site, sums, codes, light, group.seconds, likeness, image))
+            levels.append(FilterLevel(group.name, site, sums, codes, light, group.seconds, likeness, image))
         return levels
