@@ -225,7 +225,8 @@ class _Fit(DarkTransfer):
         unknown = float(np.hypot(unknown, self.dark_doubt_dn2 * float(signal.sum() / np.sum(signal**2))))
         bend = abs(float(response.slope(np.asarray(signal.max()))) - 1.0) * response.is_bent
         self.bend_doubt = bend if self.seen.dark_image.lopsided_dn else max(bend - _STRONG, 0.0)
-        self.gain_doubt = float(np.hypot(unknown / float(response.gain[0]), self.bend_doubt))
+        by_means = self.widths.averaged - 1.0
+        self.gain_doubt = float(np.hypot.reduce([unknown / float(response.gain[0]), self.bend_doubt, by_means]))
         if (said := response.finding()) is not None:
             self.findings["photon_transfer"] = said
         if response.is_bent:

@@ -165,7 +165,7 @@ def test_columns_that_jump_are_no_read_noise(tmp_path: Path) -> None:
     assert read == pytest.approx(float(np.hypot(12.0, 6.0**-0.5 / CAMERA.gain)), rel=0.03)
 
 
-def averaged(places: str) -> Change:
+def averaged(places: str | tuple[str, ...]) -> Change:
     def change(place: str, k: int, frame: Frame) -> Frame:
         if not place.startswith(places):
             return frame
@@ -181,6 +181,13 @@ def test_means_beside_single_frames_are_refused(tmp_path: Path, places: str) -> 
     """Means of four among flat frames made the gain 80 % too small, at 235 sigma."""
     with pytest.raises(CaptureError, match="give single frames for both, not means"):
         fitted(tmp_path, CAMERA, averaged(places))
+
+
+def test_means_that_were_rounded_half_to_even_are_said(tmp_path: Path) -> None:
+    """Even codes are a quarter wider. The gain was a quarter of the camera's, at 600 sigma, and nothing was said."""
+    found = fitted(tmp_path, CAMERA, averaged(("dark", "flat")))
+    assert "each frame were a mean of 4" in found.tables.findings["codes"]
+    assert pull(found, "gain_dn_per_e", CAMERA.gain) < 4.0
 
 
 @pytest.mark.parametrize("quality", [95, 98, 100])
