@@ -13,12 +13,13 @@ from typing import TYPE_CHECKING, Any
 
 from phibench.benchmark.export.containers import FOLDER, hugging_face_features
 from phibench.benchmark.export.pair_rows import INDEX, POSITION_FIELDS, SPLITS, ExportRequest
-from phibench.datasets.common.shown_text import counted, markdown_text, table_lines
+from phibench.datasets.common.shown_text import markdown_text, table_lines
 from phibench.datasets.frames.frame_files import VALUES, FrameRow
 from phibench.datasets.read import Dataset
 from phibench.datasets.store.croissant import (
     LICENSE_URL,
     PARQUET,
+    counted,
     croissant_text,
     described_field,
     file_object,

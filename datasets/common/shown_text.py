@@ -241,8 +241,3 @@ def csv_table(heads: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
         [heads, *(["" if x is None else csv_text(x) if isinstance(x, str) else x for x in row] for row in rows)]
     )
     return buffer.getvalue()
-
-
-def counted(*counts: tuple[int, str]) -> str:
-    """Numbers with their nouns: "3 pairs, 1 rig"."""
-    return ", ".join(f"{count} {noun}{'' if count == 1 else 's'}" for count, noun in counts)

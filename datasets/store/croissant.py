@@ -11,7 +11,6 @@ import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from phibench.datasets.common.shown_text import counted
 from phibench.datasets.store import schema
 from phibench.datasets.store.schema import DatasetInfo, ManifestRow, columns
 
@@ -205,3 +204,8 @@ def films_croissant(name: str, version: str, films: int, types: Mapping[str, str
     texts = {column: column.replace("_", " ") for column in types}
     records = record_set("frames", rows, types, texts, {"fileSet": {"@id": "frames_truth"}})
     return croissant_text(name, about, version, sets, [records])
+
+
+def counted(*counts: tuple[int, str]) -> str:
+    """Numbers with their nouns: "3 pairs, 1 rig"."""
+    return ", ".join(f"{count} {noun}{'' if count == 1 else 's'}" for count, noun in counts)
