@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import base64
 import binascii
+import math
 import urllib.parse
 from typing import Any
 
@@ -116,6 +117,20 @@ class GltfDocument:
             raise self.file.fault(f"is damaged: '{key}' is {number!s:.20}, not a whole number from 0 to {most}")
         return number
 
+    def number(self, owner: dict[str, Any], key: str, default: float, least: float = 0.0) -> float:
+        """Number from a least one up; glTF has no text and no truth value in its place."""
+        value = owner.get(key, default)
+        if isinstance(value, bool) or not isinstance(value, (int, float)) or not least <= value < math.inf:
+            raise self.file.fault(f"is damaged: '{key}' is {value!r:.20}, not a number from {least:g} up")
+        return float(value)
+
+    def truth(self, owner: dict[str, Any], key: str, default: bool) -> bool:
+        """True or false, never a text or number in its place."""
+        value = owner.get(key, default)
+        if not isinstance(value, bool):
+            raise self.file.fault(f"is damaged: '{key}' is {value!r:.20}, not true or false")
+        return value
+
     # Bytes and arrays.
 
     def view(self, number: Any) -> tuple[memoryview, int]:
@@ -163,7 +178,7 @@ class GltfDocument:
         """Entries of an accessor, shape (count, width), as floats; normalised whole numbers span 0 or -1 to 1."""
         raw, accessor = self.raw_array(number, width), self.row("accessors", number)
         values = raw.astype(float)
-        if accessor.get("normalized") and raw.dtype.kind in "iu":
+        if self.truth(accessor, "normalized", False) and raw.dtype.kind in "iu":
             values = np.maximum(values / np.iinfo(raw.dtype).max, -1.0)
         return values
 

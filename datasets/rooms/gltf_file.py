@@ -133,7 +133,7 @@ class _Reader:
     def _is_hidden(self, node: dict[str, Any]) -> bool:
         """Tell whether a node and what hangs on it are not shown (KHR_node_visibility)."""
         extensions = self.document.table(node, "extensions")
-        return self.document.table(extensions, "KHR_node_visibility").get("visible", True) is False
+        return not self.document.truth(self.document.table(extensions, "KHR_node_visibility"), "visible", True)
 
     def _refuse_unread(self) -> None:
         names = [str(name) for name in self.document.tree.get("extensionsRequired", [])]
@@ -386,7 +386,7 @@ class _Reader:
             return uv
         scale = np.array(self.document.numbers(stated, "scale", (1.0, 1.0)))
         shift = np.array(self.document.numbers(stated, "offset", (0.0, 0.0)))
-        angle = float(stated.get("rotation", 0.0))
+        angle = self.document.number(stated, "rotation", 0.0, least=-1e6)
         c, s = math.cos(angle), math.sin(angle)
         return uv * scale @ np.array([[c, -s], [s, c]]) + shift
 

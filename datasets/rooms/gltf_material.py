@@ -54,8 +54,9 @@ def gltf_material(document: GltfDocument, row: dict[str, Any]) -> GltfMaterial:
     base, factor, texture = document.table(row, "pbrMetallicRoughness"), "baseColorFactor", "baseColorTexture"
     if _GLOSSY in extensions:
         base, factor, texture = document.table(extensions, _GLOSSY), "diffuseFactor", "diffuseTexture"
-    strength = document.table(extensions, "KHR_materials_emissive_strength").get("emissiveStrength", 1.0)
-    light = tuple(x * float(strength) for x in document.numbers(row, "emissiveFactor", BLACK))
+    emission = document.table(extensions, "KHR_materials_emissive_strength")
+    strength = document.number(emission, "emissiveStrength", 1.0)
+    light = tuple(x * strength for x in document.numbers(row, "emissiveFactor", BLACK))
     four = document.numbers(base, factor, (1.0, 1.0, 1.0, 1.0))
     colour, shown = three_numbers(four[:3]), printable_line(str(row.get("name", "")), 60)
     if not colour or not three_numbers(light):
@@ -65,7 +66,7 @@ def gltf_material(document: GltfDocument, row: dict[str, Any]) -> GltfMaterial:
     if max(colour) > 1.0 + ROUNDED:
         raise document.file.fault(f"has a material '{shown}' with a {factor} up to {max(colour):g}: it ends at 1")
     mode = row.get("alphaMode", "OPAQUE")
-    cutoffs = {"OPAQUE": None, "MASK": float(row.get("alphaCutoff", 0.5)), "BLEND": math.ulp(0.0)}
+    cutoffs = {"OPAQUE": None, "MASK": document.number(row, "alphaCutoff", 0.5), "BLEND": math.ulp(0.0)}
     if mode not in cutoffs:
         raise document.file.fault(f"has the alphaMode {printable_line(str(mode), 20)}, which glTF does not know")
     return GltfMaterial(
@@ -74,15 +75,15 @@ def gltf_material(document: GltfDocument, row: dict[str, Any]) -> GltfMaterial:
         _texture(document, base, texture),
         tuple(min(x, BRIGHTEST) for x in light),
         _texture(document, row, "emissiveTexture"),
-        bool(row.get("doubleSided", False)),
+        document.truth(row, "doubleSided", False),
         four[3],
         cutoffs[mode],
     )
 
 
 def _texture(document: GltfDocument, owner: dict[str, Any], key: str) -> GltfTexture | None:
-    if not owner.get(key):
-        return None  # an empty table counts as none
+    if owner.get(key) is None:
+        return None
     stated = document.table(owner, key)
     transform = document.table(document.table(stated, "extensions"), "KHR_texture_transform")
     uv_set = document.whole(transform if "texCoord" in transform else stated, "texCoord", 0, 100)

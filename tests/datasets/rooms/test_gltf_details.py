@@ -129,6 +129,27 @@ def test_a_cutoff_of_zero_hides_nothing(tmp_path: Path) -> None:
     assert len(document.one(tmp_path).triangles) == 2
 
 
+@pytest.mark.parametrize(
+    ("stated", "said"),
+    [
+        ({"doubleSided": "false"}, "'doubleSided' is 'false', not true or false"),
+        ({"alphaMode": "MASK", "alphaCutoff": "0.5"}, "'alphaCutoff' is '0.5', not a number"),
+        ({"alphaMode": "MASK", "alphaCutoff": -1}, "'alphaCutoff' is -1, not a number from 0 up"),
+        ({"extensions": {"KHR_materials_emissive_strength": {"emissiveStrength": "4"}}}, "'emissiveStrength' is '4'"),
+        ({"extensions": {"KHR_materials_emissive_strength": {"emissiveStrength": True}}}, "'emissiveStrength' is True"),
+        ({"emissiveFactor": [1, 1, 1], "emissiveTexture": {}}, "number None of its textures"),
+        ({"pbrMetallicRoughness": {"baseColorTexture": {"index": "0"}}}, "number 0 of its textures"),
+    ],
+)
+def test_text_is_no_number_and_a_table_without_a_picture_is_none(
+    stated: dict[str, Any], said: str, tmp_path: Path
+) -> None:
+    document = Gltf()
+    document.material(**stated)
+    with pytest.raises(RoomError, match=said):
+        document.one(tmp_path)
+
+
 def png_16(grey: int, transparent: int | None) -> bytes:
     def chunk(kind: bytes, data: bytes) -> bytes:
         return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
