@@ -127,7 +127,7 @@ def table(dataset: Dataset) -> Table:
 def narrow_table(dataset: Dataset) -> Table:
     """Table of all samples for terminals of 80 columns: a line for each image, without phi."""
     result = Table(title=_title(dataset), box=None, padding=(0, 1, 0, 0))
-    for heading in ("sample", "D (m)", "h (m)", "image", "u, v (px)", "sigma (deg)", "visible"):
+    for heading in ("sample", "D (m)", "h (m)", "image", "u, v (px)", "sd (deg)", "visible"):
         words = heading in ("sample", "image", "visible")
         result.add_column(heading, justify="left" if words else "right", no_wrap=True)
     for row in dataset.rows:

@@ -353,7 +353,10 @@ def test_show_prints_a_table_and_draws_the_spots(copy: Path) -> None:
         colours = {colour for _, colour in image.getcolors(1 << 24)}
     assert (0, 255, 80) in colours  # the mark
     assert check(copy).ok  # the sheet is not part of the data
-    assert "- / passed" in text  # one result for each image
+    [hidden] = [row for row in read_manifest(copy) if not row.down.visible]
+    assert hidden.up.noise is not None
+    assert f"- / {np.degrees(hidden.up.noise.phi_sensor_rad):.2g} " in text  # one sigma for each image
+    assert "certificates passed: 3 of 3" in text
 
 
 @pytest.mark.parametrize("width", [60, 80, 100, 170])
