@@ -10,7 +10,7 @@ import ast
 import os
 import pickle
 import secrets
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -58,7 +58,7 @@ class PolicyFile:
             )
         if not Path(path).is_file():
             raise SceneError(f"policy '{text}': there is no file {path}; give the path of a Python file")
-        if name not in (there := _names(Path(path))):
+        if not {name, "*"} & (there := _names(Path(path))):
             raise SceneError(f"policy '{text}': {Path(path).name} has no {name}; {nearest(name, sorted(there))}")
         return cls(Path(path).resolve(), name)
 
@@ -85,16 +85,20 @@ def _names(path: Path) -> set[str]:
         tree = parsed(path)
     except MethodError as error:
         raise SceneError(f"policy in {error}") from error
-    names: set[str] = set()
-    for node in tree.body:
-        if isinstance(node, ast.FunctionDef | ast.ClassDef):
-            names.add(node.name)
-        elif isinstance(node, ast.Import | ast.ImportFrom):
-            names |= {alias.asname or alias.name for alias in node.names}
-        elif isinstance(node, ast.Assign | ast.AnnAssign):
-            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
-            names |= {target.id for target in targets if isinstance(target, ast.Name)}
-    return names
+    return set(_bound(tree))
+
+
+def _bound(node: ast.AST) -> Iterator[str]:
+    """Names that a module binds wherever it runs a line: in a tuple, a branch or a loop too; "*" of `import *`."""
+    for child in ast.iter_child_nodes(node):
+        if isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+            yield child.name
+        elif isinstance(child, ast.Import | ast.ImportFrom):
+            yield from (alias.asname or alias.name.split(".")[0] for alias in child.names)
+        elif isinstance(child, ast.Name):
+            yield from [child.id] if isinstance(child.ctx, ast.Store) else []
+        elif not isinstance(child, ast.Lambda | ast.comprehension):  # names of their own
+            yield from _bound(child)
 
 
 class PolicyProcess:

@@ -145,6 +145,12 @@ def test_policies_of_files_are_named_in_one_sentence(tmp_path) -> None:
         "class P:\n    act = staticmethod(lambda seen: None)\nmake = lambda known: P()\nthree = lambda known: 3\n"
     )
     assert PolicyFile.of(f"{file}:make").reference().function == "make"
+    for text in ("make, other = P, 1", "if True:\n    make = P", "from elsewhere import *", "for make in [P]: pass"):
+        (tmp_path / "bound.py").write_text(f"class P: pass\n{text}\n")
+        assert PolicyFile.of(f"{tmp_path / 'bound.py'}:make").name == "make"
+    (tmp_path / "bound.py").write_text("x = [make for make in ()]\ndef other():\n    make = 1\n")
+    with pytest.raises(SceneError, match=r"bound.py has no make; .*known: other, x"):
+        PolicyFile.of(f"{tmp_path / 'bound.py'}:make")
     with pytest.raises(SceneError, match="three gave int"):
         policy_of(lambda known: 3, Setup().known, "three")
     with pytest.raises(SceneError, match="four is int, no function"):
