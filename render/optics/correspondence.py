@@ -32,7 +32,7 @@ image. From `OCCLUDED` on: the object with that id more stands in the way."""
 SEEN, NOTHING, ROBOT, HOLDER, MIRROR_RIM, BACK_SIDE, OUTSIDE = range(len(CAUSES))
 OCCLUDED = 16
 
-_PIXELS = 4096  # at a time: the work arrays stay in the cache
+_SIDE = 64  # of a square of pixels: the work arrays stay in the cache
 _REST = 1e-9  # Newton's step that ends the search: the next would be its square
 
 
@@ -138,11 +138,13 @@ class _Shown:
 
 
 def _disc_pixels(view: View) -> Iterator[IntArray]:
-    """Numbers of the pixels that can see the mirror, some at a time."""
+    """Numbers of the pixels that can see the mirror, a square at a time: their rays run side by side."""
     rows, columns = disc_window(view)
     width = view.rig.camera.width_px
     v, u = np.arange(rows.start, rows.stop), np.arange(columns.start, columns.stop)
-    yield from np.array_split((v[:, None] * width + u).ravel(), v.size * u.size // _PIXELS + 1)
+    for some in np.array_split(v, len(v) // _SIDE + 1):
+        for few in np.array_split(u, len(u) // _SIDE + 1):
+            yield (some[:, None] * width + few).ravel()
 
 
 def _shown(view: View, room: RoomGeometry, pixel: IntArray) -> _Shown:

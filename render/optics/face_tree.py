@@ -1,7 +1,8 @@
 """Tree of plane faces for rays in float64, in NumPy: rays go down all together, level by level.
 
-The few largest faces are tried by all rays. The others stand in a tree of boxes, split at the median of the longest
-side, eight children to a node; what moves down are pairs (ray, node). There is no loop over rays or faces.
+Rays that run side by side meet few faces: these are tried by all of them. Where they meet many, the largest faces are
+tried by all rays. The others stand in a tree of boxes, split at the median of the longest side, eight children to a
+node; what moves down are pairs (ray, node). There is no loop over rays or faces.
 
 **No ray slips through an edge.** A ray meets the plane of a face at t = (h - n.o) / (n.d). With coordinates up to 30 m
 and about 30 roundings the numerator errs by e <= 30 * 30 m * 1.1e-16 = 1e-13 m, and the place on the face by
@@ -31,6 +32,7 @@ _BOX_MARGIN_M = 2e-6  # the reach beyond borders, and the rounding of the test w
 _LARGE = 16  # faces tried by all rays
 _LEAF = 4  # faces in a leaf, at most
 _FEW = 48  # faces without a tree
+_BUNDLE = 256  # rays from which on it pays to ask which faces they may meet
 
 
 @dataclass(frozen=True)
@@ -164,8 +166,12 @@ class FaceTree:
         some = len(near) < len(distance)
         rays, limit = (rays[near], distance[near]) if some else (rays, distance)
         best = np.full(len(near), -1, dtype=np.int64)
-        self._try_large(rays, best, limit)
-        self._try_leaves(rays, best, limit)
+        few = self._ahead(rays, limit) if len(near) >= _BUNDLE else None
+        if few is not None and len(few) <= _LARGE:
+            self._try_all(rays, few, best, limit)
+        else:
+            self._try_all(rays, self._large, best, limit)
+            self._try_leaves(rays, best, limit)
         hit = np.flatnonzero(best >= 0)
         found[near[hit]], distance[near[hit]] = self._pieces.patch[best[hit]], limit[hit]
         return found
@@ -194,20 +200,21 @@ class FaceTree:
         low, high = self._pieces.low.min(axis=0), self._pieces.high.max(axis=0)
         return np.stack([low - _BOX_MARGIN_M, high + _BOX_MARGIN_M])
 
-    def along(self, start_m: Array, end_m: Array, radius_m: float) -> FaceTree | None:
-        """Tree of what comes within a radius of a segment, or nearly so; None where that is much."""
-        span = end_m - start_m
-        inverse = 1.0 / np.where(np.abs(span) < 1e-300, 1e-300, span)
-        reach = radius_m + _BOX_MARGIN_M
-        low, high = (self._pieces.low - reach - start_m) * inverse, (self._pieces.high + reach - start_m) * inverse
-        enter, leave = np.minimum(low, high).max(axis=1), np.maximum(low, high).min(axis=1)
-        near = np.flatnonzero((enter <= leave) & (enter <= 1.0) & (leave >= 0.0))
-        if len(near) > _LARGE:
-            return None
-        tree = FaceTree.__new__(FaceTree)
-        tree._pieces, tree._faces, tree._large = self._pieces[near], self._faces, np.arange(len(near))
-        tree._leaves, tree._levels = _boxes(self._pieces, near[:0])
-        return tree
+    def _ahead(self, rays: Rays, distance: Array) -> IntArray:
+        """Pieces that a bundle of rays may meet, by boxes around its starts, its directions and each piece."""
+        enter, leave = np.zeros(len(self._pieces.patch)), np.full(len(self._pieces.patch), distance.max())
+        for axis in range(3):
+            o, d = rays.origins[axis], rays.directions[axis]
+            top, bottom = self._pieces.high[:, axis] + _BOX_MARGIN_M, self._pieces.low[:, axis] - _BOX_MARGIN_M
+            # after the way t some ray must be below the top, t d <= gap, and some above the bottom
+            for gap, most in ((top - o.min(), d.min()), (o.max() - bottom, -d.max())):
+                if most > 0.0:
+                    np.minimum(leave, gap / most, out=leave)
+                elif most < 0.0:
+                    np.maximum(enter, gap / most, out=enter)
+                else:
+                    leave[gap < 0.0] = -1.0
+        return np.flatnonzero(enter <= leave)
 
     def meet(self, origins_m: Array, directions: Array, ray: IntArray, face: IntArray) -> tuple[Array, BoolArray]:
         """Distance of rays to planes of faces, and whether they meet well inside the border of a face of one piece."""
@@ -222,11 +229,11 @@ class FaceTree:
             inside = usable & (t > 0.0) & (self._pieces.outside_m(piece, points) < -CANDIDATE_MARGIN_M)
         return t, inside
 
-    def _try_large(self, rays: Rays, best: IntArray, distance: Array) -> None:
-        """All rays with the largest pieces, as matrices (pieces, N)."""
-        if not len(self._large):
+    def _try_all(self, rays: Rays, some: IntArray, best: IntArray, distance: Array) -> None:
+        """All rays with some pieces, as matrices (pieces, N)."""
+        if not len(some):
             return
-        own, o, d = self._large_pieces, rays.origins, rays.directions
+        own, o, d = self._large_pieces if some is self._large else self._pieces[some], rays.origins, rays.directions
         with np.errstate(divide="ignore", invalid="ignore"):
             cos = own.plane[:3].T @ d
             t = (own.plane[3][:, None] - own.plane[:3].T @ o) / _not_flat(cos)
@@ -237,7 +244,7 @@ class FaceTree:
         number = np.argmin(t, axis=0)
         nearest = t[number, np.arange(len(number))]
         nearer = np.flatnonzero(nearest < distance)
-        best[nearer], distance[nearer] = self._large[number[nearer]], nearest[nearer]
+        best[nearer], distance[nearer] = some[number[nearer]], nearest[nearer]
 
     def _try_leaves(self, rays: Rays, best: IntArray, distance: Array) -> None:
         if not len(self._leaves):

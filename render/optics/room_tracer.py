@@ -28,8 +28,6 @@ Finder = Callable[[Array, Array], IntArray]
 """Rays to the number of the face that each probably meets first, -1 for none; a guess, which is checked."""
 
 SURFACE_GAP_M = 1e-7  # a segment may touch the surface it ends on by this much; far above float64 rounding
-_BUNDLE = 512  # segments from which on it pays to leave out what is far from them
-_NARROW_M = 0.2
 _CHUNK = 1024  # rays at a time: the work arrays stay in the cache
 
 
@@ -100,16 +98,6 @@ class RoomGeometry:
                 shapes_before += len(part.shapes)
                 faces_before += len(part.table.shape)
         return RoomHits(np.where(patch >= 0, distance, np.inf), object_id, patch)
-
-    def along(self, starts_m: Array, ends_m: Array) -> RoomGeometry:
-        """Geometry for segments that run side by side: without what is far from them; ids stay what they are."""
-        start, end = starts_m.mean(axis=0), ends_m.mean(axis=0)
-        radius = max(
-            float(np.sqrt(((at - of) ** 2).sum(axis=1).max())) for at, of in ((starts_m, start), (ends_m, end))
-        )
-        if not radius < _NARROW_M:
-            return self
-        return RoomGeometry._of(*(part.along(start, end, radius) for part in self._parts))
 
     def resolve(self, origins_m: Array, directions: Array, guess: IntArray) -> RoomHits:
         """First face along each ray, where nearly all are guessed right.
@@ -182,10 +170,8 @@ def blocked_by(room: GeometryLike, starts_m: Array, ends_m: Array) -> IntArray:
     span = ends_m - starts_m
     length = np.linalg.norm(span, axis=-1)
     directions = span / length[:, None]
-    limit, geometry = length - 2.0 * SURFACE_GAP_M, as_geometry(room)
-    if len(span) >= _BUNDLE:
-        geometry = geometry.along(starts_m, ends_m)
-    return geometry.first_hit(starts_m + SURFACE_GAP_M * directions, directions, limit).object_id
+    limit, starts = length - 2.0 * SURFACE_GAP_M, starts_m + SURFACE_GAP_M * directions
+    return as_geometry(room).first_hit(starts, directions, limit).object_id
 
 
 @dataclass(frozen=True)
@@ -245,15 +231,6 @@ class _Part:
     @cached_property
     def tree(self) -> FaceTree:
         return FaceTree(self.table)
-
-    def along(self, start_m: Array, end_m: Array, radius_m: float) -> _Part:
-        """Part with a smaller tree, where a bundle of segments comes near to few faces."""
-        tree = self.tree.along(start_m, end_m, radius_m)
-        if tree is None:
-            return self
-        part = _Part(self.shapes)
-        part.table, part.tree = self.table, tree
-        return part
 
 
 # Deposit of a laser beam: where its light lands on the room's surfaces, and what they scatter.
@@ -324,8 +301,7 @@ def deposit(spot: LaserSpot, room: RoomGeometry, disc: Array) -> Deposit:
         return Deposit(across, normals, np.full(count, spot.albedo), np.zeros(count), np.full(count, -1))
     beam = np.array(spot.beam_direction_world)
     starts, own = across - BEAM_REACH_M * beam, room.without_robot
-    near = own.along(starts, across + BEAM_REACH_M * beam)
-    hits = near.first_hit(starts, np.broadcast_to(beam, (count, 3)), np.full(count, 2.0 * BEAM_REACH_M))
+    hits = own.first_hit(starts, np.broadcast_to(beam, (count, 3)), np.full(count, 2.0 * BEAM_REACH_M))
     way = np.where(hits.patch >= 0, hits.distance_m, np.nan) - BEAM_REACH_M
     points = across + way[:, None] * beam
     return _scattering(spot, own.table, hits.patch, points)

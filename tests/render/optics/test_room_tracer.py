@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import pickle
 import time
+from collections import Counter
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from helpers.triangles import by_determinants
 
+from phibench.render.optics.face_tree import Rays
 from phibench.render.optics.faces import face_table
 from phibench.render.optics.room_tracer import RoomGeometry, blocked_by, first_hit, room_geometry
 from phibench.render.optics.truth import truth_layer
@@ -61,6 +63,31 @@ def test_random_rooms_against_a_loop_over_all_triangles(seed: int) -> None:
     assert np.array_equal(found.patch, face)
     assert np.count_nonzero(object_id >= 14) > 200  # the clutter is met, not the walls alone
     assert {0, 1, 2} == {shapes[k].name[0] == "b" or 2 * (shapes[k].name[0] == "m") for k in object_id if k >= 14}
+
+
+def test_bundles_of_rays_against_a_loop_over_all_triangles() -> None:
+    """Bundles as wide as a few pixels of the mirror and up to 20 degrees; each has to try few faces alone, or all.
+
+    Borders as above. Half of the rays end at the middle of their way: faces behind that are not met.
+    """
+    shapes, rng = clutter(5, 30), np.random.default_rng(5)
+    geometry, tried = RoomGeometry(shapes), Counter[bool]()
+    for k in range(30):
+        width = (0.003, 0.03, 0.2)[k % 3]
+        centre, way = rays(100 + k, 1)
+        o = centre + rng.uniform(-width, width, (300, 3)) * rng.integers(0, 2, 3)
+        d = way + rng.uniform(-width, width, (300, 3))
+        d /= np.linalg.norm(d, axis=1, keepdims=True)
+        distance, object_id, face = by_determinants(shapes, o, d)
+        limit = np.where(np.arange(300) % 2, np.inf, 0.5 * distance)
+        found = geometry.first_hit(o, d, limit)
+        met = np.isinf(limit) & np.isfinite(distance)
+        assert np.array_equal(found.patch, np.where(met, face, -1))
+        assert np.array_equal(found.object_id, np.where(met, object_id, -1))
+        np.testing.assert_allclose(found.distance_m, np.where(met, distance, np.inf), rtol=0.0, atol=1e-11)
+        tree = geometry._parts[0].tree
+        tried[len(tree._ahead(Rays.of(o, d), np.where(np.isinf(limit), 100.0, limit))) <= 16] += 1
+    assert min(tried[True], tried[False]) > 5
 
 
 def test_segments_stop_at_the_first_shape_between_their_ends() -> None:
