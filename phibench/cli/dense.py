@@ -303,8 +303,8 @@ def compare(first: Path, second: Path, *, bootstrap_seed: BootstrapSeed = 0) -> 
 
 
 @dense.command
-def show(*files: Path, by: Literal["methods", "parts", "metrics"] = "methods") -> int:
-    """Show dense scores: methods side by side, or each one's parts or metrics.
+def show(*files: Path, by: Literal["methods", "parts", "metrics"] = "methods", out: Path | None = None) -> int:
+    """Show dense scores: methods side by side, or each one's parts or metrics; --out writes a page of results.
 
     Parameters
     ----------
@@ -312,7 +312,10 @@ def show(*files: Path, by: Literal["methods", "parts", "metrics"] = "methods") -
         JSON files that `dense score --out` wrote.
     by
         methods: one row each; parts: by D, elevation, texture, edges, stroke and room; metrics: all, with intervals.
+    out
+        Markdown file to write: all tables, and each method compared with the next one.
     """
+    from phibench.benchmark.dense.dense_results import write_dense_results
     from phibench.benchmark.dense.dense_score import read_dense
     from phibench.benchmark.dense.dense_tables import dense_board, dense_metrics_table, dense_strata_table
     from phibench.datasets.common.shown_text import show_grid, table_console
@@ -321,6 +324,9 @@ def show(*files: Path, by: Literal["methods", "parts", "metrics"] = "methods") -
     if not scores:
         print("give one score or more: JSON files of `phibench dense score --out`", file=sys.stderr)
         return 1
+    if out is not None:
+        print(f"written: {write_dense_results(files, out)}")
+        return 0
     if by == "methods":
         show_grid(console, dense_board(scores))
     for score in scores if by != "methods" else ():

@@ -18,6 +18,7 @@ from rich.console import Console
 from phibench.benchmark.dense.dense_metrics import DENSE_METRICS
 from phibench.benchmark.dense.dense_pairs import dense_pairs, require_curve
 from phibench.benchmark.dense.dense_records import COLUMN_TYPES
+from phibench.benchmark.dense.dense_results import write_dense_results
 from phibench.benchmark.dense.dense_score import (
     DenseScored,
     compare_dense,
@@ -147,6 +148,29 @@ def test_a_score_comes_back_from_its_file(tiny_dataset: Path, scored: DenseScore
     (tmp_path / "a.json").write_text(json.dumps({**document, "kind": "phibench score"}))
     with pytest.raises(DatasetError, match="is no score"):
         read_dense(tmp_path / "a.json")
+
+
+def test_a_page_of_results_has_the_numbers_of_its_files(
+    tiny_dataset: Path, scored: DenseScored, tmp_path: Path
+) -> None:
+    flat = saved_dense(scored, tmp_path / "a.json").document
+    half = saved_dense(score_dense(tiny_dataset, half_right, "mjpeg", console=quiet()), tmp_path / "b.json").document
+    files, page = [tmp_path / "a.json", tmp_path / "b.json"], tmp_path / "page.md"
+    assert main(["dense", "show", *map(str, files), "--out", str(page)]) == 0
+    text = page.read_text()
+    assert write_dense_results(files[::-1], tmp_path / "again.md").read_text() == text
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines() if line[:1] == "|"]
+    heads = next(row for row in rows if row[:2] == ["method", "recall / %"])
+    shown = {row[0]: dict(zip(heads, row, strict=True)) for row in rows[rows.index(heads) + 2 :][:2]}
+    best, worst = sorted((flat, half), key=lambda score: -(score.metrics["recall"].value or 0.0))
+    assert list(shown) == [best.method.name, worst.method.name]
+    for score in (flat, half):
+        for head, name in (("recall / %", "recall"), ("median error / %", "median_relative")):
+            value = 100.0 * (score.metrics[name].value or 0.0)
+            assert float(shown[score.method.name][head].split()[0]) == pytest.approx(value, rel=5e-3)
+    assert f"| {best.method.name} - {worst.method.name} |" in text
+    with pytest.raises(DatasetError, match=f"{flat.method.name} has two scores"):
+        write_dense_results([files[0], files[0]], page)
 
 
 def test_an_interrupted_run_goes_on(tiny_dataset: Path, methods: Path, tmp_path: Path) -> None:
