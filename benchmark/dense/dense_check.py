@@ -358,8 +358,8 @@ _HYPOTHESES = [
     for sign in (1.0, -1.0)
 ]
 _SIGMAS, _ALIKE = 8.0, 25.0  # of a shift to be named; pixels whose errors count as one: windows overlap
-# Of what any shifts explain. What a shift leaves is the squared effect of its distance from the best one. The best one is
-# as near to the next hypothesis at a quarter of a pixel: of (0.5, 0.5) that leaves 0.25^2 / 0.5 = 1/8.
+# Of what any shifts explain. What a shift leaves is the squared effect of its distance from the best one. The best one
+# is as near to the next hypothesis at a quarter of a pixel: of (0.5, 0.5) that leaves 0.25^2 / 0.5 = 1/8.
 _EXPLAINS = 7.0 / 8.0
 # Another offset of the up image is told from halfway to half a pixel on, if without it the rms error is less by an
 # eighth, 1 - sqrt(3/4): what is worth less is no convention.
