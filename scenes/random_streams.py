@@ -7,8 +7,11 @@ The names (data set, pose, stage, ...) and the recipe's seed are hashed with SHA
 from __future__ import annotations
 
 import hashlib
+from functools import reduce
+from operator import xor
 
 import numpy as np
+from numpy.typing import NDArray
 
 from phibench.scenes.frames import Array
 
@@ -40,13 +43,48 @@ def seed_32(*names: Name) -> int:
     return int(seed_sequence(*names).generate_state(1, np.uint32)[0])
 
 
-def sobol(dimensions: int, count: int) -> Array:
-    """Nodes of a quadrature rule: a Sobol sequence of one scramble for all, shape (count, dimensions), in [0, 1)."""
-    from scipy.stats import qmc  # takes two seconds, and most of what imports this file needs none
+# Sobol's sequence: the points of `scipy.stats.qmc.Sobol`, whose import takes longer than most of what asks for them.
 
-    engine = qmc.Sobol(dimensions, scramble=True, rng=0)  # part of the rule, not a noise draw
-    power = max(count - 1, 0).bit_length()  # scipy warns about numbers that are no power of two
-    return np.asarray(engine.random_base2(power)[:count])
+_BITS = 30
+_JOE_KUO = (
+    *((1, (1,)), (3, (1,)), (7, (1, 3)), (11, (1, 3, 1)), (13, (1, 1, 1))),
+    *((19, (1, 1, 3, 3)), (25, (1, 3, 5, 13))),
+)
+"""Primitive polynomial of each dimension, its coefficients as bits, and first odd numbers (S. Joe, F. Y. Kuo, SIAM J.
+Sci. Comput. 30, 2635, 2008)."""
+
+
+def sobol(dimensions: int, count: int) -> Array:
+    """Nodes of a quadrature rule: a Sobol sequence of one scramble for all, shape (count, dimensions), in [0, 1).
+
+    There are seven dimensions at most.
+    """
+    rng = np.random.default_rng(0).spawn(1)[0]  # part of the rule, not a noise draw
+    shift = rng.integers(2, size=(dimensions, _BITS), dtype=np.uint32) @ (1 << np.arange(_BITS, dtype=np.int64))
+    matrices = np.tril(rng.integers(2, size=(dimensions, _BITS, _BITS), dtype=np.uint32), -1)
+    scrambled = np.array(
+        [_scrambled(_directions(*one), m) for one, m in zip(_JOE_KUO[:dimensions], matrices, strict=True)]
+    )
+    words = np.array(shift[None])
+    for k in range(max(count - 1, 0).bit_length()):  # by Gray's code, which runs backwards with the next bit set
+        words = np.concatenate([words, words[::-1] ^ scrambled[:, k]])
+    return words[:count] * 0.5**_BITS
+
+
+def _directions(polynomial: int, first: tuple[int, ...]) -> list[int]:
+    """Direction numbers of a dimension, `_BITS` bits each, by the recurrence of its polynomial."""
+    degree, odd = polynomial.bit_length() - 1, list(first)
+    for _ in range(len(first), _BITS):
+        steps = (odd[-k] << k for k in range(1, degree + 1) if polynomial >> (degree - k) & 1)
+        odd.append(reduce(xor, steps, odd[-degree] if degree else 1))
+    return [value << (_BITS - 1 - place) for place, value in enumerate(odd)]
+
+
+def _scrambled(directions: list[int], matrix: NDArray[np.uint32]) -> NDArray[np.int64]:
+    """Direction numbers times a lower triangular matrix of bits with ones on its diagonal (Matousek)."""
+    places = np.arange(_BITS)[::-1]
+    bits = np.array(directions)[:, None] >> places & 1
+    return np.asarray((bits + bits @ matrix.T.astype(np.int64)) % 2 @ (1 << places))
 
 
 def _digest(names: tuple[Name, ...]) -> bytes:
