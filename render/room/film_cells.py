@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from phibench.render.room.lamp_outlines import LampCells
 from phibench.render.room.noise_budget import allowed_per_s2
 from phibench.render.room.subpixel_grid import FilmGrid, Stack
 
@@ -31,7 +32,7 @@ class Cells:
     """A window's pixels, and cells of those that are cut; changed in place.
 
     Arrays of whole pixels have the shape (rows, columns) of the window and the blur's margin. Those of cells have the
-    shape (cells, cells, N), N the pixels that are cut, or (3, cells, cells, N).
+    shape (N, k) or (3, N, k), with k cells of each pixel that is cut, by rows. N may be more than the pixels that are.
 
     Attributes
     ----------
@@ -49,14 +50,17 @@ class Cells:
         Brightest lamp that samples of a pixel met, -1 for none.
     rank : int32
         Place of a pixel among those that are cut, -1 for others.
-    numbers : array, shape (cells, cells, N), uint32
-    halves : list of two arrays, shape (3, cells, cells, N), float32
-    side : list of two arrays, shape (cells, cells, N), int32
+    count : int
+        Pixels that are cut.
+    numbers : array, shape (N, k), uint32
+    halves : list of two arrays, shape (3, N, k), float32
+    side : list of two arrays, shape (N, k), int32
         Strata along a side, of each half.
-    edges : array, shape (3, cells, cells, N), float32
+    edges : array, shape (3, N, k), float32
         Least variance, by the spread of single samples.
-    lamps : array, shape (cells, cells, N), int32
-        Lamp whose part of each cell is computed, -1 for none.
+    lamps : array, shape (N, k), int32
+        Place in `cover` of each cell of which a lamp's part is computed, -1 for none.
+    cover : LampCells, or None
     """
 
     grid: FilmGrid
@@ -67,11 +71,13 @@ class Cells:
     whole: tuple[Stack, Stack]
     met: NDArray[np.int32]
     rank: NDArray[np.int32]
+    count: int
     numbers: NDArray[np.uint32]
     halves: list[Stack]
     side: list[NDArray[np.int32]]
     edges: Stack
     lamps: NDArray[np.int32]
+    cover: LampCells | None = None
 
     @classmethod
     def uncut(
@@ -83,28 +89,51 @@ class Cells:
         contrast: Stack,
     ) -> Cells:
         """Pixels of which none is cut, without samples."""
-        shape, none = squares.shape, (grid.cells, grid.cells, 0)
+        shape, none = squares.shape, (0, grid.cells**2)
         whole = np.zeros((3, *shape), dtype=np.float32), np.zeros((3, *shape), dtype=np.float32)
         met, rank = (np.full(shape, -1, dtype=np.int32) for _ in range(2))
         a, b, edges = (np.zeros((3, *none), dtype=np.float32) for _ in range(3))
         one, other, lamps = (np.zeros(none, dtype=np.int32) for _ in range(3))
         numbers = np.zeros(none, dtype=np.uint32)
         return cls(
-            grid, squares, mirrored, full, contrast, whole, met, rank, numbers, [a, b], [one, other], edges, lamps
+            grid, squares, mirrored, full, contrast, whole, met, rank, 0, numbers, [a, b], [one, other], edges, lamps
         )
 
+    def cut(self, row: NDArray[np.intp], column: NDArray[np.intp]) -> slice:
+        """Give pixels a rank, and cells without samples; the ranks."""
+        own = slice(self.count, self.count + len(row))
+        self.rank[row, column] = np.arange(own.start, own.stop)
+        self.count = own.stop
+        if own.stop > len(self.numbers):  # some more than are needed: few rounds cut many
+            more = own.stop + own.stop // 8 - len(self.numbers)
+            self.numbers = _longer(self.numbers, more, 0)
+            self.halves = [_longer(one, more, 0.0) for one in self.halves]
+            self.side = [_longer(one, more, 1) for one in self.side]
+            self.edges, self.lamps = _longer(self.edges, more, 0.0), _longer(self.lamps, more, -1)
+        self.numbers[own] = self.grid.cells_of(self.squares[row, column])
+        return own
 
-def variance_of(cells: Cells, rank: NDArray[np.int32]) -> Stack:
-    """Variance of the means of cells, shape (3, n, n, N)."""
+
+def _longer(values: NDArray[Any], more: int, fill: float) -> NDArray[Any]:
+    """Values of cells, shape (.., N, k), and room for those of more pixels."""
+    *planes, count, cells = values.shape
+    result = np.empty((*planes, count + more, cells), dtype=values.dtype)
+    result[..., :count, :], result[..., count:, :] = values, fill
+    return result
+
+
+def moments_of(cells: Cells, rank: NDArray[np.int32]) -> tuple[Stack, Stack]:
+    """Means of cells and their variances, shape (3, N, k), of pixels of some ranks."""
     a, b = (of_rank(half, rank) for half in cells.halves)
-    return np.maximum(np.square(0.5 * (a - b)), of_rank(cells.edges, rank))
+    variance = np.square(0.5 * (a - b))
+    return 0.5 * (a + b), np.maximum(variance, of_rank(cells.edges, rank), out=variance)
 
 
-def of_rank(values: Stack, rank: NDArray[np.int32]) -> Stack:
-    """Values, shape (.., N), of some pixels that are cut; those of whole rows lie together."""
+def of_rank(values: NDArray[Any], rank: NDArray[np.int32]) -> NDArray[Any]:
+    """Values, shape (.., N, k), of some pixels that are cut; those of whole rows lie together."""
     if len(rank) and len(rank) == rank[-1] - rank[0] + 1 and np.all(np.diff(rank) == 1):
-        return values[..., rank[0] : rank[-1] + 1]
-    return np.take(values, rank, axis=-1)
+        return values[..., rank[0] : rank[-1] + 1, :]
+    return np.take(values, rank, axis=-2)
 
 
 def fold(cells: Cells, pixels: Stack, rows: slice, columns: slice) -> None:
@@ -123,8 +152,7 @@ def fold(cells: Cells, pixels: Stack, rows: slice, columns: slice) -> None:
                 continue
             row, column, rank = cut_in(cells, part)
             variance = variance * np.float32(grid.cells**2)  # a whole pixel's, shared by all its cells
-            own = 0.5 * (of_rank(cells.halves[0], rank) + of_rank(cells.halves[1], rank)), variance_of(cells, rank)
-            for k, (whole, values) in enumerate(zip((mean, variance), own, strict=True)):
+            for k, (whole, values) in enumerate(zip((mean, variance), moments_of(cells, rank), strict=True)):
                 pixels[k, :, first:last, run] = grid.pixels(cell_plane(grid, whole, row, column, values), power=k + 1)
 
 
@@ -149,20 +177,30 @@ def cut_in(cells: Cells, part: Box) -> tuple[NDArray[np.intp], NDArray[np.intp],
 
 
 def cell_plane(grid: FilmGrid, whole: Stack, row: NDArray[np.intp], column: NDArray[np.intp], cut: Stack) -> Stack:
-    """Planes of cells, shape (k, rows, columns): values of whole pixels, and of those that are cut (k, n, n, N)."""
+    """Planes of cells, shape (m, rows, columns): values of whole pixels, and of those that are cut, (m, N, k)."""
     n, (count, height, width) = grid.cells, whole.shape
     plane = np.empty((count, height * n, width * n), dtype=np.float32)
-    corner = (row * (width * n) + column) * n
     for j in range(n):
         plane[:, ::n, j::n] = whole
     for i in range(1, n):
         plane[:, i::n] = plane[:, ::n]
-    for i in range(n):
-        for j in range(n):
-            places = corner + (i * width * n + j)
-            for k in range(count):
-                plane[k].reshape(-1)[places] = cut[k, i, j]
+    pair = 2 - n % 2  # cells that are moved as one
+    kind = np.dtype(f"f{4 * pair}")
+    per_row = n // pair
+    corner = (row * (width * n) + column) * per_row
+    for of_cells, of_cut in zip(plane, cut, strict=True):
+        places, values = of_cells.reshape(-1).view(kind), of_cut.reshape(len(row), n * n).view(kind)
+        for i in range(n):
+            for j in range(per_row):
+                places[corner + (i * width * per_row + j)] = values[:, i * per_row + j]
     return plane
+
+
+def of_cells(grid: FilmGrid, plane: Stack, row: NDArray[np.intp], column: NDArray[np.intp]) -> Stack:
+    """Values of the cells of some pixels, shape (N, k), from a plane of cells."""
+    n = grid.cells
+    within = np.arange(n)[:, None] * plane.shape[1] + np.arange(n)
+    return np.take(plane, ((row * plane.shape[1] + column) * n)[:, None] + within.ravel())
 
 
 def strips_of(grid: FilmGrid, changed: NDArray[np.bool_]) -> Iterator[Box]:
@@ -235,8 +273,8 @@ def sum_of_colours(planes: Stack) -> Stack:
 
 
 def any_cell(of_cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Pixels with a cell that is true."""
-    return np.asarray(of_cells.any(axis=(0, 1)))
+    """Pixels with a cell that is true, by cells (N, k); NumPy's own takes longer along few."""
+    return np.asarray(np.logical_or.reduce(of_cells.T.copy()))
 
 
 def allowed_of_sum(total: Stack, grid: FilmGrid, budget: float) -> Stack:

@@ -18,6 +18,30 @@ _GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))  # of a spiral that fills the d
 _MEANS = (1.0 / 6.0, 1.0 / 6.0, 1.0 / 8.0, 1.0 / 8.0)  # of a second difference: half of the mean square
 _MOST_BENDS = (0.04, 0.04, 0.1, 0.1)  # second differences over the film and over the lens, half squares
 _FLAT = 1e-9  # of the area that the same sides would span: a lamp seen edge on
+PARTS = 2  # of a cell, along a side, in each of which the map to a lamp is linear
+
+
+@dataclass(frozen=True)
+class LampCells:
+    """What lamps cover of n cells, each cut into `PARTS` x `PARTS` squares.
+
+    Attributes
+    ----------
+    lamp : array, shape (n,), int32
+    light : array, shape (3, n), float32
+        Of a lamp on a cell that it covers whole, electrons/s per square pixel; 0 where it is not known.
+    crossed, within : bool arrays, shape (squares, n)
+        Squares that the lamp's outline may cross, and those that the lamp covers whole.
+    """
+
+    lamp: NDArray[np.int32]
+    light: NDArray[np.float32]
+    crossed: NDArray[np.bool_]
+    within: NDArray[np.bool_]
+
+    def of(self, chosen: Any) -> LampCells:
+        """Some of the cells."""
+        return LampCells(self.lamp[chosen], self.light[:, chosen], self.crossed[:, chosen], self.within[:, chosen])
 
 
 @dataclass(frozen=True)
@@ -61,43 +85,52 @@ class LampOutlines:
         centre = MM_PER_M * (table.centre_m[patches] - surfaces.view.sphere_centre_m)
         axes = [axis[patches] / half[:, [k]] for k, axis in enumerate((table.x_axis, table.y_axis))]
         rows = np.concatenate([centre, table.normal[patches], *axes, table.radiance_w_m2_sr[patches]], axis=1)
-        self._lamp = np.full(len(table.size_m), -1, dtype=np.int32)
+        numbers = np.full(len(table.size_m), -1, dtype=np.int32)
         brightest_last = np.argsort(table.radiance_w_m2_sr[patches].sum(axis=1), kind="stable")
-        self._lamp[patches[brightest_last]] = np.arange(len(patches), dtype=np.int32)
+        numbers[patches[brightest_last]] = np.arange(len(patches), dtype=np.int32)
+        self._lamp = mi.Int32(aligned(numbers, np.int32))
         self._rows = [mi.Float64(aligned(column, np.float64)) for column in rows[brightest_last].T]
 
-    def lamp(self, patch: NDArray[np.uint32]) -> NDArray[np.int32]:
+    def of_patch(self, patch: Any) -> Any:
         """Number of the lamp that is a patch, -1 where it is none; brighter lamps have higher numbers."""
-        return np.asarray(self._lamp[patch])
+        import drjit as dr
 
-    def outline(self, middle: list[Any], half: Any, lamp: Any) -> tuple[Any, Any, Any]:
-        """Light of lamps on squares of the film, electrons/s per square pixel; whether their outlines may cross these.
+        return dr.gather(self._mi.Int32, self._lamp, patch)
 
-        The light is that of a square which the lamp covers whole; 0 where the map is not known well enough. Where no
-        point of the lens brings an outline into a square, the third mask tells whether the lamp covers it.
+    def cells(self, middle: list[Any], half: Any, _: Any, lamp: NDArray[np.int32]) -> LampCells:
+        """What lamps, shape (n,), cover of cells, whose squares follow each other.
+
+        The light is known where the map to the lamp is so in all squares of a cell.
 
         Parameters
         ----------
         middle, half
             Middle (u, v) of squares and half of their sides, float64 pixels.
-        lamp
-            Numbers of lamps, -1 for none.
         """
         import drjit as dr
 
         mi = self._mi
-        ends, known, weight, radiance = self._ends(middle, half, lamp)
+        ends, known, weight, radiance = self._ends(middle, half, mi.Int32(aligned(np.repeat(lamp, PARTS**2), np.int32)))
         shape = self._square(ends)
         light = weight * mi.Color3f(*(mi.Float(value) for value in radiance))
-        return dr.select(known & shape.valid, light, 0.0), shape.crossed, shape.within
+        light = dr.select(known & shape.valid, light, 0.0)
+        dr.eval(light, shape.crossed, shape.within)
+        lights = light.numpy().reshape(3, -1, PARTS**2)
+        whole = (lights.sum(axis=0) > 0.0).all(axis=1)
+        crossed, within = (np.array(one, dtype=bool).reshape(-1, PARTS**2).T for one in (shape.crossed, shape.within))
+        return LampCells(lamp, np.where(whole, lights.mean(axis=2), np.float32(0.0)), crossed, within)
 
     def share(self, middle: list[Any], half: Any, points: Any, turn: list[Any], lamp: Any) -> Any:
-        """Part of squares of the film that lamps cover; arguments as for `outline`.
+        """Part of squares of the film that lamps cover.
 
         Parameters
         ----------
+        middle, half
+            As for `cells`.
         points, turn
             Number of lens points, and two uniform deviates that turn their pattern.
+        lamp
+            Number of each square's lamp.
         """
         return self._mi.Float(self._covered(self._square(self._ends(middle, half, lamp)[0]), points, turn))
 

@@ -22,8 +22,6 @@ see twice g: c^2 / 18 is nearly three times as much, and strata gain more there.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -43,14 +41,15 @@ from phibench.render.room.film_cells import (
     inner,
     mean_of_nine,
     means_of_cells,
+    moments_of,
     moved,
+    of_cells,
     of_rank,
     reach_px,
     share_of_cell,
     strips_of,
     sum_of_colours,
     taps_of_pixels,
-    variance_of,
 )
 from phibench.render.room.noise_budget import allowed_per_s2, excess, is_full
 from phibench.render.room.subpixel_grid import RIM_PX, CellSampler, Crop, Stack
@@ -109,18 +108,16 @@ def first_pass(film: CellSampler, window: Crop, budget: float) -> Cells:
         new = matters & grown(cells.met >= 0, reach_px(grid)) & (cells.rank < 0)
     if (whole := cells.rank < 0).any():  # none where every pixel is cut
         _sample_whole(film, cells, whole)
-    cells.lamps = _lamps_near(film, cells)
+    _find_lamps(film, cells)
     return cells
 
 
 def _scouted(film: CellSampler, squares: NDArray[np.uint32]) -> tuple[Stack, NDArray[np.bool_], NDArray[np.int32]]:
     """Light of scouts, shape (3, n, rows, columns); pixels that see the mirror; brightest lamp met, -1 for none."""
     numbers = film.grid.scouts_of(squares.ravel())
-    shape = (numbers.shape[0] ** 2, *squares.shape)
+    shape = (len(numbers), *squares.shape)
     found = film.sample_once(numbers.ravel(), _SCOUT, film.grid.scouts)
-    met = np.full(squares.shape, -1, dtype=np.int32)
-    if film.lamps is not None:
-        met[:] = film.lamps.lamp(found.patch).reshape(shape).max(axis=0)
+    met = found.lamp.reshape(shape).max(axis=0)
     return found.electrons_per_s.reshape(3, *shape), np.asarray(found.mirrored.reshape(shape).any(axis=0)), met
 
 
@@ -137,56 +134,42 @@ def _sample_whole(film: CellSampler, cells: Cells, chosen: NDArray[np.bool_]) ->
 
 def _cut(film: CellSampler, cells: Cells, row: NDArray[np.intp], column: NDArray[np.intp]) -> None:
     """Cut pixels into cells with two samples."""
-    first = cells.numbers.shape[2]
-    cells.rank[row, column] = first + np.arange(len(row))
-    numbers = cells.grid.cells_of(cells.squares[row, column])
-    shape = numbers.shape
-    found = [film.sample_once(numbers.ravel(), _FIRST + half) for half in (0, 1)]
-    for half, one in enumerate(found):
-        cells.halves[half] = _longer(cells.halves[half], one.electrons_per_s.reshape(3, *shape))
-        cells.side[half] = _longer(cells.side[half], np.ones(shape, dtype=np.int32))
-        cells.mirrored[row, column] |= any_cell(one.mirrored.reshape(shape))
-        if film.lamps is not None:
-            met = film.lamps.lamp(one.patch).reshape(shape).max(axis=(0, 1))
-            cells.met[row, column] = np.maximum(cells.met[row, column], met)
-    cells.numbers = _longer(cells.numbers, numbers)
-    cells.edges = _longer(cells.edges, np.zeros((3, *shape), dtype=np.float32))
-    cells.lamps = _longer(cells.lamps, np.full(shape, -1, dtype=np.int32))
+    own = cells.cut(row, column)
+    numbers = cells.numbers[own]
+    for half in (0, 1):
+        found = film.sample_once(numbers.ravel(), _FIRST + half)
+        cells.halves[half][:, own] = found.electrons_per_s.reshape(3, *numbers.shape)
+        cells.mirrored[row, column] |= any_cell(found.mirrored.reshape(numbers.shape))
+        met = np.maximum.reduce(found.lamp.reshape(numbers.shape).T.copy())
+        cells.met[row, column] = np.maximum(cells.met[row, column], met)
 
 
-def _longer(values: NDArray[Any], more: NDArray[Any]) -> NDArray[Any]:
-    """Values of pixels that are cut, and those of more; cells of new pixels stand last."""
-    return more if not values.size else np.concatenate([values, more], axis=-1)
-
-
-def _lamps_near(film: CellSampler, cells: Cells) -> NDArray[np.int32]:
-    """Brightest lamp that samples within the blur's reach met, for each cell that is cut, -1 for none.
+def _find_lamps(film: CellSampler, cells: Cells) -> None:
+    """Find the brightest lamp that samples within the blur's reach met, for each cell that is cut.
 
     None either where its part cannot be computed, or where a sample in reach met the outline of that lamp but not the
     lamp. What a hidden lamp would cover
     is noise, of few and large errors: the halves of a cell agree by chance on a wrong mean.
     """
-    shape = cells.numbers.shape
-    if film.lamps is None or not cells.numbers.size:
-        return np.full(shape, -1, dtype=np.int32)
-    cut = cells.rank >= 0
+    if film.lamps is None or not cells.count:
+        return
     lamp = extreme(np.maximum, cells.met, reach_px(cells.grid))
-    lamp[~cut] = -1
+    lamp[cells.rank < 0] = -1
     near = np.flatnonzero(lamp >= 0)
-    if near.size:
-        numbers = cells.numbers[:, :, cells.rank.ravel()[near]]
-        which = np.broadcast_to(lamp.ravel()[near], numbers.shape).ravel()
-        hidden = np.zeros(lamp.shape, dtype=bool)
-        behind = (film.hidden(numbers.ravel(), _FIRST + half, which) for half in (0, 1))
-        hidden.ravel()[near] = any_cell(np.logical_or(*behind).reshape(numbers.shape))
-        lamp[grown(hidden, reach_px(cells.grid))] = -1
-    by_pixel = np.empty(shape[2], dtype=np.int32)
-    by_pixel[cells.rank[cut]] = lamp[cut]
-    result = np.broadcast_to(by_pixel, shape).copy()
-    places = np.flatnonzero(result >= 0)
-    known = film.knows(cells.numbers.ravel()[places], result.ravel()[places]) if places.size else places > 0
-    result.ravel()[places[~known]] = -1
-    return result
+    if not near.size:
+        return
+    rank = cells.rank.ravel()[near]
+    numbers = cells.numbers[rank]
+    which = np.repeat(lamp.ravel()[near], numbers.shape[1])
+    hidden = np.zeros(lamp.shape, dtype=bool)
+    behind = (film.hidden(numbers.ravel(), _FIRST + half, which) for half in (0, 1))
+    hidden.ravel()[near] = any_cell(np.logical_or(*behind).reshape(numbers.shape))
+    seen = np.repeat(~grown(hidden, reach_px(cells.grid)).ravel()[near], numbers.shape[1])
+    cover = film.cover(numbers.ravel()[seen], which[seen])
+    known = cover.light.max(axis=0) > 0.0
+    places = (rank[:, None] * numbers.shape[1] + np.arange(numbers.shape[1])).ravel()[seen][known]
+    cells.lamps.ravel()[places] = np.arange(len(places))
+    cells.cover = cover.of(known)
 
 
 # Second pass: strata of each half by the samples of the other.
@@ -211,7 +194,7 @@ def _second_pass(film: CellSampler, cells: Cells, box: Box, budget: float) -> No
 def _strata(
     cells: Cells, half: int, part: Box, inside: NDArray[np.bool_], seen: Stack, budget: float
 ) -> NDArray[np.int32]:
-    """Strata along a side that cells need by one half, shape (n, n, N); 1 where `inside`, a part of pixels, is not.
+    """Strata along a side that cells need by one half, shape (N, k); 1 where `inside`, a part of pixels, is not.
 
     `seen` is the contrast of the scouts around each cell of the part.
     """
@@ -229,11 +212,9 @@ def _strata(
     here = inside[row, column] & (near[row, column] > _AIM)
     row, column, rank = row[here], column[here], rank[here]
     strata = np.ones(cells.numbers.shape, dtype=np.int32)
-    for i in range(n):
-        for j in range(n):
-            ratio = share_of_cell(grid) * variance[row * n + i, column * n + j] / tight[row, column]
-            wanted = _next_side(np.cbrt(np.minimum(ratio, near[row, column]) / _AIM))
-            strata[i, j, rank] = np.where(cells.lamps[i, j, rank] >= 0, _LAMP_SIDE, wanted)
+    ratio = share_of_cell(grid) * of_cells(grid, variance, row, column) / tight[row, column][:, None]
+    wanted = _next_side(np.cbrt(np.minimum(ratio, near[row, column][:, None]) / _AIM))
+    strata[rank] = np.where(cells.lamps[rank] >= 0, _LAMP_SIDE, wanted)
     return strata
 
 
@@ -250,9 +231,10 @@ def _sample_half(
         return
     numbers, lamps = cells.numbers.ravel()[chosen], cells.lamps.ravel()[chosen]
     values, edges = cells.halves[half].reshape(3, -1), cells.edges.reshape(3, -1)
-    for part, near in ((lamps < 0, None), (lamps >= 0, lamps[lamps >= 0])):
+    for part, known in ((lamps < 0, False), (lamps >= 0, True)):
         if part.any():
-            found = film.sample(numbers[part], side[part], stream, near)
+            cover = cells.cover.of(lamps[part]) if known and cells.cover else None
+            found = film.sample(numbers[part], side[part], stream, cover)
             least = 0.25 * found.spread / side[part].astype(np.float32) ** 3
             for k, where in ((k, chosen[part]) for k in range(3)):
                 values[k][where] = found.electrons_per_s[k]
@@ -278,8 +260,8 @@ def _without_hidden_lamps(film: CellSampler, cells: Cells, turn: int) -> NDArray
     around[cut] = any_cell(negative)[cells.rank[cut]]
     around = grown(around, reach_px(cells.grid)) & cut
     again = np.zeros_like(negative)
-    again[:, :, cells.rank[around]] = (cells.lamps >= 0)[:, :, cells.rank[around]]
-    cells.lamps[:, :, cells.rank[around]] = -1
+    again[cells.rank[around]] = cells.lamps[cells.rank[around]] >= 0
+    cells.lamps[cells.rank[around]] = -1
     side = np.maximum(*cells.side)
     chosen = np.flatnonzero(again & (side > 1))
     for half in (0, 1):
@@ -319,16 +301,16 @@ def refine(film: CellSampler, cells: Cells, pixels: Stack, box: Box, budget: flo
     if new.any():
         _cut(film, cells, row[new], column[new])
     cut = cells.rank[row, column] >= 0
-    rank, near, close, tight = cells.rank[row, column][cut], near[chosen][cut], close[chosen][cut], tight[chosen][cut]
-    side = np.maximum(*(one[:, :, rank] for one in cells.side))
-    ratio = share_of_cell(grid) * sum_of_colours(variance_of(cells, rank)) / tight
+    rank = cells.rank[row, column][cut]
+    near, close, tight = (one[chosen][cut][:, None] for one in (near, close, tight))
+    side = np.maximum(*(of_rank(one, rank) for one in cells.side))
+    ratio = share_of_cell(grid) * sum_of_colours(moments_of(cells, rank)[1]) / tight
     growth = np.clip(np.cbrt(np.minimum(ratio, near) / _AIM), 1.2, _GROWTH)
     wanted = np.where(ratio > _SMALL, _next_side(side * growth), side)
     # little is known of a cell with two samples: it gets more, whatever it seems to need
     wanted = np.where((side == 1) & (close > 1.0), np.maximum(wanted, 2), wanted)
     more = wanted > side
-    n = grid.cells
-    places = np.arange(n * n).reshape(n, n, 1) * cells.numbers.shape[2] + rank
+    places = rank[:, None] * grid.cells**2 + np.arange(grid.cells**2)
     for half in (0, 1):
         _sample_half(film, cells, half, places[more], wanted[more], _FIRST + 2 + 2 * turn + half)
     changed = _without_hidden_lamps(film, cells, turn + 1)

@@ -16,14 +16,15 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, fields
 from functools import cached_property, lru_cache
+from itertools import pairwise
 from types import ModuleType
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from phibench.render.room.lamp_outlines import LampOutlines
+from phibench.render.room.lamp_outlines import PARTS, LampCells, LampOutlines
 from phibench.render.room.shading import Look
 from phibench.render.room.surfaces import aligned
 from phibench.scenes.camera import Camera
@@ -129,21 +130,21 @@ class FilmGrid:
         return max(1, round(math.sqrt(_SCOUTS / (self.width_px * self.height_px))))
 
     def scouts_of(self, squares: NDArray[np.uint32]) -> NDArray[np.uint32]:
-        """Numbers of the parts of whole pixels, shape (scouts, scouts, n)."""
+        """Numbers of the parts of whole pixels, shape (scouts^2, n)."""
         row, column = np.divmod(squares, np.uint32(self.square_columns))
-        return _parts(row, column, self.scouts, self.square_columns * self.scouts)
+        return np.ascontiguousarray(_parts(row, column, self.scouts, self.square_columns * self.scouts).T)
 
     def cells_of(self, squares: NDArray[np.uint32]) -> NDArray[np.uint32]:
-        """Numbers of the cells of whole pixels, shape (cells, cells, n); none of them lies in the rim."""
+        """Numbers of the cells of whole pixels, shape (n, cells^2), by rows; none of them lies in the rim."""
         row, column = (part - RIM_PX for part in np.divmod(squares, np.uint32(self.square_columns)))
         return _parts(row, column, self.cells, self.columns)
 
 
 def _parts(row: NDArray[np.uint32], column: NDArray[np.uint32], n: int, columns: int) -> NDArray[np.uint32]:
-    """Numbers of n x n parts of squares, in a grid that has so many columns of parts."""
+    """Numbers of n x n parts of squares, shape (squares, n^2), in a grid that has so many columns of parts."""
     corner = (row.astype(np.int64) * columns + column) * n
     place = np.arange(n)[:, None] * columns + np.arange(n)
-    return (corner + place[..., None]).astype(np.uint32)
+    return (corner[:, None] + place.ravel()).astype(np.uint32)
 
 
 _BLOCK_PX = 16  # pixels whose weights are one dense matrix: three times as fast as a sparse one
@@ -234,10 +235,9 @@ def _uniform(mi: ModuleType, word: Any) -> Any:
 
 # Sampling.
 
-_PARTS = 2  # of a cell, along a side, in each of which the map to a lamp is linear
 _LENS_POINTS = 32  # for each of the strata along a cell's side
-_CHUNK = 256  # samples of a cell that one lane takes: the few cells with thousands share them among many lanes
 _CELLS_AT_A_TIME = 1 << 19
+_POINTS_AT_A_TIME = 1 << 20  # of strata, with the rest of a cell
 
 
 @dataclass(frozen=True)
@@ -252,14 +252,14 @@ class Samples:
         Variance of single samples, without what the outlines of lamps contribute; (3, 0) of a single one.
     mirrored : bool array, shape (n,)
         Whether a sample saw the mirror.
-    patch : array, shape (n,), uint32
-        Patch of the room that a sample met by the mirror, or 0.
+    lamp : array, shape (n,), int32
+        Lamp that a sample met by the mirror, -1 for none; brighter ones have higher numbers.
     """
 
     electrons_per_s: Stack
     spread: Stack
     mirrored: NDArray[np.bool_]
-    patch: NDArray[np.uint32]
+    lamp: NDArray[np.int32]
 
 
 class CellSampler:
@@ -283,9 +283,10 @@ class CellSampler:
         import drjit as dr
 
         value, mirrored, patch, _ = self._first(numbers, stream, parts)
-        dr.eval(value, mirrored, patch)
-        none = np.zeros((3, 0), dtype=np.float32)
-        return Samples(_planes(value), none, np.array(mirrored, dtype=bool), np.array(patch, dtype=np.uint32))
+        lamp = self._mi.Int32(-1) if self.lamps is None else self.lamps.of_patch(patch)
+        dr.eval(value, mirrored, lamp)
+        none, met = np.zeros((3, 0), dtype=np.float32), np.array(lamp, dtype=np.int32)
+        return Samples(value.numpy(), none, np.array(mirrored, dtype=bool), np.broadcast_to(met, numbers.shape))
 
     def _first(self, numbers: NDArray[np.uint32], stream: int, parts: int = 0) -> tuple[Any, Any, Any, Any]:
         """Light, mirror, patch and ray of the one point of each cell, as `Look.electrons` gives them."""
@@ -304,109 +305,101 @@ class CellSampler:
         parts = zip(np.split(numbers, starts), np.split(lamp, starts), strict=True)
         return np.concatenate([self._hidden(some, stream, near) for some, near in parts])
 
-    def knows(self, numbers: NDArray[np.uint32], lamp: NDArray[np.int32]) -> NDArray[np.bool_]:
-        """True where the part of cells, shape (n,), that a lamp covers can be computed."""
-        starts = range(_CELLS_AT_A_TIME // _PARTS**2, len(numbers), _CELLS_AT_A_TIME // _PARTS**2)
-        parts = zip(np.split(numbers, starts), np.split(lamp, starts), strict=True)
-        lights = (self._shares(cells, np.zeros(len(cells), dtype=np.int32), 0, near)[0] for cells, near in parts)
-        return np.concatenate([light.max(axis=0) > 0.0 for light in lights])
-
     def _hidden(self, numbers: NDArray[np.uint32], stream: int, lamp: NDArray[np.int32]) -> NDArray[np.bool_]:
         import drjit as dr
 
         assert self.lamps is not None
         _, _, patch, ray = self._first(numbers, stream)
-        met = self.lamps.meets(ray, self._mi.Int32(aligned(lamp, np.int32)))
-        dr.eval(met, patch)
-        return np.array(met, dtype=bool) & (self.lamps.lamp(np.array(patch, dtype=np.uint32)) != lamp)
+        which = self._mi.Int32(aligned(lamp, np.int32))
+        hidden = self.lamps.meets(ray, which) & (self.lamps.of_patch(patch) != which)
+        dr.eval(hidden)
+        return np.array(hidden, dtype=bool)
+
+    def cover(self, numbers: NDArray[np.uint32], lamp: NDArray[np.int32]) -> LampCells:
+        """What lamps, shape (n,), cover of cells."""
+        assert self.lamps is not None
+        starts = range(_CELLS_AT_A_TIME // PARTS**2, len(numbers), _CELLS_AT_A_TIME // PARTS**2)
+        parts = zip(np.split(numbers, starts), np.split(lamp, starts), strict=True)
+        return _joined([self.lamps.cells(*self._quarters(cells), near) for cells, near in parts])
 
     def sample(
-        self, numbers: NDArray[np.uint32], side: NDArray[np.int32], stream: int, lamp: NDArray[np.int32] | None
+        self, numbers: NDArray[np.uint32], side: NDArray[np.int32], stream: int, cover: LampCells | None
     ) -> Samples:
-        """Sample cells, shape (n,), with side x side points each; `lamp` is the one whose part of each is computed.
-
-        Where `lamp` is -1 there is none; None if there is none anywhere.
-        """
-        starts = _starts(len(numbers))
-        parts = [None] * (len(starts) + 1) if lamp is None else np.split(lamp, starts)
-        split = zip(np.split(numbers, starts), np.split(side, starts), parts, strict=True)
-        return _joined([self._again(some, points, stream, near) for some, points, near in split])
+        """Sample cells, shape (n,), with side x side points each; `cover` is what lamps cover of them, if anything."""
+        taken = np.cumsum(np.square(side, dtype=np.int64))
+        starts = np.searchsorted(taken, np.arange(_POINTS_AT_A_TIME, taken[-1], _POINTS_AT_A_TIME)) + 1
+        bounds = [0, *np.unique(starts[starts < len(numbers)]).tolist(), len(numbers)]
+        parts = [slice(*pair) for pair in pairwise(bounds)]
+        return _joined([self._again(numbers[k], side[k], stream, cover.of(k) if cover else None) for k in parts])
 
     def _again(
-        self, numbers: NDArray[np.uint32], side: NDArray[np.int32], stream: int, lamp: NDArray[np.int32] | None
+        self, numbers: NDArray[np.uint32], side: NDArray[np.int32], stream: int, cover: LampCells | None
     ) -> Samples:
+        """A lane for each point: those of a cell and of its neighbour lie together, and so do their rays."""
         import drjit as dr
 
-        mi, key = self._mi, self._key(stream)
-        cell, start, stop = _chunks(side)
-        lanes, m, first, end = (
-            mi.UInt32(aligned(values, np.uint32)) for values in (numbers[cell], side[cell], start, stop)
-        )
-        m = mi.Float(dr.maximum(m, 1))  # lanes beyond the last have none, and are divided by nonetheless
+        mi, key, count = self._mi, self._key(stream), np.square(side, dtype=np.int64)
+        cell = mi.UInt32(aligned(np.repeat(np.arange(len(side), dtype=np.uint32), count), np.uint32))
+        lane, m, first = (mi.UInt32(aligned(a, np.uint32)) for a in (numbers, side, np.cumsum(count) - count))
+        lanes, sides, index = (dr.gather(mi.UInt32, one, cell) for one in (lane, m, first))
         shift = paired_shifts(mi, lanes, self._dimensions, dr.opaque(mi.UInt32, key))
+        index, per_m = dr.arange(mi.UInt32, len(cell)) - index, 1.0 / mi.Float(sides)
+        x, place = points(mi, shift, index), mi.Float(index)
+        row = dr.floor((place + 0.5) * per_m)  # exact, and faster than a division of whole numbers
         corner, h = self._corner(lanes)
-        step, per_m = h / mi.Float64(m), 1.0 / m
-        if lamp is not None:
-            light, part = self._shares(numbers, side, key, lamp)
-            which = mi.Int32(aligned(lamp[cell], np.int32))
-            shine = mi.Color3f(*(mi.Float(aligned(plane[cell])) for plane in light))
+        step = h / mi.Float64(sides)
+        u, v = (
+            low + (mi.Float64(k) + mi.Float64(value)) * step
+            for low, k, value in zip(corner, (place - row * mi.Float(sides), row), x[:2], strict=True)
+        )
+        value, _, _, ray = self._look.electrons(u, v, x[2:])
+        if cover is not None:
+            value -= self._shine(cover, cell, ray)
+        mean, spread = _moments(mi, value, first, m * m)
+        if cover is not None:
+            mean = mean + cover.light * self._covered(cover, numbers, side, key)
+        none = np.zeros(0, dtype=np.int32)
+        return Samples(mean, spread, none.astype(bool), none)
 
-        def body(i: Any, total: Any, square: Any) -> tuple[Any, Any, Any]:
-            x, place = points(mi, shift, i), mi.Float(i)
-            row = dr.floor((place + 0.5) * per_m)  # exact, and faster than a division of whole numbers
-            u, v = (
-                low + (mi.Float64(k) + mi.Float64(value)) * step
-                for low, k, value in zip(corner, (place - row * m, row), x[:2], strict=True)
-            )
-            value, _, _, ray = self._look.electrons(u, v, x[2:])
-            if self.lamps is not None and lamp is not None:
-                value -= dr.select(self.lamps.meets(ray, which), shine, 0.0)
-            return i + 1, total + value, square + value * value
-
-        zero = (first, dr.zeros(mi.Color3f, len(cell)), dr.zeros(mi.Color3f, len(cell)))
-        _, *sums = dr.while_loop(zero, lambda i, *_: i < end, body)
-        dr.eval(*sums)
-        per_sample = 1.0 / side.astype(float) ** 2
-        mean, square = (_of_cells(cell, _planes(one), len(side)) * per_sample for one in sums)
-        spread = np.maximum(square - mean**2, 0.0).astype(np.float32)
-        if lamp is not None:
-            mean = mean + light * part
-        none = np.zeros(0, dtype=bool)
-        return Samples(mean.astype(np.float32), spread, none, none.astype(np.uint32))
-
-    def _shares(
-        self, numbers: NDArray[np.uint32], side: NDArray[np.int32], key: int, lamp: NDArray[np.int32]
-    ) -> tuple[Stack, Stack]:
-        """Light (3, n) of lamps on cells that they cover whole, 0 if unknown, and the part (n,) that they cover."""
+    def _shine(self, cover: LampCells, cell: Any, ray: tuple[Any, Any, Any]) -> Any:
+        """Light of the lamps of cells, where rays meet the lamp or what hides it."""
         import drjit as dr
 
         assert self.lamps is not None
-        mi, n = self._mi, _PARTS
-        cell, place = np.repeat(np.arange(len(numbers)), n * n), np.tile(np.arange(n * n), len(numbers))
+        mi = self._mi
+        light = mi.Color3f(*(dr.gather(mi.Float, mi.Float(aligned(plane)), cell) for plane in cover.light))
+        which = dr.gather(mi.Int32, mi.Int32(aligned(cover.lamp, np.int32)), cell)
+        return dr.select(self.lamps.meets(ray, which), light, 0.0)
 
-        def square(chosen: Any) -> tuple[Any, ...]:
-            lanes, column, row = (
-                mi.UInt32(aligned(values, np.uint32))
-                for values in (numbers[cell[chosen]], place[chosen] % n, place[chosen] // n)
-            )
-            corner, h = self._corner(lanes)
-            h = h / n
-            middle = [low + (mi.Float64(k) + 0.5) * h for low, k in zip(corner, (column, row), strict=True)]
-            which = mi.Int32(aligned(lamp[cell[chosen]], np.int32))
-            return middle, 0.5 * h, which, lanes * (n * n) + row * n + column
+    def _covered(
+        self, cover: LampCells, numbers: NDArray[np.uint32], side: NDArray[np.int32], key: int
+    ) -> NDArray[np.float32]:
+        """Part of cells that lamps cover, shape (n,), with some lens points for each of the strata along a side."""
+        import drjit as dr
 
-        *where, quarter = square(slice(None))
-        light, crossed, within = self.lamps.outline(*where)
-        dr.eval(light, crossed, within)
-        part = np.array(within, dtype=np.float32)
-        if (chosen := np.flatnonzero(np.array(crossed))).size and side.any():
-            middle, half, which, quarter = square(chosen)
-            points = mi.UInt32(aligned(_LENS_POINTS * side[cell[chosen]], np.uint32))
-            turn = paired_shifts(mi, quarter, 2, dr.opaque(mi.UInt32, key))
-            part[chosen] = np.array(self.lamps.share(middle, half, points, turn, which))
-        lights = _planes(light).reshape(3, -1, n * n)
-        known = (lights.sum(axis=0) > 0.0).all(axis=1)
-        return np.where(known, lights.mean(axis=2), np.float32(0.0)), part.reshape(-1, n * n).mean(axis=1)
+        assert self.lamps is not None
+        mi, part = self._mi, cover.within.astype(np.float32)
+        quarter, cell = np.nonzero(cover.crossed)
+        if cell.size:
+            middle, half, lanes = self._quarters(numbers[cell], quarter)
+            points = mi.UInt32(aligned(_LENS_POINTS * side[cell], np.uint32))
+            turn = paired_shifts(mi, lanes, 2, dr.opaque(mi.UInt32, key))
+            which = mi.Int32(aligned(cover.lamp[cell], np.int32))
+            part[quarter, cell] = np.array(self.lamps.share(middle, half, points, turn, which))
+        return np.asarray(part.mean(axis=0))
+
+    def _quarters(
+        self, numbers: NDArray[np.uint32], place: NDArray[np.intp] | None = None
+    ) -> tuple[list[Any], Any, Any]:
+        """Middle and half side of parts of cells, all of them or one of each, and their numbers."""
+        mi, n = self._mi, PARTS
+        if place is None:
+            numbers, place = np.repeat(numbers, n * n), np.tile(np.arange(n * n), len(numbers))
+        lanes, column, row = (mi.UInt32(aligned(one, np.uint32)) for one in (numbers, place % n, place // n))
+        corner, h = self._corner(lanes)
+        h = h / n
+        middle = [low + (mi.Float64(k) + 0.5) * h for low, k in zip(corner, (column, row), strict=True)]
+        return middle, 0.5 * h, lanes * (n * n) + row * n + column
 
     def _corner(self, lanes: Any, parts: int = 0) -> tuple[list[Any], Any]:
         """Corner (u, v) of cells, or parts of pixels, and their side, float64 pixels; opaque: one kernel for all."""
@@ -426,33 +419,22 @@ class CellSampler:
         return int(np.random.SeedSequence([self._seed, stream]).generate_state(1, np.uint32)[0])
 
 
-def _chunks(side: NDArray[np.int32]) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
-    """Cell, first sample and end of each lane; lanes of like length lie together, because 16 lanes run as one."""
-    samples = side.astype(np.intp) ** 2
-    if samples.max(initial=0) <= _CHUNK:  # a lane each
-        order = _longest_first(samples)
-        return order, np.zeros_like(order), samples[order]
-    count = -(-samples // _CHUNK)
-    cell = np.repeat(np.arange(len(side)), count)
-    start = (np.arange(len(cell)) - np.repeat(np.cumsum(count) - count, count)) * _CHUNK
-    stop = np.minimum(start + _CHUNK, samples[cell])
-    order = _longest_first(stop - start)
-    return cell[order], start[order], stop[order]
+def _moments(mi: ModuleType, value: Any, first: Any, count: Any) -> tuple[Stack, Stack]:
+    """Mean and variance of the values of each cell, which lie together; NumPy's sums of few take five times as long."""
+    import drjit as dr
 
+    dr.eval(value)
 
-def _longest_first(samples: NDArray[np.intp]) -> NDArray[np.intp]:
-    """Order of lanes; by radix, which takes a tenth of the time that whole words take."""
-    return np.argsort((-samples).astype(np.int16), kind="stable")
+    def body(i: Any, total: Any, square: Any) -> tuple[Any, Any, Any]:
+        one = mi.Color3f(*(dr.gather(mi.Float, plane, i) for plane in value))
+        return i + 1, total + one, square + one * one
 
-
-def _of_cells(cell: NDArray[np.intp], lanes: Stack, count: int) -> NDArray[np.float64]:
-    """Sums (3, count) over the lanes (3, n) of each cell."""
-    if len(cell) > count:
-        return np.stack([np.bincount(cell, plane, count) for plane in lanes])
-    sums = np.empty((3, count))  # a lane each: its number need not be added to anything
-    for plane, values in zip(sums, lanes, strict=True):
-        plane[cell] = values
-    return sums
+    end, zero = first + count, dr.zeros(mi.Color3f, dr.width(first))
+    _, total, square = dr.while_loop((first, zero, zero), lambda i, *_: i < end, body)
+    mean = total / mi.Float(count)
+    spread = dr.maximum(square / mi.Float(count) - mean * mean, 0.0)
+    dr.eval(mean, spread)
+    return mean.numpy(), spread.numpy()
 
 
 def _starts(cells: int) -> range:
@@ -460,13 +442,12 @@ def _starts(cells: int) -> range:
     return range(_CELLS_AT_A_TIME, cells, _CELLS_AT_A_TIME)
 
 
-def _joined(parts: list[Samples]) -> Samples:
-    """Samples of all parts, in their order."""
+_Arrays = TypeVar("_Arrays", Samples, LampCells)
+
+
+def _joined(parts: list[_Arrays]) -> _Arrays:
+    """Arrays of all parts, in their order; cells are the last axis of each."""
     if len(parts) == 1:
         return parts[0]
-    names = [field.name for field in fields(Samples)]
-    return Samples(*(np.concatenate([getattr(part, name) for part in parts], axis=-1) for name in names))
-
-
-def _planes(colour: Any) -> Stack:
-    return np.stack([np.array(colour[k], dtype=np.float32) for k in range(3)])
+    names = [field.name for field in fields(parts[0])]
+    return type(parts[0])(*(np.concatenate([getattr(part, name) for part in parts], axis=-1) for name in names))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from phibench.render.optics.truth import spot_truth, truth_layer
 from phibench.render.room import refinement
 from phibench.render.room.ambient_layer import render_ambient, view_film, view_surfaces
 from phibench.render.room.film_cells import Cells, cell_plane, fold
+from phibench.render.room.lamp_outlines import LampCells
 from phibench.render.room.light_map import BakeSettings, LightMap, bake
 from phibench.render.room.noise_budget import (
     BUDGET,
@@ -34,7 +36,6 @@ from phibench.render.room.subpixel_grid import (
     CellSampler,
     FilmGrid,
     Samples,
-    _chunks,
     golden_steps,
     paired_shifts,
     shifts,
@@ -107,12 +108,12 @@ def test_whole_pixels_are_summed_as_their_cells() -> None:
     cells = Cells.uncut(grid, squares, off, off, np.zeros(squares.shape, dtype=np.float32))
     for plane in cells.whole:
         plane[:] = rng.random(plane.shape)
-    cells.rank[6, 150] = 0
-    cells.halves = [rng.random((3, 2, 2, 1)).astype(np.float32) for _ in range(2)]
-    cells.edges = np.zeros((3, 2, 2, 1), dtype=np.float32)
+    cells.cut(np.array([6]), np.array([150]))
+    for half in cells.halves:
+        half[:, :1] = rng.random((3, 1, 4))
     pixels = np.empty((2, 3, 8, 200), dtype=np.float32)
     fold(cells, pixels, slice(0, 8), slice(0, 200))
-    (a, b), place = cells.halves, (np.array([6]), np.array([150]))
+    (a, b), place = (half[:, :1] for half in cells.halves), (np.array([6]), np.array([150]))
     own = 0.5 * (a + b), np.square(0.5 * (a - b))
     for k, (whole, cut) in enumerate(zip((cells.whole[0], 4.0 * cells.whole[1]), own, strict=True)):
         wanted = grid.pixels(cell_plane(grid, whole, *place, cut), power=k + 1)
@@ -209,7 +210,7 @@ def outline(film: CellSampler) -> tuple[np.ndarray, np.ndarray]:
     """100 cells of which one of two samples met a lamp, and the lamps' numbers."""
     numbers = film.grid.numbers((0, 0, RIG.camera.width_px, RIG.camera.height_px)).ravel()
     assert film.lamps is not None
-    one, other = (film.lamps.lamp(film.sample_once(numbers, stream).patch) for stream in (0, 1))
+    one, other = (film.sample_once(numbers, stream).lamp for stream in (0, 1))
     cut = np.flatnonzero((one >= 0) != (other >= 0))
     assert len(cut) > 500
     cut = cut[:: len(cut) // 100][:100]
@@ -224,15 +225,16 @@ def test_what_lamps_cover_is_what_samples_meet(film: CellSampler, outline: tuple
     """
     numbers, lamp = outline
     side = np.full(len(numbers), 32, dtype=np.int32)
-    light, part = film._shares(numbers, side, 1, lamp)
+    cover = film.cover(numbers, lamp)
+    light, part = cover.light, film._covered(cover, numbers, side, 1)
     known = (light[1] > 0.0) & (part > 0.02) & (part < 0.98)
     assert known.sum() > 60
 
-    def drawn(first: int, near: np.ndarray | None) -> np.ndarray:
+    def drawn(first: int, near: LampCells | None) -> np.ndarray:
         runs = [film.sample(numbers, side, first + k, near).electrons_per_s[1] for k in range(20)]
         return np.array(runs, dtype=float)[:, known] / light[1, known]
 
-    met, ours = drawn(10, None), drawn(50, lamp)
+    met, ours = drawn(10, None), drawn(50, cover)
     error = np.sqrt(met.var(axis=0, ddof=1) / 20 + 3e-4**2)
     difference = ours.mean(axis=0) - met.mean(axis=0)
     print(known.sum(), difference.std(), difference.mean(), error.mean(), np.median(ours.std(axis=0)))
@@ -244,13 +246,14 @@ def test_what_lamps_cover_is_what_samples_meet(film: CellSampler, outline: tuple
 def test_cells_at_lamps_need_few_samples(film: CellSampler, outline: tuple[np.ndarray, np.ndarray]) -> None:
     """Noise of 6 x 6 samples with the covered part known is below that of 32 x 32 samples without."""
     numbers, lamp = outline
+    cover = film.cover(numbers, lamp)
 
-    def noise(side: int, near: np.ndarray | None) -> float:
+    def noise(side: int, near: LampCells | None) -> float:
         sides = np.full(len(numbers), side, dtype=np.int32)
         runs = [film.sample(numbers, sides, stream, near).electrons_per_s[1] for stream in range(8)]
         return float(np.median(np.std(runs, axis=0)))
 
-    assert noise(6, lamp) < noise(32, None) < noise(6, None)
+    assert noise(6, cover) < noise(32, None) < noise(6, None)
 
 
 def test_a_lamp_that_something_hides_is_left_to_chance(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -289,17 +292,31 @@ def test_a_lamp_that_something_hides_is_left_to_chance(monkeypatch: pytest.Monke
     assert found()[1] > 0.02
 
 
-def test_samples_of_a_cell_are_shared_among_lanes(film: CellSampler) -> None:
-    """Each sample is one lane's, and a cell gets the same whichever cells are sampled with it."""
+def test_a_cell_gets_the_same_whichever_cells_are_sampled_with_it(film: CellSampler) -> None:
     side = np.array([1, 40, 2, 16, 17, 128], dtype=np.int32)
-    cell, start, stop = _chunks(side)
-    for k, n in enumerate(side):
-        taken = np.concatenate([np.arange(a, b) for a, b in zip(start[cell == k], stop[cell == k], strict=True)])
-        assert np.array_equal(np.sort(taken), np.arange(n * n))
     numbers = film.grid.numbers((700, 440, 6, 1))[4, 4:10]
     whole = film.sample(numbers, side, 3, None).electrons_per_s
     alone = [film.sample(numbers[[k]], side[[k]], 3, None).electrons_per_s[:, 0] for k in range(6)]
     assert np.array_equal(whole, np.stack(alone, axis=1))
+
+
+def test_points_of_a_cell_are_one_in_each_of_its_strata(film: CellSampler, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where the film is looked at, for cells of 1, 3 and 5 strata a side, in the middle of the image and at its end."""
+    numbers, side, met = film.grid.numbers((0, 0, 1280, 720))[[0, 300, -1], [7, 900, -1]], np.array([1, 3, 5]), []
+    look = film._look
+
+    def looking(u: Any, v: Any, x: list[Any]) -> Any:
+        met.append(np.stack([np.array(u), np.array(v)]))
+        return type(look).electrons(look, u, v, x)
+
+    monkeypatch.setattr(look, "electrons", looking, raising=False)
+    film.sample(numbers, side.astype(np.int32), 3, None)
+    (corner, h), start = film._corner(film._mi.UInt32(numbers)), 0
+    for k, n in enumerate(side):
+        column, row = ((met[0][i, start : start + n * n] - np.array(corner[i])[k]) / np.array(h) * n for i in (0, 1))
+        assert np.array_equal(np.floor(row) * n + np.floor(column), np.arange(n * n))
+        start += n * n
+    assert start == met[0].shape[1]
 
 
 def test_cells_sampled_in_parts_get_the_same_bits(
@@ -309,15 +326,17 @@ def test_cells_sampled_in_parts_get_the_same_bits(
     numbers, lamp = outline[0][:40], outline[1][:40].astype(np.int32)
     side = np.tile(np.array([2, 17], dtype=np.int32), 20)
 
-    def sampled() -> list[Samples]:
-        return [film.sample_once(numbers, 0), film.sample(numbers, side, 3, None), film.sample(numbers, side, 3, lamp)]
+    def sampled() -> list[Samples | LampCells]:
+        cover = film.cover(numbers, lamp)
+        strata = [film.sample(numbers, side, 3, near) for near in (None, cover)]
+        return [film.sample_once(numbers, 0), cover, *strata]
 
-    whole, known = sampled(), film.knows(numbers, lamp)
-    assert known.any()
+    whole = sampled()
+    assert whole[1].light.any()
     monkeypatch.setattr("phibench.render.room.subpixel_grid._CELLS_AT_A_TIME", 7)
-    assert np.array_equal(film.knows(numbers, lamp), known)
+    monkeypatch.setattr("phibench.render.room.subpixel_grid._POINTS_AT_A_TIME", 700)
     for one, other in zip(whole, sampled(), strict=True):
-        for field in dataclasses.fields(Samples):
+        for field in dataclasses.fields(one):
             assert np.array_equal(getattr(one, field.name), getattr(other, field.name)), field.name
 
 
