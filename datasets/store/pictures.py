@@ -9,6 +9,7 @@ from __future__ import annotations
 import io
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -19,7 +20,6 @@ from PIL import Image, ImageDraw
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.store.files import write_bytes
 from phibench.render.optics.truth import SpotTruth
-from phibench.render.sensor.processing import eight_bit
 from phibench.render.sensor.srgb import srgb_encoded
 from phibench.scenes.camera import Detector
 
@@ -30,19 +30,26 @@ Picture = NDArray[np.uint8]
 _WHITE_PERCENTILE = 98.0  # of the picture's light: lamps may be cut
 _WHITE_LEVEL = 0.8  # of the largest code: what is brighter is still told apart
 _MIDDLE_PERCENTILE, _MOST_CONTRAST = 60.0, 4.0  # a lamp that fills a tenth of the picture does not make the rest dark
+_EVERY = 2  # rows and columns do for percentiles
+_LEVELS = 65535  # linear values that are told apart: 0.05 codes where the curve is steepest
 _DARK_ROOM_ELECTRONS_PER_S = 1e5  # a room below this is shown black, the spot at its own exposure
 
 
 def display_exposure_s(planes: NDArray[Any], detector: Detector) -> float:
     """Exposure for display: it brings the brighter parts of a layer, shape (3, H, W), electrons/s, to near white."""
-    middle, bright = np.percentile(_balanced(planes, detector), (_MIDDLE_PERCENTILE, _WHITE_PERCENTILE))
+    some = np.asarray(planes[:, ::_EVERY, ::_EVERY], np.float32) * _gains(detector)[:, None, None]
+    middle, bright = np.percentile(some, (_MIDDLE_PERCENTILE, _WHITE_PERCENTILE))
     bright = min(float(bright), _MOST_CONTRAST * float(middle)) if middle > 0.0 else float(bright)
     return _WHITE_LEVEL / max(bright, _DARK_ROOM_ELECTRONS_PER_S)
 
 
 def to_srgb(planes: NDArray[Any], detector: Detector, exposure: float) -> Picture:
     """8-bit sRGB picture, shape (H, W, 3), of a layer, shape (3, H, W), electrons per second."""
-    return eight_bit(srgb_encoded(_balanced(planes, detector) * np.float32(exposure)))
+    picture = np.empty((*planes.shape[1:], 3), dtype=np.uint8)
+    for k, gain in enumerate(_gains(detector)):
+        level = np.clip(planes[k] * np.float32(exposure * gain * _LEVELS), 0.0, _LEVELS)
+        picture[..., k] = np.take(_codes(), level.astype(np.uint16))
+    return picture
 
 
 def halved(planes: NDArray[Any]) -> NDArray[Any]:
@@ -69,12 +76,16 @@ def save_png(path: Path, picture: Picture) -> Path:
     return write_bytes(path, buffer.getvalue())
 
 
-def _balanced(planes: NDArray[Any], detector: Detector) -> NDArray[Any]:
-    """Planes on one scale: electrons per second of the green band (white light gives three equal planes)."""
+def _gains(detector: Detector) -> NDArray[np.float32]:
+    """Factors to one scale: electrons per second of the green band (white light gives three equal planes)."""
     gains = np.array(detector.band_electrons_per_joule())
-    return np.asarray(planes, np.float32) * np.where(gains > 0.0, gains[1] / np.where(gains > 0.0, gains, 1.0), 0.0)[
-        :, None, None
-    ].astype(np.float32)
+    return np.where(gains > 0.0, gains[1] / np.where(gains > 0.0, gains, 1.0), 0.0).astype(np.float32)
+
+
+@cache
+def _codes() -> NDArray[np.uint8]:
+    """8-bit sRGB codes of the middles of linear values: a table takes half of the time of the curve."""
+    return np.rint(255.0 * srgb_encoded((np.arange(_LEVELS + 1) + 0.5) / _LEVELS)).astype(np.uint8)
 
 
 # Marked spots.

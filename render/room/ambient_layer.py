@@ -1,10 +1,10 @@
 """Ambient layer: the room without the laser, seen directly and through the mirror, from its light map.
 
 The radiance of a surface is albedo x irradiance / pi, plus what a lamp emits. The image is cut into cells
-(`subpixel_grid`). Every cell gets two independent samples, whose difference is the noise estimate. Where that noise is
-above the budget of `noise_budget`, the cells around are sampled again, more finely, until the budget is kept
-(`refinement`). What lamps cover of these is computed (`LampOutlines`). The light map's own noise is the same in every
-view.
+(`subpixel_grid`). Every cell gets two independent samples, whose difference is the noise estimate; so does an even
+pixel as a whole. Where that noise is above the budget of `noise_budget`, the cells around are sampled again, more
+finely, until the budget is kept (`refinement`). What lamps cover of these is computed (`LampOutlines`). The light map's
+own noise is the same in every view.
 
 Layers have the shape (3, H, W), planes R, G, B, expected electrons per second and pixel.
 """

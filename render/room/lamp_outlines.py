@@ -23,7 +23,7 @@ PARTS = 2  # of a cell, along a side, in each of which the map to a lamp is line
 
 @dataclass(frozen=True)
 class LampCells:
-    """What lamps cover of n cells, each cut into `PARTS` x `PARTS` squares.
+    """Parts of n cells that lamps cover, each cell cut into `PARTS` x `PARTS` squares.
 
     Attributes
     ----------
@@ -98,7 +98,7 @@ class LampOutlines:
         return dr.gather(self._mi.Int32, self._lamp, patch)
 
     def cells(self, middle: list[Any], half: Any, _: Any, lamp: NDArray[np.int32]) -> LampCells:
-        """What lamps, shape (n,), cover of cells, whose squares follow each other.
+        """Parts of cells, whose squares follow each other, that lamps, shape (n,), cover.
 
         The light is known where the map to the lamp is so in all squares of a cell.
 

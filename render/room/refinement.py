@@ -1,7 +1,7 @@
 """Adaptive sampling of the film: which pixels are cut into cells, and how many samples each cell gets.
 
 1. Each pixel gets one sample that decides and counts for nothing (a scout). Where the contrast of the scouts around is
-   low, two samples of the whole pixel do. Other pixels are cut into cells, each with two samples a and b.
+   low, one sample a of the whole pixel does. Other pixels are cut into cells, each with two samples a and b.
 2. Cells in the mirror whose surroundings are not even are sampled again on n x n strata. By the samples b around a cell
    n is chosen for its half a, and by a for b.
 3. Where the noise that is then found is above its budget, the cells around are sampled again, more finely.
@@ -11,8 +11,9 @@
 number of strata has the right expectation; so has a, and b likewise, exactly. 3 judges by the halves themselves. It is
 left with the few pixels in which 1 and 2 saw nothing; all cells around are replaced, whatever they had met.
 
-**Noise.** Half the difference of a cell's halves, squared, is the variance of their mean. An edge through a cell leaves
-spread / (2 n^3), with `spread` the variance of single samples: about n strata are crossed, and each counts for 1/n^2.
+**Noise.** Half the difference of a cell's halves, squared, is the variance of their mean. A whole pixel's sample and
+the mean s of its n scouts differ by (a - s)^2, in the mean 1 + 1/n times the variance of a. An edge through a cell
+leaves spread / (2 n^3), with `spread` the variance of single samples: n strata are crossed, each counts for 1/n^2.
 Once cells are refined, the larger of the two is taken: stopping by a cell's own estimate alone would flatter it.
 
 An edge of contrast c that cuts cells at random leaves single samples a variance of c^2 / 6. It is seen in the 3 x 3
@@ -60,7 +61,7 @@ _LAMP_SIDE = 2  # strata at first where a lamp's part is computed
 _SMALL = 0.3  # a cell below this part of its allowance is not what keeps a pixel above its budget: 0.3 and `_AIM` are 1
 _SURELY = 2.0  # by few samples a pixel at the edge of a lamp may look full that is not
 _AIM = 0.7  # of the allowed variance
-_EVEN = 1.0 / 16.0  # of the allowed variance: a whole pixel's sample, that counts at its centre, moves no edge then
+_EVEN = 1.0 / 8.0  # of the allowed variance: a whole pixel's sample, that counts at its centre, moves no edge then
 _OUTSIDE = 16.0  # beyond the mirror, where no spot is located, it may be so many times as much
 _CUT = 1.0 / 18.0  # variance of single samples over their squared contrast
 _TRUE = 0.4  # of the variance that contrast foretells: strata are even, and most edges are short
@@ -83,11 +84,11 @@ def render_refined(film: CellSampler, window: Crop, rounds: int, budget: float) 
     return pixels[0], pixels[1]
 
 
-# Scouts, and the first two samples.
+# Scouts, and the first samples.
 
 
 def first_pass(film: CellSampler, window: Crop, budget: float) -> Cells:
-    """Scouts of all pixels, then two samples of each pixel or of its cells."""
+    """Scouts of all pixels, then a sample of each pixel or two of its cells."""
     grid, squares = film.grid, film.grid.squares(window)
     light, mirrored, met = _scouted(film, squares)
     total = sum_of_colours(light)
@@ -95,7 +96,7 @@ def first_pass(film: CellSampler, window: Crop, budget: float) -> Cells:
     share = float(np.sum(taps_of_pixels(grid) ** 2) ** 2)
     high, low = total.max(axis=0), total.min(axis=0)
     around = extreme(np.maximum, high, 1) - extreme(np.minimum, low, 1)
-    uneven = (0.5 * share * _CUT) * np.square(around) / allowed
+    uneven = (share * _CUT) * np.square(around) / allowed
     inside = grown(mirrored, NEAR_PX)
     full = ~grown(~_all_full(light), reach_px(grid))
     cut = uneven > np.where(inside, np.float32(_EVEN), np.float32(_EVEN * _OUTSIDE))
@@ -107,7 +108,7 @@ def first_pass(film: CellSampler, window: Crop, budget: float) -> Cells:
         _cut(film, cells, *np.nonzero(new))
         new = matters & grown(cells.met >= 0, reach_px(grid)) & (cells.rank < 0)
     if (whole := cells.rank < 0).any():  # none where every pixel is cut
-        _sample_whole(film, cells, whole)
+        _sample_whole(film, cells, whole, light[:, :, *own])
     _find_lamps(film, cells)
     return cells
 
@@ -121,15 +122,14 @@ def _scouted(film: CellSampler, squares: NDArray[np.uint32]) -> tuple[Stack, NDA
     return found.electrons_per_s.reshape(3, *shape), np.asarray(found.mirrored.reshape(shape).any(axis=0)), met
 
 
-def _sample_whole(film: CellSampler, cells: Cells, chosen: NDArray[np.bool_]) -> None:
-    """Two samples of whole pixels, which a mask chooses."""
-    numbers = cells.squares[chosen]
-    a, b = (film.sample_once(numbers, _FIRST + half, 1) for half in (0, 1))
-    for k in range(3):
-        one, other = a.electrons_per_s[k], b.electrons_per_s[k]
-        cells.whole[0][k][chosen] = 0.5 * (one + other)
-        cells.whole[1][k][chosen] = (0.5 * (one - other)) ** 2
-    cells.mirrored[chosen] |= a.mirrored | b.mirrored
+def _sample_whole(film: CellSampler, cells: Cells, chosen: NDArray[np.bool_], scouts: Stack) -> None:
+    """A sample of whole pixels, which a mask chooses; its variance by their scouts, shape (3, n, rows, columns)."""
+    found, n = film.sample_once(cells.squares[chosen], _FIRST, 1), scouts.shape[1]
+    for k, value in enumerate(found.electrons_per_s):
+        expected = scouts[k, 0] if n == 1 else scouts[k].mean(axis=0)
+        cells.whole[0][k][chosen] = value
+        cells.whole[1][k][chosen] = np.float32(n / (n + 1)) * np.square(value - expected[chosen])
+    cells.mirrored[chosen] |= found.mirrored
 
 
 def _cut(film: CellSampler, cells: Cells, row: NDArray[np.intp], column: NDArray[np.intp]) -> None:

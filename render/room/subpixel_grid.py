@@ -316,7 +316,7 @@ class CellSampler:
         return np.array(hidden, dtype=bool)
 
     def cover(self, numbers: NDArray[np.uint32], lamp: NDArray[np.int32]) -> LampCells:
-        """What lamps, shape (n,), cover of cells."""
+        """Parts of cells that lamps, shape (n,), cover."""
         assert self.lamps is not None
         starts = range(_CELLS_AT_A_TIME // PARTS**2, len(numbers), _CELLS_AT_A_TIME // PARTS**2)
         parts = zip(np.split(numbers, starts), np.split(lamp, starts), strict=True)

@@ -172,7 +172,7 @@ def test_stored_variance_is_what_repeated_rendering_scatters_by(repeated: tuple[
 
 
 def test_stored_variance_beside_the_mirror_is_the_scatter_and_a_tenth(light: LightMap) -> None:
-    """Pixels beside the mirror are sampled whole, twice, and stated as if each of their n x n cells had its own noise.
+    """Pixels beside the mirror are sampled whole, and stated as if each of their n x n cells had its own noise.
 
     A pixel of weight W = sum of its cells' w counts for W^2 and is stated by n^2 sum w^2, which is more: in one
     dimension the scatter is sum W^2 / (n sum w^2) of what is stated, and 0.90 in two. 5500 independent pixels of 16
