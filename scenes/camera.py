@@ -165,26 +165,31 @@ class Camera:
 
     def distort(self, xy: Array) -> Array:
         """Apply Brown distortion to normalised coordinates, shape (..., 2)."""
-        x, y = xy[..., 0], xy[..., 1]
+        return _pairs(*self._distorted(xy[..., 0], xy[..., 1]))
+
+    def distort_jacobian(self, xy: Array) -> Array:
+        """Derivative of `distort`, shape (..., 2, 2): rows (xd, yd), columns (x, y)."""
+        xx, cross, yy = self._slopes(xy[..., 0], xy[..., 1])
+        J = np.empty((*xy.shape, 2), dtype=xx.dtype)
+        J[..., 0, 0], J[..., 0, 1], J[..., 1, 0], J[..., 1, 1] = xx, cross, cross, yy
+        return J
+
+    def _distorted(self, x: Array, y: Array) -> tuple[Array, Array]:
         r2 = x * x + y * y
         radial = 1.0 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
         xd = x * radial + 2.0 * self.p1 * x * y + self.p2 * (r2 + 2.0 * x * x)
         yd = y * radial + self.p1 * (r2 + 2.0 * y * y) + 2.0 * self.p2 * x * y
-        return _pairs(xd, yd)
+        return xd, yd
 
-    def distort_jacobian(self, xy: Array) -> Array:
-        """Derivative of `distort`, shape (..., 2, 2): rows (xd, yd), columns (x, y)."""
-        x, y = xy[..., 0], xy[..., 1]
+    def _slopes(self, x: Array, y: Array) -> tuple[Array, Array, Array]:
+        """Derivatives d xd / dx, d xd / dy = d yd / dx and d yd / dy: the distortion is a gradient."""
         r2 = x * x + y * y
         radial = 1.0 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
         slope = 2.0 * (self.k1 + r2 * (2.0 * self.k2 + r2 * 3.0 * self.k3))  # (d radial / d r2) * 2
-        # both mixed derivatives are the same: the distortion is a gradient
         cross = x * y * slope + 2.0 * (self.p1 * x + self.p2 * y)
         xx = radial + x * x * slope + 2.0 * self.p1 * y + 6.0 * self.p2 * x
         yy = radial + y * y * slope + 6.0 * self.p1 * y + 2.0 * self.p2 * x
-        J = np.empty((*xy.shape, 2), dtype=xx.dtype)
-        J[..., 0, 0], J[..., 0, 1], J[..., 1, 0], J[..., 1, 1] = xx, cross, cross, yy
-        return J
+        return xx, cross, yy
 
     def to_pixel(self, xy: Array) -> Array:
         """Pixel coordinates (u, v), shape (..., 2), of undistorted normalised coordinates (x/z, y/z)."""
@@ -207,16 +212,22 @@ class Camera:
         target = (uv - np.array([self.cx_px, self.cy_px])) / np.array([self.fx_px, self.fy_px])
         if not any((self.k1, self.k2, self.k3, self.p1, self.p2)):
             return target
-        xy = target.copy()
+        # planes of their own: those of pairs take twice as long
+        x_to, y_to = (target[..., k].copy() for k in (0, 1))
+        x, y = x_to, y_to
         with np.errstate(all="ignore"):
             for _ in range(_NEWTON_STEPS):
-                step = _solve_2x2(self.distort_jacobian(xy), target - self.distort(xy))
-                xy = xy + step
-                if not np.any(np.abs(step) > _NEWTON_TOLERANCE):
+                (a, b, d), (xd, yd) = self._slopes(x, y), self._distorted(x, y)
+                # Cramer's rule; singular: a division by 0 that shows as infinite or NaN
+                ex, ey, det = x_to - xd, y_to - yd, a * d - b * b
+                step_x, step_y = (d * ex - b * ey) / det, (a * ey - b * ex) / det
+                x, y = x + step_x, y + step_y
+                if not any(np.any(np.abs(step) > _NEWTON_TOLERANCE) for step in (step_x, step_y)):
                     break
-            bad = ~np.all(np.abs(self.distort(xy) - target) < 1e-12, axis=-1)  # 1e-9 px at any focal length of a webcam
-        xy[bad] = np.nan
-        return xy
+            ends = zip(self._distorted(x, y), (x_to, y_to), strict=True)
+            # 1e-9 px at any focal length of a webcam
+            good = np.logical_and(*(np.abs(end - to) < 1e-12 for end, to in ends))
+        return np.where(good[..., None], _pairs(x, y), np.nan)
 
     def rays(self, uv_px: Array) -> Array:
         """Unit chief-ray directions in the camera frame, shape (..., 3), of pixels (u, v), shape (..., 2)."""
@@ -246,14 +257,6 @@ class Camera:
         # integers are pixel centres, so that the image begins at -0.5
         inside_u = (uv[..., 0] >= -0.5) & (uv[..., 0] <= self.width_px - 0.5)
         return inside_u & (uv[..., 1] >= -0.5) & (uv[..., 1] <= self.height_px - 0.5)
-
-
-def _solve_2x2(matrix: Array, rhs: Array) -> Array:
-    """Solve 2 x 2 systems, matrix (..., 2, 2), rhs (..., 2), by Cramer's rule; no raise when singular."""
-    (a, b), (c, d) = (matrix[..., i, :].transpose(-1, *range(matrix.ndim - 2)) for i in (0, 1))
-    # singular: a division by 0 that the caller sees as infinite or NaN
-    det = a * d - b * c
-    return _pairs((d * rhs[..., 0] - b * rhs[..., 1]) / det, (a * rhs[..., 1] - c * rhs[..., 0]) / det)
 
 
 def _pairs(x: Array, y: Array) -> Array:
