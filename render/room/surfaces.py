@@ -2,7 +2,8 @@
 
 All triangles are one mesh: Embree answers a query five times as fast as with a shape for every face. What a kernel
 needs of a face lies in one row of 32 numbers, read in groups of four. The albedo is looked up exactly, at the point of
-the hit; the irradiance is bilinear between texel centres and linear beyond the outermost ones.
+the hit, or lies in the row where it is the same all over a face. The irradiance is bilinear between texel centres and
+linear beyond the outermost ones.
 
 A coat is a smooth dielectric over a diffuse ground (Mitsuba's `plastic`, nonlinear). With F the Fresnel reflectance
 outside and f the diffuse one inside, the ground of albedo a sends out
@@ -204,9 +205,8 @@ class Surfaces:
         import drjit as dr
 
         mi = self._mi
-        column, row, texture, light = (dr.gather(mi.Vector4f, self._rows, patch * _ROW + k) for k in range(4, _ROW))
-        s, t = (_affine(dr, group, point) for group in (column, row))
-        return self._albedo(s, t, texture, mi.Bool(True)) * mi.Color3f(light.x, light.y, light.z)
+        texture, light = (dr.gather(mi.Vector4f, self._rows, patch * _ROW + k) for k in (6, 7))
+        return self._albedo(patch, point, texture, mi.Bool(True)) * mi.Color3f(light.x, light.y, light.z)
 
     def reflectance(self, cos: Any, coat: Any) -> Any:
         """Fresnel reflectance of a coat from outside, for the cosine of the angle to its normal."""
@@ -217,15 +217,15 @@ class Surfaces:
         import drjit as dr
 
         mi = self._mi
-        plane, grid, along_x, along_y, column, row, texture, light = (
-            dr.gather(mi.Vector4f, self._rows, patch * _ROW + k, active) for k in range(_ROW)
+        plane, grid, along_x, along_y, texture, light = (
+            dr.gather(mi.Vector4f, self._rows, patch * _ROW + k, active) for k in (0, 1, 2, 3, 6, 7)
         )
         cos = dr.dot(mi.Vector3f(plane.x, plane.y, plane.z), direction)
         front = cos < 0.0
         start = dr.select(front, grid.z, grid.w)
         seen = active & (start >= 0.0)
-        fx, fy, s, t = (_affine(dr, group, point) for group in (along_x, along_y, column, row))
-        albedo = self._albedo(s, t, texture, seen)
+        fx, fy = (_affine(dr, group, point) for group in (along_x, along_y))
+        albedo = self._albedo(patch, point, texture, seen)
         if self.has_coats:
             albedo = self._coated(patch, albedo, dr.abs(cos), plane.w, seen)
         emitted = dr.select(seen & front & lamps, albedo * mi.Color3f(light.x, light.y, light.z), 0.0)
@@ -252,8 +252,24 @@ class Surfaces:
         found = dr.gather(self._mi.Vector4f, self._irradiance, texel)
         return self._mi.Color3f(found.x, found.y, found.z)
 
-    def _albedo(self, s: Any, t: Any, texture: Any, active: Any) -> Any:
-        """Value of a texture at a place in its own units; `texture` is width, height, start, and 0.5 if smooth."""
+    def _albedo(self, patch: Any, point: Any, texture: Any, active: Any) -> Any:
+        """Albedo of faces at a point; `texture` is that of a row, which `_textures` explains."""
+        import drjit as dr
+
+        mi = self._mi
+
+        def looked_up(patch: Any, point: Any, texture: Any) -> Any:
+            column, row = (dr.gather(mi.Vector4f, self._rows, patch * _ROW + k) for k in (4, 5))
+            return self._texel(_affine(dr, column, point), _affine(dr, row, point), texture)
+
+        # most faces are plain: a kernel leaves the rest out where all lanes that run together meet such
+        pictured = active & (texture.w >= 0.0)
+        return dr.if_stmt(
+            (patch, point, texture), pictured, looked_up, lambda _, __, plain: mi.Color3f(plain.x, plain.y, plain.z)
+        )
+
+    def _texel(self, s: Any, t: Any, texture: Any) -> Any:
+        """Value of a texture at a place in its own units."""
         import drjit as dr
 
         mi = self._mi
@@ -267,7 +283,7 @@ class Surfaces:
         i1, j1 = dr.select(i + 1.0 < width, i + 1.0, 0.0), dr.select(j + 1.0 < height, j + 1.0, 0.0)
         i, i1, j, j1, across = (mi.UInt32(value) for value in (i, i1, j, j1, width))
         corners = (start + j * across + i, start + j * across + i1, start + j1 * across + i, start + j1 * across + i1)
-        return self._blend(self._texels, corners, ts, tt, active)
+        return self._blend(self._texels, corners, ts, tt, True)
 
     def _blend(self, table: Any, corners: tuple[Any, ...], tx: Any, ty: Any, active: Any) -> Any:
         import drjit as dr
@@ -294,16 +310,21 @@ class Surfaces:
         return mesh
 
     def _textures(self) -> tuple[Any, Array]:
-        """Texels of all textures, four numbers each; width, height, start and smoothness of each texture."""
+        """Texels of all textures, four numbers each; four numbers of each texture, and of a white one after them.
+
+        These are width, height, start, and 0.5 if it is smooth, 0 if its cells are plain. Of a texture that is the same
+        all over they are its albedo, and -1.
+        """
         images = [_image(texture) for texture in self.table.textures]
-        counts = [image.shape[0] * image.shape[1] for image, _ in images]
-        white = sum(counts)
-        if white + 1 >= _LARGEST:
-            raise ValueError(f"the room's textures have {white} texels, more than {_LARGEST}")
-        starts = np.concatenate([[0], np.cumsum(counts)[:-1]])
-        places = [(i.shape[1], i.shape[0], start, half) for (i, half), start in zip(images, starts, strict=True)]
+        starts = np.cumsum([0, *(image.shape[0] * image.shape[1] for image, _ in images)])
+        if starts[-1] >= _LARGEST:
+            raise ValueError(f"the room's textures have {starts[-1]} texels, {_LARGEST} or more")
+        numbers = [
+            (*image[0, 0, :3], -1.0) if image.shape[:2] == (1, 1) and not half else (*image.shape[1::-1], start, half)
+            for (image, half), start in zip(images, starts[:-1], strict=True)
+        ]
         texels = np.concatenate([*(image.reshape(-1, 4) for image, _ in images), np.ones((1, 4))])
-        return self._mi.Float(aligned(texels)), np.array([*places, (1, 1, white, 0.0)])
+        return self._mi.Float(aligned(texels)), np.array([*numbers, (1.0, 1.0, 1.0, -1.0)])
 
     def _row_table(self, grid: TexelGrid) -> Array:
         """Rows of all patches, shape (P, 8, 4); see `ground`."""
