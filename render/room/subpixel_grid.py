@@ -26,7 +26,7 @@ from scipy.special import ndtr
 
 from phibench.render.room.lamp_outlines import PARTS, LampCells, LampOutlines
 from phibench.render.room.shading import Look
-from phibench.render.room.surfaces import aligned
+from phibench.render.room.surfaces import aligned, planes
 from phibench.scenes.camera import Camera
 from phibench.scenes.validation import SceneError
 
@@ -286,7 +286,7 @@ class CellSampler:
         lamp = self._mi.Int32(-1) if self.lamps is None else self.lamps.of_patch(patch)
         dr.eval(value, mirrored, lamp)
         none, met = np.zeros((3, 0), dtype=np.float32), np.array(lamp, dtype=np.int32)
-        return Samples(value.numpy(), none, np.array(mirrored, dtype=bool), np.broadcast_to(met, numbers.shape))
+        return Samples(planes(value), none, np.array(mirrored, dtype=bool), np.broadcast_to(met, numbers.shape))
 
     def _first(self, numbers: NDArray[np.uint32], stream: int, parts: int = 0) -> tuple[Any, Any, Any, Any]:
         """Light, mirror, patch and ray of the one point of each cell, as `Look.electrons` gives them."""
@@ -434,7 +434,7 @@ def _moments(mi: ModuleType, value: Any, first: Any, count: Any) -> tuple[Stack,
     mean = total / mi.Float(count)
     spread = dr.maximum(square / mi.Float(count) - mean * mean, 0.0)
     dr.eval(mean, spread)
-    return mean.numpy(), spread.numpy()
+    return planes(mean), planes(spread)
 
 
 def _starts(cells: int) -> range:
