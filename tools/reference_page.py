@@ -420,13 +420,14 @@ def _property_default(key: str) -> str:
 def _default(field: Any, model: type[BaseModel]) -> str:
     if field.is_required():
         return "must be given"
-    if field.default is None:
+    default = field.get_default(call_default_factory=True)
+    if default is None:
         return _ABSENT.get(model, "none")
-    if isinstance(field.default, DistributionTable):
-        return _distribution(field.default)
-    if field.default == ():
+    if isinstance(default, DistributionTable):
+        return _distribution(default)
+    if default == ():
         return "none"
-    return "see below" if isinstance(field.default, BaseModel) else _shown(field.default)
+    return "see below" if isinstance(default, BaseModel) else _shown(default)
 
 
 def _distribution(table: DistributionTable) -> str:

@@ -5,7 +5,8 @@ A value is the quantile of a number u in [0, 1), so any sequence of points in th
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
+from functools import cached_property
 from typing import Annotated, Any, ClassVar, Literal, get_origin
 
 import numpy as np
@@ -26,7 +27,6 @@ from pydantic import (
     model_validator,
 )
 from pydantic_core import CoreSchema, core_schema
-from scipy.special import ndtr, ndtri
 
 from phibench.scenes.frames import Array
 from phibench.scenes.validation import allowed, schema_node
@@ -35,7 +35,8 @@ from phibench.scenes.validation import allowed, schema_node
 class Table(BaseModel):
     """A table of a recipe: no unknown keys, no silent conversions, no NaN or infinity, immutable."""
 
-    model_config = ConfigDict(strict=True, frozen=True, extra="forbid", allow_inf_nan=False)
+    # validators are built at their first use: many commands import the tables and read no recipe
+    model_config = ConfigDict(strict=True, frozen=True, extra="forbid", allow_inf_nan=False, defer_build=True)
     later: ClassVar[Collection[str]] = ()
     """Keys that came later: a recipe that does not give them keeps the hash that it had before there were any."""
 
@@ -43,7 +44,8 @@ class Table(BaseModel):
     def _without_later_defaults(self, serialised: SerializerFunctionWrapHandler) -> dict[str, Any]:
         document: dict[str, Any] = serialised(self)
         fields = type(self).model_fields
-        return {key: x for key, x in document.items() if key not in self.later or x != fields[key].default}
+        later = {key: fields[key].get_default(call_default_factory=True) for key in self.later}
+        return {key: x for key, x in document.items() if key not in later or x != later[key]}
 
 
 KINDS = ("uniform", "log_uniform", "normal", "choice")
@@ -150,36 +152,37 @@ class ValuesOf:
     The JSON schema tells the range of the values by the key `values`.
     """
 
-    def __init__(self, check: Callable[[DistributionTable], DistributionTable], words: str) -> None:
-        self._check, self._words = check, words
+    def __init__(self, kind: Any, whole: bool = False) -> None:
+        self._kind, self._whole = kind, whole
+
+    @cached_property  # at its first use: a recipe has a hundred of them, and uses few
+    def _adapter(self) -> TypeAdapter[Any]:
+        return TypeAdapter(self._kind)
+
+    @cached_property
+    def _words(self) -> str:
+        return allowed(schema_node(self._adapter.json_schema(), ()))
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
         """Schema of the annotated type, and the check after it."""
-        return core_schema.no_info_after_validator_function(self._check, handler(source))
+        return core_schema.no_info_after_validator_function(self._checked, handler(source))
 
     def __get_pydantic_json_schema__(self, core: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
         """JSON schema of the annotated type, and the range of its values."""
-        return {**handler(core), "values": self._words}
+        words = self._words.replace("a number", "a whole number") if self._whole else self._words
+        return {**handler(core), "values": words}
 
+    def _checked(self, table: DistributionTable) -> DistributionTable:
+        if faulty := [f"{value:g}" for value in dict.fromkeys(table.support) if not self._is_sound(value)]:
+            raise ValueError(f"reaches {' and '.join(faulty)}, which is not allowed; stay with {self._words}")
+        return is_whole(table) if self._whole else table
 
-def values_of(kind: Any, whole: bool = False) -> ValuesOf:
-    """Make a validator of distributions whose values are all of a type, and whole numbers where that is asked for."""
-    adapter = TypeAdapter(kind)
-    words = allowed(schema_node(adapter.json_schema(), ()))
-
-    def is_sound(value: float) -> bool:
+    def _is_sound(self, value: float) -> bool:
         try:
-            adapter.validate_python(value)
+            self._adapter.validate_python(value)
         except ValidationError:  # its sentence speaks of the value; ours tells the whole distribution
             return False
         return True
-
-    def check(table: DistributionTable) -> DistributionTable:
-        if faulty := [f"{value:g}" for value in dict.fromkeys(table.support) if not is_sound(value)]:
-            raise ValueError(f"reaches {' and '.join(faulty)}, which is not allowed; stay with {words}")
-        return is_whole(table) if whole else table
-
-    return ValuesOf(check, words.replace("a number", "a whole number") if whole else words)
 
 
 def drawn_fields(table: type[Table], keys: Iterable[str]) -> dict[str, Any]:
@@ -189,7 +192,7 @@ def drawn_fields(table: type[Table], keys: Iterable[str]) -> dict[str, Any]:
         given = table.model_fields[key]
         kind = Annotated[given.annotation, Field(), *given.metadata]  # type: ignore[name-defined]
         is_name = get_origin(given.annotation) is Literal
-        drawn: Any = names_of(given.annotation) if is_name else Annotated[Distribution, values_of(kind)] | None
+        drawn: Any = names_of(given.annotation) if is_name else Annotated[Distribution, ValuesOf(kind)] | None
         fields[key] = (drawn, Field(default=None, description=given.description))
     return fields
 
@@ -226,6 +229,8 @@ def _quantile(table: DistributionTable, u: Array) -> Array:
         low, high = np.log(table.log_uniform)
         return np.exp(low + u * (high - low))
     if table.normal is not None and table.clip is not None:
+        from scipy.special import ndtr, ndtri  # here: most commands read recipes, and few draw
+
         mean, sigma = table.normal
         low, high = ndtr((np.array(table.clip) - mean) / sigma)
         return np.asarray(mean + sigma * ndtri(low + u * (high - low)), float)

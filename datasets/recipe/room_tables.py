@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import AfterValidator, Field, create_model
 
 from phibench.datasets.common.input_files import FILE_NAME, NAME_LENGTH
-from phibench.datasets.recipe.distributions import Distribution, Name, Table, names_of, values_of
+from phibench.datasets.recipe.distributions import Distribution, Name, Table, ValuesOf, names_of
 from phibench.datasets.rooms.mesh_placement import MeshLamp, MeshSettings
 from phibench.datasets.rooms.panorama_room import PanoramaSettings
 from phibench.scenes.validation import SHA256, SceneError
@@ -34,7 +34,7 @@ def _property(entry: Property) -> Any:
     if entry.choices:
         kind = names_of(Literal[entry.choices])
     else:
-        values = values_of(Annotated[float, Field(ge=entry.low, le=entry.high)], entry.whole)
+        values = ValuesOf(Annotated[float, Field(ge=entry.low, le=entry.high)], entry.whole)
         kind = Annotated[Distribution, values] | None
     return kind, Field(default=None, description=entry.meaning)
 
@@ -211,7 +211,7 @@ class RoomsTable(Table):
         description="how many are generated; where not given 1, or 0 beside panoramas or meshes",
     )
     properties: RoomPropertiesTable = Field(
-        default=RoomPropertiesTable(), description="distributions of what the generated rooms are like"
+        default_factory=RoomPropertiesTable, description="distributions of what the generated rooms are like"
     )
     panoramas: Annotated[tuple[PanoramaTable, ...], Field(strict=False, max_length=100_000)] = Field(
         default=(), description="photographed rooms"

@@ -17,9 +17,9 @@ from phibench.datasets.recipe.distributions import (
     Name,
     Table,
     Targets,
+    ValuesOf,
     drawn_fields,
     is_whole,
-    values_of,
 )
 from phibench.datasets.recipe.film_tables import FilmTable
 from phibench.datasets.recipe.mirror_tables import (
@@ -80,8 +80,13 @@ SENSOR_OF_FRAME = (
 )
 """What `[frames.sensor]` does not take: what belongs to frames, and a sensor file's tables beside its numbers."""
 
-_ONE = DistributionTable(choice=(1.0,))
-_HALF = DistributionTable(log_uniform=(0.05, 0.5))
+
+def _one() -> DistributionTable:
+    return DistributionTable(choice=(1.0,))
+
+
+def _half() -> DistributionTable:
+    return DistributionTable(log_uniform=(0.05, 0.5))
 
 
 def _albedo_tag(given: object) -> str:
@@ -92,12 +97,12 @@ def _exposure_tag(given: object) -> str:
     return "<auto>" if isinstance(given, str) else "<distribution>"
 
 
-Stroke = Annotated[Distribution, values_of(StrokeM)]
-Level = Annotated[Distribution, values_of(Annotated[float, Field(ge=0.0, le=1e6)])]
-FluxRatio = Annotated[Distribution, values_of(Annotated[float, Field(ge=1e-6, le=0.5)])]
-Diameter = Annotated[Distribution, values_of(Annotated[float, Field(ge=1e-6, le=min(BOARD_SIZE_M) / 2.0)])]
-Distance = Annotated[Distribution, values_of(Annotated[float, Field(ge=0.1, le=100.0)])]
-Elevation = Annotated[Distribution, values_of(Annotated[float, Field(ge=-89.0, le=89.0)])]
+Stroke = Annotated[Distribution, ValuesOf(StrokeM)]
+Level = Annotated[Distribution, ValuesOf(Annotated[float, Field(ge=0.0, le=1e6)])]
+FluxRatio = Annotated[Distribution, ValuesOf(Annotated[float, Field(ge=1e-6, le=0.5)])]
+Diameter = Annotated[Distribution, ValuesOf(Annotated[float, Field(ge=1e-6, le=min(BOARD_SIZE_M) / 2.0)])]
+Distance = Annotated[Distribution, ValuesOf(Annotated[float, Field(ge=0.1, le=100.0)])]
+Elevation = Annotated[Distribution, ValuesOf(Annotated[float, Field(ge=-89.0, le=89.0)])]
 WholeNumbers = Annotated[Distribution, AfterValidator(is_whole)]
 Exposure = Annotated[
     Annotated[Distribution, Tag("<distribution>")] | Annotated[Literal["auto"], Tag("<auto>")],
@@ -164,7 +169,7 @@ class RigTable(Table):
     stroke_tilt_x_rad: Tilt = Field(default=0.0, description="stroke axis turned about world x")
     stroke_tilt_y_rad: Tilt = Field(default=0.0, description="stroke axis turned about world y")
     reflectance: ReflectionTable | None = Field(default=None, description="measured reflectance of the mirror")
-    holder: HolderTable = Field(default=HolderTable(), description="what carries the mirror")
+    holder: HolderTable = Field(default_factory=HolderTable, description="what carries the mirror")
     mirror: MirrorTable | None = Field(default=None, description="a mirror of another shape than a sphere")
 
 
@@ -311,7 +316,7 @@ else:
         **drawn_fields(RigTable, DRAWABLE),
         holder=(
             RandomHolderTable,
-            Field(default=RandomHolderTable(), description="distributions of keys of [rig.holder]"),
+            Field(default_factory=RandomHolderTable, description="distributions of keys of [rig.holder]"),
         ),
         mirror=(
             RandomMirrorTable | None,
@@ -358,11 +363,11 @@ class RandomTable(Table):
         default="sobol", description="points that fill the space evenly, or independent ones"
     )
     stroke_m: Stroke = Field(description="distribution of the stroke; drawn ones are rounded to 1 nm")
-    rig: RandomRigTable = Field(default=RandomRigTable(), description="distributions of keys of [rig]")
+    rig: RandomRigTable = Field(default_factory=RandomRigTable, description="distributions of keys of [rig]")
     misalignment: RandomMisalignmentTable = Field(
-        default=RandomMisalignmentTable(), description="distributions of keys of [misalignment]"
+        default_factory=RandomMisalignmentTable, description="distributions of keys of [misalignment]"
     )
-    spot: RandomSpotTable = Field(default=RandomSpotTable(), description="distribution of the laser spot")
+    spot: RandomSpotTable = Field(default_factory=RandomSpotTable, description="distribution of the laser spot")
 
 
 class DrawnRigsTable(Table):
@@ -370,7 +375,7 @@ class DrawnRigsTable(Table):
 
     count: int = Field(default=1, ge=1, le=100_000, description="how many; more keep those that are there")
     misalignment: RandomMisalignmentTable = Field(
-        default=RandomMisalignmentTable(), description="distributions of keys of [misalignment]"
+        default_factory=RandomMisalignmentTable, description="distributions of keys of [misalignment]"
     )
 
 
@@ -386,8 +391,8 @@ class FramesTable(Table):
     exposure_s: Exposure | None = Field(
         default="auto", description="exposure time; 'auto' is the camera's for the down image, kept for the others"
     )
-    laser_level: Level = Field(default=_ONE, description="factor of the laser's light")
-    lamp_level: Level = Field(default=_ONE, description="factor of the room's light")
+    laser_level: Level = Field(default_factory=_one, description="factor of the laser's light")
+    lamp_level: Level = Field(default_factory=_one, description="factor of the room's light")
     jpeg_quality: WholeNumbers | None = Field(default=None, description="libjpeg's quality; whole numbers")
     sharpen_amount: Distribution | None = Field(default=None, description="gain of the unsharp mask")
     analogue_gain: Distribution | None = Field(default=None, description="gain before the converter")
@@ -410,7 +415,7 @@ class DistractorTable(Table):
     )
     probability: Probability = Field(default=1.0, description="part of the samples that have it")
     flux_ratio: FluxRatio = Field(
-        default=_HALF, description="its electrons over the spot's, in the image where that is more"
+        default_factory=_half, description="its electrons over the spot's, in the image where that is more"
     )
     diameter_m: Diameter = Field(default=DistributionTable(choice=(0.005,)), description="diameter of the disc")
     target: Targets = Field(default=None, description="boards; all but the sample's own where no place is given")
@@ -434,11 +439,15 @@ class Recipe(Table):
     later = ("film",)
 
     dataset: DatasetTable = Field(description="name and seed")
-    rig: RigTable = Field(default=RigTable(), description="camera, mirror and stroke axis, as the estimator knows them")
-    misalignment: MisalignmentTable = Field(default=MisalignmentTable(), description="what the true rig deviates by")
-    room: RoomTable = Field(default=RoomTable(), description="the room")
-    laser: LaserTable = Field(default=LaserTable(), description="the laser")
-    ambient: AmbientTable = Field(default=AmbientTable(), description="quality of the ambient layer")
+    rig: RigTable = Field(
+        default_factory=RigTable, description="camera, mirror and stroke axis, as the estimator knows them"
+    )
+    misalignment: MisalignmentTable = Field(
+        default_factory=MisalignmentTable, description="what the true rig deviates by"
+    )
+    room: RoomTable = Field(default_factory=RoomTable, description="the room")
+    laser: LaserTable = Field(default_factory=LaserTable, description="the laser")
+    ambient: AmbientTable = Field(default_factory=AmbientTable, description="quality of the ambient layer")
     rooms: RoomsTable | None = Field(default=None, description="rooms of several kinds, instead of the one of [room]")
     targets: Annotated[tuple[TargetTable, ...], Field(strict=False)] = Field(
         default=(), description="boards with a laser spot; the rooms of [rooms] have none"

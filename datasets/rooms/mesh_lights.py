@@ -11,8 +11,6 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from phibench.datasets.rooms.mesh_parts import MeshPart, Paint
 from phibench.datasets.rooms.mesh_placement import MeshSettings, corners_of, meets_box
@@ -210,6 +208,9 @@ def _lamp(panel: Rectangle, t: Array, R: Array) -> Rectangle:
 
 def _rectangles(part: MeshPart) -> Iterator[tuple[NDArray[np.int64], Pose, tuple[float, float]]]:
     """Yield pairs of triangles that touch no other and make a rectangle, of the largest ones: which, pose, size."""
+    from scipy.sparse import coo_array  # here, as every command reads recipes, and few a mesh with lamps
+    from scipy.sparse.csgraph import connected_components
+
     corners, index = corners_of(part), merged_places(part)
     count = len(index)
     rows = np.repeat(np.arange(count), 3)

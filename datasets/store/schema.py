@@ -52,7 +52,8 @@ Vector3 = Annotated[tuple[Number, Number, Number], Field(strict=False)]
 class Document(BaseModel):
     """A frozen document without unknown keys; values of the wrong type are refused."""
 
-    model_config = ConfigDict(strict=True, frozen=True, extra="forbid")
+    # validators are built at their first use: a command uses few of the models that it imports
+    model_config = ConfigDict(strict=True, frozen=True, extra="forbid", defer_build=True)
 
 
 def described(unit: str, text: str, **default: Any) -> Any:

@@ -15,7 +15,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import erf, ndtr
+import scipy
 
 from phibench.render.optics.ray_tracer import MirrorRays, lens_rays, reflect, trace_pixels
 from phibench.render.optics.reflection_point import MirrorPoints, mirror_points, onward
@@ -158,7 +158,7 @@ def _integrals(edges_px: Array, sigma: float) -> tuple[Array, Array]:
     """The same between neighbours of edges, shape (N, n + 1), relative to the centre: shapes (N, n)."""
     edges = edges_px / sigma
     density = np.exp(-0.5 * edges**2) / (sigma * math.sqrt(2.0 * math.pi))
-    return np.diff(ndtr(edges), axis=1), -np.diff(density, axis=1)
+    return np.diff(scipy.special.ndtr(edges), axis=1), -np.diff(density, axis=1)
 
 
 def _dark_layer() -> SpotLayer:
@@ -297,5 +297,5 @@ def _smith(cos: Array, alpha: float) -> Array:
     """Smith's masking G1 for Beckmann's distribution; 0 below the horizon."""
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         a = cos / (alpha * np.sqrt(np.maximum(1.0 - cos * cos, 1e-300)))
-        hidden = 0.5 * (erf(a) - 1.0) + np.exp(-a * a) / (2.0 * a * math.sqrt(math.pi))
+        hidden = 0.5 * (scipy.special.erf(a) - 1.0) + np.exp(-a * a) / (2.0 * a * math.sqrt(math.pi))
         return np.where(cos > 0.0, 1.0 / (1.0 + hidden), 0.0)
