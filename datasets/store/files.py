@@ -16,11 +16,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
 
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import DIGITS, InputFile, bounds_fault, first_fault
-from phibench.datasets.store.schema import Document
 from phibench.datasets.store.temporary_folders import TEMPORARY_PREFIX, owned, remove_leftovers, remove_tree
 from phibench.scenes.validation import printable_line
 
@@ -197,7 +196,7 @@ def _nearest_folder(folder: Path) -> Path:
 
 # Files of one JSON document a line.
 
-Row = TypeVar("Row", bound=Document)
+Row = TypeVar("Row", bound=BaseModel)
 
 
 def read_rows(path: Path, model: type[Row]) -> list[Row]:

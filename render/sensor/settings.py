@@ -51,7 +51,8 @@ class Sensor(BaseModel):
     Use `sensor(name)` for a preset and `Sensor.replace` for a changed one.
     """
 
-    model_config = ConfigDict(strict=True, frozen=True, extra="forbid", allow_inf_nan=False)
+    # its validator is built at first use: a method's process imports it, and takes a card that is made
+    model_config = ConfigDict(strict=True, frozen=True, extra="forbid", allow_inf_nan=False, defer_build=True)
 
     name: str = Field(description="name of the preset")
     output: Literal["electrons", "raw", "srgb8", "yuyv", "mjpeg"] = Field(
@@ -148,7 +149,7 @@ def sensor(preset: str = "mjpeg", **changes: Any) -> Sensor:
 class PresetsFile(BaseModel):
     """Content of `settings_presets.toml`; the numbers of a preset are checked when it is asked for."""
 
-    model_config = ConfigDict(strict=True, extra="forbid")
+    model_config = ConfigDict(strict=True, extra="forbid", defer_build=True)
 
     webcam: dict[str, Any] = Field(description="what all presets share")
     presets: dict[str, dict[str, Any]] = Field(description="what each preset changes")
