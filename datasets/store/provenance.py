@@ -93,6 +93,7 @@ def code_sha256() -> str:
     return digest.hexdigest()
 
 
+@cache  # a process keeps the packages that it has loaded, and asks four times for a data set
 def _version(package: str) -> str | None:
     try:
         return metadata.version(package)

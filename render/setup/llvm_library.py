@@ -106,15 +106,28 @@ def companions_of(path: Path) -> tuple[Path, ...]:
     return tuple(sorted(file for file in found if not file.is_symlink() and "libLLVM" not in file.name))
 
 
+_ASKED: dict[tuple[object, ...], Llvm] = {}  # by path, time of change, size and companions: `make` asks three times
+
+
 def probe(path: Path) -> Llvm | None:
-    """Load a library in a child process and ask it for its version (about 30 ms).
+    """Load a library in a child process and ask it for its version (about 30 ms), once while its file stays as it is.
 
     Returns
     -------
     Llvm or None
         None for what cannot be loaded, crashes, or has no ``LLVMGetVersion``: that function came with LLVM 16.
     """
-    companions = companions_of(path)
+    try:
+        state, companions = path.stat(), companions_of(path)
+    except OSError:
+        return None
+    key = (path, state.st_mtime_ns, state.st_size, companions)
+    if key not in _ASKED and (found := _answer(path, companions)):
+        _ASKED[key] = found
+    return _ASKED.get(key)
+
+
+def _answer(path: Path, companions: tuple[Path, ...]) -> Llvm | None:
     search = os.pathsep.join(sorted({str(companion.parent) for companion in companions}))
     environment = {**os.environ, "LD_LIBRARY_PATH": search} if companions else None
     command = [sys.executable, "-I", "-S", "-c", _PROBE, str(path)]

@@ -184,6 +184,25 @@ def test_a_name_proves_nothing(machine: Path, content: str) -> None:
         llvm.find_llvm()
 
 
+def test_a_library_is_asked_once_while_its_file_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What could not be loaded is asked again, and so is what changed; what is gone is none."""
+    asked, library = list[Path](), put(tmp_path / "libLLVM.so", "one")
+
+    def answer(path: Path, companions: tuple[Path, ...]) -> Llvm | None:
+        asked.append(path)
+        return Llvm(path, (19, 1, len(asked)), companions) if len(asked) > 1 else None
+
+    monkeypatch.setattr(llvm_library, "_ASKED", {})
+    monkeypatch.setattr(llvm_library, "_answer", answer)
+    found = [llvm_library.probe(library) for _ in range(3)]
+    assert found == [None, Llvm(library, (19, 1, 2), ()), Llvm(library, (19, 1, 2), ())]
+    put(library, "another")
+    assert llvm_library.probe(library) == Llvm(library, (19, 1, 3), ())
+    library.unlink()
+    assert llvm_library.probe(library) is None
+    assert len(asked) == 3
+
+
 OLD = sorted(
     {
         path.resolve()
