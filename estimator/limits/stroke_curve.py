@@ -321,10 +321,10 @@ def _seen(rig: Rig, values: Array, strokes_m: Array, points_m: Array) -> tuple[A
     """Down pixels (1, m, 2), up pixels (n, m, 2) and true D (1, m) of a rig that deviates."""
     true = changed(rig, values)
     view, axis = true.at(0.0), np.array(true.stroke_axis_world)
-    offsets = stroke_of(strokes_m, values)
-    lowered = points_m - offsets[:, None, None] * axis
-    up = image_of(view, lowered).uv_px
-    down = np.broadcast_to(image_of(view, points_m).uv_px, up.shape)
+    offsets = np.append(0.0, stroke_of(strokes_m, values))
+    pixels = image_of(view, points_m - offsets[:, None, None] * axis).uv_px  # both at once: a call's own time counts
+    up = pixels[1:]
+    down = np.broadcast_to(pixels[:1], up.shape)
     # the true D counts from the mirror of the rig that deviates
     away = points_m[:, :2] - view.sphere_centre_m[:2]
     return down, up, np.hypot(away[:, 0], away[:, 1])[None]
