@@ -104,7 +104,8 @@ def write_series(folder: Path, name: str, s: Sensor, electrons_per_s: float, fra
     lines = []
     for k in range(frames):
         file = f"{name}-{k}.png"
-        Image.fromarray(Chain(s, 5).frame(light, NoiseStream(("emva", name, k)))).save(folder / file)
+        frame = Chain(s, 5).frame(light, NoiseStream(("emva", name, k)))
+        Image.fromarray(frame).save(folder / file, compress_level=0)  # noise, read once: packing takes seconds
         lines.append(f"i {file}")
     return lines
 
