@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import polars as pl
 import pytest
+import scipy
 from helpers.bench_cases import Cases, cases, change, outcomes, sampler, shifted, truth_itself
-from scipy import integrate, stats
 
 from phibench.benchmark.pair_sets.dataset_pairs import BOX_PX, tracks_of
 from phibench.benchmark.scores.answer_errors import MATCH_PX, Rules
@@ -41,7 +41,7 @@ def test_the_perfect_row_is_the_integral_over_a_gaussian(ratio: float, bound_px:
         error = min(np.hypot(sigma[0] * x, sigma[1] * y), MATCH_PX)
         return np.log(max(error / bound_px, LEAST_RATIO)) * np.exp(-0.5 * (x * x + y * y)) / (2.0 * np.pi)
 
-    expected = 4.0 * integrate.dblquad(part, 0.0, 6.0, 0.0, 6.0, epsabs=2e-5)[0]
+    expected = 4.0 * scipy.integrate.dblquad(part, 0.0, 6.0, 0.0, 6.0, epsabs=2e-5)[0]
     found = perfect_log(np.diag(sigma**2)[None], np.array([bound_px**2]))
     assert found[0] == pytest.approx(expected, abs=1e-3)
 
@@ -134,8 +134,8 @@ def claiming(sigma_factor: float, error_factor: float = 1.0):
 
 def test_a_right_claim_at_the_bound_has_119() -> None:
     """The normal law's integral at z = 1.96; a score scatters by 1.15, the mean of 200 by 0.081: 4 sigma are 0.33."""
-    z = stats.norm.ppf(0.975)
-    expected = 1.0 + 2.0 / 0.05 * 2.0 * (stats.norm.pdf(z) - 0.025 * z) / (2.0 * z)
+    z = scipy.stats.norm.ppf(0.975)
+    expected = 1.0 + 2.0 / 0.05 * 2.0 * (scipy.stats.norm.pdf(z) - 0.025 * z) / (2.0 * z)
     assert expected == pytest.approx(1.19, abs=0.005)
     found = values(table(cases(), claiming(1.0)), "interval_score")["interval_score"]
     assert found == pytest.approx(expected, abs=0.33)

@@ -17,7 +17,6 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import distributed
 import pytest
 from helpers.folders import contents
 from helpers.listeners import listeners
@@ -295,6 +294,8 @@ def test_a_wait_for_a_scheduler_that_starts_late(tmp_path: Path) -> None:
 
 def test_a_client_that_failed_is_gone_before_the_next_begins(monkeypatch: pytest.MonkeyPatch) -> None:
     """Deleted while the next one starts, it would wait for dask's lock of loops, which that one has, for ever."""
+    import distributed  # here: workers import this file
+
     made: list[weakref.ref[distributed.Client]] = []
 
     class Client(distributed.Client):  # type: ignore[misc]
