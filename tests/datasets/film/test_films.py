@@ -8,7 +8,6 @@ from typing import Any
 
 import av
 import numpy as np
-import pandas
 import polars
 import polars as pl
 import pytest
@@ -267,6 +266,8 @@ def test_the_enlarged_square_stands_where_the_picture_is_empty(film_images: Path
 
 def test_films_are_laid_out_as_lerobot_reads_them(film_images: Path, film_windows: Path, tmp_path: Path) -> None:
     """Against libraries alone: pandas for the tasks' names, PyAV for the times. LeRobot 0.4.4 reads such a folder."""
+    import pandas  # here: importing it takes as long as collecting ten files
+
     film, out = film_of(film_images), tmp_path / "set"
     info = json.loads(write_lerobot(film_images, out, draws=2, workers=1).read_text())
     assert (info["codebase_version"], info["fps"]) == ("v3.0", 10)
