@@ -21,6 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from phibench.calibration.captures.pair_photos import (
+    LARGEST_SIGMA,
     LEAST_STROKE_M,
     MOST_STROKE_M,
     PairPhotos,
@@ -33,7 +34,13 @@ from phibench.calibration.captures.pair_photos import (
 )
 from phibench.calibration.captures.picture_files import Photo, SensorChoice, require_colour, sensor_choice
 from phibench.calibration.captures.raw_frames import PATTERNS
-from phibench.calibration.captures.rig_doubts import apart, calibration_note, contradicted, outlines_as_one
+from phibench.calibration.captures.rig_doubts import (
+    apart,
+    calibration_note,
+    contradicted,
+    of_another_size,
+    outlines_as_one,
+)
 from phibench.calibration.captures.rig_file import MeasuredRig, read_rig_file, require_camera_size
 from phibench.calibration.captures.spot_doubts import (
     DOUBTFUL_P,
@@ -184,6 +191,11 @@ def measure(photos: PairPhotos, stroke_m: float, setting: KnownNumbers, told: To
     """
     if not LEAST_STROKE_M <= stroke_m <= MOST_STROKE_M:
         raise DatasetError(f"a stroke of {stroke_m:g} m: allowed is {LEAST_STROKE_M:g} to {MOST_STROKE_M:g} m, metres")
+    if (sigma := setting.stroke_sigma_m) > LARGEST_SIGMA * stroke_m:
+        raise DatasetError(
+            f"a stroke of {stroke_m:g} m with a standard deviation of {sigma:g} m: allowed is a quarter of the stroke; "
+            f"{sigma:g} mm are {1e-3 * sigma:g} m"
+        )
     for photo in photos.all:
         require_colour(photo)
         require_camera_size(setting.known.rig, photo.size_px, str(photo.path))
@@ -283,6 +295,8 @@ def _fitted(
         limb = _outlines(pair, setting.calibration is not None)
     outlines, missing = limb
     rig, covariance, values, note, doubt = _corrected(setting, outlines, missing)
+    if not outlines:
+        doubt = of_another_size(rig, _picture(pair, "down"), card)
     stroke = float(stroke_of(np.array(stroke_m), values))
     told("fitting the spots")
     seen = replace(pair, rig=with_blur_of(rig, outlines), stroke_m=stroke)

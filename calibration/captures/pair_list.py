@@ -18,7 +18,13 @@ from functools import partial
 from pathlib import Path
 
 from phibench.calibration.captures.measure import KnownNumbers, Measurement, measure
-from phibench.calibration.captures.pair_photos import LEAST_STROKE_M, MOST_STROKE_M, PairPhotos, PositionPhotos
+from phibench.calibration.captures.pair_photos import (
+    LARGEST_SIGMA,
+    LEAST_STROKE_M,
+    MOST_STROKE_M,
+    PairPhotos,
+    PositionPhotos,
+)
 from phibench.calibration.captures.picture_files import read_photo
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import FILE_NAME, MIB, InputFile
@@ -119,6 +125,12 @@ def _row(line: dict[str, str | None], fault: Callable[[str], DatasetError]) -> L
         raise fault("it has no stroke_m")
     if ("depth_m" in numbers) != ("depth_sigma_m" in numbers):
         raise fault("depth_m and depth_sigma_m go together: a tape has a standard deviation, too")
+    for key in ("stroke", "depth"):
+        sigma = numbers.get(f"{key}_sigma_m", 0.0)
+        if sigma > LARGEST_SIGMA * numbers.get(f"{key}_m", math.inf):
+            raise fault(
+                f"{key}_sigma_m = {sigma:g}: allowed is a quarter of {key}_m, metres; {sigma:g} mm are {1e-3 * sigma:g}"
+            )
     return ListedPair(texts["name"], files, **numbers)
 
 

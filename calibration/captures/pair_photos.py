@@ -30,6 +30,7 @@ from phibench.scenes.frames import Array
 from phibench.scenes.rig import POSITIONS, Rig
 
 LEAST_STROKE_M, MOST_STROKE_M = 1e-3, 10.0  # those of a recipe
+LARGEST_SIGMA = 0.25  # of a length that somebody measured; a larger one is of another unit
 _FACTORS = (0.1, 10.0, 0.3, 3.0, 0.01, 100.0, 0.001)  # of the stroke: units mistaken, and a few times too much
 _SURE_SIGMAS, _EACH_SIGMAS = 12.0, 9.0  # of both spots together and of each: a fainter one may be noise
 _OUTLINE_POINTS, _INSIDE = 24, 2e-3  # and the part of the mirror's size by which rays are traced inside its outline

@@ -10,6 +10,7 @@ A calibration of another program that is given in its place is told what to copy
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -20,12 +21,13 @@ from phibench.calibration.captures.foreign_calibration import foreign_calibratio
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import SETTINGS_BYTES, InputFile
 from phibench.datasets.recipe.distributions import Table
+from phibench.datasets.recipe.mirror_tables import HolderTable, MirrorTable
 from phibench.datasets.recipe.recipe_scene import build_rig, idle_holder_keys
 from phibench.datasets.recipe.tables import LaserTable, RigTable
 from phibench.scenes.laser import Beam
 from phibench.scenes.rig import Rig
 from phibench.scenes.room import RIGS
-from phibench.scenes.validation import Fault, SceneError, structural_faults, without_unit
+from phibench.scenes.validation import Fault, SceneError, printable_line, structural_faults, without_unit
 
 _REMEDY = "docs/measure.md has an example of a rig file"
 
@@ -78,8 +80,10 @@ def read_rig_file(path: Path) -> MeasuredRig:
         if isinstance(raw[loose[0]], dict):
             raise file.fault(f"has the table [{loose[0]}], which belongs to [rig]: write [rig.{loose[0]}]")
         raise file.fault(f"has {loose[0]} outside its table: begin the file with a line [rig]")
-    if faults := structural_faults(RigFile, raw):
-        raise file.fault("; ".join(str(_advised(fault)) for fault in faults))
+    unusual = {fault.path: fault for fault in unusual_numbers(raw)}
+    faults = [_advised(fault, raw) for fault in structural_faults(RigFile, raw) if fault.path not in unusual]
+    if faults := [*unusual.values(), *faults]:
+        raise file.fault("; ".join(map(str, faults)))
     document = RigFile.model_validate(raw)
     table = document.rig
     if idle := idle_holder_keys("rig.holder", sorted(table.holder.model_fields_set), (table.holder.kind,)):
@@ -133,15 +137,30 @@ _UNITS = {
 }  # fmt: skip
 
 
-def _advised(fault: Fault) -> Fault:
-    """Fault of an unknown key with what to do, where its meaning is known."""
-    if not fault.unknown:
-        return fault
+_OTHER_TABLES: dict[str, tuple[str, type[Table]]] = {
+    "holder": ("rig.holder", HolderTable),
+    "mirror": ("rig.mirror", MirrorTable),
+    "laser": ("laser", LaserTable),
+}
+
+
+def _advised(fault: Fault, raw: dict[str, Any]) -> Fault:
+    """Fault of an unknown key, or of a number that is a text, with what to do where the meaning is known."""
     table, _, key = fault.path.rpartition(".")
+    if not fault.unknown:
+        given = _table_of(raw, table).get(key)
+        if isinstance(given, str) and _NUMBER.match(given) and "give a" in fault.text:
+            advice = "a number has no quotes, no unit and a decimal point"
+            return replace(fault, text=f"{fault.text}; {printable_line(given, 40)!r} is a text: {advice}")
+        if isinstance(given, list) and given and isinstance(given[0], dict):
+            return replace(fault, text=f"a list of tables; write [{fault.path}] with one bracket, once")
+        return fault
     stem = without_unit(key)
     advice = _ADVICE.get(stem, "") if table == "rig" else ""
     if table == "rig" and key.lower().endswith("_mm") and stem in ("f", "fx", "fy", "focal", "focal_length"):
         advice = "the focal length is given in pixels: write millimetres over the pixel pitch as fx_px"
+    if table == "rig":
+        advice = advice or _of_another_table(key)
     for unit, names in _UNITS.items():
         for other, name in names.items():
             if (
@@ -157,6 +176,87 @@ def _advised(fault: Fault) -> Fault:
     if not table and stem == "sensor":
         advice = "the sensor has a file of its own: give it with --sensor"
     return replace(fault, text=f"unknown key; {advice}") if advice else fault
+
+
+# -- numbers in another unit -----------------------------------------------------------------------------------------
+
+_NUMBER = re.compile(r"\s*[-+\u2212]?[\d.,]*\d")
+_LENGTHS = {"mm": 1e-3, "cm": 1e-2}
+_OTHERS: dict[str, tuple[str, dict[str, float]]] = {
+    "_m": ("metres", _LENGTHS),
+    "_um": ("micrometres", {"nm": 1e-3, "mm": 1e3, "m": 1e6}),
+    "_rad": ("radians", {"degrees": math.pi / 180.0, "mrad": 1e-3}),
+    "_deg": ("degrees", {"radians": 180.0 / math.pi}),
+}
+"""Unit at the end of a key: its name, and others that people write there, in it."""
+_SMALL_RAD, _SMALL_M = (-0.1, 0.1), (-0.03, 0.03)  # a rig is upright to some degrees, its mirror centred to some mm
+_USUAL = {
+    "rig": {
+        "radius_m": (0.002, 0.5), "z_c_m": (0.01, 3.0), "camera_height_m": (0.34, 10.0), "pixel_pitch_um": (0.3, 100.0),
+        "fx_px": (50.0, 50_000.0), "fy_px": (50.0, 50_000.0), "fov_deg": (5.0, 150.0), "focus_distance_m": (0.01, 20.0),
+        **dict.fromkeys(("tilt_x_rad", "tilt_y_rad", "stroke_tilt_x_rad", "stroke_tilt_y_rad"), _SMALL_RAD),
+        **dict.fromkeys(("decentre_x_m", "decentre_y_m"), _SMALL_M),
+    },
+    "rig.mirror": {
+        "rim_radius_m": (0.002, 0.5), "vertex_radius_m": (1e-4, 2.0), "half_angle_deg": (3.0, 87.0),
+        **dict.fromkeys(("tilt_x_rad", "tilt_y_rad"), _SMALL_RAD),
+    },
+    "rig.holder": dict.fromkeys(("radius_m", "circle_m", "plate_m", "rise_m", "wall_m"), (1e-4, 0.5)),
+    "laser": {"diameter_m": (1e-4, 0.1), "diameter_base_m": (0.0, 0.1), "diameter_growth_m_per_m": (0.0, 0.1)},
+}  # fmt: skip
+"""Least and most of each number of a rig that fits on a table; what lies beyond is of another unit."""
+
+
+def unusual_numbers(raw: dict[str, Any]) -> list[Fault]:
+    """Faults of numbers that no usual rig has but another unit explains: value, usual range, and what to write."""
+    faults = []
+    for table, ranges in _USUAL.items():
+        given = _table_of(raw, table)
+        for key, (low, high) in ranges.items():
+            value = given.get(key)
+            if isinstance(value, bool) or not isinstance(value, (int, float)) or low <= value <= high:
+                continue
+            if text := _in_other_units(key, float(value), (low, high), _pitch_um(raw)):
+                faults.append(Fault(f"{table}.{key}", text))
+    return faults
+
+
+def _in_other_units(key: str, value: float, usual: tuple[float, float], pitch_um: float) -> str:
+    """Words on a number that is usual if it has another unit; "" where none makes it usual."""
+    low, high = usual
+    name, others = next((unit for end, unit in _OTHERS.items() if key.endswith(end)), _OTHERS["_m"])
+    end = ""
+    if key.endswith("_px"):
+        name, others, end = "pixels", {"mm": 1e3 / pitch_um, "m": 1e6 / pitch_um}, f", at pixels of {pitch_um:g} um"
+    meant = {unit: value * factor for unit, factor in others.items() if low <= value * factor <= high}
+    if not meant:
+        return ""
+    advice = " or ".join(f"{converted:.6g} if it is {value:g} {unit}" for unit, converted in meant.items())
+    return f"{value:g} is unusual, {low:g} to {high:g} {name} are usual; write {advice}{end}"
+
+
+def _of_another_table(key: str) -> str:
+    """Advice on a key of [rig] that is one of another table, also with that table's name before it."""
+    for name, (path, model) in _OTHER_TABLES.items():
+        inner = key.removeprefix(f"{name}_")
+        if inner in model.model_fields:
+            return f"{inner} belongs to the table [{path}]: begin that with a line of its own, below those of [rig]"
+    return ""
+
+
+def _table_of(raw: dict[str, Any], path: str) -> dict[str, Any]:
+    """Table of a path such as "rig.mirror"; an empty one where there is none."""
+    found: object = raw
+    for key in filter(None, path.split(".")):
+        found = found.get(key) if isinstance(found, dict) else None
+    return found if isinstance(found, dict) else {}
+
+
+def _pitch_um(raw: dict[str, Any]) -> float:
+    """Pixel pitch of the file where it is usual, else that of the default rig."""
+    pitch = _table_of(raw, "rig").get("pixel_pitch_um")
+    low, high = _USUAL["rig"]["pixel_pitch_um"]
+    return float(pitch) if isinstance(pitch, (int, float)) and low <= pitch <= high else Rig().camera.pixel_pitch_um
 
 
 def _tables(file: InputFile) -> dict[str, Any]:

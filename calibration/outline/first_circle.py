@@ -22,7 +22,7 @@ from phibench.scenes.rig import Rig
 
 _FEW, _CANDIDATES = 6, 12  # circles about the nominal size, and of all sizes
 _NEAR = (0.95, 1.05)  # of the nominal rig's outline: looked at first
-_RADII = (0.7, 1.4)  # of the nominal outline's: sizes that are looked at
+SIZES_LOOKED_FOR = (0.7, 1.4)  # of the nominal outline's: sizes that are looked at
 _LEAST_RADIUS_PX = 30.0  # a smaller outline has too few pixels for its sectors
 _LEVEL_PX = 1000  # rows and columns that are enough for a level
 PICTURE_BLUR_PX2 = 0.5 + 1.0 / 6.0 + 1.0 / 12.0
@@ -52,7 +52,7 @@ def circles_by_size(picture: Array, rig: Rig) -> Iterator[Iterator[BallCircle]]:
     mirror's own; the fit of the light across them tells which is which.
     """
     low, high = radii_px(rig)
-    near = (low * _NEAR[0] / _RADII[0], high * _NEAR[1] / _RADII[1])
+    near = (low * _NEAR[0] / SIZES_LOOKED_FOR[0], high * _NEAR[1] / SIZES_LOOKED_FOR[1])
     return (circles(picture, radii, count) for radii, count in ((near, _FEW), ((low, high), _CANDIDATES)))
 
 
@@ -72,7 +72,7 @@ def radii_px(rig: Rig) -> tuple[float, float]:
             f"an image of {camera.width_px} x {camera.height_px}: check these numbers, {_LEAST_RADIUS_PX:.0f} to "
             f"{largest:.0f} px can be measured"
         )
-    return _RADII[0] * radius, _RADII[1] * radius
+    return SIZES_LOOKED_FOR[0] * radius, SIZES_LOOKED_FOR[1] * radius
 
 
 def rig_circle(rig: Rig) -> Circle:

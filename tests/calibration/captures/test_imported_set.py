@@ -233,6 +233,8 @@ def test_vertical_edges_of_pictures_tell_the_tilt(
         ("name,down,up,stroke_m\na,d.jpg,u.jpg,0.4,7\n", "another number of columns"),
         ("name,down,up,stroke\na,d.jpg,u.jpg,0.4\n", "did you mean 'stroke_m'"),
         ("name,down,up,stroke_m,depth_m\na,d.jpg,u.jpg,0.4,2.0\n", "depth_m and depth_sigma_m go together"),
+        (HEAD + "a,d.jpg,u.jpg,,,0.4,2.0,2\n", "2 mm are 0.002"),
+        ("name,down,up,stroke_m,stroke_sigma_m\na,d.jpg,u.jpg,0.4,0.5\n", "allowed is a quarter of stroke_m"),
     ],
 )
 def test_each_wrong_row_is_one_sentence(tmp_path: Path, text: str, words: str) -> None:
