@@ -9,6 +9,7 @@ A name in a document that leads to another file is a `FileName`: relative, below
 
 from __future__ import annotations
 
+import codecs
 import contextlib
 import io
 import json
@@ -27,6 +28,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar, cast
 from pydantic import AfterValidator, BaseModel, Field, ValidationError
 
 from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.common.toml_advice import toml_advice
 from phibench.scenes.validation import printable_line
 
 if TYPE_CHECKING:
@@ -77,7 +79,6 @@ def below(folder: Path, name: str) -> Path:
 
 
 _PART = r"""(?:[\w-]+|"[^"\n]*"|'[^'\n]*')"""
-_COMMA = re.compile(r"(?m)^[ \t]*\w+[ \t]*=[ \t]*[-+]?\d+,\d+[ \t]*(?:#.*)?$")
 _LONG_KEY = re.compile(rf"(?<![\w-]){_PART}(?:[ \t]*\.[ \t]*{_PART}){{{KEY_PARTS},}}")
 
 M = TypeVar("M", bound=BaseModel)
@@ -185,11 +186,18 @@ class InputFile:
     # Documents.
 
     def text(self, data: bytes | None = None, encoding: str = "utf-8") -> str:
-        """Text of the file, or of bytes that are already read from it."""
+        """Text of the file, or of bytes that are already read from it; a byte order mark of UTF-16 is obeyed."""
+        data = self.read() if data is None else data
+        if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):  # of editors and shells on Windows
+            encoding = "utf-32" if data.startswith(codecs.BOM_UTF32_LE) else "utf-16"
+        elif data[1:2] == b"\0":
+            encoding = "utf-16-le"
         try:
-            return (self.read() if data is None else data).decode(encoding)
+            return data.decode(encoding)
         except UnicodeDecodeError as error:
-            raise self.fault(f"cannot be read: byte {error.start} is not UTF-8") from error
+            raise self.fault(
+                f"cannot be read: byte {error.start} is not {encoding.removesuffix('-sig').upper()}; save it as UTF-8"
+            ) from error
 
     def json(self, data: bytes | None = None) -> dict[str, Any]:
         """JSON object, bounded.
@@ -224,12 +232,13 @@ class InputFile:
         if _LONG_KEY.search(text):  # tomllib takes the square of its length in time and memory
             raise self.fault(f"is not valid here: a key has more than {KEY_PARTS} parts")
         try:
-            document = tomllib.loads(text)
+            document = tomllib.loads(text if "\n" in text else text.replace("\r", "\n"))  # an old Macintosh's lines
         except RecursionError as error:
             raise self.fault(f"is not valid TOML: it is nested deeper than {DEPTH} levels") from error
         except ValueError as error:  # tomllib lets a number of 5000 digits end in Python's own words
-            comma = "; numbers have a decimal point, no comma" if _COMMA.search(text) else ""
-            raise self.fault(f"is not valid TOML: {printable_line(str(error), 200)}{comma}") from error
+            advice = toml_advice(text, str(error))
+            advice = f"; {advice}" if advice else ""
+            raise self.fault(f"is not valid TOML: {printable_line(str(error), 200)}{advice}") from error
         if fault := bounds_fault(document, finite=False):
             raise self.fault(f"is not valid here: {fault}")
         return document
