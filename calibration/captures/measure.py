@@ -61,6 +61,7 @@ from phibench.calibration.captures.spot_shape import (
     spot_images,
 )
 from phibench.calibration.captures.tested_chain import ChainTest, chain_test
+from phibench.calibration.captures.turned_pictures import require_alike
 from phibench.calibration.outline.outline import find_outline
 from phibench.calibration.outline.outline_result import Outline
 from phibench.calibration.rig.bundle import calibrate
@@ -200,6 +201,7 @@ def measure(photos: PairPhotos, stroke_m: float, setting: KnownNumbers, told: To
         require_colour(photo)
         require_camera_size(setting.known.rig, photo.size_px, str(photo.path))
         sensor_choice(photo, setting.sensor)
+    require_alike(photos.of_one_room, setting.known.rig)
     told("trying what the files stand for")
     test = chain_test(
         photos,

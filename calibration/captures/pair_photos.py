@@ -75,6 +75,13 @@ class PairPhotos:
         """All pictures, those with the laser on first."""
         return (*self.down.on, *self.up.on, *self.down.off, *self.up.off)
 
+    @property
+    def of_one_room(self) -> tuple[tuple[Photo, Photo], ...]:
+        """Pictures that are to be alike around the mirror: all others of a position with its first, and both firsts."""
+        groups = [(*position.on, *position.off) for position in (self.down, self.up)]
+        within = [(group[0], other) for group in groups for other in group[1:]]
+        return (*within, (self.down.on[0], self.up.on[0]))
+
 
 def pair_of_photos(photos: PairPhotos, stroke_m: float, known: MeasuredRig, card: SensorCard) -> Pair:
     """Pair of all frames; images of several are their means."""

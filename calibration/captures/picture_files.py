@@ -177,6 +177,11 @@ def require_one_camera(photos: Sequence[Photo]) -> None:
     """
     first = photos[0]
     for other in photos[1:]:
+        if other.size_px == first.size_px[::-1] != first.size_px:
+            raise ImageError(
+                f"{other.path} is turned by 90 degrees against {first.path}: {other.size_px[0]} x {other.size_px[1]} "
+                f"and {first.size_px[0]} x {first.size_px[1]} pixels; give all pictures as the camera delivers them"
+            )
         for what, one, two in (
             ("size", f"{first.size_px[0]} x {first.size_px[1]}", f"{other.size_px[0]} x {other.size_px[1]}"),
             ("EXIF orientation", str(first.orientation), str(other.orientation)),
