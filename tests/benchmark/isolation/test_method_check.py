@@ -12,17 +12,10 @@ import numpy as np
 import pytest
 from helpers.sandbox_pairs import HEADER, method_file
 
+from phibench.benchmark.isolation.answer_faults import Views, covariance_fault, position_fault
 from phibench.benchmark.isolation.answers import AnswerError, answer_text, checked
 from phibench.benchmark.isolation.easy_pairs import EasyPairs
-from phibench.benchmark.isolation.method_check import (
-    PAIRS,
-    Check,
-    Views,
-    check_method,
-    covariance_fault,
-    judged,
-    position_fault,
-)
+from phibench.benchmark.isolation.method_check import PAIRS, Check, check_method, judged
 from phibench.benchmark.isolation.run_limits import MethodError, RunLimits
 from phibench.cli import main as cli
 from phibench.estimator.geometry.phi import phi_normal, phi_ray
@@ -145,6 +138,15 @@ def depth(factor: float) -> Method:
     return method
 
 
+def of_depth(f: Callable[[float, Pair], float], sigma: Callable[[float], float] | None = None) -> Method:
+    def method(pair: Pair) -> Answer:
+        D = depth(1.0)(pair).depth_m
+        assert D is not None
+        return replace(right(pair), depth_m=f(D, pair), sigma_depth_m=None if sigma is None else sigma(D))
+
+    return method
+
+
 MISTAKES: dict[str, tuple[Method, str]] = {
     "wrong type": (
         lambda pair: (1.0, 2.0),
@@ -171,7 +173,7 @@ MISTAKES: dict[str, tuple[Method, str]] = {
         "relative to the box",
     ),
     "binned": (each(moved(lambda u, v, *_: (u / 2.0, v / 2.0))), "positions are halved"),
-    "something else": (each(moved(lambda u, v, *_: (200.0, 200.0))), "something else than the laser spot"),
+    "something else": (each(moved(lambda u, v, *_: (200.0, 200.0))), "all positions are (200.0, 200.0) px"),
     "degrees": (
         each(lambda p, s, n: replace(s, phi_rad=math.degrees(phi(p, s, n)))),
         "These look like degrees: give radians",
@@ -181,7 +183,7 @@ MISTAKES: dict[str, tuple[Method, str]] = {
         each(lambda p, s, n: replace(s, phi_rad=float(phi_normal(p.rig.at(0.0), np.array(s.uv_px))))),
         "phi_rad is the angle 'normal', not 'ray'",
     ),
-    "phi of nothing": (each(lambda p, s, n: replace(s, phi_rad=0.1)), "rad (median) from the angle 'ray'"),
+    "phi of nothing": (each(lambda p, s, n: replace(s, phi_rad=0.1)), "phi_rad is 0.1 for all spots"),
     "NaN": (each(moved(lambda *_: (math.nan, math.nan))), "finite numbers, or Spot.missing('why')"),
     "indefinite": (
         each(lambda p, s, n: replace(s, covariance_px2=((1.0, 2.0), (2.0, 1.0)))),
@@ -193,6 +195,43 @@ MISTAKES: dict[str, tuple[Method, str]] = {
     "millimetres": (depth(1000.0), "depth_m is in millimetres"),
     "centimetres": (depth(100.0), "depth_m is in centimetres"),
     "half the depth": (depth(0.4), "times the true depth"),
+    "turned": (each(moved(lambda u, v, *_: (1279.0 - u, 719.0 - v))), "turned by 180 degrees"),
+    "from the middle": (each(moved(lambda u, v, *_: (u - 639.5, v - 359.5))), "count from the image's middle"),
+    "doubled": (each(moved(lambda u, v, *_: (2.0 * u, 2.0 * v))), "positions are doubled"),
+    "quarter": (each(moved(lambda u, v, *_: (u / 4.0, v / 4.0))), "positions are a quarter"),
+    "parts of the image": (each(moved(lambda u, v, *_: (u / 1280.0, v / 720.0))), "positions are no pixels"),
+    "cut out": (each(moved(lambda u, v, *_: (u - 40.0, v - 20.0))), "off by (-40.0, -20.0) px, as in a part"),
+    "middle of the box": (
+        each(moved(lambda u, v, p, n: (box_of(p, n)[0] + 31.5, box_of(p, n)[1] + 31.5))),
+        "the middles of the boxes",
+    ),
+    "(v, u) in the box": (
+        each(moved(lambda u, v, p, n: (v - box_of(p, n)[1] + box_of(p, n)[0], u - box_of(p, n)[0] + box_of(p, n)[1]))),
+        "the axes are swapped in the box",
+    ),
+    "down for up": (lambda pair: Answer(right(pair).down, right(pair).down), "both are the spot of the down image"),
+    "one image": (
+        each(moved(lambda u, v, p, n: (u, v) if n == "down" else (v, u))),
+        "positions in the image 'up' are wrong, those in 'down' are right: the axes are swapped",
+    ),
+    "some pairs": (
+        each(moved(lambda u, v, p, n: (u + 100.0, v) if p.number < 4 else (u, v))),
+        "8 of 20 positions are 100 px from the spot (median), others are right",
+    ),
+    "pair before": (lambda pair: right(MADE(SET, max(pair.number - 1, 0))), "the spots of the pair before"),
+    "phi halved twice": (each(lambda p, s, n: replace(s, phi_rad=0.5 * phi(p, s, n))), "halved twice"),
+    "elevation": (each(lambda p, s, n: replace(s, phi_rad=0.5 * math.pi - phi(p, s, n))), "the rest to a right angle"),
+    "tangent": (each(lambda p, s, n: replace(s, phi_rad=min(math.tan(phi(p, s, n)), 1.57))), "the angle's tangent"),
+    "half turns": (each(lambda p, s, n: replace(s, phi_rad=phi(p, s, n) / math.pi)), "in half turns"),
+    "feet": (depth(1.0 / 0.3048), "depth_m is in feet"),
+    "twice the depth": (depth(2.0), "depth_m is twice D"),
+    "a tenth more": (depth(1.1), "1.100 times the D of the answer's own positions"),
+    "stroke left out": (of_depth(lambda D, p: D / p.stroke_m), "D over the stroke"),
+    "with the stroke": (of_depth(lambda D, p: D + p.stroke_m), "D and the stroke together"),
+    "inverse": (of_depth(lambda D, p: 1.0 / D), "1 / D"),
+    "one depth": (of_depth(lambda D, p: 9.0), "depth_m is 9 for all pairs"),
+    "variance of D": (of_depth(lambda D, p: D, lambda D: (0.002 * D) ** 2), "sigma_depth_m holds variances"),
+    "sigma of D in mm": (of_depth(lambda D, p: D, lambda D: 2.0 * D), "sigma_depth_m is in millimetres"),
     "gives up": (lambda pair: Answer(Spot.missing("dim"), Spot.missing("dim")), "all are easy: 'dim' (20 times)"),
 }
 
@@ -218,6 +257,7 @@ def test_sound_methods_pass(pairs: list[Pair], name: str) -> None:
 def test_a_sound_method_may_give_angle_and_depth(pairs: list[Pair]) -> None:
     assert tried(each(lambda p, s, n: replace(s, phi_rad=phi(p, s, n))), pairs).ok
     assert tried(depth(1.0), pairs).ok
+    assert tried(METHODS["joint_fit"], pairs).ok
 
 
 def test_noise_alone_is_not_taken_for_a_mistake() -> None:
