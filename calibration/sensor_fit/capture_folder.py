@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from pydantic import Field
 
+from phibench.calibration.sensor_fit.code_faults import code_fault
 from phibench.datasets.common.camera_pictures import read_camera_picture
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import SETTINGS_BYTES, InputFile
@@ -272,26 +273,9 @@ def raw_frames(capture: Capture, group: FrameGroup) -> NDArray[Any]:
     CaptureError
         If they are not codes of the stated bits as a converter writes them, or too small.
     """
-    frames, top = capture.stack(group), (1 << capture.notes.bits) - 1
-    if int(frames.max()) > top:
-        raise CaptureError(
-            f"{capture.folder / group.name} has the code {int(frames.max())}, and {capture.notes.bits} bits end at "
-            f"{top}: write `bits` into capture.toml, and give codes that are not scaled to 16 bits"
-        )
-    codes = np.flatnonzero(np.bincount(frames[0].ravel()))
-    step = int(np.diff(codes).min()) if len(codes) > 2 else 1
-    if step > 1:  # rounding is a whole step then, and not one code
-        unused = step.bit_length() - 1
-        stretched = top / (top >> unused)  # of a program that makes the last code the last one of more bits
-        most = 1.0 if step > 3 else 0.5  # upper bits that are repeated below are up to 1 off
-        shifted = any(np.abs(codes - s * np.rint(codes / s)).max() <= most for s in (1 << unused, stretched))
-        remedy = (
-            f"which a program scaled: shift them right by {unused} bits, and write bits = "
-            f"{capture.notes.bits - unused} into capture.toml"
-            if shifted
-            else "which a table or a digital gain spread: give the codes of the converter"
-        )
-        raise CaptureError(f"{capture.folder / group.name} has codes {step} or more apart, {remedy}")
+    frames = capture.stack(group)
+    if fault := code_fault(frames, capture.notes.bits):
+        raise CaptureError(f"{capture.folder / group.name} {fault}")
     if min(frames.shape[1:]) < 32:
         raise CaptureError(f"{capture.folder / group.name}: {frames.shape[2]} x {frames.shape[1]} pixels; {_SHAPE}")
     return frames
