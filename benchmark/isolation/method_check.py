@@ -12,7 +12,12 @@ from textwrap import indent
 
 import numpy as np
 
-from phibench.benchmark.isolation.answer_faults import (
+from phibench.benchmark.isolation.easy_pairs import EasyPairs
+from phibench.benchmark.isolation.run_limits import RunLimits
+from phibench.benchmark.isolation.runner import Harness
+from phibench.estimator.geometry.triangulate import depth_exact
+from phibench.estimator.interface import OK, Outcome, Spot
+from phibench.estimator.methods.answer_faults import (
     NEAR_PX,
     SeenAngle,
     SeenDepth,
@@ -26,11 +31,6 @@ from phibench.benchmark.isolation.answer_faults import (
     whole_pixels_note,
     wild_fault,
 )
-from phibench.benchmark.isolation.easy_pairs import EasyPairs
-from phibench.benchmark.isolation.run_limits import RunLimits
-from phibench.benchmark.isolation.runner import Harness
-from phibench.estimator.geometry.triangulate import depth_exact
-from phibench.estimator.interface import OK, Outcome, Spot
 from phibench.estimator.pair_set import ImageTruth, PairTruth
 from phibench.scenes.frames import Array
 

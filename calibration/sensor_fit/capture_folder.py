@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from pydantic import Field
 
-from phibench.calibration.sensor_fit.code_faults import code_fault
+from phibench.calibration.sensor_fit.code_widths import code_fault
 from phibench.datasets.common.camera_pictures import read_camera_picture
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import SETTINGS_BYTES, InputFile

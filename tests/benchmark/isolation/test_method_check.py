@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from helpers.sandbox_pairs import HEADER, method_file
 
-from phibench.benchmark.isolation.answer_faults import Views, covariance_fault, position_fault
 from phibench.benchmark.isolation.answers import AnswerError, answer_text, checked
 from phibench.benchmark.isolation.easy_pairs import EasyPairs
 from phibench.benchmark.isolation.method_check import PAIRS, Check, check_method, judged
@@ -21,6 +20,7 @@ from phibench.cli import main as cli
 from phibench.estimator.geometry.phi import phi_normal, phi_ray
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.estimator.interface import Answer, Method, Outcome, Pair, Spot
+from phibench.estimator.methods.answer_faults import Views, covariance_fault, position_fault
 from phibench.estimator.methods.pair_light import mirror_mask
 from phibench.estimator.methods.registry import METHODS
 from phibench.estimator.methods.spot_search import SharedPair

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from phibench.calibration.sensor_fit.code_faults import code_fault
+from phibench.calibration.sensor_fit.code_widths import code_fault
 
 SHAPE = (4, 64, 96)
 
