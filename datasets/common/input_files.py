@@ -188,7 +188,7 @@ class InputFile:
     def text(self, data: bytes | None = None, encoding: str = "utf-8") -> str:
         """Text of the file, or of bytes that are already read from it; a byte order mark of UTF-16 is obeyed."""
         data = self.read() if data is None else data
-        if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):  # of editors and shells on Windows
+        if len(data) > 2 and data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):  # of Windows
             encoding = "utf-32" if data.startswith(codecs.BOM_UTF32_LE) else "utf-16"
         elif data[1:2] == b"\0":
             encoding = "utf-16-le"
