@@ -195,7 +195,7 @@ def test_rays_past_the_mirror_go_on_as_if_it_were_not_there() -> None:
     v, u = np.mgrid[crop[1] : crop[1] + 24, crop[0] : crop[0] + 10]
     alone = electrons(view.rig.camera, np.stack([u.ravel(), v.ravel()], axis=-1).astype(float)).reshape(24, 10)
     assert len(beside) >= 8  # of which five are in the shell
-    # One ray for each pixel: by eight seeds pixels scatter by 5.5e-4 and their mean by 1.3e-4; 4.5 of each are 1 of 1e5.
+    # One ray a pixel: by eight seeds pixels scatter by 5.5e-4 and their mean by 1.3e-4; 4.5 of each are 1 of 1e5.
     assert beside == pytest.approx(alone[rows < edge - 4.0], rel=2.5e-3)
     assert np.mean(beside / alone[rows < edge - 4.0]) == pytest.approx(1.0, abs=6e-4)
     assert 0.5 < inside.max() / beside.min() < 0.9  # the lamp again, by the steel at grazing incidence
