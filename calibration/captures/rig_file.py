@@ -189,7 +189,7 @@ _OTHERS: dict[str, tuple[str, dict[str, float]]] = {
     "_deg": ("degrees", {"radians": 180.0 / math.pi}),
 }
 """Unit at the end of a key: its name, and others that people write there, in it."""
-_SMALL_RAD, _SMALL_M = (-0.1, 0.1), (-0.03, 0.03)  # a rig is upright to some degrees, its mirror centred to some mm
+_SMALL_RAD, _SMALL_M = (-0.2, 0.2), (-0.03, 0.03)  # a rig is upright to ten degrees, its mirror centred to some mm
 _USUAL = {
     "rig": {
         "radius_m": (0.002, 0.5), "z_c_m": (0.01, 3.0), "camera_height_m": (0.34, 10.0), "pixel_pitch_um": (0.3, 100.0),
