@@ -142,5 +142,5 @@ def _by_parts(scores: Sequence[DenseScore]) -> str:
         rows.append((part.by, part.label, str(part.pairs), *cells))
     heads = ("by", "part", "pairs", *(score.method.name for score in scores))
     return _section(
-        "Parts", heads, rows, "Recall / %; median error / %. Parts of pixels have 200 pixels in a pair, or more."
+        "Parts", heads, rows, "Recall / %; median error / %. Pairs are those with at least 200 such pixels."
     )

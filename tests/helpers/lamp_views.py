@@ -42,7 +42,7 @@ def lamp_window(view: View) -> tuple[int, int, int, int]:
     return int(low[0]), int(low[1]), int(width), int(height)
 
 
-def lamp_image(view: View, room: Room, crop: tuple[int, int, int, int]) -> np.ndarray:
+def lamp_image(view: View, room: Room, crop: tuple[int, int, int, int], seed: int = 0) -> np.ndarray:
     """Ambient layer, plane R, of a room with nothing in it but a lamp: its light map is dark."""
     from phibench.render.room.ambient_layer import render_ambient
     from phibench.render.room.light_map import BakeSettings, LightMap, texel_count
@@ -51,7 +51,7 @@ def lamp_image(view: View, room: Room, crop: tuple[int, int, int, int]) -> np.nd
     texels = texel_count(room, settings.texel_m)
     dark = np.zeros((texels, 3), dtype=np.float32)
     light = LightMap(dark, dark, np.zeros(texels, dtype=bool))
-    return render_ambient(view, room, light, settings, 4, 0, crop).electrons_per_s[0]
+    return render_ambient(view, room, light, settings, 4, seed, crop).electrons_per_s[0]
 
 
 def traced_lamp(view: View, crop: tuple[int, int, int, int], side: int = 5) -> np.ndarray:
