@@ -78,7 +78,10 @@ QUESTION_WORDS = {"What", "Where", "How", "Whether", "Which", "That"}
 RENDERERS = {"mitsuba", "drjit"}
 MAY_IMPORT_RENDERERS = ("render/room", "render/setup")
 # The simulator and the estimator share numbers, not mathematics; only studies render.
-RENDERS = ("render", "datasets", "benchmark/export", "benchmark/release", "studies", "phibench/__")
+RENDERS = (
+    *("render", "datasets", "benchmark/sealed/dense_set", "benchmark/export", "benchmark/release"),
+    *("studies", "phibench/__"),
+)
 
 
 def sources(root: Path) -> list[Path]:

@@ -17,7 +17,6 @@ from rich.console import Console
 
 from phibench.benchmark.export.containers import NEEDS_PYARROW, image_name, shard_name, write_shard
 from phibench.benchmark.export.dataset_card import card, croissant
-from phibench.benchmark.export.dense_set import DENSE_SEAL, DENSE_TRUTH
 from phibench.benchmark.export.pair_rows import (
     INDEX,
     SPLITS,
@@ -30,6 +29,7 @@ from phibench.benchmark.export.pair_rows import (
 )
 from phibench.benchmark.pair_sets.dataset_pairs import DatasetPairs, dataset_pairs
 from phibench.benchmark.pair_sets.frames_set import frames_row, frames_set_documents
+from phibench.benchmark.sealed.dense_set import DENSE_SEAL, DENSE_TRUTH
 from phibench.benchmark.sealed.sealed_set import SEAL
 from phibench.datasets.build.parts import Brought, bring_all
 from phibench.datasets.build.tasks import BuildTask, Made

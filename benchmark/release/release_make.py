@@ -15,14 +15,6 @@ from pathlib import Path
 
 from rich.console import Console
 
-from phibench.benchmark.export.dense_set import (
-    DENSE_SEAL,
-    DENSE_SET,
-    first_pairs,
-    pairs_of_sealed,
-    seal_dense_set,
-    write_dense_set,
-)
 from phibench.benchmark.export.export_make import export_frames_sets
 from phibench.benchmark.release.release_archives import archive_tasks, digest_of, packed_files
 from phibench.benchmark.release.release_parts import (
@@ -38,6 +30,14 @@ from phibench.benchmark.release.release_parts import (
     drawn_numbers,
     read_manifest_file,
     same_but_drawn,
+)
+from phibench.benchmark.sealed.dense_set import (
+    DENSE_SEAL,
+    DENSE_SET,
+    first_pairs,
+    pairs_of_sealed,
+    seal_dense_set,
+    write_dense_set,
 )
 from phibench.benchmark.sealed.sealed_set import secret_seed
 from phibench.datasets.build.forecast import megabytes

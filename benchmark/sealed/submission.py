@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Protocol
 
 from pydantic import Field
 
@@ -252,7 +252,33 @@ def read_submission(path: Path) -> Submission:
     return document
 
 
-def check_complete(document: Submission, seal: Seal, name: str) -> None:
+class _Answering(Protocol):
+    """Document of answers, of spots or of dense pairs."""
+
+    @property
+    def seal(self) -> str: ...
+
+    @property
+    def task_version(self) -> int: ...
+
+    @property
+    def answers(self) -> Sequence[Any]: ...
+
+
+class _Sealing(Protocol):
+    """Seal of a set, of spots or of dense pairs."""
+
+    @property
+    def id(self) -> str: ...
+
+    @property
+    def task_version(self) -> int: ...
+
+    @property
+    def pairs(self) -> int: ...
+
+
+def check_complete(document: _Answering, seal: _Sealing, name: str) -> None:
     """Refuse a submission of another seal or version, and one that has not each pair once; `name` is what it is called.
 
     Raises
@@ -293,14 +319,14 @@ def _line(outcome: Outcome) -> AnswerLine:
         interval_depth_m=None if answer is None else answer.interval_depth_m,
         seconds=math.nan if _finite(outcome.seconds) is None else float(outcome.seconds),
         failure=outcome.failure,
-        message=_without_folders(outcome.message),
+        message=without_folders(outcome.message),
     )
 
 
 _FOLDERS = re.compile(r"""(?<![\w.:/\\])(?:~|[A-Za-z]:)?[\\/](?:[^\\/\s'"<>|:]+[\\/])+""")
 
 
-def _without_folders(text: str) -> str:
+def without_folders(text: str) -> str:
     """Message without the folders of the paths in it: a submission is published, a user's folders are his."""
     for folder in (Path.cwd(), Path.home()):
         text = text.replace(f"{folder}/", "") if len(folder.parts) > 1 else text

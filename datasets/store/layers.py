@@ -38,6 +38,7 @@ from phibench.scenes.rig import View
 from phibench.scenes.validation import printable_line
 
 ATTRIBUTE = "phibench"
+MOST_PLANES = 64  # of a file, more than any layer has
 Plane = NDArray[np.float32]
 
 
@@ -94,8 +95,8 @@ def write_exr(
     return write_atomic(path, lambda temporary: _write(temporary, arrays, text, origin_px, half))
 
 
-def read_exr(path: Path) -> Exr:
-    """Read a file that `write_exr` wrote.
+def read_exr(path: Path, most_planes: int = MOST_PLANES) -> Exr:
+    """Read a file that `write_exr` wrote; one with more planes is refused before they are decoded.
 
     Raises
     ------
@@ -107,7 +108,7 @@ def read_exr(path: Path) -> Exr:
     _check_readable(path)
     try:
         with quiet_terminal(), OpenEXR.File(str(path), header_only=True) as file:
-            _check_size(path, file.header() if file.parts else {})
+            _check_size(path, [part.header for part in file.parts], most_planes)
         with quiet_terminal(), OpenEXR.File(str(path), separate_channels=True) as file:
             if not file.parts:
                 raise DatasetError(f"{path} is damaged or truncated")
@@ -118,10 +119,14 @@ def read_exr(path: Path) -> Exr:
         raise DatasetError(f"{path} is damaged: {printable_line(str(error), 300)}") from error
 
 
-def _check_size(path: Path, header: dict[str, Any]) -> None:
-    """Refuse a file that declares more pixels than any layer has, before they are decoded."""
-    if "dataWindow" not in header:
+def _check_size(path: Path, headers: list[dict[str, Any]], most_planes: int) -> None:
+    """Refuse a file that declares more pixels, planes or parts than any layer has, before they are decoded."""
+    header = headers[0] if headers else {}
+    if "dataWindow" not in header or "channels" not in header:
         raise DatasetError(f"{path} is damaged or truncated")
+    if len(headers) > 1 or len(header["channels"]) > most_planes:
+        what = f"{len(headers)} parts" if len(headers) > 1 else f"{len(header['channels'])} planes"
+        raise DatasetError(f"{path} was not written by phibench: it has {what}, at most {most_planes} in one part")
     low, high = (np.asarray(corner, dtype=np.int64) for corner in header["dataWindow"])
     width, height = (high - low + 1).tolist()
     if not (0 < width <= LARGEST_SIDE_PX and 0 < height <= LARGEST_SIDE_PX and width * height <= PICTURE_PIXELS):

@@ -185,7 +185,7 @@ def _scored_pairs(
 ) -> DensePairSet:
     """Pairs of a data set, or of a dense set, whose frames are drawn."""
     from phibench.benchmark.dense.dense_score import chosen_pairs
-    from phibench.benchmark.export.dense_set import DENSE_SEAL, DENSE_SET, DenseSet
+    from phibench.benchmark.sealed.dense_set import DENSE_SEAL, DENSE_SET, DenseSet
     from phibench.datasets.common.errors import DatasetError
 
     if not any((directory / name).is_file() for name in (DENSE_SET, DENSE_SEAL)):

@@ -214,16 +214,23 @@ def submit(
     Parameters
     ----------
     public
-        Folder of the sealed set.
+        Folder of the sealed set; that of a sealed dense set asks a dense method.
     method
-        A method: a name that `phibench method list` shows, or FILE.py:FUNCTION.
+        A method: a name that `phibench method list` or `phibench dense list` shows, or FILE.py:FUNCTION.
     out
-        JSON file to write.
+        JSON file to write; for a dense set a folder.
     workers
         Pairs that are worked on at a time.
     """
+    from phibench.benchmark.sealed.dense_submission import is_dense_seal, submit_dense
     from phibench.benchmark.sealed.submission import submit as submit_method
 
+    if is_dense_seal(public):
+        dense = submit_dense(public, method, out, workers, limits.of_run, own.declared([method]))
+        print(f"{dense.path}: {dense.answered} of {dense.pairs} pairs answered")
+        if dense.silence:
+            print(f"most often without an answer: {dense.silence}")
+        return int(dense.answered == 0)
     done = submit_method(public, method, out, workers, limits.of_run, own.declared([method]))
     print(
         f"{done.path}: {done.answered} of {done.pairs} pairs answered, {done.positions} of {2 * done.pairs} positions"
@@ -244,15 +251,16 @@ def open_(public: Path, *, truth: Path, submission: Path, out: Path | None = Non
     public
         Folder of the sealed set.
     truth
-        File that `phibench seal make` wrote into the data set's folder.
+        File that `phibench seal make` wrote into the data set's folder; of a dense set its dense.truth.json.
     submission
-        File that `phibench seal submit` wrote.
+        File that `phibench seal submit` wrote; for a dense set the folder.
     out
         JSON file for the score.
     """
     from phibench.benchmark.scores.answer_errors import Rules
     from phibench.benchmark.scores.score import isolated, saved, score_outcomes
     from phibench.benchmark.scores.score_tables import nothing_answered, print_scores
+    from phibench.benchmark.sealed.dense_submission import is_dense_seal
     from phibench.benchmark.sealed.submission import unseal as unseal_set
     from phibench.datasets.common.errors import DatasetError
     from phibench.datasets.store.files import require_writable
@@ -261,6 +269,8 @@ def open_(public: Path, *, truth: Path, submission: Path, out: Path | None = Non
         if out.suffix != ".json":
             raise DatasetError(f"--out {out}: a score is a JSON file; give a name that ends in .json")
         require_writable(out)
+    if is_dense_seal(public):
+        return _open_dense(public, truth, submission, out)
     opened = unseal_set(public, truth, submission)  # checks the hash of the truth before any score
     if opened.pairs.note:
         print(f"note: {opened.pairs.note}", file=sys.stderr)
@@ -271,6 +281,25 @@ def open_(public: Path, *, truth: Path, submission: Path, out: Path | None = Non
     if out is not None:
         print(f"written: {out}")
     return int(nothing_answered([scored]))
+
+
+def _open_dense(public: Path, truth: Path, submission: Path, out: Path | None) -> int:
+    """Score of dense answers; the exit code is 1 if no pair was answered."""
+    from phibench.benchmark.dense.dense_score import saved_dense
+    from phibench.benchmark.dense.dense_tables import dense_board, dense_failures
+    from phibench.benchmark.sealed.dense_submission import open_dense
+    from phibench.datasets.common.shown_text import show_grid, table_console
+
+    opened = open_dense(public, truth, submission)
+    scored = opened.scored if out is None else saved_dense(opened.scored, out)
+    document = scored.document
+    print(f"seal {opened.seal}: the truth is the sealed one, the submission has each of {document.pairs} pairs")
+    show_grid(table_console(False), dense_board([document]))
+    for line in dense_failures(scored.records):
+        print(f"{document.method.name}: {line}")
+    if out is not None:
+        print(f"written: {out}")
+    return int(sum(document.failures.values()) == document.pairs)
 
 
 submission = App(name="submission", group=KEEPERS, help="Check a score that is to be added to the results.")

@@ -25,7 +25,6 @@ from PIL import Image
 from rich.console import Console
 
 from phibench.benchmark.export import export_make
-from phibench.benchmark.export.dense_set import DENSE_SET, DenseSet
 from phibench.benchmark.export.pair_rows import ExportRequest
 from phibench.benchmark.pair_sets.frames_set import FramesSet
 from phibench.benchmark.release import release_make
@@ -35,6 +34,7 @@ from phibench.benchmark.reports.bench import SHIPPED
 from phibench.benchmark.scores.score_document import ScoreDocument
 from phibench.benchmark.scores.worst_images import EncodedPicture
 from phibench.benchmark.sealed import rebuilt_score, score_check
+from phibench.benchmark.sealed.dense_set import DENSE_SET, DenseSet
 from phibench.calibration.captures import imported_set
 from phibench.calibration.sensor_fit import fit_sensor
 from phibench.calibration.sensor_fit.capture_folder import read_header

@@ -27,13 +27,13 @@ from pydantic import Field
 from phibench.benchmark.dense.dense_pairs import DENSE_TASK_VERSION, DensePairs, DenseTruth, dense_pairs
 from phibench.benchmark.pair_sets.dataset_pairs import dataset_pairs
 from phibench.benchmark.pair_sets.frames_set import Digest, pair_of_files
-from phibench.benchmark.sealed.sealed_set import single_pairs
+from phibench.benchmark.sealed.sealed_set import public_sha256, seal_id, single_pairs
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import SETTINGS_BYTES, FileName, InputFile, Name
 from phibench.datasets.exposures.pair_draws import PairDraw
 from phibench.datasets.frames.frame_files import png_bytes
 from phibench.datasets.read import Dataset
-from phibench.datasets.store.checksums import checksums_text, filling, signed, write_documents
+from phibench.datasets.store.checksums import filling, signed, write_documents
 from phibench.datasets.store.files import sha256, write_bytes, write_secret
 from phibench.datasets.store.json_forms import from_json, to_json
 from phibench.datasets.store.layers import read_exr, write_exr
@@ -93,6 +93,11 @@ class DenseSeal(Document):
     public_sha256: Digest
     truth_sha256: Digest
 
+    @property
+    def id(self) -> str:
+        """Id that follows from both hashes, as that of a `Seal`."""
+        return seal_id(self.public_sha256, self.truth_sha256)
+
 
 class DenseSet:
     """Dense pairs of a dense set by number, with their truth.
@@ -112,7 +117,10 @@ class DenseSet:
     def __init__(self, folder: str | Path, pairs: int | None = None) -> None:
         self.folder = Path(folder)
         if (self.folder / DENSE_SEAL).is_file():
-            raise DatasetError(f"{folder} is sealed and holds no truth: who has the truth scores methods on it")
+            raise DatasetError(
+                f"{folder} is sealed and holds no truth: answer it with `phibench seal submit`, and who has the truth "
+                "scores the answers"
+            )
         file = InputFile(self.folder / DENSE_SET, _AGAIN, limit_bytes=SETTINGS_BYTES)
         self.info = file.document(DenseSetInfo)
         if self.info.task_version != DENSE_TASK_VERSION:
@@ -140,9 +148,7 @@ class DenseSet:
 
     def pair(self, number: int) -> DensePair:
         """Images (down, up) with the laser off, as a method sees them; the arrays are read-only."""
-        read = pair_of_files(self._files, self._place(number))
-        frames = {"down": [read.down], "up": [read.up]}
-        return DensePair.of_frames(number, frames, rig=read.rig, stroke_m=read.stroke_m, card=read.card)
+        return dense_pair_of_files(self._files, self._place(number))
 
     def truth(self, number: int) -> DenseTruth:
         """Exact answer for every pixel.
@@ -191,6 +197,13 @@ class DenseSet:
         if not 0 <= number < len(self):
             raise DatasetError(f"pair {number}: there are {len(self)}, numbered from 0; ask for one of them")
         return number
+
+
+def dense_pair_of_files(files: PairFiles[Any], number: int) -> DensePair:
+    """Images of a pair in files; errors as of `pair_of_files`."""
+    read = pair_of_files(files, number)
+    frames = {"down": [read.down], "up": [read.up]}
+    return DensePair.of_frames(number, frames, rig=read.rig, stroke_m=read.stroke_m, card=read.card)
 
 
 def counterparts(rig: Rig, stroke_m: float, planes: dict[str, Any], names: Sequence[str]) -> Correspondence:
@@ -327,14 +340,14 @@ def seal_dense_set(folder: Path, out: Path) -> Path:
         for name in (name for row in rows for name in row.files.values()):
             hashes[name] = sha256(write_bytes(out / name, read.bytes_of(name)))
         lines = "".join(json.dumps(row.model_dump(mode="json"), allow_nan=False) + "\n" for row in rows).encode()
-        content = checksums_text(hashes | {PAIRS: hashlib.sha256(lines).hexdigest()})
+        content = public_sha256(hashes | {PAIRS: hashlib.sha256(lines).hexdigest()})
         # a secret is the one number that must not come from a named stream
         truth = {"salt": secrets.token_hex(32), "sums_sha256": sha256(folder / CHECKSUMS)}
         text = json.dumps(truth, sort_keys=True) + "\n"
         seal = DenseSeal(
             task_version=DENSE_TASK_VERSION,
             pairs=len(rows),
-            public_sha256=hashlib.sha256(content.encode()).hexdigest(),
+            public_sha256=content,
             truth_sha256=hashlib.sha256(text.encode()).hexdigest(),
         )
         write_secret(folder / DENSE_TRUTH, text)  # first: no seal without its truth

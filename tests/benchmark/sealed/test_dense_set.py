@@ -15,7 +15,9 @@ from helpers.sealed_sets import SECRET_SEED, with_secret_seed
 from helpers.small_release import ask, part_of, snapshot
 
 from phibench.benchmark.dense.dense_records import TruthErrors
-from phibench.benchmark.export.dense_set import (
+from phibench.benchmark.pair_sets.dataset_pairs import dataset_pairs
+from phibench.benchmark.release.release_make import release
+from phibench.benchmark.sealed.dense_set import (
     DENSE_SEAL,
     DENSE_TRUTH,
     PLANES,
@@ -25,8 +27,6 @@ from phibench.benchmark.export.dense_set import (
     seal_dense_set,
     write_dense_set,
 )
-from phibench.benchmark.pair_sets.dataset_pairs import dataset_pairs
-from phibench.benchmark.release.release_make import release
 from phibench.benchmark.sealed.sealed_set import seal, single_pairs
 from phibench.cli.main import main
 from phibench.datasets.common.errors import DatasetError
@@ -41,15 +41,9 @@ KINDS = part_of("kinds", "tiny_kinds.toml", "pairs")
 FRAMES = FramesTable(presets=["srgb8", "mjpeg"], laser_off=True).model_dump(mode="json")
 
 
-@pytest.fixture(scope="module")
-def written(kinds_dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Dense set of the first two of three samples. Read only."""
-    return write_dense_set(first_pairs(open_finished(kinds_dataset), 2), tmp_path_factory.mktemp("dense") / "set")
-
-
-def test_pairs_and_truth_are_those_of_the_data_set(written: Path, kinds_dataset: Path) -> None:
+def test_pairs_and_truth_are_those_of_the_data_set(dense_set: Path, kinds_dataset: Path) -> None:
     """Images byte for byte. D is rounded to float32, to 6e-8 of itself; places follow by 1e-5 px."""
-    pairs, read = first_pairs(open_finished(kinds_dataset), 2), DenseSet(written)
+    pairs, read = first_pairs(open_finished(kinds_dataset), 2), DenseSet(dense_set)
     assert len(pairs) == len(read) == 2
     assert {pairs.truth(k).sample_id for k in (0, 1)} == {row.sample_id for row in pairs.dataset.rows[:2]}
     for number in (0, 1):
@@ -72,14 +66,14 @@ def test_pairs_and_truth_are_those_of_the_data_set(written: Path, kinds_dataset:
         assert np.nanmax(np.abs(errors.calibration[held.scored])) < 1e-9  # the truth agrees with itself in float64
 
 
-def test_a_set_is_kept_whole_and_damage_is_told(written: Path, kinds_dataset: Path, tmp_path: Path) -> None:
-    before = snapshot(written)
-    write_dense_set(first_pairs(open_finished(kinds_dataset), 2), written)
-    assert snapshot(written) == before
-    assert differing_files(written, read_checksums(written)) == []
-    assert set(read_exr(written / "truth" / "000000.exr").planes) == set(PLANES)
+def test_a_set_is_kept_whole_and_damage_is_told(dense_set: Path, kinds_dataset: Path, tmp_path: Path) -> None:
+    before = snapshot(dense_set)
+    write_dense_set(first_pairs(open_finished(kinds_dataset), 2), dense_set)
+    assert snapshot(dense_set) == before
+    assert differing_files(dense_set, read_checksums(dense_set)) == []
+    assert set(read_exr(dense_set / "truth" / "000000.exr").planes) == set(PLANES)
     copy = tmp_path / "copy"
-    shutil.copytree(written, copy)
+    shutil.copytree(dense_set, copy)
     (copy / "truth" / "000001.exr").write_bytes(b"nothing")
     with pytest.raises(DatasetError, match=r"truth/000001\.exr was changed"):
         DenseSet(copy).truth(1)
@@ -89,11 +83,11 @@ def test_a_set_is_kept_whole_and_damage_is_told(written: Path, kinds_dataset: Pa
 
 
 def test_verify_takes_dense_sets_and_their_sealed_form(
-    written: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    dense_set: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Every file but that of the secret is listed; a flipped bit and a stray file are faults."""
     folder = tmp_path / "set"
-    shutil.copytree(written, folder)
+    shutil.copytree(dense_set, folder)
     public = seal_dense_set(folder, tmp_path / "public")
     for whole in (folder, public):
         assert main(["dataset", "verify", str(whole)]) == 0
@@ -175,14 +169,14 @@ def test_parts_of_a_release_are_dense_sets(kinds_dataset: Path, tmp_path: Path) 
     assert differing_files(made.out, read_checksums(made.out)) == []
 
 
-def test_the_command_scores_a_dense_set(written: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_scores_a_dense_set(dense_set: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     method = tmp_path / "mine.py"
     method.write_text(
         "import numpy as np\nfrom phibench.estimator.dense.dense_interface import DenseAnswer\n\n"
         "def depth(pair):\n    return DenseAnswer(np.full(pair.shape, 2.0))\n"
     )
     out = tmp_path / "score.json"
-    assert main(["dense", "score", str(written), "--method", f"{method}:depth", "--out", str(out)]) == 0
+    assert main(["dense", "score", str(dense_set), "--method", f"{method}:depth", "--out", str(out)]) == 0
     assert json.loads(out.read_text())["pairs"] == 2
-    assert main(["dense", "score", str(written), "--preset", "srgb8", "--method", f"{method}:depth"]) == 2
+    assert main(["dense", "score", str(dense_set), "--preset", "srgb8", "--method", f"{method}:depth"]) == 2
     assert "holds frames that are drawn: leave --preset" in capsys.readouterr().err
