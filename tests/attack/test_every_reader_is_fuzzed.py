@@ -11,7 +11,7 @@ import pytest
 from attack.test_fuzz_readers import FEW, MANY, fuzz_a_file, outcome, read_dataset
 from attack.test_fuzz_rooms import as_room, written
 from helpers.fuzz_folders import ALWAYS_READ as ALWAYS_READ_IN_FOLDERS
-from helpers.fuzz_folders import folder_kinds
+from helpers.fuzz_folders import DENSE_ANSWERS, folder_kinds
 from helpers.fuzz_targets import ALWAYS_READ, ROOT, further_kinds, readers
 from helpers.valid_files import Kind, kinds, read_sealed, write_sealed
 
@@ -28,6 +28,7 @@ OF_FOLDERS = (
     *("room000.npz", "imported.json", "pairs.jsonl", "imported.png", "header.jpg", "encoded.txt", "drawing.svg"),
     *("manifest-of-a-release.json", "frames_set.json", "lines-of-frames.jsonl"),
     *("dense_set.json", "lines-of-dense.jsonl"),
+    *DENSE_ANSWERS,
 )
 BUILDS_A_ROOM = ("rooms.json", "room000.npz")  # 1 s of a processor for each case
 OF_WRITERS = {

@@ -31,10 +31,18 @@ from phibench.benchmark.release import release_make
 from phibench.benchmark.release.release_make import ReleaseRequest
 from phibench.benchmark.release.release_parts import PARTS
 from phibench.benchmark.reports.bench import SHIPPED
-from phibench.benchmark.scores.score_document import ScoreDocument
+from phibench.benchmark.scores.score_document import MethodCard, ScoreDocument
 from phibench.benchmark.scores.worst_images import EncodedPicture
-from phibench.benchmark.sealed import rebuilt_score, score_check
-from phibench.benchmark.sealed.dense_set import DENSE_SET, DenseSet
+from phibench.benchmark.sealed import dense_submission, rebuilt_score, score_check
+from phibench.benchmark.sealed.dense_set import DENSE_SEAL, DENSE_SET, DENSE_TRUTH, DenseSeal, DenseSet
+from phibench.benchmark.sealed.dense_submission import (
+    ANSWERS,
+    DenseAnswerLine,
+    DenseSubmission,
+    SealedDensePairs,
+)
+from phibench.benchmark.sealed.sealed_set import public_sha256
+from phibench.benchmark.sealed.submission import check_complete
 from phibench.calibration.captures import imported_set
 from phibench.calibration.sensor_fit import fit_sensor
 from phibench.calibration.sensor_fit.capture_folder import read_header
@@ -49,8 +57,9 @@ from phibench.datasets.read import open_finished
 from phibench.datasets.recipe.load import load_recipe, recipe_text
 from phibench.datasets.rooms.room_files import RoomFiles
 from phibench.datasets.store import schema
-from phibench.datasets.store.checksums import checksums_text
+from phibench.datasets.store.checksums import checksums_text, read_checksums
 from phibench.datasets.store.json_forms import to_json
+from phibench.datasets.store.layers import write_exr
 from phibench.datasets.store.metadata import parse_info
 from phibench.datasets.store.pair_files import FRAMES_SET
 from phibench.datasets.store.pair_files import PAIRS as LINES
@@ -251,6 +260,75 @@ def _dense_line() -> bytes:
     return compact(first | {"truth": truth}) + b"\n"
 
 
+_ANSWER = f"{ANSWERS}/000000.exr"
+DENSE_ANSWERS = (DENSE_SEAL, DENSE_TRUTH, "dense-submission.json", "dense-answer.exr")
+"""Files of a sealed dense set, its truth and a submission: one pair that was answered."""
+
+
+def _listed(folder: Path, files: dict[str, bytes]) -> str:
+    """Write files of a folder and their list; its hash."""
+    for name, content in files.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(content)
+    text = checksums_text({name: digest(content) for name, content in files.items()})
+    (folder / schema.CHECKSUMS).write_text(text)
+    return digest(text.encode())
+
+
+def _dense_answers(replaced: str, path: Path) -> object:
+    """A submission opened, one file of it, of the sealed set or its truth damaged, with hashes that fit."""
+    folder, own = path.parent / "dense-answers", path.read_bytes()
+    line = _dense_line()
+    public_line = compact({key: value for key, value in json.loads(line).items() if key != "truth"}) + b"\n"
+    sums = _listed(folder / "set", {DENSE_SET: _DENSE_INFO, LINES: line})
+    truth = own if replaced == DENSE_TRUTH else compact({"salt": TEXT, "sums_sha256": sums})
+    (folder / "set" / DENSE_TRUTH).write_bytes(truth)
+    seal = DenseSeal(
+        task_version=1, pairs=1, public_sha256=public_sha256({LINES: digest(public_line)}), truth_sha256=digest(truth)
+    )
+    told = own if replaced == DENSE_SEAL else compact(seal.model_dump(mode="json"))
+    _listed(folder / "public", {LINES: public_line, DENSE_SEAL: told})
+    pairs = SealedDensePairs(folder / "public")
+    pairs.check()
+    true = dense_submission._true_set(folder / "set" / DENSE_TRUTH, pairs)
+    submitted = own if replaced == "dense-submission.json" else _dense_answer_lines(pairs.seal.id)
+    answer = own if replaced == "dense-answer.exr" else _dense_answer(path.parent / "whole.exr")
+    _listed(folder / "sent", {dense_submission.SUBMISSION: submitted, _ANSWER: answer})
+    document = dense_submission._read_submission(folder / "sent")
+    check_complete(document, pairs.seal, "it")
+    listed = read_checksums(folder / "sent")
+    return len(true), dense_submission._answer(folder / "sent", document.answers[0], listed, (2, 3))
+
+
+def _dense_answer_lines(seal: str) -> bytes:
+    line = {"number": 0, "file": _ANSWER, "seconds": 1.0, "failure": "", "message": ""}
+    submission = DenseSubmission(
+        seal=seal, task_version=1, method=MethodCard.of("mine"), provenance={}, answers=(DenseAnswerLine(**line),)
+    )
+    return compact(submission.model_dump(mode="json"))
+
+
+def _dense_answer(path: Path) -> bytes:
+    return write_exr(path, {"depth_m": np.ones((2, 3))}, {}).read_bytes()
+
+
+def _dense_answer_kinds(folder: Path) -> list[Kind]:
+    line = _dense_line()
+    public_line = compact({key: value for key, value in json.loads(line).items() if key != "truth"}) + b"\n"
+    sums = checksums_text({DENSE_SET: digest(_DENSE_INFO), LINES: digest(line)})
+    truth = compact({"salt": TEXT, "sums_sha256": digest(sums.encode())})
+    content = public_sha256({LINES: digest(public_line)})
+    seal = DenseSeal(task_version=1, pairs=1, public_sha256=content, truth_sha256=digest(truth))
+    data = {
+        DENSE_SEAL: compact(seal.model_dump(mode="json")),
+        DENSE_TRUTH: truth,
+        "dense-submission.json": _dense_answer_lines(seal.id),
+        "dense-answer.exr": _dense_answer(folder / "dense-answer.exr"),
+    }
+    signs = {name: compact if name.endswith("json") else None for name in data}
+    return [Kind(name, data[name], partial(_dense_answers, name), signs[name]) for name in DENSE_ANSWERS]
+
+
 def folder_kinds(folder: Path, dataset: Path) -> dict[str, Kind]:
     """Targets by the name of their file."""
     opened = open_finished(dataset)
@@ -287,6 +365,7 @@ def folder_kinds(folder: Path, dataset: Path) -> dict[str, Kind]:
         Kind("lines-of-frames.jsonl", _one_line(), partial(_frames_set, LINES), compact),
         Kind(DENSE_SET, _DENSE_INFO, partial(_dense_set, DENSE_SET), compact),
         Kind("lines-of-dense.jsonl", _dense_line(), partial(_dense_set, LINES), compact),
+        *_dense_answer_kinds(folder),
         Kind(imported_set.INFO, info, partial(_imported, info, rows, png()), compact),
         Kind(imported_set.ROWS, rows, partial(_imported, info, rows, png()), compact),
         Kind("imported.png", png(), partial(_imported, info, rows, png())),
