@@ -16,7 +16,7 @@ Film positions are pixels (u, v), shape (N, 2); points are world coordinates in 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -63,20 +63,39 @@ def aim(view: View, spot: LaserSpot, bundle: RayBundle, wall_m: Array, start_px:
         Points in the spot's plane, metres from the spot's centre along its tangents.
     start_px : array, shape (N, 2)
     """
-    uv, miss = start_px, _on_wall(view, spot, start_px, bundle) - wall_m
+    targets = np.array(spot.position_world_m) + wall_m @ np.stack(spot.tangents())
+    sight = targets - _reflect(view, spot, start_px, bundle).starts_m
+    sight /= np.linalg.norm(sight, axis=-1, keepdims=True)
+    across = _across(sight)
+
+    def missed(uv: Array) -> Array:
+        """By how much rays pass their points, across the line of sight: a wall seen edge on has no place for some."""
+        rays = _reflect(view, spot, uv, bundle)
+        offset = rays.starts_m - targets
+        distance = -np.einsum("ni,ni->n", offset, sight) / np.einsum("ni,ni->n", rays.directions, sight)
+        return np.einsum("nki,ni->nk", across, offset + distance[:, None] * rays.directions)
+
+    uv, miss = start_px, missed(start_px)
     for _ in range(_NEWTON_STEPS):
-        step = _solve(_wall_jacobian(view, spot, uv, bundle), miss)
-        uv, miss = _step(view, spot, bundle, wall_m, uv, step)
+        step = _solve(_jacobian(missed, uv), miss)
+        uv, miss = _step(missed, uv, step)
         if not np.any(np.abs(step) > 1e-11):
             break
     return uv
 
 
-def _step(view: View, spot: LaserSpot, bundle: RayBundle, wall_m: Array, uv: Array, step: Array) -> tuple[Array, Array]:
+def _across(directions: Array) -> Array:
+    """Two unit vectors across each direction (N, 3), shape (N, 2, 3)."""
+    first = np.cross(directions, np.eye(3)[np.abs(directions).argmin(axis=-1)])
+    first /= np.linalg.norm(first, axis=-1, keepdims=True)
+    return np.stack([first, np.cross(directions, first)], axis=1)
+
+
+def _step(missed: Callable[[Array], Array], uv: Array, step: Array) -> tuple[Array, Array]:
     """Take a Newton step, halved where the ray would leave the mirror."""
     for _ in range(_HALVINGS):
         new = uv - step
-        miss = _on_wall(view, spot, new, bundle) - wall_m
+        miss = missed(new)
         lost = np.any(~np.isfinite(miss), axis=-1)
         if not lost.any():
             break
@@ -263,8 +282,13 @@ def _meet(spot: LaserSpot, origins: Array, directions: Array) -> tuple[Array, Ar
 
 
 def _wall_jacobian(view: View, spot: LaserSpot, uv: Array, bundle: RayBundle) -> Array:
-    """d(wall) / d(u, v), shape (N, 2, 2), by central differences."""
-    sides = [[_on_wall(view, spot, uv + sign * step, bundle) for sign in (1, -1)] for step in _STEP_PX * np.eye(2)]
+    """d(wall) / d(u, v), shape (N, 2, 2)."""
+    return _jacobian(lambda uv: _on_wall(view, spot, uv, bundle), uv)
+
+
+def _jacobian(function: Callable[[Array], Array], uv: Array) -> Array:
+    """Derivatives of places (N, 2) by (u, v), shape (N, 2, 2), by central differences."""
+    sides = [[function(uv + sign * step) for sign in (1, -1)] for step in _STEP_PX * np.eye(2)]
     return np.stack([(plus - minus) / (2.0 * _STEP_PX) for plus, minus in sides], axis=-1)
 
 
