@@ -1,13 +1,18 @@
-"""Two frames against a film of the whole stroke: `dense_sweep` and `dense_stroke` in the rooms of a data set.
+"""Two frames against a whole stroke: `dense_sweep` and `dense_stroke` in the rooms of a data set, or of films.
 
 Usage: python docs/measure_dense_stroke.py DATASET FRAMES [EVERY] [WIDTH]
+       python docs/measure_dense_stroke.py FILMS,FILMS,... - [EVERY] [WIDTH]
 
-Every third sample, or every EVERYth, gets three more MJPEG frames at a quarter, a half and three quarters of its
-stroke: laser off, by the sample's own rig, room, light map, sensor and exposure. They are rendered into the folder
-FRAMES, where a further run finds them. Other lights (`[[distractors]]`) are left out of them. WIDTH is that of the
-panoramas, 960 by default.
+Of a data set every third sample, or every EVERYth, gets three more MJPEG frames at a quarter, a half and three quarters
+of its stroke: laser off, by the sample's own rig, room, light map, sensor and exposure. They are rendered into the
+folder FRAMES, where a further run finds them. Other lights (`[[distractors]]`) are left out of them. WIDTH is that of
+the panoramas, 960 by default.
 
-Prints a row per sample, then medians and gains with intervals over samples.
+Of films, such as those of docs/films_of_strokes.toml, frames between are the camera's own while the carriage moves.
+Beside them are stills in the same poses, with their true heights: the same key views of the room, and another noise.
+With "one height", rows of a frame are taken to be exposed at one height, as if there were no rolling shutter.
+
+Prints a row per sample or film, then medians and gains with intervals over samples.
 """
 
 from __future__ import annotations
@@ -15,21 +20,30 @@ from __future__ import annotations
 import io
 import sys
 import time
+from collections.abc import Iterator
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
 
+from phibench.benchmark.dense.dense_pairs import with_between
+from phibench.benchmark.export.dense_films import MOST_BETWEEN, DenseFilms
 from phibench.datasets.build.bake_task import bake_settings, read_light_map
+from phibench.datasets.film.film_read import film_light
 from phibench.datasets.frames.frame_source import noise_draw
 from phibench.datasets.frames.sensor_card import card_of
-from phibench.datasets.read import Sample, open_dataset
+from phibench.datasets.read import Dataset, Sample, open_dataset
 from phibench.datasets.store.files import write_bytes
+from phibench.datasets.store.schema import TruthFolder
 from phibench.estimator.dense.dense_interface import DenseAnswer, DensePair
 from phibench.estimator.dense.sweep import dense_stroke, dense_sweep
 from phibench.estimator.dense.unrolled_pair import WIDTH_PX
 from phibench.render.optics.correspondence import Correspondence
+from phibench.render.sensor.camera_chain import Chain
+from phibench.render.sensor.electrons import NoiseStream
+from phibench.render.sensor.processing import decoded
 from phibench.scenes.frames import Array
 
 PARTS = (0.25, 0.5, 0.75)
@@ -71,10 +85,9 @@ def rendered(sample: Sample, part: float, number: int) -> bytes:
     return side.chain.jpeg_bytes(light, frame_stream(*source.names, f"step {part}", False, noise_draw("mjpeg", 0)))
 
 
-def with_between(pair: DensePair, frames: dict[float, Array], parts: tuple[float, ...]) -> DensePair:
+def with_parts(pair: DensePair, frames: dict[float, Array], parts: tuple[float, ...]) -> DensePair:
     """The pair with frames between."""
-    heights_m = tuple(part * pair.stroke_m for part in parts)
-    return replace(pair, between=np.stack([frames[part] for part in parts]), between_m=heights_m)
+    return with_between(pair, [frames[part] for part in parts], tuple(part * pair.stroke_m for part in parts))
 
 
 def pair_of(sample: Sample) -> DensePair:
@@ -123,17 +136,57 @@ def told(name: str, values: list[float]) -> str:
     return f"{name}: {', '.join(parts)}, of {len(values)}"
 
 
-def main() -> None:
-    """Print the figures."""
-    dataset, folder = open_dataset(sys.argv[1]), Path(sys.argv[2])
-    every = int(sys.argv[3]) if len(sys.argv) > 3 else 3
-    width_px = int(sys.argv[4]) if len(sys.argv) > 4 else WIDTH_PX
-    kept: dict[str, list[float]] = {}
+Asked = dict[str, DensePair]
+"""Pairs of one stroke: "two", with two frames, and by another name those with images between."""
+
+
+def asked_of_samples(dataset: Dataset, folder: Path, every: int) -> Iterator[tuple[str, Asked, Correspondence]]:
+    """Name, pairs and truth of each sample."""
     for number in range(0, len(dataset), every):
         sample = dataset[number]
-        pair, truth = pair_of(sample), sample.correspondence()
-        frames = film(sample, folder, number)
-        asked = {"two": pair, **{name: with_between(pair, frames, parts) for name, parts in FILMS.items()}}
+        pair, frames = pair_of(sample), film(sample, folder, number)
+        asked = {"two": pair, **{name: with_parts(pair, frames, parts) for name, parts in FILMS.items()}}
+        yield sample.row.sample_id, asked, sample.correspondence()
+
+
+def asked_of_films(films: DenseFilms, every: int) -> Iterator[tuple[str, Asked, Correspondence]]:
+    """Name, pairs and truth of each stroke."""
+    for number in range(0, len(films), every):
+        pair = films.pair(number)
+        two = replace(pair, between=None, between_m=(), between_row_m=())
+        asked = {"two": two, "film": pair, "stills": with_stills(films, two)}
+        asked["one height"] = replace(pair, between_row_m=())
+        yield films.stroke(number)[1].film_id, asked, films.truth(number).found
+
+
+def with_stills(films: DenseFilms, pair: DensePair) -> DensePair:
+    """A pair of two frames with stills in the poses of its film's frames between, at their true heights."""
+    film, stroke, draw = films.stroke(pair.number)
+    scene = film.plan.scene
+    # rows of a still are all exposed at the frame's time
+    still = replace(scene, times=replace(scene.times, exposure_s=0.0, readout_s=0.0))
+    at_once = replace(film, plan=replace(film.plan, scene=still))
+    camera = Chain(film.sensor("mjpeg"), pair.number, scene.rig.camera)
+    images = []
+    for frame in stroke.between:
+        light = film_light(scene, at_once.room(frame), film.spots[frame]).laser_off()
+        images.append(decoded(camera.jpeg_bytes(light, NoiseStream((*film.plan.names, "still", frame, draw)))))
+    heights = scene.offset_m(scene.times.frame_s[list(stroke.between)])
+    return with_between(pair, images, tuple(map(float, heights)))
+
+
+def main() -> None:
+    """Print the figures."""
+    sources, folder = [Path(name) for name in sys.argv[1].split(",")], Path(sys.argv[2])
+    every = int(sys.argv[3]) if len(sys.argv) > 3 else 3
+    width_px = int(sys.argv[4]) if len(sys.argv) > 4 else WIDTH_PX
+    if (sources[0] / TruthFolder.FILMS.value).is_file():
+        films = (DenseFilms(source, between=MOST_BETWEEN) for source in sources)
+        every_one = chain.from_iterable(asked_of_films(some, every) for some in films)
+    else:
+        every_one = chain.from_iterable([asked_of_samples(open_dataset(sources[0]), folder, every)])
+    kept: dict[str, list[float]] = {}
+    for label, asked, truth in every_one:
         found, claimed = {}, {}
         for name, one in asked.items():
             begin = time.process_time()
@@ -143,19 +196,21 @@ def main() -> None:
             row = {**numbers(found[name], int(truth.seen.sum())), "CPU s": seconds}
             for key, value in row.items():
                 kept.setdefault(f"{name}: {key}", []).append(value)
-        for name in FILMS:
-            both = np.isfinite(found["two"]) & np.isfinite(found[name])
-            ratio = np.median(np.abs(found[name][both])) / np.median(np.abs(found["two"][both]))
-            kept.setdefault(f"{name} over two, median at the same pixels", []).append(float(ratio))
-            count = min(int(np.isfinite(found[one]).sum()) for one in ("two", name))
-            same = surest(found[name], claimed[name], count) / surest(found["two"], claimed["two"], count)
-            kept.setdefault(f"{name} over two, median at the same share", []).append(same)
-            gain = kept[f"{name}: recall"][-1] - kept["two: recall"][-1]
-            kept.setdefault(f"{name} less two, recall, points", []).append(gain)
-            less = kept[f"{name}: above 10 %"][-1] - kept["two: above 10 %"][-1]
-            kept.setdefault(f"{name} less two, above 10 %, points", []).append(less)
+        others = [(name, "two") for name in asked if name != "two"]
+        others += [("film", name) for name in ("stills", "one height") if name in asked]
+        for name, other in others:
+            both = np.isfinite(found[other]) & np.isfinite(found[name])
+            ratio = np.median(np.abs(found[name][both])) / np.median(np.abs(found[other][both]))
+            kept.setdefault(f"{name} over {other}, median at the same pixels", []).append(float(ratio))
+            count = min(int(np.isfinite(found[one]).sum()) for one in (other, name))
+            same = surest(found[name], claimed[name], count) / surest(found[other], claimed[other], count)
+            kept.setdefault(f"{name} over {other}, median at the same share", []).append(same)
+            for key in ("recall", "answered", "above 10 %"):
+                less = kept[f"{name}: {key}"][-1] - kept[f"{other}: {key}"][-1]
+                kept.setdefault(f"{name} less {other}, {key}, points", []).append(less)
         shown = "; ".join(f"{key} {values[-1]:.3g}" for key, values in kept.items() if "CPU" not in key)
-        print(f"{sample.row.sample_id}, h = {pair.stroke_m:.2f} m: {shown}", flush=True)
+        heights = max(len(one.between_m) for one in asked.values())
+        print(f"{label}, h = {asked['two'].stroke_m:.2f} m, {heights} between: {shown}", flush=True)
     for name, values in kept.items():
         print(told(name, values))
 

@@ -39,7 +39,8 @@ DENSE_TASK_VERSION = 1
 """Version of the task: what a dense method is given, what it must answer and what is counted."""
 _CERTIFIED = 997  # every so many pixels the estimator's projection looks at a counterpart
 _CERTIFICATE_PX = 1e-6
-_FURTHER_DRAW = 10**6  # of the noise, for the texture of a pair: no method sees it
+FURTHER_DRAW = 10**6
+"""Draw of the noise, after a pair's own, for its texture: no method sees it."""
 
 
 class CertificateError(RuntimeError):
@@ -208,11 +209,7 @@ class DensePairs:
             if card_of(source.sides["up"].chain.sensor) == pair.card:  # the same exposure and processing
                 images.append(_frame(source, "up", pair_draw.draw, 0))
                 heights_m.append(self._given(sample.nominal_rig, stroke_m)[1])
-        if not images:
-            return pair
-        stack = np.stack(images)
-        stack.flags.writeable = False
-        return replace(pair, between=stack, between_m=tuple(heights_m))
+        return with_between(pair, images, tuple(heights_m))
 
     def frames(self, number: int) -> dict[str, Frame]:
         """First frame of each image of a pair, with the camera's JPEG file."""
@@ -261,6 +258,17 @@ class DensePairs:
         calibrated = {} if self._calibration is None else {"calibration": self._calibration.sha256}
         between = {"between": True} if self._between else {}
         return {**kept, "task_version": DENSE_TASK_VERSION, "frames": self._count, **calibrated, **between}
+
+
+def with_between(
+    pair: DensePair, images: Sequence[Image], heights_m: tuple[float, ...], rows_m: tuple[float, ...] = ()
+) -> DensePair:
+    """The pair with images at heights between, if there are any; the array is read-only."""
+    if not images:
+        return pair
+    stack = np.stack(images)
+    stack.flags.writeable = False
+    return replace(pair, between=stack, between_m=heights_m, between_row_m=rows_m)
 
 
 def dense_pairs(
@@ -430,4 +438,4 @@ def _grey(image: Image) -> Array:
 
 
 def _texture(source: FrameSource, draw: int) -> Array:
-    return texture_ratio(*(source.frame("down", k, False).image for k in (draw, draw + _FURTHER_DRAW)))
+    return texture_ratio(*(source.frame("down", k, False).image for k in (draw, draw + FURTHER_DRAW)))

@@ -46,9 +46,11 @@ from phibench.datasets.film.film_store import (
 from phibench.datasets.frames.frame_request import in_one_sentence
 from phibench.datasets.plan.plan import Plan
 from phibench.datasets.recipe.load import parse_recipe, recipe_files, recipe_text
+from phibench.datasets.rooms.room_sources import RoomSource
 from phibench.datasets.store.layers import SpotWindow
 from phibench.render.film.key_views import PoseParts, blended
 from phibench.render.film.moving_rows import RowsImage
+from phibench.render.optics.correspondence import Correspondence, correspondence
 from phibench.render.optics.room_tracer import room_geometry
 from phibench.render.optics.truth import truth_layer
 from phibench.render.sensor.camera_chain import Chain
@@ -58,6 +60,7 @@ from phibench.render.sensor.processing import decoded
 from phibench.render.sensor.settings import Sensor, sensor
 from phibench.scenes.frames import Array
 from phibench.scenes.motion.film_scene import FilmScene
+from phibench.scenes.rig import View
 
 
 @dataclass(frozen=True)
@@ -256,9 +259,20 @@ class Film:
 
     def truth_layer(self, number: int, time_s: float | None = None) -> dict[str, Array]:
         """Exact geometry of every pixel in the pose of a frame, or of any time: `render.optics.truth.truth_layer`."""
-        scene = self.plan.scene
-        view = scene.view_at(float(scene.times.frame_s[self._number(number)]) if time_s is None else time_s)
+        view = self._view(number) if time_s is None else self.plan.scene.view_at(time_s)
         return truth_layer(view, room_geometry(self._set.room(self.plan.pair.room), view))
+
+    def correspondence(self, number: int, other: int) -> Correspondence:
+        """Counterparts of the pixels of a frame in another one, both in the poses of their times, in some CPU-s."""
+        return correspondence(self._set.room(self.plan.pair.room), self._view(number), self._view(other))
+
+    @property
+    def room_source(self) -> RoomSource:
+        """Source that the room is made from."""
+        return self._set.rooms[self.plan.pair.room]
+
+    def _view(self, frame: int) -> View:
+        return self.plan.scene.view_at(float(self.plan.scene.times.frame_s[self._number(frame)]))
 
     def _number(self, frame: int) -> int:
         if not 0 <= frame < self.info.frames:

@@ -50,6 +50,9 @@ class DensePair(FramedImages):
         Images at heights between both, if the pair has them, as `up`: methods of a whole stroke take them.
     between_m : tuple of float
         Their nominal heights above the down position, from low to high.
+    between_row_m : tuple of float
+        What the carriage rises by from the exposure of a row to that of the next one, in each of these images; empty
+        for stills. `between_m` is then the height of the row (H - 1) / 2.
     """
 
     IMAGE_NAMES = ("down", "up", "between")
@@ -63,6 +66,7 @@ class DensePair(FramedImages):
     frames: Mapping[str, Image] | None = field(default=None, repr=False)
     between: Image | None = field(default=None, repr=False)
     between_m: tuple[float, ...] = ()
+    between_row_m: tuple[float, ...] = ()
 
     @property
     def shape(self) -> tuple[int, int]:

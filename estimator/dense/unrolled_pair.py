@@ -79,12 +79,15 @@ class PanoramaMaps:
     ----------
     nearest_m : float
         Least D of `up_px` and `up_px_of`.
+    row_m : float
+        Rise of the carriage from row to row of the up image, about its middle row: a rolling shutter on the way.
     """
 
     rig: Rig
     stroke_m: float
     grid: PanoramaGrid
     nearest_m: float = 0.4
+    row_m: float = 0.0
 
     @cached_property
     def inverses(self) -> Array:
@@ -102,7 +105,12 @@ class PanoramaMaps:
         ray = room_rays(view, down)
         P, r = ray.origin_world_m, ray.direction_world
         t = range_at(P - view.sphere_centre_m, r, 1.0 / self.inverses[:, None, None])
-        raised = image_of(self.rig.at(self.stroke_m), P + t[..., None] * r).uv_px
+        points, above = P + t[..., None] * r, self.rig.at(self.stroke_m)
+        raised = image_of(above, points).uv_px
+        if self.row_m:
+            # a camera higher by d sees points lower by d; one step, as a row's height moves the image by < 0.01 rows
+            later_m = self.row_m * (raised[..., 1] - 0.5 * (self.rig.camera.height_px - 1))
+            raised = image_of(above, points - later_m[..., None] * np.array(self.rig.stroke_axis_world)).uv_px
         if not (np.isfinite(down).all() and np.isfinite(raised).all()):
             raise DatasetError(
                 f"this mirror does not show all elevations from {math.degrees(self.grid.low_rad):.0f} to "
@@ -198,13 +206,12 @@ class UnrolledPair:
 
     def at_heights(self) -> tuple[UnrolledPair, ...]:
         """Pair itself, and one of the down image with each image between, on the same grid."""
-        between = [] if self.pair.between is None else list(zip(self.pair.between_m, self.pair.between, strict=True))
+        pair = replace(self.pair, between=None, between_m=(), between_row_m=())
+        rows_m = self.pair.between_row_m or (0.0,) * len(self.pair.between_m)
+        between = zip(self.pair.between_m, rows_m, () if self.pair.between is None else self.pair.between, strict=True)
         lower = [
-            UnrolledPair(
-                replace(self.pair, up=image, stroke_m=height_m, between=None, between_m=()),
-                replace(self.maps, stroke_m=height_m),
-            )
-            for height_m, image in between
+            UnrolledPair(replace(pair, up=image, stroke_m=height_m), replace(self.maps, stroke_m=height_m, row_m=row_m))
+            for height_m, row_m, image in between
         ]
         return self, *lower
 

@@ -137,7 +137,7 @@ def score(
     frames
         Frames of each image.
     between
-        Also images at the heights between, from pairs of shorter strokes in the same place.
+        Also images at the heights between: of shorter strokes in the same place, or frames of a film on its way up.
     calibration
         File of `phibench calibrate`: its rig's samples, with the calibrated rig and stroke.
     out
@@ -183,11 +183,17 @@ def _scored_pairs(
     calibration: Path | None,
     between: bool,
 ) -> DensePairSet:
-    """Pairs of a data set, or of a dense set, whose frames are drawn."""
+    """Pairs of a data set, of films, or of a dense set, whose frames are drawn."""
     from phibench.benchmark.dense.dense_score import chosen_pairs
+    from phibench.benchmark.export.dense_films import MOST_BETWEEN, DenseFilms
     from phibench.benchmark.sealed.dense_set import DENSE_SEAL, DENSE_SET, DenseSet
     from phibench.datasets.common.errors import DatasetError
+    from phibench.datasets.store.schema import TruthFolder
 
+    if (directory / TruthFolder.FILMS.value).is_file():
+        if calibration is not None or frames != 1:
+            raise DatasetError(f"{directory} holds films: leave --calibration and --frames out")
+        return DenseFilms(directory, preset, 1 if draws is None else draws, pairs, MOST_BETWEEN * between)
     if not any((directory / name).is_file() for name in (DENSE_SET, DENSE_SEAL)):
         return chosen_pairs(directory, preset, draws, pairs, frames, calibration, between)
     if between or any(option is not None for option in (preset, draws, calibration)) or frames != 1:

@@ -58,6 +58,23 @@ def test_maps_are_the_exact_projection(shape: str) -> None:
     np.testing.assert_allclose(maps.up_px(1.3)[i, j], up_image(rig, 1.4, down, np.full(60, 1.3)).uv_px, atol=1e-3)
 
 
+def test_maps_of_a_moving_carriage_have_each_row_at_its_own_height() -> None:
+    """The carriage rises by 10 mm from the first row to the last: places that are solved row by row are 0.13 px off."""
+    rig, rise_m = small_rig(TILTED), 0.01
+    maps, height = maps_of(rig, STROKE_M, 96), rig.camera.height_px
+    down = maps.down_px.reshape(-1, 2)[::97]
+    inverse = np.random.default_rng(4).uniform(0.05, 2.0, maps.down_px.shape[:2])
+    still = up_image(rig, STROKE_M, down, inverse.reshape(-1)[::97]).uv_px
+    exact = still
+    for _ in range(6):
+        heights = STROKE_M + rise_m / height * (exact[:, 1] - 0.5 * (height - 1))
+        rows = zip(heights, down, inverse.reshape(-1)[::97], strict=True)
+        exact = np.concatenate([up_image(rig, float(h), uv[None], np.array([q])).uv_px for h, uv, q in rows])
+    found = replace(maps, row_m=rise_m / height).up_px_of(inverse).reshape(-1, 2)[::97]
+    np.testing.assert_allclose(found, exact, atol=1e-3)
+    assert np.abs(exact - still).max() > 0.1
+
+
 @pytest.mark.parametrize("tilted", [False, True])
 def test_the_sweep_finds_the_room(tilted: bool) -> None:
     """The small rig's pixel is 23 mrad: at 2.5 m, and a stroke of 0.4 m, one of disparity is 0.14 of D.
