@@ -208,7 +208,7 @@ def main() -> None:
             for key in ("recall", "answered", "above 10 %"):
                 less = kept[f"{name}: {key}"][-1] - kept[f"{other}: {key}"][-1]
                 kept.setdefault(f"{name} less {other}, {key}, points", []).append(less)
-        shown = "; ".join(f"{key} {values[-1]:.3g}" for key, values in kept.items() if "CPU" not in key)
+        shown = "; ".join(f"{key} {values[-1]:.4g}" for key, values in kept.items() if "CPU" not in key)
         heights = max(len(one.between_m) for one in asked.values())
         print(f"{label}, h = {asked['two'].stroke_m:.2f} m, {heights} between: {shown}", flush=True)
     for name, values in kept.items():

@@ -36,8 +36,8 @@ from phibench.estimator.dense.dense_interface import DensePair
 from phibench.estimator.interface import Image
 from phibench.scenes.motion.carriage import Carriage
 
-MOST_BETWEEN = 12
-"""Frames on the way that a pair has at most, evenly spaced in height: each is some 3 MB, and some CPU-s of a method."""
+MOST_BETWEEN = 6
+"""Frames on the way that a pair has at most, evenly spaced in height: each costs `dense_stroke` 2 CPU-s."""
 _PRESET = "mjpeg"
 
 
