@@ -10,6 +10,7 @@ the panoramas, 960 by default.
 
 Of films, such as those of docs/films_of_strokes.toml, frames between are the camera's own while the carriage moves.
 Beside them are stills in the same poses, with their true heights: the same key views of the room, and another noise.
+The light of each room is made such that auto exposure would choose the film's: films have no auto exposure.
 With "one height", rows of a frame are taken to be exposed at one height, as if there were no rolling shutter.
 
 Prints a row per sample or film, then medians and gains with intervals over samples.
@@ -31,7 +32,7 @@ from PIL import Image
 from phibench.benchmark.dense.dense_pairs import with_between
 from phibench.benchmark.export.dense_films import MOST_BETWEEN, DenseFilms
 from phibench.datasets.build.bake_task import bake_settings, read_light_map
-from phibench.datasets.film.film_read import film_light
+from phibench.datasets.film.film_read import Film, film_light
 from phibench.datasets.frames.frame_source import noise_draw
 from phibench.datasets.frames.sensor_card import card_of
 from phibench.datasets.read import Dataset, Sample, open_dataset
@@ -41,7 +42,7 @@ from phibench.estimator.dense.dense_interface import DenseAnswer, DensePair
 from phibench.estimator.dense.sweep import dense_stroke, dense_sweep
 from phibench.estimator.dense.unrolled_pair import WIDTH_PX
 from phibench.render.optics.correspondence import Correspondence
-from phibench.render.sensor.camera_chain import Chain
+from phibench.render.sensor.camera_chain import Chain, auto_exposed
 from phibench.render.sensor.electrons import NoiseStream
 from phibench.render.sensor.processing import decoded
 from phibench.scenes.frames import Array
@@ -152,6 +153,7 @@ def asked_of_samples(dataset: Dataset, folder: Path, every: int) -> Iterator[tup
 def asked_of_films(films: DenseFilms, every: int) -> Iterator[tuple[str, Asked, Correspondence]]:
     """Name, pairs and truth of each stroke."""
     for number in range(0, len(films), every):
+        lit_as_exposed(films.stroke(number)[0])
         pair = films.pair(number)
         two = replace(pair, between=None, between_m=(), between_row_m=())
         asked = {"two": two, "film": pair, "stills": with_stills(films, two)}
@@ -159,13 +161,21 @@ def asked_of_films(films: DenseFilms, every: int) -> Iterator[tuple[str, Asked, 
         yield films.stroke(number)[1].film_id, asked, films.truth(number).found
 
 
+def lit_as_exposed(film: Film) -> None:
+    """Give the room the light for which auto exposure chooses the film's exposure, as frames of a data set have it."""
+    camera, light = film.sensor("mjpeg"), film.light(0).laser_off()
+    chosen = auto_exposed(camera, light)
+    film.views[:] *= chosen.exposure_s * chosen.analogue_gain / camera.exposure_s
+
+
 def with_stills(films: DenseFilms, pair: DensePair) -> DensePair:
     """A pair of two frames with stills in the poses of its film's frames between, at their true heights."""
     film, stroke, draw = films.stroke(pair.number)
     scene = film.plan.scene
-    # rows of a still are all exposed at the frame's time
-    still = replace(scene, times=replace(scene.times, exposure_s=0.0, readout_s=0.0))
+    # rows of a still are all exposed at the time of the frame, on 0.1 mm of the way at most
+    still = replace(scene, times=replace(scene.times, exposure_s=1e-4, readout_s=0.0))
     at_once = replace(film, plan=replace(film.plan, scene=still))
+    vars(at_once)["views"] = film.views
     camera = Chain(film.sensor("mjpeg"), pair.number, scene.rig.camera)
     images = []
     for frame in stroke.between:
@@ -175,6 +185,29 @@ def with_stills(films: DenseFilms, pair: DensePair) -> DensePair:
     return with_between(pair, images, tuple(map(float, heights)))
 
 
+def compared(asked: Asked, truth: Correspondence, width_px: int) -> dict[str, float]:
+    """Metrics of all pairs of a stroke, and each against those with two frames; a film also against its like."""
+    found, claimed, row = {}, {}, {}
+    for name, one in asked.items():
+        begin = time.process_time()
+        answer = (dense_stroke if one.between_m else dense_sweep)(one, width_px)
+        seconds = time.process_time() - begin
+        found[name], claimed[name] = relative(answer, truth), claims(answer)
+        own = {**numbers(found[name], int(truth.seen.sum())), "CPU s": seconds}
+        row |= {f"{name}: {key}": value for key, value in own.items()}
+    others = [(name, "two") for name in asked if name != "two"]
+    for name, other in [*others, *(("film", like) for like in ("stills", "one height") if like in asked)]:
+        both = np.isfinite(found[other]) & np.isfinite(found[name])
+        ratio = np.median(np.abs(found[name][both])) / np.median(np.abs(found[other][both]))
+        row[f"{name} over {other}, median at the same pixels"] = float(ratio)
+        count = min(int(np.isfinite(found[one]).sum()) for one in (other, name))
+        same = surest(found[name], claimed[name], count) / surest(found[other], claimed[other], count)
+        row[f"{name} over {other}, median at the same share"] = same
+        for key in ("recall", "answered", "above 10 %"):
+            row[f"{name} less {other}, {key}, points"] = row[f"{name}: {key}"] - row[f"{other}: {key}"]
+    return row
+
+
 def main() -> None:
     """Print the figures."""
     sources, folder = [Path(name) for name in sys.argv[1].split(",")], Path(sys.argv[2])
@@ -182,37 +215,17 @@ def main() -> None:
     width_px = int(sys.argv[4]) if len(sys.argv) > 4 else WIDTH_PX
     if (sources[0] / TruthFolder.FILMS.value).is_file():
         films = (DenseFilms(source, between=MOST_BETWEEN) for source in sources)
-        every_one = chain.from_iterable(asked_of_films(some, every) for some in films)
+        strokes = chain.from_iterable(asked_of_films(some, every) for some in films)
     else:
-        every_one = chain.from_iterable([asked_of_samples(open_dataset(sources[0]), folder, every)])
-    kept: dict[str, list[float]] = {}
-    for label, asked, truth in every_one:
-        found, claimed = {}, {}
-        for name, one in asked.items():
-            begin = time.process_time()
-            answer = (dense_stroke if one.between_m else dense_sweep)(one, width_px)
-            seconds = time.process_time() - begin
-            found[name], claimed[name] = relative(answer, truth), claims(answer)
-            row = {**numbers(found[name], int(truth.seen.sum())), "CPU s": seconds}
-            for key, value in row.items():
-                kept.setdefault(f"{name}: {key}", []).append(value)
-        others = [(name, "two") for name in asked if name != "two"]
-        others += [("film", name) for name in ("stills", "one height") if name in asked]
-        for name, other in others:
-            both = np.isfinite(found[other]) & np.isfinite(found[name])
-            ratio = np.median(np.abs(found[name][both])) / np.median(np.abs(found[other][both]))
-            kept.setdefault(f"{name} over {other}, median at the same pixels", []).append(float(ratio))
-            count = min(int(np.isfinite(found[one]).sum()) for one in (other, name))
-            same = surest(found[name], claimed[name], count) / surest(found[other], claimed[other], count)
-            kept.setdefault(f"{name} over {other}, median at the same share", []).append(same)
-            for key in ("recall", "answered", "above 10 %"):
-                less = kept[f"{name}: {key}"][-1] - kept[f"{other}: {key}"][-1]
-                kept.setdefault(f"{name} less {other}, {key}, points", []).append(less)
-        shown = "; ".join(f"{key} {values[-1]:.4g}" for key, values in kept.items() if "CPU" not in key)
+        strokes = chain.from_iterable([asked_of_samples(open_dataset(sources[0]), folder, every)])
+    rows = []
+    for label, asked, truth in strokes:
+        rows.append(compared(asked, truth, width_px))
+        shown = "; ".join(f"{key} {value:.3g}" for key, value in rows[-1].items() if "CPU" not in key)
         heights = max(len(one.between_m) for one in asked.values())
         print(f"{label}, h = {asked['two'].stroke_m:.2f} m, {heights} between: {shown}", flush=True)
-    for name, values in kept.items():
-        print(told(name, values))
+    for name in rows[0]:
+        print(told(name, [row[name] for row in rows]))
 
 
 if __name__ == "__main__":

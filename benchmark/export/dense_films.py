@@ -37,7 +37,7 @@ from phibench.estimator.interface import Image
 from phibench.scenes.motion.carriage import Carriage
 
 MOST_BETWEEN = 6
-"""Frames on the way that a pair has at most, evenly spaced in height: each costs `dense_stroke` 2 CPU-s."""
+"""Frames on the way that a pair has at most, evenly spaced in height: each costs `dense_stroke` some 3 CPU-s."""
 _PRESET = "mjpeg"
 
 

@@ -99,7 +99,7 @@ def test_the_truth_is_where_the_estimator_projects_the_points(films: DenseFilms)
 def test_a_stroke_down_and_a_stop_on_the_way_are_taken(films: DenseFilms) -> None:
     """Told heights are still those of the film, on its way up."""
     down = Carriage((0.3, 0.15, 0.0), (0.15, 0.0, 0.1), 2.0, 8.0)
-    (stroke,) = strokes_of(changed(films.stroke(0)[0], carriage=down))
+    (stroke,) = strokes_of(changed(films.stroke(0)[0], carriage=down), 12)
     assert (stroke.down, stroke.up) == (8, 1)
     assert stroke.between == (3, 4, 5, 6, 7)
 
@@ -134,13 +134,13 @@ def test_other_faults_are_told_in_a_sentence(
 
 
 def test_the_command_scores_with_the_frames_between(folder: Path, tmp_path: Path) -> None:
-    """It takes as long as the method's own process takes to start."""
+    """On the command line; the method's process takes seconds to start."""
     method = tmp_path / "mine.py"
     method.write_text(
         "import numpy as np\n"
         "from phibench.estimator.dense.dense_interface import DenseAnswer\n"
         "def depth(pair):\n"
-        "    assert len(pair.between) == len(pair.between_m) == 5\n"
+        "    assert 2 < len(pair.between) == len(pair.between_m) <= 6\n"
         "    return DenseAnswer(depth_m=np.full(pair.shape, 2.0))\n"
     )
     out = tmp_path / "score.json"
