@@ -165,6 +165,8 @@ def _find_lamps(film: CellSampler, cells: Cells) -> None:
     behind = (film.hidden(numbers.ravel(), _FIRST + half, which) for half in (0, 1))
     hidden.ravel()[near] = any_cell(np.logical_or(*behind).reshape(numbers.shape))
     seen = np.repeat(~grown(hidden, reach_px(cells.grid)).ravel()[near], numbers.shape[1])
+    if not seen.any():
+        return
     cover = film.cover(numbers.ravel()[seen], which[seen])
     known = cover.light.max(axis=0) > 0.0
     places = (rank[:, None] * numbers.shape[1] + np.arange(numbers.shape[1])).ravel()[seen][known]

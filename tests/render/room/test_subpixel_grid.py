@@ -292,6 +292,20 @@ def test_a_lamp_that_something_hides_is_left_to_chance(monkeypatch: pytest.Monke
     assert found()[1] > 0.02
 
 
+def test_a_window_whose_lamps_are_all_hidden_is_left_to_chance(
+    film: CellSampler, outline: tuple[np.ndarray, np.ndarray], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Cells at a lamp are computed in it, and none if all are told to be hidden; the kernel has no lane then."""
+    corner, h = film._corner(film._mi.UInt32(outline[0][:1]))
+    u, v = (round(float(np.array(low)[0] + 0.5 * np.array(h)[0])) for low in corner)
+    window = (u - 4, v - 4, 8, 8)
+    assert (refinement.first_pass(film, window, BUDGET).lamps >= 0).any()
+    monkeypatch.setattr(CellSampler, "hidden", lambda self, numbers, stream, lamp: np.ones(len(numbers), dtype=bool))
+    found = refinement.first_pass(film, window, BUDGET)
+    assert found.count
+    assert (found.lamps < 0).all()
+
+
 def test_a_cell_gets_the_same_whichever_cells_are_sampled_with_it(film: CellSampler) -> None:
     side = np.array([1, 40, 2, 16, 17, 128], dtype=np.int32)
     numbers = film.grid.numbers((700, 440, 6, 1))[4, 4:10]
