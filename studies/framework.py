@@ -20,7 +20,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Generic, Literal, TypeVar
 
 import numpy as np
 import polars as pl
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, GetCoreSchemaHandler
+from pydantic_core import CoreSchema
 from rich.console import Console
 
 from phibench.benchmark.reports import figures
@@ -315,19 +316,38 @@ class StudyResult:
             raise DatasetError(f"findings with the same label: {'; '.join(twice)}")
 
 
+def _take_arrays(schema: Any) -> None:
+    """Let each tuple of a schema take a list; its entries stay strict."""
+    if isinstance(schema, dict):
+        if schema.get("type") == "tuple":
+            schema["strict"] = False
+        schema = list(schema.values())
+    if isinstance(schema, list):
+        for part in schema:
+            _take_arrays(part)
+
+
 class Settings(BaseModel):
-    """Settings of a study; each study has its own, frozen and strict, with ranges and descriptions."""
+    """Settings of a study; each study has its own, frozen and strict, with ranges and descriptions.
+
+    An array of TOML fills a field that is a tuple.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
+    @classmethod
+    def __get_pydantic_core_schema__(cls, source: type[BaseModel], handler: GetCoreSchemaHandler, /) -> CoreSchema:
+        schema = handler(source)
+        _take_arrays(schema)
+        return schema
 
-# TOML knows arrays; settings have tuples
-Names = Annotated[tuple[str, ...], Field(strict=False)]
-Numbers = Annotated[tuple[float, ...], Field(strict=False)]
-Metres = Annotated[tuple[Annotated[float, Field(ge=0.2, le=20.0)], ...], Field(strict=False, min_length=1)]
-Heights = Annotated[tuple[Annotated[float, Field(ge=0.0, le=3.0)], ...], Field(strict=False, min_length=1)]
+
+Names = tuple[str, ...]
+Numbers = tuple[float, ...]
+Metres = Annotated[tuple[Annotated[float, Field(ge=0.2, le=20.0)], ...], Field(min_length=1)]
+Heights = Annotated[tuple[Annotated[float, Field(ge=0.0, le=3.0)], ...], Field(min_length=1)]
 StudyPreset = Literal["bayer-raw", "srgb8", "mjpeg"]
-Presets = Annotated[tuple[StudyPreset, ...], Field(strict=False, min_length=1)]
+Presets = Annotated[tuple[StudyPreset, ...], Field(min_length=1)]
 
 S = TypeVar("S", bound=Settings)
 

@@ -62,7 +62,7 @@ if TYPE_CHECKING:
 
 AS_BUILT, CALIBRATED = "as built", "calibrated"
 _QUALITY = 85  # of the spot's JPEG, as in the study `stroke`
-_Strokes = Annotated[tuple[Annotated[float, Field(ge=0.05, le=3.0)], ...], Field(strict=False, min_length=2)]
+_Strokes = Annotated[tuple[Annotated[float, Field(ge=0.05, le=3.0)], ...], Field(min_length=2)]
 
 
 class DenseSettings(Settings):
@@ -75,7 +75,7 @@ class DenseSettings(Settings):
     divisor: float = Field(ge=1.0, le=16.0, description="of the pixels along each side, for perfect matches")
     bands_m: Metres = Field(description="ends of the bands of D, rising")
     matching_px: float = Field(gt=0.0, le=10.0, description="error of a match along its curve, pixels")
-    outline_sigma_um: Annotated[tuple[float, float, float], Field(strict=False)] = Field(
+    outline_sigma_um: tuple[float, float, float] = Field(
         description="sphere centre from the outline: across, across, along the axis"
     )
     samples: int = Field(ge=2, le=500, description="rendered pairs of `bench-dev`, in a room each")

@@ -72,7 +72,7 @@ from phibench.studies.isotropy.lines import (
 from phibench.studies.isotropy.room_edges import SeenEdge, seen_edge, track, vertical_edges
 from phibench.studies.misaligned_rigs import Places, errors
 
-Depths = Annotated[tuple[Annotated[float, Field(gt=0.2, le=50.0)], ...], Field(strict=False, min_length=3)]
+Depths = Annotated[tuple[Annotated[float, Field(gt=0.2, le=50.0)], ...], Field(min_length=3)]
 
 
 class IsotropySettings(Settings):

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import polars as pl
@@ -61,9 +61,9 @@ class LoopSettings(Settings):
     """Settings of the study."""
 
     episodes: int = Field(ge=2, le=2000, description="of each condition")
-    policies: Annotated[tuple[PolicyName, ...], Field(strict=False)] = Field(description="compared at the base")
+    policies: tuple[PolicyName, ...] = Field(description="compared at the base")
     powers: Numbers = Field(description="of the laser, relative to 1 mW")
-    lights: Annotated[tuple[int, ...], Field(strict=False)] = Field(description="beside the target")
+    lights: tuple[int, ...] = Field(description="beside the target")
     misalignments: Numbers = Field(description="sizes, 1 is a rig as built by hand")
     rigs: int = Field(ge=1, le=100, description="drawn for each size")
     slip_sigmas: Numbers = Field(description="standard deviation of the slip from run to run")

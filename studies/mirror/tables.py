@@ -26,8 +26,8 @@ _NONE, _LOST = "-", "lost"
 _FEW = 2  # names that a cell holds
 # as people state tolerances
 _SHOWN_UNITS = {"m": ("mm", 1e3), "rad": ("deg", math.degrees(1.0)), "px": ("px", 1.0), "1": ("", 1.0)}
-_Angles = Annotated[tuple[Annotated[float, Field(ge=0.0, le=180.0)], ...], Field(strict=False, min_length=1)]
-_Blurs = Annotated[tuple[Annotated[float, Field(ge=0.3, le=10.0)], ...], Field(strict=False, min_length=2)]
+_Angles = Annotated[tuple[Annotated[float, Field(ge=0.0, le=180.0)], ...], Field(min_length=1)]
+_Blurs = Annotated[tuple[Annotated[float, Field(ge=0.3, le=10.0)], ...], Field(min_length=2)]
 
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ class MirrorEntry(Settings):
     vertex_radius_m: float | None = Field(default=None, gt=0.0, le=1.0)
     conic: float | None = Field(default=None, ge=-100.0, le=100.0)
     half_angle_deg: float | None = Field(default=None, ge=3.0, le=87.0)
-    even_terms: tuple[float, ...] | None = Field(default=None, max_length=8, strict=False)
+    even_terms: tuple[float, ...] | None = Field(default=None, max_length=8)
 
     def rig(self, rim_radius_m: float) -> Rig:
         """Default rig with this mirror.
@@ -74,12 +74,12 @@ class MirrorSettings(Settings):
     blurs_px: _Blurs = Field(description="rising blurs for which bounds are tabulated")
     heights_m: Heights = Field(description="of the spots, for the bounds")
     depths_m: Metres = Field(description="distances of the tables, rising")
-    curve_m: Annotated[tuple[float, float, float], Field(strict=False)] = Field(description="first, last, step")
+    curve_m: tuple[float, float, float] = Field(description="first, last, step")
     spot_height_m: float = Field(ge=0.0, le=3.0, description="of the curves and of the misalignments")
     misaligned_m: Metres = Field(description="distances of the misalignments, rising")
     angles_deg: _Angles = Field(description="theta of the resolution")
-    viewpoints_deg: Annotated[tuple[float, float], Field(strict=False)] = Field(description="theta of the viewpoints")
-    azimuths_deg: Annotated[tuple[float, ...], Field(strict=False, min_length=1)] = Field(
+    viewpoints_deg: tuple[float, float] = Field(description="theta of the viewpoints")
+    azimuths_deg: Annotated[tuple[float, ...], Field(min_length=1)] = Field(
         description="of places that the robot may hide; even steps from front to rear"
     )
     map_step_m: float = Field(ge=0.01, le=0.5, description="of the map of places")

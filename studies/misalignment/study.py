@@ -59,8 +59,8 @@ from phibench.studies.misalignment.sobol_indices import Interactions, interactio
 
 Distance = Annotated[float, Field(gt=0.1, le=20.0)]
 Positive = Annotated[float, Field(gt=0.0, le=1.0)]
-Distances = Annotated[tuple[Distance, ...], Field(strict=False, min_length=1, max_length=20)]
-Spot = Annotated[tuple[Distance, Annotated[float, Field(ge=-360.0, le=360.0)]], Field(strict=False)]
+Distances = Annotated[tuple[Distance, ...], Field(min_length=1, max_length=20)]
+Spot = tuple[Distance, Annotated[float, Field(ge=-360.0, le=360.0)]]
 
 
 class SearchSettings(Settings):
@@ -83,10 +83,10 @@ class MisalignmentSettings(Settings):
     search_calibrated: SearchSettings
     rendered_every: int = Field(ge=1, description="every n-th azimuth is rendered, from the second one on")
     agreement: float = Field(gt=0.0, lt=1.0, description="allowed difference of rendered and predicted change of D")
-    calibration_spots: Annotated[tuple[Spot, ...], Field(strict=False, min_length=1)]
+    calibration_spots: Annotated[tuple[Spot, ...], Field(min_length=1)]
     calibration_pixel_sigma_px: Positive
     calibration_distance_sigma_m: Positive
-    calibration_outline_sigma_m: Annotated[tuple[Positive, Positive, Positive], Field(strict=False)]
+    calibration_outline_sigma_m: tuple[Positive, Positive, Positive]
     noise_draws: int = Field(ge=2, le=10000, description="calibrations of the aligned rig from noisy measurements")
     sobol_log2: int = Field(ge=3, le=16, description="base sample of the Sobol indices: 2 to this power")
     resamples: int = Field(ge=20, le=100000, description="of the bootstrap")

@@ -54,7 +54,7 @@ from phibench.studies.stroke.tables import (
 )
 
 AS_BUILT, CALIBRATED, EXACT = "as built", "calibrated by the outline", "pixels alone"
-_Range = Annotated[tuple[float, float], Field(strict=False)]
+_Range = tuple[float, float]
 _QUALITY = 85  # of the charts' JPEG, if their preset has one: that of the study's figures
 _FREE_STROKES_M = (0.1, 6.0)  # beyond every carriage: by geometry alone the best stroke is 1.2 to 2 D
 
@@ -64,7 +64,7 @@ class CheckSettings(Settings):
 
     preset: StudyPreset = Field(description="of the sensor")
     depths_m: Metres = Field(description="distances")
-    factors: Annotated[tuple[float, ...], Field(strict=False, min_length=1)] = Field(description="of the best stroke")
+    factors: Annotated[tuple[float, ...], Field(min_length=1)] = Field(description="of the best stroke")
     strokes_m: _Range = Field(description="between which the best stroke is sought")
     power_mw: float = Field(gt=0.0, le=10.0, description="of the laser; weak enough that no pixel is full")
     draws: int = Field(ge=8, le=5000, description="pairs, each of a rig of its own")
@@ -77,7 +77,7 @@ class StrokeSettings(Settings):
     depths_m: Metres = Field(description="distances of the chart")
     spot_height_m: float = Field(ge=0.0, le=3.0, description="above the floor")
     strokes_m: _Range = Field(description="of the carriage")
-    outline_sigma_um: Annotated[tuple[float, float, float], Field(strict=False)] = Field(
+    outline_sigma_um: tuple[float, float, float] = Field(
         description="sphere centre from the outline: across, across, along the axis"
     )
     paper_depths_m: Metres = Field(description="distances of the paper's tables 1 to 3")

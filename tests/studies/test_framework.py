@@ -38,7 +38,7 @@ class Counting(Settings):
 
     upto: int = Field(ge=1, le=100)
     step: int = Field(default=1, ge=1)
-    ends: tuple[float, float] | None = Field(default=None, strict=False)
+    ends: tuple[float, float] | None = None
 
 
 def _count(settings: Counting, datasets: StudyDatasets) -> StudyResult:
@@ -187,6 +187,32 @@ def test_bad_settings_end_in_a_sentence(tmp_path: Path, text: str, words: tuple[
         read_settings(COUNT, False, file)
     said = str(caught.value).replace(str(tmp_path), "")
     assert all(word in said for word in words), said
+
+
+class Nested(Settings):
+    """An array of arrays, and arrays in tables."""
+
+    strokes_m: tuple[tuple[float, float], ...]
+    inner: dict[str, Counting] = Field(default_factory=dict)
+    several: tuple[Counting, ...] = ()
+
+
+NESTED = Study("nested", "Nested", "Do arrays come in?", Nested, lambda settings, datasets: StudyResult({}, ()))
+
+
+def test_an_array_fills_a_tuple_wherever_it_stands(tmp_path: Path) -> None:
+    file = tmp_path / "settings.toml"
+    file.write_text(
+        "strokes_m = [[0.1, 0.4]]\ninner.a = { upto = 1, ends = [0, 1.5] }\n[[several]]\nupto = 2", encoding="utf-8"
+    )
+    a, b = Counting(upto=1, ends=(0.0, 1.5)), Counting(upto=2)
+    assert read_settings(NESTED, False, file) == Nested(strokes_m=((0.1, 0.4),), inner={"a": a}, several=(b,))
+    file.write_text('strokes_m = [[0.1, "0.4"]]', encoding="utf-8")  # entries stay strict
+    with pytest.raises(DatasetError, match=r"strokes_m\[0\]\[1\]: '0.4' is not allowed; give a number"):
+        read_settings(NESTED, False, file)
+    file.write_text("strokes_m = 0.4", encoding="utf-8")
+    with pytest.raises(DatasetError, match=r"strokes_m: 0.4 is not allowed; give a list"):
+        read_settings(NESTED, False, file)
 
 
 def test_same_study_same_bytes(tmp_path: Path, datasets: StudyDatasets) -> None:
