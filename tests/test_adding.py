@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 from helpers.districts import DISTRICTS
+from helpers.page_numbers import Published
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = (*DISTRICTS, "phibench", "tools")
@@ -121,7 +122,7 @@ print(rig.mirror.profile.conic, down.visible, abs(float(depth_exact(rig, 0.3, *p
 print(MirrorEntry(shape="oblate", conic=0.3).rig(0.05).mirror.profile.conic)
 """
 
-# A study: its folder is its command.
+# A study: its folder is its command. Its page is written by hand, its document by a full run.
 
 STUDY = '''"""Study `echo`: its own setting."""
 
@@ -144,6 +145,11 @@ def run(settings: EchoSettings, datasets: StudyDatasets) -> StudyResult:
 
 STUDY = Study("echo", "Echo", "Does a setting come back?", EchoSettings, run)
 '''
+STUDY_PAGE = """# Echo
+
+<!-- from: depth; settings.depth_m -->
+The setting of 2.5 m comes back as 2.5 m.
+"""
 
 
 def add_study(copy: Copy) -> None:
@@ -151,6 +157,9 @@ def add_study(copy: Copy) -> None:
     folder.mkdir()
     (folder / "study.py").write_text(STUDY, encoding="utf-8")
     (folder / "settings.toml").write_text("depth_m = 2.5\n\n[quick]\ndepth_m = 1.5\n", encoding="utf-8")
+    page = copy.root / "docs" / "studies" / "echo.md"
+    page.parent.mkdir(parents=True)
+    page.write_text(STUDY_PAGE, encoding="utf-8")
 
 
 USE_STUDY = """
@@ -159,6 +168,7 @@ from phibench.cli.main import main
 from phibench.cli.studies import study_sentences
 print(study_sentences()["echo"], main(["study", "echo", "--quick", "--out", "echo"]))
 print([line for line in pathlib.Path("echo/findings.md").read_text().splitlines() if "depth" in line])
+print(main(["study", "echo", "--out", "echo-full", "--publish", "docs/studies"]))
 """
 
 # A method: it is listed, completed and called. Its function is there already; one of one's own needs no entry.
@@ -280,9 +290,13 @@ print(json.dumps(said))
 
 
 @pytest.fixture(scope="module")
-def outcome(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[set[str], str]]:
+def copy(tmp_path_factory: pytest.TempPathFactory) -> Copy:
+    return Copy.of_checkout(tmp_path_factory.mktemp("adding") / "checkout")
+
+
+@pytest.fixture(scope="module")
+def outcome(copy: Copy) -> dict[str, tuple[set[str], str]]:
     """Files that each addition took, and what its use said."""
-    copy = Copy.of_checkout(tmp_path_factory.mktemp("adding") / "checkout")
     took: dict[str, set[str]] = {}
     for name, addition in ADDITIONS.items():
         before = copy.added()
@@ -297,6 +311,13 @@ def test_each_is_added_in_few_files_and_works(name: str, outcome: dict[str, tupl
     took, said = outcome[name]
     assert took == set(ADDITIONS[name].files)
     assert set(ADDITIONS[name].says.splitlines()) <= set(said.splitlines()), said
+
+
+def test_the_page_of_the_study_holds(outcome: dict[str, tuple[set[str], str]], copy: Copy) -> None:
+    assert outcome["study"][1].endswith("\n0\n")
+    published = Published(copy.root / "docs" / "studies")
+    assert published.wrong("echo", STUDY_PAGE) == ([], 2)
+    assert len(published.wrong("echo", STUDY_PAGE.replace("2.5 m.", "2.6 m."))[0]) == 1
 
 
 def test_the_page_says_how_many() -> None:

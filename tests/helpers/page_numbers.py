@@ -100,7 +100,7 @@ class Published:
 
     def __init__(self, folder: Path) -> None:
         self._documents = {path.stem: json.loads(path.read_text(encoding="utf-8")) for path in folder.glob("*.json")}
-        beside = self._documents.pop("beside")
+        beside = self._documents.pop("beside", {})
         self._findings = {
             name: {row["label"]: row for row in (*document["findings"], *beside.get(name, ()))}
             for name, document in self._documents.items()
@@ -141,6 +141,11 @@ class Published:
         known = tuple(x for source in block.sources for x in self.numbers(study, source))
         for text in printed(block.text):
             yield Token(text, known)
+
+    def wrong(self, study: str, page: str) -> tuple[list[str], int]:
+        """Numbers of a page that are no published ones, with their blocks, and how many were looked at."""
+        pairs = [(block, token) for block in blocks(page) for token in self.tokens(study, block)]
+        return [f"{token.text} in: {block.text[:90]}" for block, token in pairs if not token.holds], len(pairs)
 
     def _cells(self, study: str, block: Block) -> Iterator[Token]:
         lines = [_cut(line) for line in block.text.splitlines() if line.startswith("|")]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
@@ -36,25 +37,42 @@ def test_every_study_has_page_and_document(published: Published) -> None:
 
 
 def test_every_number_is_a_published_one(published: Published, name: str) -> None:
-    wrong, checked = [], 0
-    for block in blocks(_page(name)):
-        for token in published.tokens(name, block):
-            checked += 1
-            if not token.holds:
-                wrong.append(f"{token.text} in: {block.text[:90]}")
+    wrong, checked = published.wrong(name, _page(name))
     assert not wrong, "\n".join(wrong)
-    assert checked > 30
+    assert checked, f"{name}.md states no number"
+
+
+def test_the_pages_have_many_numbers(published: Published) -> None:
+    assert sum(published.wrong(name, _page(name))[1] for name in NAMES) > 800
+
+
+@pytest.mark.parametrize(
+    ("page", "wrong", "checked"),
+    [
+        ("D is 2.5 m.\n<!-- from: depth -->", 0, 1),  # a small study may state one number
+        ("<!-- from: settings.depth_m -->\nD is 2.5 m.", 0, 1),
+        ("D is 2.6 m.\n<!-- from: depth -->", 1, 1),
+        ("<!-- from: depth -->\n\nD is 2.5 m.", 1, 1),  # an empty line parts them
+        ("D is 2.5 m.", 1, 1),
+        ("D comes back.\n<!-- from: depth -->", 0, 0),
+    ],
+)
+def test_a_small_page_passes_and_fails(tmp_path: Path, page: str, wrong: int, checked: int) -> None:
+    document = {"settings": {"depth_m": 2.5}, "findings": [{"label": "depth", "value": 2.5}]}
+    (tmp_path / "echo.json").write_text(json.dumps(document), encoding="utf-8")
+    found = Published(tmp_path).wrong("echo", f"# Echo 7\n\n{page}\n")
+    assert (len(found[0]), found[1]) == (wrong, checked)
 
 
 def test_a_changed_number_is_found(published: Published, name: str) -> None:
-    """Another last digit; a block with many numbers may hold the changed one as well, in one case of 20 at most."""
+    """Another last digit; a block with many numbers may hold the changed one as well, once or in one case of 20."""
     found = checked = 0
     for block in blocks(_page(name)):
         for token in published.tokens(name, block):
             for by in (1, 3, 5, 8):
                 checked += 1
                 found += not agrees(_changed(token.text, by), token.known)
-    assert found >= 0.95 * checked, f"{found} of {checked}"
+    assert found >= min(0.95 * checked, checked - 1), f"{found} of {checked}"
 
 
 def _changed(text: str, by: int) -> str:
