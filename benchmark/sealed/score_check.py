@@ -58,7 +58,7 @@ _NOT_BELOW_0 = (
 
 
 @dataclass(frozen=True)
-class SealedScoreCheck:
+class ScoreCheck:
     """Outcome: faults, a sentence each, and what could not be checked."""
 
     file: str
@@ -81,7 +81,7 @@ def check_score(
     workers: int = 1,
     console: Console | None = None,
     calibration: Path | None = None,
-) -> SealedScoreCheck:
+) -> ScoreCheck:
     """Check a score of a set that is not sealed.
 
     Parameters
@@ -121,7 +121,7 @@ def check_score(
         too = " with --calibration" if document.pair_set.get("calibration") else ""
         unchecked.append(f"truth, bounds, causes and worst images: give --data, the folder of the data set{too}")
     if broken:  # of wrong records every number would differ
-        return SealedScoreCheck(path.name, document.method.name, document.pairs, (*faults, *broken), tuple(unchecked))
+        return ScoreCheck(path.name, document.method.name, document.pairs, (*faults, *broken), tuple(unchecked))
     faults += [f"the method {line}"] if (line := failure_line(table)) else []
     if data is None:
         wrong = list(_of_errors(table, document))
@@ -132,7 +132,7 @@ def check_score(
         if method is not None and again.pairs is not None:
             run = check_run(document, table, method, again.pairs, limits or RunLimits(), workers, console)
             faults, unchecked = [*faults, *run.faults], [*unchecked, *run.unchecked]
-    return SealedScoreCheck(path.name, document.method.name, document.pairs, tuple(faults), tuple(unchecked))
+    return ScoreCheck(path.name, document.method.name, document.pairs, tuple(faults), tuple(unchecked))
 
 
 # -- the document ------------------------------------------------------------------------------------------------------

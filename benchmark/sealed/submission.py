@@ -1,6 +1,7 @@
-"""Sealed sets read: a method's submission to one (`submit`), and its join with the truth (`unseal`).
+"""Answers to a sealed set (`submit`), and their join with the truth (`unseal`).
 
 A submission says what a method answered on a sealed set and which method it was; it holds no images and no truth.
+The command `submission check` is another thing: it checks a score file of an open set, by `score_check`.
 Unsealing proves that truth and submission belong to the seal, and gives truths and outcomes for the score.
 """
 
