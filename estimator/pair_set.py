@@ -89,7 +89,7 @@ class PairTruth(ShortForm):
         D of the light on the surfaces, and the true stroke.
     true_rig, nominal_rig : Rig
         The rig that was rendered, and the one in `Pair.rig`.
-    down, up : SpotTruth
+    down, up : ImageTruth
     nominal_stroke_m : float or None
         The stroke in `Pair.stroke_m`; None if it is the true one.
     calibration_covariance : array, shape (p, p), or None

@@ -47,7 +47,7 @@ class Rig:
     ----------
     camera : Camera
         Intrinsics, lens and detector.
-    mirror : Mirror
+    mirror : AnyMirror
         Shape and metal.
     T_world_camera : Pose
         Camera pose at the down position.

@@ -1,4 +1,4 @@
-"""Dotted names in docstrings and comments: every module, class, function and field that one points to exists."""
+"""Names in docstrings and comments: a dotted one points to what exists, a type is that of the annotation."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 from helpers.districts import DISTRICTS
+from helpers.docstring_entries import annotations, entries
 
 ROOT = Path(__file__).resolve().parent.parent
 NAME = re.compile(r"`((?:phibench\.)?[a-z_]+(?:\.[A-Za-z_]\w*)+)(?:\(.*?\))?`")
@@ -18,6 +19,9 @@ for _room in (room for top in DISTRICTS for room in [ROOT / top, *(ROOT / top).r
     ROOMS.setdefault(_room.name, []).append(_room)
 # folders whose name is that of an argument as well: `frames.down`, `sensor.output`, a recipe's `mirror.form`
 ARGUMENTS = {"frames", "limits", "mirror", "misalignment", "rig", "room", "sensor"}
+# words like `Rig` where a type begins: a capital, then a small letter
+TYPE = re.compile(r"(?:^|\b(?:of|to|or) )([A-Z][a-z]\w*)")
+NO_TYPES = {"None", "NaN", "Dr"}  # values, and Dr.Jit's own
 FILE_ENDS = {"py", "toml", "json", "jsonl", "md", "html", "js", "exr", "npz", "parquet", "png", "csv", "yuyv"}
 
 
@@ -94,3 +98,64 @@ def test_names_in_docstrings_exist() -> None:
 )
 def test_the_search_sees_faults(name: str, there: bool) -> None:
     assert exists(name) == there
+
+
+# Types of entries such as `rig : Rig` or `rigs : sequence of Rig`.
+
+
+@cache
+def aliases() -> dict[str, str]:
+    """Values of the names that modules give to types, as `AnyPair = Pair | DensePair`."""
+    values: dict[str, str] = {}
+    for node in (node for file in sources() for node in tree(file).body if isinstance(node, ast.Assign)):
+        for name in defined(node):
+            values[name] = f"{values.get(name, '')} {ast.unparse(node.value)}"
+    return values
+
+
+@cache
+def classes() -> frozenset[str]:
+    return frozenset(node.name for file in sources() for node in tree(file).body if isinstance(node, ast.ClassDef))
+
+
+def wrong_types(module: ast.Module) -> Iterator[tuple[str, bool]]:
+    """Every word for a type in a module's entries, and True where it is no part of the annotation.
+
+    Excepted are `NO_TYPES`. An alias counts as what it stands for. Where there is no annotation, or `Any`, a class of
+    the library or a name of the module is enough.
+    """
+    bound = classes().union(*(defined(node) for node in ast.walk(module) if isinstance(node, ast.stmt)))
+    for node in (node for node in ast.walk(module) if isinstance(node, ast.ClassDef | ast.FunctionDef)):
+        types = annotations(node)
+        for section, head, _ in entries(ast.get_docstring(node) or ""):
+            names, _, text = head.partition(" : ")
+            words = set(TYPE.findall(text)) - NO_TYPES if section in ("Parameters", "Attributes") else ()
+            for name, word in ((name, word) for name in names.split(", ") for word in words):
+                known = set(re.findall(r"\w+", types.get(name, "Any")))
+                known.update(*(re.findall(r"\w+", aliases().get(one, "")) for one in known))
+                yield f"{node.name}: {head}", word not in (bound if "Any" in known else known)
+
+
+def test_types_in_docstrings_are_those_of_the_annotations() -> None:
+    seen = [(file, *found) for file in sources() for found in wrong_types(tree(file))]
+    assert len(seen) > 400
+    assert [f"{file.relative_to(ROOT)}: {entry}" for file, entry, wrong in seen if wrong] == []
+
+
+@pytest.mark.parametrize(
+    ("annotation", "entry", "wrong"),
+    [
+        ("Rig", "Rig", [False]),
+        ("Rig", "Mirror", [True]),
+        ("Sequence[SpotReading]", "sequence of Reading", [True]),
+        ("dict[str, Rig] | None", "dict of str to Rig, or None", [False]),
+        ("AnyPair", "Pair or DensePair", [False, False]),
+        ("Any", "DensePair", [False]),
+        ("Any", "NoClassOfOurs", [True]),
+        ("Array", "array, shape (N, 3), in DN of Y'", []),
+    ],
+)
+def test_the_search_sees_types(annotation: str, entry: str, wrong: list[bool]) -> None:
+    text = f'"""Use it.\n\n    Parameters\n    ----------\n    one : {entry}\n    """'
+    module = ast.parse(f"def use(one: {annotation}) -> None:\n    {text}\n")
+    assert [found for _, found in wrong_types(module)] == wrong

@@ -343,7 +343,7 @@ def spot_bounds(
 
     Parameters
     ----------
-    side : Side
+    side : PositionLight
         Light and sensor; its region is not used.
     pattern_known : bool
         Whether the camera's PRNU and DSNU are calibrated; otherwise the bounds count them as noise.

@@ -17,7 +17,7 @@ class Section:
     Attributes
     ----------
     paragraphs : plain text
-    pictures : tuple of Picture
+    pictures : tuple of EmbeddedFigure
     tables : rows of cells, the first row being heads
     captions : one for each table, or none at all
     """

@@ -127,7 +127,7 @@ def with_causes(records: pl.DataFrame, pairs: PairSet, rules: Rules, fit: FitAtT
     records : as of `records.records`
     pairs : PairSet
         Images are asked for only where a rule looks at them, those of a pair twice at most: give `CachedPairs`.
-    fit : Reference
+    fit : FitAtTruth
         Fit that knows where to look.
     """
     columns: dict[str, list[str | None]] = {"kind": [], "cause": [], "taken_for": []}

@@ -92,7 +92,7 @@ def score_methods(
 
     Parameters
     ----------
-    methods : MethodCards, in the order in which `ask` answers
+    methods : sequence of MethodCard, in the order in which `ask` answers
     rules : Rules, by default the usual ones
     seed : int
         Of the bootstrap; 0 or above.

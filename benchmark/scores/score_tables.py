@@ -341,8 +341,8 @@ def print_scores(scored: Sequence[HasScore], form: str, by: str, wide: bool, cal
 
     Parameters
     ----------
-    scored : sequence of Scored
-    form : Form
+    scored : sequence of HasScore
+    form : one of the `Form`s
         "terminal" has further tables and lines; the others are one table, or one JSON object a line.
     by : "phi" or "depth"
     wide : bool

@@ -188,7 +188,7 @@ class _Linear:
 
     Attributes
     ----------
-    A, B, C : Fisher matrices of the spot's own unknowns (k, k), with the shape (k, 3), of the shape (3, 3)
+    A, B, C : arrays, Fisher matrices of the spot's own unknowns (k, k), with the shape (k, 3), of the shape (3, 3)
     g, h : scores, shapes (k,) and (3,)
     excess : float
         Misfit per degree of freedom where it is above 1.

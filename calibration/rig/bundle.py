@@ -140,11 +140,11 @@ def calibrate(
     Parameters
     ----------
     nominal : Rig
-    outline : Measured, optional
+    outline : PoseMeasurement, optional
         Sphere centre in the camera frame, or vertex and ellipse, found with the nominal camera and mirror:
         `Outline.measured`.
     spots : sequence of KnownSpot
-    vertical : Measured, optional
+    vertical : PoseMeasurement, optional
         The world's vertical in the camera frame, x and y of the unit vector, shape (2,), found with the nominal camera
         and the sphere where the outline is (`find_vertical`): a wrong principal point turns it.
     sigmas : shape (p,), optional

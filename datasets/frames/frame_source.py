@@ -197,7 +197,7 @@ class FrameSource:
         Sensor, levels and region that were asked for.
     names : tuple of str, int, str
         Data set, seed and sample id, which name the noise.
-    sides : mapping of str to Side
+    sides : mapping of str to PositionLight
         For "down" and "up".
     """
 

@@ -109,7 +109,7 @@ def pixels_by_model(view: View, grid: PanoramaGrid, distance_m: float = FAR_M) -
     ----------
     view : View
         Of the nominal rig.
-    grid : Grid
+    grid : PanoramaGrid
     distance_m : float
         Of the scene from the sphere centre.
     """

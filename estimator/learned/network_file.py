@@ -70,7 +70,7 @@ def require_layers(model: OnnxModel, nodes: list[Node], shapes: Mapping[str, tup
 
     Parameters
     ----------
-    model : Model
+    model : OnnxModel
     nodes : operators in their order
     shapes : mapping
         Of the weights, by name; all are float32 and finite.

@@ -78,7 +78,7 @@ def fit_region(
 
     Parameters
     ----------
-    region : Region
+    region : JpegRegion
     starts : shape (s, 6) or (s, 7)
         u, v in the region, flux, levels on top of the background, width if it is free.
     model : SpotModel

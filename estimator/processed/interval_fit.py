@@ -303,7 +303,7 @@ class IntervalPosterior:
 
     Attributes
     ----------
-    window : Window
+    window : CoefficientWindow
     theta : shape (k,), mean
     covariance : shape (k, k)
     index : shape (l,), outputs that tell something

@@ -110,7 +110,7 @@ def noise_budget(view: View, uv_px: Array, layer: SpotImage, ambient: Array, var
     ----------
     uv_px : array, shape (2,)
         Image of the spot.
-    layer : SpotLayer, or a window read from a file
+    layer : SpotImage, rendered or read from a file
     ambient, variance : arrays, shape (3, H, W)
         Ambient layer, electrons/s, and its variance, (electrons/s)^2, of the whole image.
     """

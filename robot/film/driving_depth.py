@@ -135,7 +135,7 @@ def driving_depth(
     ----------
     rig : Rig
         Nominal, or calibrated.
-    way : Way
+    way : RobotWay
         At the times at which the spot's rows were exposed, N in all.
     positions : FilmPositions
         In these N frames; those without one count for the way alone.

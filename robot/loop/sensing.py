@@ -161,7 +161,7 @@ class Sensing:
 
         Parameters
         ----------
-        lights : sequence of Light
+        lights : sequence of SpotOnSurface
         placement : (3, 3) and (3,)
             Rotation and origin of the rig's frame in the world, `vehicle.rig_placement`.
         exposure : int

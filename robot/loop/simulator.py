@@ -81,7 +81,7 @@ class Observation(NamedTuple):
         Pitch and roll by the ground alone, from an inclinometer; all four are exact.
     lit : bool
         The robot's laser was on.
-    spots : tuple of Reading
+    spots : tuple of SpotReading
         Spots that were seen, by rising u; measured in the pixels where there are any.
     windows : tuple of Window
         Pixels around spots, by rising u, or the whole frame; none of the exact model.

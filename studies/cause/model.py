@@ -294,7 +294,7 @@ def unrounded(
 
     Parameters
     ----------
-    model : Model
+    model : DepthModel
     points : shape (m, d)
     random : Generator
     experiments : Experiments, optional

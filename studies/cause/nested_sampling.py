@@ -81,7 +81,7 @@ def sample(model: DepthModel, live_points: int, stop: float, *names: Name) -> Po
 
     Parameters
     ----------
-    model : Model
+    model : DepthModel
     stop : float
         Remaining log evidence at which it ends.
     *names
@@ -217,7 +217,7 @@ class Run:
     ----------
     key : tuple
         What it is for; also the names of its random stream.
-    model : Model
+    model : DepthModel
     """
 
     key: tuple[Name, ...]

@@ -135,7 +135,7 @@ def read(parameters: Parameters, experiments: Experiments, reader: Reader, rig: 
 
     Returns
     -------
-    Reading
+    PaperReading
         NaN where the reader's pixel misses the reader's mirror.
     """
     down, up = radii_px(parameters, experiments, reader, rig)

@@ -69,7 +69,7 @@ def epipolar_line(
     stroke_m : float, true
     down_point_m : shape (3,)
     depths_m : shape (n,), of the points on the ray
-    grid : Grid
+    grid : PanoramaGrid
     """
     down, up = true.at(0.0), true.at(stroke_m)
     down_px = seen_px(down, down_point_m)

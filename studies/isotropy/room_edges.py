@@ -91,7 +91,7 @@ def seen_edge(panorama: Array, grid: PanoramaGrid, name: str, expected_px: Array
     Parameters
     ----------
     panorama : shape (H, W), linear in the light
-    grid : Grid
+    grid : PanoramaGrid
     expected_px : shape (n, 2), see `track`
     """
     (bottom, top), trim = expected_px[[0, -1], 1], _TRIMMED * float(expected_px[0, 1] - expected_px[-1, 1])

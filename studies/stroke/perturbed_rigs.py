@@ -67,7 +67,7 @@ class RenderedOutcome:
 
     Attributes
     ----------
-    check : Check
+    check : RenderedCheck
     errors_m : tuple of float
         D of the frames minus the true one, of the pairs in which both spots were found.
     """
