@@ -114,10 +114,12 @@ from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.render.optics.truth import spot_truth
 from phibench.scenes.laser import LaserSpot
 from phibench.studies.mirror.tables import MirrorEntry
+from tools.reference_page import recipe_page
 rig = build_rig(RigTable.model_validate({"mirror": {"shape": "oblate", "rim_radius_m": 0.05}}))
 spot = LaserSpot((2.0, 0.0, 0.5), (-1.0, 0.0, 0.0), 0.004)
 down, up = (spot_truth(rig.at(h), spot, ()) for h in (0.0, 0.3))
 pixels = (np.array([truth.u_px, truth.v_px]) for truth in (down, up))
+print("* oblate: `vertex_radius_m` (0.06), `conic` above 0 (0.2)" in recipe_page())
 print(rig.mirror.profile.conic, down.visible, abs(float(depth_exact(rig, 0.3, *pixels).depth_m) - 2.0) < 1e-9)
 print(MirrorEntry(shape="oblate", conic=0.3).rig(0.05).mirror.profile.conic)
 """
@@ -260,7 +262,7 @@ ADDITIONS = {
         USE_PRESET,
         "255 True\n('night-raw8',) True True\nTrue\nnight-raw8\n",
     ),
-    "conic": Addition(add_conic, ("datasets/recipe/mirror_tables.py",), USE_CONIC, "0.2 True True\n0.3\n"),
+    "conic": Addition(add_conic, ("datasets/recipe/mirror_tables.py",), USE_CONIC, "True\n0.2 True True\n0.3\n"),
     "study": Addition(
         add_study,
         ("studies/echo/settings.toml", "studies/echo/study.py"),

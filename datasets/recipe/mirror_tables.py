@@ -47,6 +47,8 @@ class HolderTable(OfHolder):
     )
 
 
+VERTEX_RADIUS_M = 0.060  # as the sphere's radius
+HALF_ANGLE_DEG = 45.0
 OF_SHAPES = ("vertex_radius_m", "conic", "half_angle_deg", "even_terms")
 """Keys of `[rig.mirror]` that belong to some shapes alone."""
 

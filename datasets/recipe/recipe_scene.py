@@ -9,7 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from phibench.datasets.recipe.mirror_tables import OF_SHAPES, SHAPES, HolderTable, MirrorTable
+from phibench.datasets.recipe.mirror_tables import (
+    HALF_ANGLE_DEG,
+    OF_SHAPES,
+    SHAPES,
+    VERTEX_RADIUS_M,
+    HolderTable,
+    MirrorTable,
+)
 from phibench.datasets.recipe.room_tables import RoomTable
 from phibench.datasets.recipe.tables import OWN_ALBEDO, LaserTable, MisalignmentTable, Recipe, RigTable, TargetTable
 from phibench.datasets.rooms.room_sources import NamedRoom, room_of
@@ -104,7 +111,6 @@ def _rig(table: RigTable) -> Rig:
 
 
 _VERTEX_M = 0.220  # from the lens: rims of 60 mm fit the image
-_VERTEX_RADIUS_M = 0.060  # as the sphere's radius
 
 
 def idle_mirror_keys(path: str, table: MirrorTable, shapes: Sequence[str] = ()) -> list[Fault]:
@@ -112,8 +118,9 @@ def idle_mirror_keys(path: str, table: MirrorTable, shapes: Sequence[str] = ()) 
     shapes = shapes or (table.shape,)
     given = [key for key in OF_SHAPES if getattr(table, key) is not None]
     faults = _idle_of_shapes(path, given, shapes)
-    if "polynomial" in shapes and not table.even_terms:
-        faults.append(Fault(f"{path}.even_terms", 'is missing: shape = "polynomial" needs at least one number'))
+    needing = [shape for shape in shapes if "even_terms" in SHAPES[shape].keys]
+    if needing and not table.even_terms:
+        faults.append(Fault(f"{path}.even_terms", f'is missing: shape = "{needing[0]}" needs at least one number'))
     return faults
 
 
@@ -158,13 +165,13 @@ def build_profile(table: MirrorTable, vertex_m: float) -> Profile:
     """Profile of a mirror whose vertex lies so far before the lens; the lens is in a hyperboloid's focus by default."""
     shape = SHAPES[table.shape]
     if shape.conic is None:
-        return cone(float(np.radians(table.half_angle_deg or 45.0)), table.rim_radius_m)
+        return cone(float(np.radians(table.half_angle_deg or HALF_ANGLE_DEG)), table.rim_radius_m)
     conic = shape.conic if table.conic is None else table.conic
     if not shape.low < conic < shape.high:
         raise SceneError(f'Profile.conic = {conic:g}: {shape.side} for shape = "{table.shape}"')
     radius_m = table.vertex_radius_m
     if radius_m is None:
-        radius_m = vertex_m * ((-conic) ** 0.5 - 1.0) if shape.lens_in_focus else _VERTEX_RADIUS_M
+        radius_m = vertex_m * ((-conic) ** 0.5 - 1.0) if shape.lens_in_focus else VERTEX_RADIUS_M
     return Profile(radius_m, conic, table.rim_radius_m, table.even_terms or ())
 
 
