@@ -15,6 +15,18 @@ from typing import TypedDict, Unpack
 
 from rich.console import Console
 
+from phibench.datasets.build.dataset_build import (
+    Build,
+    claimed,
+    copy_room_files,
+    finish,
+    missing_room_files,
+    plan_tasks,
+    refuse_other,
+    remove_files,
+    stale_exports,
+    visibility_line,
+)
 from phibench.datasets.build.draws_file import draws_bytes, read_draws, seen_causes, write_draws
 from phibench.datasets.build.earlier_runs import (
     OR_REPLACE,
@@ -34,18 +46,6 @@ from phibench.datasets.build.forecast import Forecast, forecast, slowdown
 from phibench.datasets.build.journal import Journal
 from phibench.datasets.build.parts import unfinished
 from phibench.datasets.build.room_export import damaged_exports, export_lines, export_rooms, held, own_files
-from phibench.datasets.build.run_tasks import (
-    Build,
-    claimed,
-    copy_room_files,
-    finish,
-    missing_room_files,
-    plan_tasks,
-    refuse_other,
-    remove_files,
-    stale_exports,
-    visibility_line,
-)
 from phibench.datasets.build.workers import Environment, NoRendererError, WorkerPool
 from phibench.datasets.common.errors import DatasetError, IncompleteError
 from phibench.datasets.common.progress import progress_console

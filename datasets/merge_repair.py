@@ -15,9 +15,9 @@ from typing import Any
 
 from rich.console import Console
 
+from phibench.datasets.build.dataset_build import claimed, copy_room_files, finish, held_head, task_names
 from phibench.datasets.build.earlier_runs import lost_work
 from phibench.datasets.build.journal import Entry, FolderHead, Journal, Refusal, is_intact
-from phibench.datasets.build.run_tasks import claimed, copy_room_files, finish, held_head, task_names
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.progress import Steps, progress_console
 from phibench.datasets.make import MakeOptions, make_from_plan

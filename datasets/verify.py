@@ -19,8 +19,8 @@ import numpy as np
 from rich.console import Console
 
 from phibench.datasets.build.bake_task import read_light_map
+from phibench.datasets.build.dataset_build import sample_task_name
 from phibench.datasets.build.journal import Journal
-from phibench.datasets.build.run_tasks import sample_task_name
 from phibench.datasets.build.sample_task import noise_row, spot_noise
 from phibench.datasets.build.spot_task import OUT_OF_TOLERANCE, SpotAnswer, answer_spot, certificate_fault
 from phibench.datasets.common.errors import DatasetError

@@ -18,7 +18,7 @@ from phibench.calibration.captures.picture_files import read_photo
 from phibench.calibration.captures.rig_file import MeasuredRig
 from phibench.datasets.frames.frame_files import png_bytes
 from phibench.datasets.read import open_dataset
-from phibench.estimator.methods.simulated_pairs import pairs_of
+from phibench.estimator.drawn_pairs import pairs_of
 from phibench.scenes.room import default_rig
 
 _WIDTH = 1000

@@ -20,9 +20,9 @@ from phibench.datasets.exposures.pair_draws import CachedSample, PairDraw, searc
 from phibench.datasets.frames.frame_request import FrameRequest
 from phibench.datasets.frames.frame_source import FrameSource
 from phibench.datasets.read import Dataset, Sample, open_dataset
+from phibench.estimator.drawn_pairs import DrawnPairs
 from phibench.estimator.interface import Answer, Box, Pair
 from phibench.estimator.methods.registry import METHODS
-from phibench.estimator.methods.simulated_pairs import DrawnPairs
 from phibench.estimator.methods.spot_search import SharedPair, detected
 from phibench.scenes.rig import POSITIONS
 

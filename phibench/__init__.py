@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from phibench.benchmark.isolation.easy_pairs import EasyPairs
+    from phibench.benchmark.make_dataset import make
     from phibench.benchmark.scored_dataset import open_dataset
     from phibench.benchmark.scores.score import score
     from phibench.datasets.scene.scene_export import mitsuba_scene
@@ -23,7 +24,6 @@ if TYPE_CHECKING:
     from phibench.estimator.geometry.triangulate import depth_exact
     from phibench.estimator.interface import Answer, Pair, Spot
     from phibench.estimator.spots.simple_spots import find_spot
-    from phibench.studies.paper.sensitivity_table import make
 
     __version__: str
 
@@ -51,7 +51,7 @@ _HOMES = {
     "Spot": "phibench.estimator.interface",
     "depth_exact": "phibench.estimator.geometry.triangulate",
     "find_spot": "phibench.estimator.spots.simple_spots",
-    "make": "phibench.studies.paper.sensitivity_table",
+    "make": "phibench.benchmark.make_dataset",
     "mitsuba_scene": "phibench.datasets.scene.scene_export",
     "open_dataset": "phibench.benchmark.scored_dataset",
     "phi": "phibench.estimator.geometry.phi",

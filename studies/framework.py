@@ -1,4 +1,4 @@
-"""Frame of the studies: findings, tables of text, data sets, drawings, the result, and settings in a TOML file.
+"""Framework of the studies: findings, tables of text, data sets, drawings, the result, and settings in a TOML file.
 
 A study is a question, settings, and a function from settings and data sets to a result. Data sets are rendered from
 recipes, kept between runs and shared between studies. The top level of `settings.toml` is the full study; its table

@@ -46,7 +46,7 @@ datasets/scene
 datasets/film
 datasets/show datasets/sample_page datasets/verify datasets/merge_repair datasets/training
 estimator/interface
-estimator/pair_set
+estimator/pair_set estimator/drawn_pairs
 estimator/geometry
 estimator/spots
 estimator/processed
@@ -62,7 +62,7 @@ benchmark/pair_sets
 benchmark/scores
 benchmark/reports
 benchmark/dense
-benchmark/scored_dataset
+benchmark/scored_dataset benchmark/make_dataset
 benchmark/sealed
 benchmark/export
 benchmark/release

@@ -24,11 +24,11 @@ from phibench.datasets.frames.sensor_card import card_of
 from phibench.datasets.read import Dataset
 from phibench.datasets.store.schema import ManifestRow
 from phibench.estimator.dense.dense_interface import DensePair
+from phibench.estimator.drawn_pairs import DrawnPairs
 from phibench.estimator.geometry.epipolar_line import up_image
 from phibench.estimator.geometry.reflection import image_of
 from phibench.estimator.geometry.rig_parameters import stroke_of
 from phibench.estimator.interface import Image
-from phibench.estimator.methods.simulated_pairs import DrawnPairs
 from phibench.scenes.frames import Array, BoolArray
 from phibench.scenes.rig import Rig, View
 

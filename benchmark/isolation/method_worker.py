@@ -1,7 +1,8 @@
-"""Worker: the process in which a method or a policy runs, started by `isolation.supervisor`.
+"""Worker that loads a method or a policy and asks it (`main`); `reply_of` and sentences on failures serve others, too.
 
-The worker tells how it is isolated, gets a reference, imports the method, gets pairs, and answers with JSON. Every
-reply repeats number and nonce of its pair. Standard output and error are the method's alone.
+`isolation.supervisor` starts the worker. It tells how it is isolated, gets a reference, imports the method, gets pairs,
+and answers with JSON. Every reply repeats number and nonce of its pair. Standard output and error are the method's
+alone.
 
 The address space is limited while the method runs (RLIMIT_AS; kept by Linux). Fatal signals print Python's stack, and
 SIGUSR1 prints it at any time: the runner reads the method's line from it.

@@ -35,7 +35,7 @@ from phibench.estimator.interface import Pair
 from phibench.estimator.pair_set import PairSet, PairTruth, truth_folders
 
 
-class PairsAhead:
+class PrefetchedPairs:
     """Pairs of a set and their truths, made by other processes; pairs before they are asked for, in order.
 
     Making a pair takes as long as all built-in methods take on it. Its truth is made after all methods have answered it
@@ -67,7 +67,7 @@ class PairsAhead:
         for first, maker in enumerate(self._makers):  # all import what they need by now, side by side
             maker.begin(told, first)
 
-    def __enter__(self) -> PairsAhead:
+    def __enter__(self) -> PrefetchedPairs:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: object, trace: TracebackType | None) -> None:

@@ -28,10 +28,10 @@ from phibench.datasets.store import schema
 from phibench.datasets.store.files import sha256
 from phibench.datasets.store.pair_files import LEAST_BOX_PX
 from phibench.datasets.store.provenance import provenance
+from phibench.estimator.drawn_pairs import DrawnPairs
 from phibench.estimator.interface import Pair
 from phibench.estimator.limits.position_bound import SpotLimit, processed_snr, raw_snr, spot_limit
 from phibench.estimator.limits.processed_bound import chain_limit, on_off_limit, processed_on_off_limit
-from phibench.estimator.methods.simulated_pairs import DrawnPairs
 from phibench.estimator.pair_set import Distraction, ImageTruth, PairTruth
 from phibench.estimator.spots.gaussian_spot import SpotBlur
 from phibench.estimator.spots.image_planes import PROCESSED

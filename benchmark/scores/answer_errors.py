@@ -1,4 +1,4 @@
-"""Rules of a score (`Rules`): found, missed, false detections; errors of answers; bounds that they are held against.
+"""Rules of a score (`Rules`), and the arithmetic of its records: errors in px and phi, pulls, squares for ranks.
 
 Definitions, used by all metrics:
 

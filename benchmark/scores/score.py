@@ -16,7 +16,7 @@ import polars as pl
 from rich.console import Console
 
 from phibench.benchmark.isolation.method_references import code_of_function, resolve
-from phibench.benchmark.isolation.prefetched_pairs import PairsAhead
+from phibench.benchmark.isolation.prefetched_pairs import PrefetchedPairs
 from phibench.benchmark.isolation.run_limits import MethodError, RunLimits
 from phibench.benchmark.isolation.runner import Harness, Ran, asked_here, function_name, ran_here
 from phibench.benchmark.pair_sets.dataset_pairs import DatasetPairs
@@ -388,7 +388,7 @@ def _ahead(pairs: PairSet, workers: int) -> Iterator[tuple[PairSet, dict[str, fl
     if workers == 1 or len(pairs) < _WORTH_A_PROCESS or not isinstance(drawn, DatasetPairs):
         yield pairs, {}
         return
-    with PairsAhead(drawn, workers) as made:
+    with PrefetchedPairs(drawn, workers) as made:
         yield CalibratedPairs(made, pairs.calibration) if isinstance(pairs, CalibratedPairs) else made, made.seconds
 
 

@@ -1,4 +1,4 @@
-"""Calibration from images of a data set, its verdict: outlines; if asked, upright edges, spots at known distances.
+"""Calibration of a rig from images of its data set (`calibrate_dataset`): outlines, edges, known spots; its verdict.
 
 Its verdict has three marks. "bad": the data contradict each other or the priors beyond chance. "doubtful": something
 unusual that a person should look at. "good": neither. Parameters that only the prior knows are named under every mark.
@@ -27,10 +27,10 @@ from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.datasets.read import Dataset, Sample, open_dataset
 from phibench.datasets.store.files import require_writable
+from phibench.estimator.drawn_pairs import pairs_of
 from phibench.estimator.geometry.rig_parameters import PARAMETERS, prior_sigmas
 from phibench.estimator.geometry.status import Status, describe
 from phibench.estimator.methods.registry import method_for
-from phibench.estimator.methods.simulated_pairs import pairs_of
 from phibench.estimator.spots.simple_spots import find_spot
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import POSITIONS, Rig

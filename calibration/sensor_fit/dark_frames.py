@@ -1,4 +1,4 @@
-"""Light and curves in dark frames, which read as black level, read noise and pattern of the dark.
+"""Dark frames as one image (`DarkImage`) and its pattern; light and curves in them that pass for noise and black level.
 
 Light shows itself three ways. The pixels' responsivity (PRNU) is in it: the dark pattern is then like that of lit
 frames. Its shot noise grows with it over the picture, with the slope K. And where a curve, a cut or a program bends

@@ -20,9 +20,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from phibench.datasets.build.dataset_build import held_head, listed, plan_tasks, sample_task_name
 from phibench.datasets.build.journal import Entry, FolderHead, Journal, is_intact
 from phibench.datasets.build.parts import intact
-from phibench.datasets.build.run_tasks import held_head, listed, plan_tasks, sample_task_name
 from phibench.datasets.build.tasks import BuildTask
 from phibench.datasets.build.workers import versions
 from phibench.datasets.common.errors import DatasetError

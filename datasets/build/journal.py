@@ -1,4 +1,4 @@
-"""Log of the finished tasks of a folder, for resuming: the journal.
+"""Journal of a folder (`Journal`): a log of its finished and refused tasks, for resuming.
 
 It alone decides what is finished; names and times of files do not.
 

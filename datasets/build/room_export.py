@@ -17,8 +17,8 @@ import numpy as np
 from rich.console import Console
 
 from phibench.datasets.build.bake_task import bake_settings, light_map
+from phibench.datasets.build.dataset_build import missing_room_files
 from phibench.datasets.build.parts import schedule
-from phibench.datasets.build.run_tasks import missing_room_files
 from phibench.datasets.build.tasks import BuildTask, Failed, Made
 from phibench.datasets.build.workers import WorkerPool
 from phibench.datasets.common.errors import DatasetError

@@ -1,4 +1,4 @@
-"""Samples against Mitsuba's own path tracer: their exported scenes beside the stored layers.
+"""Check of samples by Mitsuba's own path tracer (`check_sample`): their exported scenes beside the stored layers.
 
 Nothing of phibench's optics, light maps or Dr.Jit kernels takes part: the XML holds standard plugins alone. Compared
 are

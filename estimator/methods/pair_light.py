@@ -1,4 +1,4 @@
-"""For a method of one's own: light of the laser in a pair's images, masks of mirror and lamps, and the noise.
+"""Helpers of a user's own method: light of the laser in a pair's images, masks of mirror and lamps, and the noise.
 
 >>> import numpy as np
 >>> from phibench.estimator.interface import Answer, Pair, Spot

@@ -137,7 +137,7 @@ def make(
 
         print(dry_run_text(recipe, out, processes.workers, **given))
         return 0
-    from phibench.studies.paper.sensitivity_table import make as make_dataset
+    from phibench.benchmark.make_dataset import make as make_dataset
 
     processes.wait()
     make_dataset(recipe, out, processes.workers, scheduler=processes.scheduler, **given)
@@ -157,7 +157,7 @@ def _secret(path: Path, seed: int | None, make_it: bool) -> int | None:
 @dataset.command
 def repair(directory: DataFolder, *, workers: Workers = None, scheduler: Scheduler = None) -> int:
     """Render again what is damaged or missing in a data set."""
-    from phibench.studies.paper.sensitivity_table import repair as repair_dataset
+    from phibench.benchmark.make_dataset import repair as repair_dataset
 
     for name in repair_dataset(directory, workers, scheduler=scheduler):
         print(f"made again: {name}")
@@ -173,7 +173,7 @@ def merge(*shards: Path, out: OutFolder) -> int:
     shards
         Folders of all shards.
     """
-    from phibench.studies.paper.sensitivity_table import merge as merge_shards
+    from phibench.benchmark.make_dataset import merge as merge_shards
 
     merge_shards(out, shards)
     return 0
@@ -470,8 +470,8 @@ def sensitivities(directory: DataFolder, *, out: Path | None = None) -> int:
     """
     from phibench.datasets.read import open_finished
     from phibench.datasets.store import schema
+    from phibench.estimator.geometry.sensitivity_table import columns, write_sensitivities
     from phibench.estimator.geometry.triangulate import ESTIMATORS
-    from phibench.studies.paper.sensitivity_table import columns, write_sensitivities
 
     dataset = open_finished(directory)
     out = directory / schema.SENSITIVITIES if out is None else out

@@ -1,9 +1,9 @@
-"""Room tracer in float64: first plane face along rays, blocked segments, and the light that a laser leaves on faces.
+"""Room tracer: `room_geometry`, the first face along rays (`first_hit`), and the light of a laser there (`deposit`).
 
 A room is the table of its plane faces (`faces`) and a tree of them (`face_tree`). What belongs to the room is made
 ready once and stays with the room; robot, carriage and holder are added for each view.
 
-Rays are origins and unit directions, shape (N, 3), world frame, metres.
+All is float64. Rays are origins and unit directions, shape (N, 3), world frame, metres.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Programs of the package that run in a process of their own because they may abort or hang, and what they complain of.
+"""Run of a program of the package in a process of its own, which may abort or hang: its fault in a line (`fault_of`).
 
 Only the standard library is used here.
 """

@@ -23,8 +23,8 @@ from phibench.datasets.exposures.pair_draws import CachedSample, FrameCounts
 from phibench.datasets.frames.frame_request import Exposure
 from phibench.datasets.frames.frame_source import FrameSource
 from phibench.datasets.read import Dataset, Sample
+from phibench.estimator.drawn_pairs import pairs_of
 from phibench.estimator.geometry.least_squares_depth import depth_general
-from phibench.estimator.methods.simulated_pairs import pairs_of
 from phibench.scenes.frames import Array
 from phibench.scenes.laser import Beam
 from phibench.scenes.random_streams import generator

@@ -30,12 +30,12 @@ from phibench.calibration.rig.known_spots import Ruler, one_per_pose
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.exposures.pair_draws import FrameCounts
 from phibench.datasets.read import Dataset, Sample
+from phibench.estimator.drawn_pairs import pairs_of
 from phibench.estimator.geometry.least_squares_depth import GeneralDepth, depth_general
 from phibench.estimator.geometry.status import describe
 from phibench.estimator.interface import OK, Answer, Pair
 from phibench.estimator.methods.raw_likelihood import joint_of
 from phibench.estimator.methods.registry import method_for
-from phibench.estimator.methods.simulated_pairs import pairs_of
 from phibench.estimator.pair_set import PairTruth
 from phibench.scenes.rig import POSITIONS
 

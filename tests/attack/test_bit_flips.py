@@ -11,7 +11,7 @@ from rich.console import Console
 
 from phibench.datasets.store import schema
 from phibench.datasets.verify import verify
-from phibench.studies.paper.sensitivity_table import keep_sensitivities
+from phibench.estimator.geometry.sensitivity_table import keep_sensitivities
 
 pytestmark = pytest.mark.slow
 

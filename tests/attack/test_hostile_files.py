@@ -24,8 +24,8 @@ from phibench.calibration.captures.picture_files import read_picture
 from phibench.calibration.rig.bundle import Bundle
 from phibench.calibration.rig.calibration_file import read_calibration, write_calibration
 from phibench.cli.main import main
+from phibench.datasets.build.dataset_build import held_head, refuse_other
 from phibench.datasets.build.journal import Entry, FolderHead, Journal
-from phibench.datasets.build.run_tasks import held_head, refuse_other
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import DEPTH, InputFile
 from phibench.datasets.plan.plan import parse_shard

@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 from helpers.processes import quiet
 
+from phibench.datasets.build.dataset_build import plan_tasks
 from phibench.datasets.build.forecast import START_S, Pace, forecast, slowdown
 from phibench.datasets.build.parts import schedule
-from phibench.datasets.build.run_tasks import plan_tasks
 from phibench.datasets.build.tasks import Done
 from phibench.datasets.build.workers import local_environment, local_workers, versions
 from phibench.datasets.make import make

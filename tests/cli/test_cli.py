@@ -138,7 +138,7 @@ assert not {"mitsuba", "drjit"} & set(sys.modules)
 def sensitivities_kept(monkeypatch) -> list[Path]:
     """Folders whose sensitivities are asked for, instead of writing them."""
     kept: list[Path] = []
-    monkeypatch.setattr("phibench.studies.paper.sensitivity_table.keep_sensitivities", kept.append)
+    monkeypatch.setattr("phibench.benchmark.make_dataset.keep_sensitivities", kept.append)
     return kept
 
 

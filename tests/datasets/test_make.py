@@ -21,9 +21,9 @@ from helpers.processes import SMALLEST, left_of, quiet, said, wait_until
 from rich.console import Console
 
 from phibench.datasets import make
-from phibench.datasets.build import run_tasks, spot_task
+from phibench.datasets.build import dataset_build, spot_task
+from phibench.datasets.build.dataset_build import plan_tasks
 from phibench.datasets.build.forecast import forecast
-from phibench.datasets.build.run_tasks import plan_tasks
 from phibench.datasets.common import progress
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.progress import Steps
@@ -159,7 +159,7 @@ def test_a_folder_that_cannot_be_written_is_refused(tmp_path: Path, monkeypatch:
 
 @pytest.mark.usefixtures("inline")
 def test_no_room_on_the_disk_is_refused_with_numbers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(run_tasks.shutil, "disk_usage", lambda _: Usage(10**9, 10**9 - 200_000, 200_000))
+    monkeypatch.setattr(dataset_build.shutil, "disk_usage", lambda _: Usage(10**9, 10**9 - 200_000, 200_000))
     text = refusal(tmp_path / "out")
     assert "about 0.8 MB are needed and 0.2 MB are free" in text
 
@@ -203,7 +203,7 @@ def test_a_full_disk_in_the_middle_loses_nothing(tmp_path: Path, monkeypatch: py
     def full(*_: object) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr(run_tasks, "write_documents", full)
+    monkeypatch.setattr(dataset_build, "write_documents", full)
     assert "No space left on device" in refusal(tmp_path / "out")
     assert complete_but_unfinished(tmp_path / "out") == 3 + 6
 

@@ -14,8 +14,8 @@ from helpers.processes import quiet
 from helpers.room_files import KINDS_TOML, write_files
 from rich.console import Console
 
+from phibench.datasets.build.dataset_build import plan_tasks
 from phibench.datasets.build.forecast import forecast
-from phibench.datasets.build.run_tasks import plan_tasks
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.make import dry_run, make
 from phibench.datasets.merge_repair import merge, repair

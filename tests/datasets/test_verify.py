@@ -33,7 +33,7 @@ from PIL import Image
 from rich.console import Console
 
 from phibench.datasets import show as show_module
-from phibench.datasets.build.run_tasks import visibility_line
+from phibench.datasets.build.dataset_build import visibility_line
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.read import open_dataset
 from phibench.datasets.show import show
@@ -49,7 +49,7 @@ from phibench.datasets.store.layers import (
 from phibench.datasets.store.metadata import read_manifest
 from phibench.datasets.store.pictures import Picture
 from phibench.datasets.verify import Report, file_faults, verify
-from phibench.studies.paper.sensitivity_table import keep_sensitivities
+from phibench.estimator.geometry.sensitivity_table import keep_sensitivities
 
 PREVIEW = schema.preview_file("seen-near-h0.500")
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from phibench.datasets.frames.frame_files import png_bytes
 from phibench.datasets.frames.frame_request import Exposure
 from phibench.datasets.read import Dataset, Sample
-from phibench.estimator.methods.simulated_pairs import DrawnPairs, pairs_of
+from phibench.estimator.drawn_pairs import DrawnPairs, pairs_of
 from phibench.scenes.rig import Rig
 
 NAMES = ("down", "up", "down_off", "up_off")

@@ -46,9 +46,9 @@ from phibench.benchmark.sealed.submission import check_complete
 from phibench.calibration.captures import imported_set
 from phibench.calibration.sensor_fit import fit_sensor
 from phibench.calibration.sensor_fit.capture_folder import read_header
-from phibench.datasets.build import draws_file, run_tasks
+from phibench.datasets.build import dataset_build, draws_file
+from phibench.datasets.build.dataset_build import held_head
 from phibench.datasets.build.journal import Journal
-from phibench.datasets.build.run_tasks import held_head
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.film import moving_camera
 from phibench.datasets.frames import frame_files
@@ -77,7 +77,7 @@ def _held(text: str, path: Path) -> object:
     info = parse_info(text)
     folder = path.parent
     (folder / schema.RECIPE).write_text(recipe_text("bench-dev"))
-    run_tasks._info_text(info, Journal(folder), folder)
+    dataset_build._info_text(info, Journal(folder), folder)
     held_head(folder)
     part = PARTS[0]
     release_make._misfit(_request(folder), part, folder)

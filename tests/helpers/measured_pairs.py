@@ -38,9 +38,9 @@ from phibench.datasets.exposures.pair_draws import FrameCounts
 from phibench.datasets.frames.frame_files import png_bytes
 from phibench.datasets.frames.sensor_file import write_sensor_file
 from phibench.datasets.read import Dataset, Sample, open_finished
+from phibench.estimator.drawn_pairs import pairs_of
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.estimator.methods.registry import METHODS
-from phibench.estimator.methods.simulated_pairs import pairs_of
 from phibench.estimator.spots.image_planes import ImageError
 from phibench.render.sensor.settings import sensor
 

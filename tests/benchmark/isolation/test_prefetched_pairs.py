@@ -17,7 +17,7 @@ import pytest
 from helpers.processes import quiet
 
 from phibench.benchmark.isolation.easy_pairs import EasyPairs
-from phibench.benchmark.isolation.prefetched_pairs import PairsAhead
+from phibench.benchmark.isolation.prefetched_pairs import PrefetchedPairs
 from phibench.benchmark.pair_sets.dataset_pairs import dataset_pairs
 from phibench.benchmark.scores import score as scoring
 from phibench.datasets.common.errors import DatasetError
@@ -50,7 +50,7 @@ def assert_same(made: PairSet, plain: PairSet, number: int) -> None:
 
 def test_pairs_and_truths_are_those_of_the_set_in_any_order() -> None:
     plain = EasyPairs("bayer-raw", count=5)
-    with PairsAhead(plain, 2) as made:
+    with PrefetchedPairs(plain, 2) as made:
         assert len(made) == 5
         for number in (*range(5), 4, 0, 3, 3, 2):  # in order, then the last one again, back, ahead, twice
             assert_same(made, plain, number)
@@ -61,7 +61,7 @@ def test_pairs_and_truths_are_those_of_the_set_in_any_order() -> None:
 def test_pairs_of_a_data_set_are_the_same_bytes(bench_dataset: Path) -> None:
     """Pictures, with boxes; the test above has raw images."""
     plain = dataset_pairs(open_finished(bench_dataset), "mjpeg", boxes_px=64)
-    with PairsAhead(plain, 2) as made:
+    with PrefetchedPairs(plain, 2) as made:
         for number in range(len(plain)):
             assert_same(made, plain, number)
         assert made.document() == plain.document()
@@ -71,8 +71,10 @@ def test_pairs_of_a_data_set_are_the_same_bytes(bench_dataset: Path) -> None:
 
 def test_a_score_does_not_depend_on_who_makes_the_pairs(bench_dataset: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     began: list[int] = []
-    start = PairsAhead.__init__
-    monkeypatch.setattr(PairsAhead, "__init__", lambda self, *given: (began.append(given[1]), start(self, *given))[1])
+    start = PrefetchedPairs.__init__
+    monkeypatch.setattr(
+        PrefetchedPairs, "__init__", lambda self, *given: (began.append(given[1]), start(self, *given))[1]
+    )
 
     def scored(workers: int) -> scoring.Scored:
         return scoring.score(bench_dataset, "red_centroid", "srgb8", workers=workers, console=quiet())
@@ -109,7 +111,7 @@ def test_what_a_process_raises_is_raised_here_and_the_others_go_on(monkeypatch: 
     monkeypatch.setattr(Faulty, "__module__", here.stem)
     monkeypatch.setitem(sys.modules, here.stem, sys.modules[__name__])
     plain = EasyPairs(count=4)
-    with PairsAhead(Faulty(count=4), 2) as made:
+    with PrefetchedPairs(Faulty(count=4), 2) as made:
         assert_same(made, plain, 0)
         with pytest.raises(DatasetError, match="layer is gone"):
             made.pair(1)
@@ -119,7 +121,7 @@ def test_what_a_process_raises_is_raised_here_and_the_others_go_on(monkeypatch: 
 
 
 def test_a_process_that_dies_is_a_sentence() -> None:
-    with PairsAhead(EasyPairs(count=4), 1) as made:
+    with PrefetchedPairs(EasyPairs(count=4), 1) as made:
         made.pair(0)
         os.kill(made._makers[0]._process.pid, signal.SIGKILL)
         with pytest.raises(DatasetError, match="died; most often memory has run out: take fewer --workers"):
@@ -138,7 +140,7 @@ def test_a_process_that_cannot_be_started_is_a_sentence(monkeypatch: pytest.Monk
 
     monkeypatch.setattr(subprocess, "Popen", popen)
     with pytest.raises(DatasetError, match="can be started: Resource temporarily unavailable; take --workers 1"):
-        PairsAhead(EasyPairs(count=4), 2)
+        PrefetchedPairs(EasyPairs(count=4), 2)
     assert started[0].poll() is not None  # the first one was ended
 
 
@@ -151,14 +153,14 @@ def is_alive(pid: int) -> bool:
 
 
 def test_nothing_is_left_of_the_processes(tmp_path: Path) -> None:
-    with PairsAhead(EasyPairs(count=4), 2) as made:
+    with PrefetchedPairs(EasyPairs(count=4), 2) as made:
         pids = [maker._process.pid for maker in made._makers]
         assert all(map(is_alive, pids))
     assert not any(map(is_alive, pids))
     code = (
         "import time\nfrom phibench.benchmark.isolation.easy_pairs import EasyPairs\n"
-        "from phibench.benchmark.isolation.prefetched_pairs import PairsAhead\n"
-        "made = PairsAhead(EasyPairs(count=9), 2)\nmade.pair(0)\n"
+        "from phibench.benchmark.isolation.prefetched_pairs import PrefetchedPairs\n"
+        "made = PrefetchedPairs(EasyPairs(count=9), 2)\nmade.pair(0)\n"
         "print(*(maker._process.pid for maker in made._makers), flush=True)\ntime.sleep(600)\n"
     )
     with subprocess.Popen([sys.executable, "-c", code], cwd=tmp_path, stdout=subprocess.PIPE, text=True) as parent:

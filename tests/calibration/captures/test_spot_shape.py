@@ -18,8 +18,8 @@ from phibench.calibration.captures.spot_shape import (
 )
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.read import Sample, open_dataset
+from phibench.estimator.drawn_pairs import pairs_of
 from phibench.estimator.interface import Pair, Spot
-from phibench.estimator.methods.simulated_pairs import pairs_of
 from phibench.scenes.rig import Rig
 
 WRONG = np.array([0.95, 0.16, 0.06])  # 0.70 px, 0.10 and 0.03 are true: off by one sigma of the prior each

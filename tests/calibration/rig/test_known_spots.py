@@ -17,10 +17,10 @@ from phibench.calibration.rig.known_spots import Ruler, known_spot, one_per_pose
 from phibench.cli.main import main
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.read import Dataset, open_finished
+from phibench.estimator.drawn_pairs import pairs_of
 from phibench.estimator.geometry.rig_parameters import PARAMETERS, has_effect, prior_sigmas
 from phibench.estimator.interface import Answer, Spot
 from phibench.estimator.methods.registry import method_for
-from phibench.estimator.methods.simulated_pairs import pairs_of
 from phibench.studies.paper.experiment_tables import Procedure, run_experiments
 
 EVERYTHING = Ruler(distance_m=2e-3, height_m=5e-3, azimuth_rad=0.01)

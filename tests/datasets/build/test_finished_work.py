@@ -7,9 +7,9 @@ import pytest
 from helpers.folders import contents
 from helpers.processes import SMALLEST, quiet
 
+from phibench.datasets.build.dataset_build import plan_tasks
 from phibench.datasets.build.earlier_runs import lost_work
 from phibench.datasets.build.journal import Journal
-from phibench.datasets.build.run_tasks import plan_tasks
 from phibench.datasets.build.workers import versions
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.make import make

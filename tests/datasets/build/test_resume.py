@@ -13,8 +13,8 @@ import pytest
 from helpers.folders import contents, done
 from helpers.processes import SMALLEST, left_of, quiet, said
 
+from phibench.datasets.build.dataset_build import claimed
 from phibench.datasets.build.journal import Entry, FolderHead, Journal
-from phibench.datasets.build.run_tasks import claimed
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.make import make
 from phibench.datasets.read import open_finished

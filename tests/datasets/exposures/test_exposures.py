@@ -15,8 +15,8 @@ from helpers.bench_samples import many, with_tables
 from helpers.processes import quiet
 from helpers.recipes import changed, complaints
 
+from phibench.datasets.build.dataset_build import plan_tasks
 from phibench.datasets.build.journal import Journal
-from phibench.datasets.build.run_tasks import plan_tasks
 from phibench.datasets.common.errors import DatasetError, RecipeError
 from phibench.datasets.exposures import pair_draws as module
 from phibench.datasets.exposures.pair_draws import BOX_MARGIN_PX, CachedSample, PairDraw, pair_draws

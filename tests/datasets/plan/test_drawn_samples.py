@@ -16,8 +16,8 @@ from helpers.folders import contents, done
 from helpers.inline_workers import InlineWorkerPool
 from helpers.processes import quiet, said
 
+from phibench.datasets.build.dataset_build import plan_tasks
 from phibench.datasets.build.forecast import forecast
-from phibench.datasets.build.run_tasks import plan_tasks
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.make import dry_run, make
 from phibench.datasets.merge_repair import merge, repair

@@ -11,7 +11,7 @@ import scipy
 from helpers.drawn_values import RAY, drawing, shipped
 from helpers.recipes import target
 
-from phibench.datasets.build.run_tasks import plan_tasks
+from phibench.datasets.build.dataset_build import plan_tasks
 from phibench.datasets.common.errors import RecipeError
 from phibench.datasets.plan.plan import Plan, make_plan
 from phibench.datasets.plan.sampling import PARAMETERS, drawn_parameters, first_points

@@ -24,8 +24,8 @@ from phibench.datasets.store import schema
 from phibench.datasets.store.checksums import strays
 from phibench.datasets.store.sensitivity_file import read_sensitivities, sensitivity_bytes, sensitivity_fault
 from phibench.datasets.verify import verify
+from phibench.estimator.geometry.sensitivity_table import columns, keep_sensitivities
 from phibench.estimator.geometry.triangulate import ESTIMATORS
-from phibench.studies.paper.sensitivity_table import columns, keep_sensitivities
 
 
 @pytest.fixture

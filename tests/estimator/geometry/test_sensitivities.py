@@ -25,6 +25,7 @@ from phibench.estimator.geometry.sensitivities import (
     sensitivity,
     truth_gradient,
 )
+from phibench.estimator.geometry.sensitivity_table import TRUTH, columns
 from phibench.estimator.geometry.triangulate import ESTIMATORS, depth_exact, exact_gradient
 from phibench.render.optics.certificate import pixel_centroid
 from phibench.render.optics.spot_layer import spot_layer
@@ -35,7 +36,6 @@ from phibench.scenes.misalignment import PARAMETERS as MISALIGNMENT
 from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.rig import POSITIONS, Rig, View
 from phibench.scenes.room import default_rig
-from phibench.studies.paper.sensitivity_table import TRUTH, columns
 
 Pixels = tuple[np.ndarray, np.ndarray]
 STILL = dict.fromkeys(("roll_rad", "pitch_rad", "yaw_rad", "shift_x_m", "shift_y_m", "shift_z_m"), 0.0)
@@ -341,7 +341,7 @@ def test_the_table_of_a_data_set(misaligned_dataset: Path, tmp_path: Path, capsy
 
 
 def test_a_hidden_spot_is_a_row_of_nulls_with_its_cause(misaligned_dataset: Path) -> None:
-    from phibench.studies.paper.sensitivity_table import sensitivity_rows
+    from phibench.estimator.geometry.sensitivity_table import sensitivity_rows
 
     sample = open_finished(misaligned_dataset).samples[0]
     nowhere = sample.row.up.model_copy(update={"visible": False, "cause": "occluded:crate"})

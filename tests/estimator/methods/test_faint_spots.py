@@ -11,12 +11,12 @@ from helpers.bench_samples import with_tables
 from helpers.faint_spots import faint_spots
 
 from phibench.datasets.read import open_dataset
+from phibench.estimator.drawn_pairs import pairs_of
 from phibench.estimator.interface import Answer
 from phibench.estimator.methods import raw_likelihood
 from phibench.estimator.methods.likelihood_maps import SpotLikelihood, claimed_px2
 from phibench.estimator.methods.raw_likelihood import with_posteriors
 from phibench.estimator.methods.registry import METHODS
-from phibench.estimator.methods.simulated_pairs import pairs_of
 from phibench.scenes.rig import POSITIONS
 
 DRAWS = 14

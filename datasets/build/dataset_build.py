@@ -1,4 +1,4 @@
-"""Tasks of a data set: their list with keys, the folder they may use, their run, and the small files made at the end.
+"""A data set being made (`Build`): its tasks, the guarded folder, the run, and the small files at the end (`finish`).
 
 The second part guards the output folder: it must hold no other data set, and have room on its disk. The last gives
 the small files as bytes, from plan and journal, so that each can be checked and written anew.

@@ -1,4 +1,4 @@
-"""Pairs of images (down, up) of a data set, with random sensor noise, as a method sees them.
+"""Pairs of a data set as a method sees them, drawn with sensor noise: a set (`DrawnPairs`), a few (`pairs_of`).
 
 A pair is simulated when it is asked for: the same bytes every time. Its truth is in `pair_sets.dataset_pairs`.
 """

@@ -1,20 +1,13 @@
-"""Table of how D reacts to each error of the rig; data sets made, repaired and merged with this table in them.
-
-`datasets` may not import the estimators. `make`, `repair` and `merge` therefore stand here: they render through
-`datasets` and write the table beside the result. The command line and Python programs get the same folder.
-"""
+"""Table of how D reacts to each error of the rig: a row per sample and estimator, and its file in a data set."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any, Unpack
+from typing import Any
 
 import numpy as np
-from rich.console import Console
 
-from phibench.datasets import make as rendering
-from phibench.datasets import merge_repair
 from phibench.datasets.read import Dataset, Sample, open_finished
 from phibench.datasets.store import schema
 from phibench.datasets.store.files import write_bytes
@@ -94,40 +87,3 @@ def _row(sample: Sample, estimator: str) -> Row:
 
 def _number(value: Any) -> float | None:
     return float(value) if np.isfinite(value) else None
-
-
-# Data sets with their table.
-
-
-def make(
-    recipe: str | Path,
-    out: str | Path,
-    workers: int | None = None,
-    console: Console | None = None,
-    scheduler: str | None = None,
-    **options: Unpack[rendering.MakeKeywords],
-) -> Path:
-    """Make the data set of a recipe; parameters and errors are those of `phibench.datasets.make.make`.
-
-    A shard has no table of sensitivities: `merge` writes that of the whole.
-    """
-    folder = rendering.make(recipe, out, workers, console, scheduler, **options)
-    if options.get("shard") is None:
-        keep_sensitivities(folder)
-    return folder
-
-
-def repair(
-    folder: str | Path, workers: int | None = None, console: Console | None = None, scheduler: str | None = None
-) -> list[str]:
-    """Make a data set whole again; return what was done. Errors are those of `phibench.datasets.merge_repair`."""
-    done = merge_repair.repair(folder, workers, console, scheduler)
-    keep_sensitivities(Path(folder))
-    return done
-
-
-def merge(out: str | Path, shards: Sequence[str | Path], console: Console | None = None) -> Path:
-    """Put finished shards together. Errors are those of `phibench.datasets.merge_repair`."""
-    folder = merge_repair.merge(out, shards, console)
-    keep_sensitivities(folder)
-    return folder
