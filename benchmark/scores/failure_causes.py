@@ -124,7 +124,7 @@ def with_causes(records: pl.DataFrame, pairs: PairSet, rules: Rules, fit: FitAtT
 
     Parameters
     ----------
-    records : as of `records.records`
+    records : as of `records.record_table`
     pairs : PairSet
         Images are asked for only where a rule looks at them, those of a pair twice at most: give `CachedPairs`.
     fit : FitAtTruth

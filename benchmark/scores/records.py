@@ -36,31 +36,12 @@ from phibench.estimator.geometry.least_squares_depth import nominal_depth
 from phibench.estimator.geometry.phi import outline_circle
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.estimator.interface import OK, Answer, Outcome, Spot
-from phibench.estimator.pair_set import ImageTruth, PairSet, PairTruth
+from phibench.estimator.pair_set import ImageTruth, PairTruth
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import POSITIONS, Rig
 
 _NO_MATRIX = np.full((2, 2), np.nan)
 _BAYER = {(0, 0): "red", (1, 0): "green in red row", (0, 1): "green in blue row", (1, 1): "blue"}
-
-
-def records(pairs: PairSet, outcomes: Iterable[Outcome], rules: Rules) -> pl.DataFrame:
-    """Records of a run, `COLUMNS` and `COUNTED`, two rows per pair in the order of their numbers.
-
-    Parameters
-    ----------
-    pairs : PairSet
-        Truths are taken of the pairs that have an outcome.
-    outcomes : one per pair
-
-    Raises
-    ------
-    DatasetError
-        If a pair has several outcomes, a number is none of the set, or the set is sealed.
-    """
-    ordered = in_order(outcomes, len(pairs))
-    table = record_table([pairs.truth(outcome.number) for outcome in ordered], ordered, rules)
-    return with_missed(table, missed_relative(table, rules))
 
 
 def missed_relative(table: pl.DataFrame, rules: Rules) -> float:
@@ -81,7 +62,7 @@ def with_missed(table: pl.DataFrame, missed: float) -> pl.DataFrame:
 
 
 def record_table(truths: Sequence[PairTruth], outcomes: Sequence[Outcome], rules: Rules) -> pl.DataFrame:
-    """`COLUMNS` of truths and outcomes side by side."""
+    """Records of a run: `COLUMNS` of truths and outcomes side by side, two rows per pair, by number."""
     if not truths:
         raise DatasetError("a score of no pairs: give at least one")
     index: dict[tuple[Rig, Rig, int], list[int]] = {}

@@ -109,7 +109,7 @@ def refused(records: pl.DataFrame) -> str:
 
     Parameters
     ----------
-    records : as of `records.records`
+    records : as of `records.record_table`
     """
     said = set(records.select("failure", "status").rows())
     ((failure, status),) = said if len(said) == 1 else (("", ""),)
@@ -270,7 +270,7 @@ def failure_line(records: pl.DataFrame) -> str:
 
     Parameters
     ----------
-    records : as of `records.records`
+    records : as of `records.record_table`
     """
     asked = records.filter(pl.col("image") == "down")
     said = Counter(asked.select("failure", "message").rows())

@@ -42,7 +42,7 @@ def outcomes_of_records(table: pl.DataFrame) -> list[Outcome]:
 
     Parameters
     ----------
-    table : as of `records.records`, two rows for each pair, down and up
+    table : as of `records.record_table`, two rows for each pair, down and up
 
     Raises
     ------

@@ -6,18 +6,21 @@ the reflection point, so that neither comes from what is tested.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
+import polars as pl
 from helpers.oracles import alhazen_quartic, true_pixel, true_reflection
 from scipy.linalg import block_diag
 
+from phibench.benchmark.scores.answer_errors import Rules
+from phibench.benchmark.scores.records import in_order, missed_relative, record_table, with_missed
 from phibench.datasets.frames.sensor_card import sensor_card
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.estimator.interface import Answer, Outcome, Pair, Spot
-from phibench.estimator.pair_set import ImageTruth, PairTruth
+from phibench.estimator.pair_set import ImageTruth, PairSet, PairTruth
 from phibench.scenes.random_streams import generator
 from phibench.scenes.rig import Rig
 
@@ -208,3 +211,10 @@ def _of_the_point(t: PairTruth, seed: int, directions: np.ndarray, spread: float
     uv = np.concatenate([t.down.uv_px, t.up.uv_px]) + M @ move
     D = np.linalg.norm((point_of(t) + directions @ move)[:2] - RIG.at(0.0).sphere_centre_m[:2])
     return Answer(Spot((uv[0], uv[1])), Spot((uv[2], uv[3])), float(D))
+
+
+def records(pairs: PairSet, outcomes: Iterable[Outcome], rules: Rules) -> pl.DataFrame:
+    """Records of a run with what missed pairs count, as a score has them."""
+    ordered = in_order(outcomes, len(pairs))
+    table = record_table([pairs.truth(outcome.number) for outcome in ordered], ordered, rules)
+    return with_missed(table, missed_relative(table, rules))

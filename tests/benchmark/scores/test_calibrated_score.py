@@ -10,13 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scipy
-from helpers.bench_cases import RIG, Cases, cases
+from helpers.bench_cases import RIG, Cases, cases, records
 
 from phibench.benchmark.pair_sets.wanted_pairs import CalibratedPairs, of_calibration
 from phibench.benchmark.reports import bench as benching
 from phibench.benchmark.scores.answer_errors import Rules
 from phibench.benchmark.scores.metrics import measure, prepared
-from phibench.benchmark.scores.records import records
 from phibench.benchmark.sealed.score_check import check_score
 from phibench.calibration.rig.bundle import Bundle
 from phibench.calibration.rig.calibration_file import Calibration, CalibrationError, read_calibration, write_calibration

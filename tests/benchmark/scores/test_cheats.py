@@ -22,6 +22,7 @@ from helpers.bench_cases import (
     cases,
     constant,
     outcomes,
+    records,
     sampler,
     silent,
     truth_itself,
@@ -44,7 +45,6 @@ from phibench.benchmark.scores.beyond_images import (
     searched_px2,
 )
 from phibench.benchmark.scores.metrics import measure, prepared
-from phibench.benchmark.scores.records import records
 from phibench.datasets.read import open_finished
 from phibench.estimator.interface import Answer, Spot
 from phibench.estimator.pair_set import CachedPairs, PairTruth

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.bench_cases import Cases, cases, outcomes, sampler, scaled, shifted, silent, truth_itself
+from helpers.bench_cases import Cases, cases, outcomes, records, sampler, scaled, shifted, silent, truth_itself
 
 from phibench.benchmark.scores.answer_errors import Rules
 from phibench.benchmark.scores.compare import (
@@ -18,7 +18,6 @@ from phibench.benchmark.scores.compare import (
     refuse_different,
 )
 from phibench.benchmark.scores.metrics import METRICS
-from phibench.benchmark.scores.records import records
 from phibench.benchmark.scores.score import score_outcomes
 from phibench.benchmark.scores.score_document import MethodCard
 from phibench.benchmark.scores.score_files import read_score, write_score

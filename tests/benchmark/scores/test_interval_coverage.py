@@ -9,12 +9,11 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-from helpers.bench_cases import cases, outcomes, sampler
+from helpers.bench_cases import cases, outcomes, records, sampler
 
 from phibench.benchmark.scores.answer_errors import Rules
 from phibench.benchmark.scores.compare import compare_records
 from phibench.benchmark.scores.intervals import Clusters, estimates, quantile_of, rms_of
-from phibench.benchmark.scores.records import records
 
 RULES = Rules(resamples=999)
 TRIALS, COMPARISONS = 200, 100

@@ -10,7 +10,7 @@ from itertools import product
 import numpy as np
 import pytest
 import scipy
-from helpers.bench_cases import cases, outcomes, sampler
+from helpers.bench_cases import cases, outcomes, records, sampler
 
 from phibench.benchmark.scores import intervals as ours
 from phibench.benchmark.scores.answer_errors import Rules
@@ -27,7 +27,6 @@ from phibench.benchmark.scores.intervals import (
     rms_ratio_of,
 )
 from phibench.benchmark.scores.metrics import measure, prepared
-from phibench.benchmark.scores.records import records
 
 RULES = Rules(resamples=999)
 SINGLE = 50

@@ -12,6 +12,7 @@ from helpers.bench_cases import (
     change,
     constant,
     outcomes,
+    records,
     sampler,
     scaled,
     shifted,
@@ -24,7 +25,6 @@ from scipy.optimize import minimize_scalar
 from phibench.benchmark.scores.answer_errors import MATCH_PX, Rules
 from phibench.benchmark.scores.metrics import METRICS, measure, prepared
 from phibench.benchmark.scores.record_columns import COLUMNS, COUNTED
-from phibench.benchmark.scores.records import records
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.estimator.interface import Answer, Spot
 

@@ -17,6 +17,7 @@ from helpers.bench_cases import (
     knows_boards,
     outcomes,
     point_of,
+    records,
     sampler,
     shifted,
     silent,
@@ -29,7 +30,6 @@ from phibench.benchmark.isolation.method_references import resolve
 from phibench.benchmark.scores.answer_errors import Rules
 from phibench.benchmark.scores.beyond_images import MODEL_MARGIN, RAW_MARGIN, excesses
 from phibench.benchmark.scores.metrics import METRICS, PAIR_TWINS, applies, measure, prepared
-from phibench.benchmark.scores.records import records
 from phibench.benchmark.scores.score import score_outcomes
 from phibench.benchmark.scores.score_document import Flag, MethodCard
 from phibench.benchmark.scores.score_tables import leaderboard, scores_csv, scores_json

@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import polars as pl
 import pytest
-from helpers.bench_cases import RIG, Cases, cases, change, outcomes, sampler, shifted, truth_itself
+from helpers.bench_cases import RIG, Cases, cases, change, outcomes, records, sampler, shifted, truth_itself
 from helpers.oracles import random_rig, true_pixel
 from scipy.linalg import cholesky, solve_triangular
 
 from phibench.benchmark.scores.answer_errors import MATCH_PX, Rules, kept, phi_of
 from phibench.benchmark.scores.record_columns import COLUMNS, COUNTED
-from phibench.benchmark.scores.records import record_table, records, with_missed
+from phibench.benchmark.scores.records import record_table, with_missed
 from phibench.datasets.common.errors import DatasetError
 from phibench.estimator.geometry.phi import CONVENTIONS, outline_circle
 from phibench.estimator.geometry.triangulate import depth_exact

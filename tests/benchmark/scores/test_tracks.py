@@ -8,13 +8,12 @@ import numpy as np
 import polars as pl
 import pytest
 import scipy
-from helpers.bench_cases import Cases, cases, change, outcomes, sampler, shifted, truth_itself
+from helpers.bench_cases import Cases, cases, change, outcomes, records, sampler, shifted, truth_itself
 
 from phibench.benchmark.pair_sets.dataset_pairs import BOX_PX, tracks_of
 from phibench.benchmark.scores.answer_errors import MATCH_PX, Rules
 from phibench.benchmark.scores.metrics import measure, prepared
 from phibench.benchmark.scores.record_columns import LEAST_RATIO, THRESHOLDS, perfect_log
-from phibench.benchmark.scores.records import records
 from phibench.estimator.interface import Answer, Outcome, Spot
 from phibench.estimator.pair_set import PairTruth
 
