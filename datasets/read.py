@@ -344,8 +344,8 @@ class Sample(ShortForm):
 
         Parameters
         ----------
-        preset : "ideal", "mono-raw", "bayer-raw", "srgb8", "yuyv" or "mjpeg"
-            Where the camera's chain ends.
+        preset : str
+            Name of a sensor's preset, such as "mjpeg": where the camera's chain ends.
         draw : int
             Number of the noise realisation, 0 or above.
         laser_off : bool

@@ -114,7 +114,8 @@ class EasyDensePairs:
 
     Parameters
     ----------
-    preset : "bayer-raw", "mono-raw", "srgb8", "yuyv" or "mjpeg"
+    preset : str
+        Name of a sensor's preset that ends in pixels, such as "mjpeg".
 
     Raises
     ------

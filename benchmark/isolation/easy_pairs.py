@@ -212,7 +212,8 @@ class EasyPairs(ShortForm):
 
     Parameters
     ----------
-    preset : "bayer-raw", "mono-raw", "srgb8", "yuyv" or "mjpeg"
+    preset : str
+        Name of a sensor's preset that ends in pixels, such as "mjpeg".
     rig : Rig
         Its whole mirror should be in the image.
     laser_off, hinted : bool

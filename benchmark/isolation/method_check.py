@@ -87,7 +87,8 @@ def check_method(
     ----------
     reference : str
         As for `runner.run_method`.
-    preset : "bayer-raw", "mono-raw", "srgb8", "yuyv" or "mjpeg"
+    preset : str
+        Name of a sensor's preset that ends in pixels, such as "mjpeg".
     limits : RunLimits, optional
     count : int
         How many pairs.

@@ -20,6 +20,7 @@ from phibench.datasets.common.errors import DatasetError, whole_number
 from phibench.datasets.frames.distractors import Distractor, distractors, present
 from phibench.datasets.frames.frame_request import FrameOptions, FrameRequest, sample_stream
 from phibench.datasets.frames.frame_source import FrameSource, has_place
+from phibench.datasets.frames.sensor_card import presets_of
 from phibench.datasets.frames.sensor_file import SensorFile
 from phibench.datasets.read import Dataset, Sample
 from phibench.datasets.recipe.tables import FramesTable
@@ -134,7 +135,7 @@ def _of_sample(
 def _request(sample: Sample, preset: str, sensor: SensorFile | None) -> FrameRequest:
     request = sample.frame_request(FrameOptions(preset, {} if sensor is None else dict(sensor.numbers)))
     if request.sensor().output == "electrons":
-        raise DatasetError(f"preset '{preset}' ends before the pixels: take bayer-raw, mono-raw, srgb8, yuyv or mjpeg")
+        raise DatasetError(f"preset '{preset}' ends before the pixels: take one of {', '.join(presets_of())}")
     return request
 
 

@@ -44,7 +44,7 @@ class FrameRequest:
     Parameters
     ----------
     preset : str
-        Sensor preset: "ideal", "mono-raw", "bayer-raw", "srgb8", "yuyv" or "mjpeg".
+        Name of a sensor's preset, such as "mjpeg"; "ideal" gives expected electrons.
     exposure : float, "auto" or None
         Seconds; "auto" is the camera's auto exposure for the down image, kept for all; None is the preset's time.
     lamp_level, laser_level : float

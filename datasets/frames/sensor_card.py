@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from phibench.render.sensor.settings import Sensor, sensor
+from phibench.render.sensor.settings import Sensor, preset_outputs, sensor
 
 
 @dataclass(frozen=True)
@@ -112,6 +112,12 @@ def sensor_card(preset: str = "bayer-raw", **changes: Any) -> SensorCard:
         If there is no such preset, or a change is not allowed.
     """
     return card_of(sensor(preset, **changes))
+
+
+def presets_of(*outputs: str) -> tuple[str, ...]:
+    """Names of the presets with one of these outputs; of all that end in pixels, if none is given."""
+    known = preset_outputs().items()
+    return tuple(name for name, output in known if (output in outputs if outputs else output != "electrons"))
 
 
 def card_of(s: Sensor) -> SensorCard:

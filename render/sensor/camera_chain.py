@@ -48,7 +48,7 @@ from phibench.render.sensor.processing import (
     white_balanced,
     yuyv,
 )
-from phibench.render.sensor.settings import Sensor, SensorError
+from phibench.render.sensor.settings import Sensor, SensorError, preset_outputs
 from phibench.scenes.camera import Camera
 from phibench.scenes.frames import Array
 
@@ -160,9 +160,8 @@ class Chain:
     def photo_electrons(self, light: Light, region: Region, gain: float = 1.0) -> Array:
         """Expected photo-electrons of the pixels, shape (h, w), without the fixed pattern."""
         if self.sensor.output == "electrons":
-            raise SensorError(
-                f"sensor preset '{self.sensor.name}' ends before the pixels: take 'bayer-raw' or 'mono-raw'"
-            )
+            raw = " or ".join(repr(name) for name, output in preset_outputs().items() if output == "raw")
+            raise SensorError(f"sensor preset '{self.sensor.name}' ends before the pixels: take {raw}")
         return expected_electrons(light, self.sensor, self.camera, region, gain)
 
     def pattern(self, region: Region) -> FixedPattern:

@@ -146,6 +146,12 @@ def sensor(preset: str = "mjpeg", **changes: Any) -> Sensor:
     return _checked(preset, {"name": preset, **tables["webcam"], **tables["presets"][preset], **changes})
 
 
+def preset_outputs() -> dict[str, str]:
+    """Output of every preset, by name."""
+    tables = _tables()
+    return {name: str({**tables["webcam"], **table}["output"]) for name, table in tables["presets"].items()}
+
+
 class PresetsFile(BaseModel):
     """Content of `settings_presets.toml`; the numbers of a preset are checked when it is asked for."""
 

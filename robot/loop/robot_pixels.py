@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phibench.datasets.film.moving_camera import BakedRoom, MovingCamera, window_around
-from phibench.datasets.frames.sensor_card import SensorCard, sensor_card
+from phibench.datasets.frames.sensor_card import SensorCard, presets_of, sensor_card
 from phibench.estimator.geometry.status import Status
 from phibench.estimator.interface import Box
 from phibench.estimator.spots.candidates import peaks
@@ -65,7 +65,7 @@ def pixel_form(preset: str) -> tuple[tuple[int, ...], type[np.generic], int]:
     """
     card = sensor_card(preset)
     if card.output == "electrons":
-        raise SceneError(f"preset '{preset}': pixels of a robot are codes; take bayer-raw, mono-raw, srgb8 or mjpeg")
+        raise SceneError(f"preset '{preset}': pixels of a robot are codes; take one of {', '.join(presets_of())}")
     if card.output == "raw":
         return (), np.uint16, card.top_dn
     return ((2,) if card.output == "yuyv" else (3,)), np.uint8, 255
@@ -163,8 +163,8 @@ class SpotReader:
         self._cards = [replace(sensor_card(preset), exposure_s=exposure) for exposure in EXPOSURES_S]
         if self._cards[0].output != "raw":
             raise SceneError(
-                f"preset '{preset}': the policies here read raw pixels; take bayer-raw or mono-raw, or read the "
-                "pixels of the environment yourself"
+                f"preset '{preset}': the policies here read raw pixels; take {' or '.join(presets_of('raw'))}, or read "
+                "the pixels of the environment yourself"
             )
         self.rig, self._least_z = rig, _LEAST_Z[fidelity]
         self._sigma_px = rig.camera.blur_sigma_px
