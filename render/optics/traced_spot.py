@@ -35,6 +35,9 @@ from phibench.scenes.rig import View
 
 _RAYS_AT_ONCE = 2**16  # of a beam: more take a gigabyte
 _STEP_PX = 1e-3
+_REST_PX = 1e-11  # last step of a search for a place
+_NEAR_PX = 1e-3  # of one for the middle of drawn places, whose density is known wherever it lies
+_SMOOTH_PX = 1e-6  # of one whose slopes count: a thousandth of their own `_STEP_PX`
 _NEWTON_STEPS = 8
 _HALVINGS = 6
 
@@ -63,13 +66,22 @@ def aim(view: View, spot: LaserSpot, bundle: RayBundle, wall_m: Array, start_px:
         Points in the spot's plane, metres from the spot's centre along its tangents.
     start_px : array, shape (N, 2)
     """
+    return _aimed(view, spot, bundle, wall_m, start_px, _REST_PX)[0]
+
+
+def _aimed(
+    view: View, spot: LaserSpot, bundle: RayBundle, wall_m: Array, start_px: Array, rest_px: float
+) -> tuple[Array, Array]:
+    """As `aim`, to a last step of `rest_px`, and about d(wall) / d(u, v), shape (N, 2, 2): before that step.
+
+    Rays are aimed across the line of sight: on a wall that is seen edge on there is no place for some of them.
+    """
     targets = np.array(spot.position_world_m) + wall_m @ np.stack(spot.tangents())
     sight = targets - _reflect(view, spot, start_px, bundle).starts_m
     sight /= np.linalg.norm(sight, axis=-1, keepdims=True)
     across = _across(sight)
 
     def missed(uv: Array) -> Array:
-        """By how much rays pass their points, across the line of sight: a wall seen edge on has no place for some."""
         rays = _reflect(view, spot, uv, bundle)
         offset = rays.starts_m - targets
         distance = -np.einsum("ni,ni->n", offset, sight) / np.einsum("ni,ni->n", rays.directions, sight)
@@ -77,11 +89,13 @@ def aim(view: View, spot: LaserSpot, bundle: RayBundle, wall_m: Array, start_px:
 
     uv, miss = start_px, missed(start_px)
     for _ in range(_NEWTON_STEPS):
-        step = _solve(_jacobian(missed, uv), miss)
+        slopes = _jacobian(missed, uv)
+        step = _solve(slopes, miss)
         uv, miss = _step(missed, uv, step)
-        if not np.any(np.abs(step) > 1e-11):
+        if not np.any(np.abs(step) > rest_px):
             break
-    return uv
+    seen = across @ np.stack(spot.tangents()).T  # of the wall's tangents across the sight
+    return uv, np.stack([_solve(seen, slopes[:, :, k]) for k in (0, 1)], axis=-1)
 
 
 def _across(directions: Array) -> Array:
@@ -157,8 +171,9 @@ def trace_spot(view: View, spot: LaserSpot, room: GeometryLike, truth: SpotTruth
     bundle = RayBundle(view.rig.camera.aperture_radius_m * _disc(x[:, :2]), _facets(view, x[:, 4:]))
     wall, density = _wall_samples(spot, x[:, 2:4])
     if view.rig.mirror.radius_m is None:
-        uv = aim(view, spot, bundle, wall, through_chief_point(view, truth, bundle.lens_m))
-        jacobian = _wall_jacobian(view, spot, uv, bundle)
+        start = through_chief_point(view, truth, bundle.lens_m)
+        uv = _aimed(view, spot, bundle, wall, start, _SMOOTH_PX)[0]
+        jacobian = _jacobian(lambda place: _on_wall(view, spot, place, bundle), uv)
     else:
         uv, jacobian = _linear_aim(view, spot, bundle, wall, truth)
     with np.errstate(invalid="ignore"):
@@ -181,13 +196,13 @@ def _moments(view: View, uv: Array, points: Array, watts: Array) -> TracedSpot:
 
 
 def _linear_aim(view: View, spot: LaserSpot, bundle: RayBundle, wall: Array, truth: SpotTruth) -> tuple[Array, Array]:
-    """Film samples: the exact image of the spot's centre for each ray, plus a linear map of the wall sample.
+    """Film samples: the image of the spot's centre for each ray, plus a linear map of the wall sample.
 
-    Sampling only: where on the wall such a ray really lands, and with what weight, is traced afterwards.
+    Sampling only: where on the wall such a ray really lands, and with what weight, is traced afterwards. So centre and
+    map need not be exact: what counts is that the density is that of this map.
     """
     start = through_chief_point(view, truth, bundle.lens_m)
-    centres = aim(view, spot, bundle, np.zeros_like(wall), start)
-    jacobian = _wall_jacobian(view, spot, centres, bundle)
+    centres, jacobian = _aimed(view, spot, bundle, np.zeros_like(wall), start, _NEAR_PX)
     return centres + _solve(jacobian, wall), jacobian
 
 
@@ -243,8 +258,10 @@ def _reflect(view: View, spot: LaserSpot, uv: Array, bundle: RayBundle) -> _Refl
     """Reflect each ray at its facet; the weight (o.m) / (o.n n.m) turns drawn facets into f_r cos_i, shadowing 1."""
     origins, directions = lens_rays(view, uv, bundle.lens_m)
     rays = reflect(view, origins, directions)
-    facet = rays.normals + np.einsum("nk,nki->ni", bundle.slopes, _tangents(view, spot, rays))
-    facet /= np.linalg.norm(facet, axis=-1, keepdims=True)
+    facet = rays.normals
+    if view.rig.mirror.roughness_alpha > 0.0:
+        facet = facet + np.einsum("nk,nki->ni", bundle.slopes, _tangents(view, spot, rays))
+        facet /= np.linalg.norm(facet, axis=-1, keepdims=True)
     cos_facet = -np.einsum("ni,ni->n", facet, directions)
     out = directions + 2.0 * cos_facet[:, None] * facet
     # projected area of the facet over that of the smooth mirror, seen along the ray
@@ -279,11 +296,6 @@ def _meet(spot: LaserSpot, origins: Array, directions: Array) -> tuple[Array, Ar
     distance = (centre - origins) @ normal / (directions @ normal)
     points = origins + distance[:, None] * directions
     return (points - centre) @ np.stack(spot.tangents()).T, points
-
-
-def _wall_jacobian(view: View, spot: LaserSpot, uv: Array, bundle: RayBundle) -> Array:
-    """d(wall) / d(u, v), shape (N, 2, 2)."""
-    return _jacobian(lambda uv: _on_wall(view, spot, uv, bundle), uv)
 
 
 def _jacobian(function: Callable[[Array], Array], uv: Array) -> Array:
@@ -329,7 +341,8 @@ def _beam_rays(
 ) -> tuple[Array, Array, Array]:
     """Film positions (n, 2), points on surfaces (n, 3) and watts over density (n,) of numbers `x`, shape (n, 7)."""
     bundle = RayBundle(view.rig.camera.aperture_radius_m * _disc(x[:, :2]), _facets(view, x[:, 4:6]))
-    centres = aim(view, spot, bundle, np.zeros((len(x), 2)), through_chief_point(view, truth, bundle.lens_m))
+    start = through_chief_point(view, truth, bundle.lens_m)
+    centres, _ = _aimed(view, spot, bundle, np.zeros((len(x), 2)), start, _NEAR_PX)
     # dimension 6 chooses the part of the image, by its share of the light
     chosen = np.searchsorted(np.cumsum([part.share for part in parts])[:-1], x[:, 6], side="right")
     z = ndtri(x[:, 2:4])
