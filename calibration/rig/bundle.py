@@ -33,14 +33,15 @@ from phibench.calibration.outline.first_circle import sphere_from_rays
 from phibench.calibration.outline.limb_image import PoseMeasurement
 from phibench.calibration.rig.vertical_edges import vertical_of
 from phibench.datasets.common.errors import DatasetError
-from phibench.estimator.geometry.reflection import image_of, reflect, reflect_jacobian
+from phibench.estimator.geometry.reflection import image_of, reflect_both
 from phibench.estimator.geometry.rig_parameters import PARAMETERS, changed, has_effect, prior_sigmas, stroke_of
 from phibench.estimator.geometry.triangulate import depth_exact
-from phibench.scenes.frames import Array, as_vector
+from phibench.scenes.frames import Array, as_vector, cross
 from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.rig import Rig, View
 from phibench.scenes.validation import SceneError
 
+_FORWARD = np.finfo(float).eps ** 0.5  # of an unknown, or of 1 where it is less: the step of a difference
 _NEWTON = 3  # steps from pixels nearby: each squares what is left
 _TURNS = ("mirror_tilt_x_rad", "mirror_tilt_y_rad")
 _TURN_RAD = 0.01  # for differences of a tilt
@@ -163,7 +164,9 @@ def calibrate(
     problem = _Problem(nominal, outline, tuple(spots), vertical, prior, free, turned)
     start = np.concatenate([np.zeros(free.size), *(_start(nominal, spot) for spot in spots)])
     try:
-        solution = optimize.least_squares(problem.residuals, start, x_scale="jac", xtol=1e-12, ftol=1e-12)
+        solution = optimize.least_squares(
+            problem.residuals, start, problem.jacobian, x_scale="jac", xtol=1e-12, ftol=1e-12
+        )
     except SceneError as error:  # a step led to a rig that cannot be
         raise DatasetError(f"the calibration does not come to rest: {error}") from error
     if not solution.success or not np.isfinite(solution.cost):
@@ -218,6 +221,23 @@ class _Problem:
         if self.spots:
             parts.append(_spot_residuals(rig, values, self.spots, points))
         return np.concatenate(parts)
+
+    def jacobian(self, x: Array) -> Array:
+        """Forward differences of `residuals`. A point moves its own spot's rows alone: so all points move at once."""
+        f, n = self.residuals(x), self.free.size
+        step = x + _FORWARD * np.where(x >= 0.0, 1.0, -1.0) * np.maximum(1.0, np.abs(x)) - x
+        J, spots = np.zeros((f.size, x.size)), np.arange(len(self.spots))
+
+        def change(columns: NDArray[np.intp]) -> Array:
+            return self.residuals(x + np.where(np.isin(np.arange(x.size), columns), step, 0.0)) - f
+
+        for i in range(n):
+            J[:, i] = change(np.array([i])) / step[i]
+        own = _spot_of_rows(self.spots)
+        for columns in (n + 3 * spots + axis for axis in range(3 if self.spots else 0)):
+            rows = change(columns)[-own.size :, None] / step[columns]
+            J[-own.size :, columns] = np.where(own[:, None] == spots, rows, 0.0)
+        return J
 
 
 @dataclass(frozen=True)
@@ -345,20 +365,32 @@ def _spot_residuals(rig: Rig, values: Array, spots: Sequence[KnownSpot], points:
         ],
         axis=-1,
     )
-    sigma = np.array([(s.depth_sigma_m, s.height_sigma_m, s.azimuth_sigma_rad) for s in spots])
+    sigma = _place_sigmas(spots)
     return np.concatenate([*seen, (known / sigma)[np.isfinite(sigma)]])
+
+
+def _place_sigmas(spots: Sequence[KnownSpot]) -> Array:
+    """Sigmas of distance, height and azimuth, shape (K, 3); infinite where one was not measured."""
+    return np.array([(s.depth_sigma_m, s.height_sigma_m, s.azimuth_sigma_rad) for s in spots]).reshape(-1, 3)
+
+
+def _spot_of_rows(spots: Sequence[KnownSpot]) -> NDArray[np.intp]:
+    """Spot to which each row of `_spot_residuals` belongs."""
+    every = np.arange(len(spots))
+    pixels, places = np.repeat(every, 2), np.repeat(every, 3).reshape(-1, 3)
+    return np.concatenate([pixels, pixels, places[np.isfinite(_place_sigmas(spots))]])
 
 
 def seen_at(view: View, points: Array, near_px: Array) -> Array:
     """Pixels (K, 2) at which world points (K, 3) are seen in the mirror, by Newton's method from pixels nearby."""
     uv = np.asarray(near_px, float)
     for _ in range(_NEWTON):
-        ray, J = reflect(view, uv), reflect_jacobian(view, uv)
+        ray, J = reflect_both(view, uv)
         r, w = ray.direction_world, points - ray.origin_world_m
         t = np.sum(w * r, axis=-1)[:, None, None]
         # what is across the ray, seen along two of its normals
-        first = np.cross(r, np.where(np.abs(r[:, 2:]) < 0.9, [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]))
-        basis = np.stack([first, np.cross(r, first)], axis=-2)
+        first = cross(r, np.where(np.abs(r[:, 2:]) < 0.9, [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]))
+        basis = np.stack([first, cross(r, first)], axis=-2)
         slope = -basis @ (J.origin_m_per_px + t * J.direction_per_px)
         uv = uv - np.linalg.solve(slope, basis @ w[..., None])[..., 0]
     return uv

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from phibench.estimator.geometry.reflection import image_of, room_rays, room_rays_jacobian
+from phibench.estimator.geometry.reflection import image_of, room_rays_both
 from phibench.estimator.geometry.status import Status, StatusArray, first_fault, flag, keep, stroke_status
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import Rig
@@ -47,7 +47,7 @@ def up_image(rig: Rig, stroke_m: ArrayLike, uv_down_px: Array, inverse_depth_per
     """
     view, uv = rig.at(0.0), np.asarray(uv_down_px, float)
     q, h = np.asarray(inverse_depth_per_m, float), np.asarray(stroke_m, float)
-    ray, J = room_rays(view, uv), room_rays_jacobian(view, uv)
+    ray, J = room_rays_both(view, uv)
     with np.errstate(all="ignore"):
         D = 1.0 / q
         t = range_at(ray.origin_world_m - view.sphere_centre_m, ray.direction_world, D)

@@ -21,7 +21,7 @@ from phibench.datasets.common.errors import DatasetError
 from phibench.estimator.geometry.paper_depth import depth_paper, depth_revolved, paper_gradient, revolved_gradient
 from phibench.estimator.geometry.status import DepthEstimate
 from phibench.scenes.form_error import HARMONICS, Form, Level, gradients_by_parameter, level
-from phibench.scenes.frames import Array, Pose
+from phibench.scenes.frames import Array, Pose, cross
 from phibench.scenes.mirror import Mirror, SphereMirror
 from phibench.scenes.revolved_mirror import RevolvedMirror
 from phibench.scenes.revolved_profile import FormedProfile, Heights, Profile, height_level, lengthening
@@ -111,7 +111,7 @@ def _hit_at(mirror: Mirror, d: Array, distance: Array, pose: Pose) -> Hit:
     P = t * d - pose.t
     n = unit_normal(mirror.level(P @ pose.R)) @ pose.R.T
     cos_i = -np.sum(d * n, axis=-1, keepdims=True)
-    return Hit(d, t, P, n, cos_i, np.linalg.norm(np.cross(d, n), axis=-1, keepdims=True), n)
+    return Hit(d, t, P, n, cos_i, np.linalg.norm(cross(d, n), axis=-1, keepdims=True), n)
 
 
 # Sphere.
@@ -126,7 +126,7 @@ class _Round:
     def first_hit(self, d: Array, pose: Pose) -> Hit:
         s, radius = pose.t, self.mirror.radius_m
         b = np.sum(d * s, axis=-1, keepdims=True)
-        miss2 = np.sum(np.cross(d, s) ** 2, axis=-1, keepdims=True)  # squared distance of the ray from the centre
+        miss2 = np.sum(cross(d, s) ** 2, axis=-1, keepdims=True)  # squared distance of the ray from the centre
         # NaN where the line misses; one that hits does so ahead, because a Rig has its whole sphere before the camera
         root = np.sqrt(radius**2 - miss2)
         # t^2 - 2 b t + c = 0; the near root b - root loses digits, c / (b + root) does not

@@ -18,7 +18,7 @@ import numpy as np
 from phibench.estimator.geometry.mirror_geometry import Hit, geometry_of
 from phibench.estimator.geometry.status import Status, StatusArray, first_fault, flag, keep
 from phibench.scenes.camera import Camera
-from phibench.scenes.frames import Array
+from phibench.scenes.frames import Array, cross
 from phibench.scenes.glass_tube import GlassTube
 from phibench.scenes.rig import View
 
@@ -70,18 +70,7 @@ def reflect(view: View, uv_px: Array) -> Reflection:
     Reflection
         In the world frame.
     """
-    with np.errstate(all="ignore"):
-        hit = geometry_of(view.rig.mirror).first_hit(view.rig.camera.rays(uv_px), view.rig.T_camera_sphere)
-        status = _status(hit)
-        r = hit.d + 2.0 * hit.cos_i * hit.n  # d - 2 (d.n) n with d.n = -cos i
-    T = view.T_world_camera
-    return Reflection(
-        keep(view.sphere_centre_m + T.directions(hit.P), status),
-        keep(T.directions(r), status),
-        keep(T.directions(hit.n), status),
-        keep(np.arctan2(hit.sin_i, hit.cos_i)[..., 0], status),
-        status,
-    )
+    return _reflection(view, *_first_hit(view, uv_px))
 
 
 def reflect_jacobian(view: View, uv_px: Array) -> ReflectionJacobian:
@@ -91,10 +80,37 @@ def reflect_jacobian(view: View, uv_px: Array) -> ReflectionJacobian:
     ----------
     uv_px : shape (..., 2), pixels
     """
+    return _reflection_jacobian(view, uv_px, *_first_hit(view, uv_px))
+
+
+def reflect_both(view: View, uv_px: Array) -> tuple[Reflection, ReflectionJacobian]:
+    """`reflect` and `reflect_jacobian`: both ask for the same hit."""
+    hit, status = _first_hit(view, uv_px)
+    return _reflection(view, hit, status), _reflection_jacobian(view, uv_px, hit, status)
+
+
+def _first_hit(view: View, uv_px: Array) -> tuple[Hit, StatusArray]:
+    with np.errstate(all="ignore"):
+        hit = geometry_of(view.rig.mirror).first_hit(view.rig.camera.rays(uv_px), view.rig.T_camera_sphere)
+        return hit, _status(hit)
+
+
+def _reflection(view: View, hit: Hit, status: StatusArray) -> Reflection:
+    T = view.T_world_camera
+    with np.errstate(all="ignore"):
+        r = hit.d + 2.0 * hit.cos_i * hit.n  # d - 2 (d.n) n with d.n = -cos i
+    return Reflection(
+        keep(view.sphere_centre_m + T.directions(hit.P), status),
+        keep(T.directions(r), status),
+        keep(T.directions(hit.n), status),
+        keep(np.arctan2(hit.sin_i, hit.cos_i)[..., 0], status),
+        status,
+    )
+
+
+def _reflection_jacobian(view: View, uv_px: Array, hit: Hit, status: StatusArray) -> ReflectionJacobian:
     geometry, pose = geometry_of(view.rig.mirror), view.rig.T_camera_sphere
     with np.errstate(all="ignore"):
-        hit = geometry.first_hit(view.rig.camera.rays(uv_px), pose)
-        status = _status(hit)
         d, n, cos_i, t, outward = (x[..., None] for x in (hit.d, hit.n, hit.cos_i, hit.t, hit.outward))
         dd = ray_jacobian(view.rig.camera, uv_px)
         dt = -t * _dot(outward, dd) / _dot(outward, d)  # P stays on the mirror: n . dP = 0
@@ -145,7 +161,7 @@ def ray_slope(view: View, uv_px: Array, points_world_m: Array) -> Array:
 
     At a distance t along the ray r from the mirror point P, d(P + t r)/d(u, v) along the two directions of `ray_basis`.
     """
-    ray, J = room_rays(view, uv_px), room_rays_jacobian(view, uv_px)
+    ray, J = room_rays_both(view, uv_px)
     along = np.sum((points_world_m - ray.origin_world_m) * ray.direction_world, axis=-1)[..., None, None]
     return ray_basis(ray.direction_world) @ (J.origin_m_per_px + along * J.direction_per_px)
 
@@ -153,9 +169,9 @@ def ray_slope(view: View, uv_px: Array, points_world_m: Array) -> Array:
 def ray_basis(directions: Array) -> Array:
     """Two unit vectors across each unit direction (..., 3), as rows: shape (..., 2, 3)."""
     least = np.eye(3)[np.argmin(np.nan_to_num(np.abs(directions)), axis=-1)]
-    first = np.cross(directions, least)
+    first = cross(directions, least)
     first = first / np.linalg.norm(first, axis=-1, keepdims=True)
-    return np.stack([first, np.cross(directions, first)], axis=-2)
+    return np.stack([first, cross(directions, first)], axis=-2)
 
 
 # -- glass tube around the mirror --------------------------------------------------------------------------------------
@@ -176,13 +192,21 @@ def room_rays(view: View, uv_px: Array) -> Reflection:
 
 def room_rays_jacobian(view: View, uv_px: Array) -> ReflectionJacobian:
     """Derivatives of `room_rays` by the pixel, analytically."""
-    J = reflect_jacobian(view, uv_px)
+    return room_rays_both(view, uv_px)[1]
+
+
+def room_rays_both(view: View, uv_px: Array) -> tuple[Reflection, ReflectionJacobian]:
+    """`room_rays` and `room_rays_jacobian`: both ask for the same hit."""
+    ray, J = reflect_both(view, uv_px)
     if view.tube is None:
-        return J
-    ray = reflect(view, uv_px)
+        return ray, J
     with np.errstate(all="ignore"):
-        _, _, origin, direction = _through_glass(view.tube, ray, J)
-    return replace(J, origin_m_per_px=keep(origin, ray.status), direction_per_px=keep(direction, ray.status))
+        places = _through_glass(view.tube, ray, J)
+    origin, direction, origin_per_px, direction_per_px = (keep(x, ray.status) for x in places)
+    return (
+        replace(ray, origin_world_m=origin, direction_world=direction),
+        replace(J, origin_m_per_px=origin_per_px, direction_per_px=direction_per_px),
+    )
 
 
 def _through_glass(tube: GlassTube, ray: Reflection, J: ReflectionJacobian | None) -> tuple[Array, Array, Array, Array]:
@@ -260,7 +284,7 @@ def image_of(view: View, points_world_m: Array) -> MirrorImage:
 
 def _newton(view: View, uv: Array, X: Array) -> tuple[Array, Array]:
     """Step of (u, v), shape (..., 2), and derivative by the point, shape (..., 2, 3), exact where the step is 0."""
-    ray, J = room_rays(view, uv), room_rays_jacobian(view, uv)
+    ray, J = room_rays_both(view, uv)
     w, r = X - ray.origin_world_m, ray.direction_world
     along = np.sum(w * r, axis=-1)
     e = w - along[..., None] * r

@@ -43,19 +43,25 @@ def flag(*cases: tuple[ArrayLike, Status]) -> StatusArray:
     *cases : pairs (condition, status)
         Conditions are boolean arrays that broadcast together.
     """
-    conditions = np.broadcast_arrays(*(np.asarray(condition, bool) for condition, _ in cases))
-    return np.asarray(np.select(conditions, [int(status) for _, status in cases], int(Status.OK)), np.int64)
+    conditions = [np.asarray(condition, bool) for condition, _ in cases]
+    status = np.full(np.broadcast_shapes(*(condition.shape for condition in conditions)), int(Status.OK), np.int64)
+    for condition, (_, value) in reversed(list(zip(conditions, cases, strict=True))):  # the first is written last
+        np.copyto(status, int(value), where=condition)
+    return status
 
 
 def first_fault(*statuses: ArrayLike) -> StatusArray:
     """Return the first status that is not OK, elementwise."""
-    arrays = np.broadcast_arrays(*(np.asarray(status, np.int64) for status in statuses))
-    return np.asarray(np.select([array != Status.OK for array in arrays], arrays, int(Status.OK)), np.int64)
+    arrays = [np.asarray(status, np.int64) for status in statuses]
+    first = np.full(np.broadcast_shapes(*(array.shape for array in arrays)), int(Status.OK), np.int64)
+    for array in reversed(arrays):
+        np.copyto(first, array, where=array != int(Status.OK))
+    return first
 
 
 def keep(values: Array, status: StatusArray) -> Array:
     """Return `values` with NaN where the status is not OK; trailing axes of `values` follow those of `status`."""
-    good = (status == Status.OK).reshape(status.shape + (1,) * (values.ndim - status.ndim))
+    good = (status == int(Status.OK)).reshape(status.shape + (1,) * (values.ndim - status.ndim))
     return np.where(good, values, np.nan)
 
 

@@ -43,7 +43,7 @@ from numpy.typing import NDArray
 
 from phibench.render.optics.revolved_reflection import revolved_determinant, revolved_points, rising_root
 from phibench.scenes.form_error import Form, Level, deviation, level
-from phibench.scenes.frames import Array, BoolArray
+from phibench.scenes.frames import Array, BoolArray, cross
 from phibench.scenes.glass_tube import GlassTube, across
 from phibench.scenes.mirror import Mirror, SphereMirror
 from phibench.scenes.revolved_mirror import RevolvedMirror
@@ -259,9 +259,9 @@ def _stretch(view: View, tube: GlassTube, found: MirrorPoints, eyes_m: Array) ->
             return across(np.einsum("nk,nki->ni", flat, tangents), ray, length)
 
         axis = np.broadcast_to(tube.axis, ray.shape)
-        by_moment = across(np.cross(tube.axis, found.points_m - tube.origin_m), ray, length)
+        by_moment = across(cross(tube.axis, found.points_m - tube.origin_m), ray, length)
         by_cosine = across(axis, ray, length)
-        moment_slope = by_moment + moved(np.cross(ray, axis) - by_moment)
+        moment_slope = by_moment + moved(cross(ray, axis) - by_moment)
         cosine_slope = by_cosine - moved(by_cosine)
         return tube.stretch(found.apparent_m, found.points_m, moment_slope, cosine_slope)
 
@@ -404,9 +404,9 @@ def _path(P: Array, a: Array, b: Array, surface: Level) -> tuple[Array, Array, A
 def _tangents(N: Array) -> Array:
     """Two unit vectors across each unit normal, shape (N, 2, 3)."""
     helper = np.eye(3)[np.argmin(np.abs(N), axis=-1)]
-    first = np.cross(N, helper)
+    first = cross(N, helper)
     first /= np.linalg.norm(first, axis=-1, keepdims=True)
-    return np.stack([first, np.cross(N, first)], axis=1)
+    return np.stack([first, cross(N, first)], axis=1)
 
 
 def _onto(P: Array, radius_m: float, form: Form) -> Array:

@@ -27,7 +27,7 @@ from phibench.render.optics.room_tracer import (
     into_room,
 )
 from phibench.scenes.form_error import limb_points
-from phibench.scenes.frames import Array, BoolArray
+from phibench.scenes.frames import Array, BoolArray, cross
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.rig import View
 
@@ -177,7 +177,7 @@ def _outline_distance_px(view: View, mirror: Array) -> float:
     if view.rig.mirror.radius_m is None:
         return _polygon_distance_px(view, mirror)
     to_mirror, to_centre = mirror - view.camera_centre_m, view.sphere_centre_m - view.camera_centre_m
-    across, along = np.linalg.norm(np.cross(to_mirror, to_centre)), np.dot(to_mirror, to_centre)
+    across, along = np.linalg.norm(cross(to_mirror, to_centre)), np.dot(to_mirror, to_centre)
     outline = _outline_angle(view, to_mirror, to_centre)
     return float((outline - np.arctan2(across, along)) * view.rig.camera.fx_px)
 
@@ -199,10 +199,10 @@ def _outline_angle(view: View, to_mirror: Array, to_centre: Array) -> float:
     axes, axis = view.T_world_sphere.R, to_centre / distance
     across = to_mirror - np.dot(to_mirror, axis) * axis
     if np.linalg.norm(across) < 1e-12:  # on the axis: any side will do
-        across = np.cross(axis, axes[:, np.argmin(np.abs(axis @ axes))])
+        across = cross(axis, axes[:, np.argmin(np.abs(axis @ axes))])
     across = across / np.linalg.norm(across)
     limb = limb_points(-to_centre @ axes, (across @ axes)[None], mirror.radius_m, mirror.form)[0] @ axes.T + to_centre
-    return float(np.arctan2(np.linalg.norm(np.cross(axis, limb)), np.dot(axis, limb)))
+    return float(np.arctan2(np.linalg.norm(cross(axis, limb)), np.dot(axis, limb)))
 
 
 def _floats(values: Array) -> tuple[float, ...]:

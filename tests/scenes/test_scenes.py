@@ -10,7 +10,7 @@ import pytest
 from helpers.oracles import TARGETS
 
 from phibench.scenes.camera import Camera
-from phibench.scenes.frames import Pose, rotation_facing, rotation_xyz
+from phibench.scenes.frames import Pose, cross, rotation_facing, rotation_xyz
 from phibench.scenes.laser import LaserSpot, beam_diameter_m
 from phibench.scenes.metals import METALS, STEEL
 from phibench.scenes.mirror import SphereMirror
@@ -79,6 +79,14 @@ def test_rotation_facing_is_a_rotation_onto_the_normal(normal):
 
 
 # -- rig ---------------------------------------------------------------------------------------------------------
+
+
+def test_cross_products_are_those_of_numpy_to_the_bit():
+    rng = np.random.default_rng(7)
+    for shapes in (((3,), (3,)), ((5, 3), (3,)), ((4, 1, 3), (5, 3))):
+        a, b = (rng.normal(size=shape) for shape in shapes)
+        assert np.array_equal(cross(a, b), np.cross(a, b))
+        assert not np.array_equal(cross(a, b), cross(b, a))
 
 
 def test_rig_moves_as_one_along_the_stroke_axis():

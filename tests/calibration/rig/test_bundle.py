@@ -13,7 +13,7 @@ from helpers.oracles import true_pixel
 
 from phibench.calibration.outline.limb_image import PoseMeasurement
 from phibench.calibration.outline.outline_result import Outline, mean_outline
-from phibench.calibration.rig.bundle import Bundle, KnownSpot, calibrate, seen_at
+from phibench.calibration.rig.bundle import Bundle, KnownSpot, _Problem, calibrate, seen_at
 from phibench.calibration.rig.calibration_file import CalibrationError, read_calibration, write_calibration
 from phibench.cli import main as cli
 from phibench.datasets.common.errors import DatasetError
@@ -52,6 +52,23 @@ def test_exact_data_of_the_nominal_rig_change_nothing() -> None:
     bundle = calibrate(RIG, apparent(RIG), spots_of(RIG, zero, None))
     assert np.abs(bundle.values / prior_sigmas()).max() < 1e-4
     assert bundle.chi2 < 1e-4
+
+
+def test_differences_are_those_of_one_unknown_after_the_other() -> None:
+    """Spots with and without measured height and azimuth: each row of a spot goes to its own point's unknowns."""
+    known = spots_of(RIG, np.zeros(len(PARAMETERS)), np.random.default_rng(3))
+    known[1] = replace(known[1], height_m=0.51, height_sigma_m=2e-3)
+    known[2] = replace(known[2], height_m=0.49, height_sigma_m=2e-3, azimuth_rad=3.4, azimuth_sigma_rad=1e-3)
+    prior = np.where(has_effect(RIG), prior_sigmas(), 0.0)
+    problem = _Problem(RIG, apparent(RIG), tuple(known), None, prior, np.flatnonzero(prior), np.zeros((2, 2)))
+    points = np.array([[d * np.cos(a), d * np.sin(a), 0.5] for d, a in PLACES])
+    x = np.concatenate([np.full(len(problem.free), 0.1), points.ravel()])
+    J, f = problem.jacobian(x), problem.residuals(x)
+    for i, step in enumerate(np.sqrt(np.finfo(float).eps) * np.where(x < 0.0, -1.0, 1.0) * np.maximum(1.0, np.abs(x))):
+        moved = x.copy()
+        moved[i] += step
+        assert np.array_equal(J[:, i], (problem.residuals(moved) - f) / (moved[i] - x[i])), i
+    assert (np.abs(J).max(axis=0) > 0.5).all()
 
 
 @pytest.mark.parametrize(("rigs", "wrong"), [(12, 2.0), pytest.param(40, 1.7, marks=pytest.mark.slow)])
