@@ -16,7 +16,7 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 
 import pytest  # noqa: E402
 from filelock import FileLock  # noqa: E402
-from helpers.inline_workers import InlineWorkerPool, make_inline  # noqa: E402
+from helpers.inline_workers import PROBE, InlineWorkerPool, make_inline, nothing  # noqa: E402
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -91,6 +91,7 @@ def python() -> Callable[..., subprocess.CompletedProcess[str]]:
 def inline(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let `make` do its tasks in this process."""
     monkeypatch.setattr("phibench.datasets.make.WorkerPool", InlineWorkerPool)
+    monkeypatch.setattr(PROBE, nothing)
 
 
 class SharedFolder:

@@ -183,9 +183,9 @@ def test_swapped_layers_are_refused(copy: Path, pair: tuple[str, str]) -> None:
             (sample.truth if "truth" in pair[0] else sample.expected_image)(position)
 
 
-def test_a_layer_of_another_data_set_is_refused(copy: Path, smoke_dataset: Path) -> None:
-    shutil.copy(smoke_dataset / view("ambient", "h0.000"), copy / view("ambient", "h0.000"))
-    with pytest.raises(DatasetError, match="dataset smoke, not of dataset tiny"):
+def test_a_layer_of_another_data_set_is_refused(copy: Path, smallest_dataset: Path) -> None:
+    shutil.copy(smallest_dataset / view("ambient", "h0.000"), copy / view("ambient", "h0.000"))
+    with pytest.raises(DatasetError, match="dataset smallest, not of dataset tiny"):
         open_dataset(copy).samples[0].ambient("down")
 
 

@@ -34,8 +34,16 @@ def make_inline(recipe: str | Path, out: Path, **options: Any) -> Path:
     """Data set, rendered in this process: the same bytes as by workers, without starting them."""
     from phibench.datasets.make import make
 
-    with patch("phibench.datasets.make.WorkerPool", InlineWorkerPool):
+    with patch("phibench.datasets.make.WorkerPool", InlineWorkerPool), patch(PROBE, nothing):
         return make(recipe, out, workers=1, **options)
+
+
+PROBE = "phibench.datasets.build.forecast._probe"
+"""Work that a forecast times: what it says in seconds is the subject of its own tests."""
+
+
+def nothing() -> None:
+    """Take no time."""
 
 
 class InlineExecutor:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from functools import cached_property
 
 import numpy as np
 from helpers.oracles import random_spot
@@ -29,7 +30,7 @@ class Case:
     nominal_stroke_m: float
     spot: LaserSpot
 
-    @property
+    @cached_property
     def rig(self) -> Rig:
         return self.nominal.perturbed(self.misalignment)
 

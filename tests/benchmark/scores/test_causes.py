@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from hashlib import sha256
 
 import numpy as np
 import polars as pl
@@ -23,6 +24,7 @@ from phibench.benchmark.scores.failure_causes import (
     taken_for,
     with_causes,
 )
+from phibench.benchmark.scores.fit_at_truth import fit_at_truth
 from phibench.benchmark.scores.records import record_table
 from phibench.benchmark.scores.score_tables import false_line
 from phibench.datasets.frames.sensor_card import sensor_card
@@ -34,6 +36,19 @@ TRUTH = cases(20).truths[0]
 UV = np.array(TRUTH.down.uv_px)
 
 
+FITS = {}
+
+
+def fit_once(pair, truth):
+    """`fit_at_truth`, once for equal images, cards and places: it asks a pair and its truth for nothing else."""
+    images = (pair.down, pair.up, pair.down_off, pair.up_off)
+    shown = [None if image is None else sha256(np.ascontiguousarray(image)).digest() for image in images]
+    key = (pair.card, pair.rig, *shown, *((spot.visible, spot.uv_px) for spot in (truth.down, truth.up)))
+    if key not in FITS:
+        FITS[key] = fit_at_truth(pair, truth)
+    return FITS[key]
+
+
 def pair_of(truth, image=None, off=None, output="mjpeg"):
     shown = image_of(truth.down) if image is None else image
     card = sensor_card(output)
@@ -43,7 +58,8 @@ def pair_of(truth, image=None, off=None, output="mjpeg"):
 def cause(truth=TRUTH, answer=None, failure="", image=None, off=None, output="mjpeg", **spot):
     truth = change(truth, "down", **spot) if spot else truth
     asked = pair_of(truth, image, off, output)
-    return cause_of(Case("down", truth, None if answer is None else np.array(answer), failure, lambda _: asked, RULES))
+    answer_px = None if answer is None else np.array(answer)
+    return cause_of(Case("down", truth, answer_px, failure, lambda _: asked, RULES, fit_once))
 
 
 @pytest.mark.parametrize(
@@ -162,7 +178,7 @@ def test_every_image_that_is_not_detected_has_one_cause():
     answers[5] = Outcome(5, constant(truths[5]), 0.1)
     answers[0] = Outcome(0, Answer(Spot((600.0, 300.0)), Spot(truths[0].up.uv_px)), 0.1)
     pairs = Cases(tuple(truths))
-    table = with_causes(record_table(truths, answers, RULES), pairs, RULES)
+    table = with_causes(record_table(truths, answers, RULES), pairs, RULES, fit_once)
     assert table["cause"].is_null().to_list() == table["detected"].to_list() == table["kind"].is_null().to_list()
     down = table.filter(image="down")
     assert down["cause"].to_list()[:6] == ["occluded", "saturated", "below_noise", "timeout", None, "method"]
@@ -241,7 +257,7 @@ def test_a_table_full_of_false_detections_says_what_they_are():
     truths = [change(t, "up", distractions=(Distraction("glow", (640.0, 360.0), 50.0),)) for t in truths]
     for share, expected in ((0.9, "90 % of the answers are another light"), (0.1, "")):
         answers = [Outcome(t.number, (constant if t.number < 20 * share else truth_itself)(t), 0.1) for t in truths]
-        table = with_causes(record_table(truths, answers, RULES), Cases(tuple(truths)), RULES)
+        table = with_causes(record_table(truths, answers, RULES), Cases(tuple(truths)), RULES, fit_once)
         assert false_line(table).startswith(expected)
         assert ("--track localise" in false_line(table)) == bool(expected)
 
