@@ -178,17 +178,27 @@ def test_the_tree_obeys_every_rule(graph: grimp.ImportGraph) -> None:
 def test_nothing_imports_the_top_and_no_folder_is_a_package() -> None:
     """What grimp cannot tell: the package's own name is the root of every import, and districts are namespaces."""
     for file in sources(ROOT):
-        names = [name for _, name in imports(file)]
-        assert all(level == 0 for level, _ in imports(file)), f"{file}: relative import"
+        found = list(imports(file))
+        names = [name for _, name in found]
+        assert all(level == 0 for level, _ in found), f"{file}: relative import"
         if file.parent != ROOT / PACKAGE:
             assert [name for name in names if name == PACKAGE or name.startswith(f"{PACKAGE}.__")] == [], file
             assert [name for name in names if name.startswith(f"{PACKAGE}.") and name.count(".") < 2] == [], file
         assert file.name != "__init__.py" or file.relative_to(ROOT).parts[0] == PACKAGE, f"{file}: no __init__.py here"
 
 
+def statements(node: ast.AST) -> Iterator[ast.AST]:
+    """Yield a node and the statements in it, at any depth; expressions, most of a tree, are not looked into."""
+    yield node
+    for name in ("body", "orelse", "finalbody", "handlers", "cases"):
+        inner = getattr(node, name, ())
+        for child in inner if isinstance(inner, list) else ():
+            yield from statements(child)
+
+
 def imports(file: Path) -> Iterator[tuple[int, str]]:
     """Yield (level, dotted name) of every import, wherever it stands; ``from a import b`` gives ``a.b``."""
-    for node in ast.walk(tree(file)):
+    for node in statements(tree(file)):
         if isinstance(node, ast.Import):
             yield from ((0, alias.name) for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -287,7 +297,7 @@ def test_docstrings_begin_with_a_noun_or_a_verb() -> None:
     texts = [
         (file.relative_to(ROOT), text)
         for file in sources(ROOT)
-        for node in ast.walk(tree(file))
+        for node in statements(tree(file))
         if isinstance(node, documented) and (text := ast.get_docstring(node))
     ]
     assert len(texts) > 1000
