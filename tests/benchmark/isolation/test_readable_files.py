@@ -189,6 +189,7 @@ def test_a_folder_with_too_much_to_look_through_is_refused(tmp_path: Path, monke
 
 NAMES = re.compile(r"[\w.{}-]+\.(json|jsonl|parquet|csv|npz|npy)")
 OPEN = {
+    "submission.json": "answers of a method to a sealed dense set: no truth",
     "croissant.json": "says what a set holds, and hashes",
     "run.json": "time and workers",
     "log.jsonl": "time and causes of tasks",
