@@ -29,8 +29,8 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from phibench.benchmark.dense.dense_films import MOST_BETWEEN, DenseFilms
 from phibench.benchmark.dense.dense_pairs import with_between
-from phibench.benchmark.export.dense_films import MOST_BETWEEN, DenseFilms
 from phibench.datasets.build.bake_task import bake_settings, read_light_map
 from phibench.datasets.film.film_read import Film, film_light
 from phibench.datasets.frames.frame_source import noise_draw

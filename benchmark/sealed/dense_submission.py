@@ -59,6 +59,13 @@ def is_dense_seal(public: Path) -> bool:
     return (public / DENSE_SEAL).is_file()
 
 
+def _listed(folder: Path, remedy: str) -> dict[str, str]:
+    """Hashes that the folder's list has; a folder of somebody else is not made again, but asked for."""
+    if not (folder / CHECKSUMS).is_file():
+        raise DatasetError(f"{folder / CHECKSUMS} is missing; {remedy}")
+    return read_checksums(folder)
+
+
 class SealedDensePairs:
     """Dense pairs of a sealed dense set by number; every file is checked against its hash when it is read.
 
@@ -71,7 +78,7 @@ class SealedDensePairs:
     def __init__(self, folder: Path) -> None:
         file = InputFile(folder / DENSE_SEAL, _AGAIN, limit_bytes=SETTINGS_BYTES)
         self.seal = file.document(DenseSeal)
-        if public_sha256(read_checksums(folder)) != self.seal.public_sha256:
+        if public_sha256(_listed(folder, _AGAIN)) != self.seal.public_sha256:
             raise file.fault(f"and {CHECKSUMS} do not belong together, one was changed")
         self._files = PairFiles(folder, PublicPair, self.seal.pairs, first=(DENSE_SEAL,))
 
@@ -251,7 +258,7 @@ def open_dense(
     true = _true_set(truth, pairs)
     document = _read_submission(submission)
     check_complete(document, pairs.seal, str(submission))
-    listed, tables = read_checksums(submission), []
+    listed, tables = _listed(submission, _SUBMIT), []
     with Steps(console or progress_console(), "dense pairs", len(true)) as steps:
         for line in sorted(document.answers, key=lambda line: line.number):
             errors = TruthErrors(true.truth(line.number))

@@ -184,8 +184,8 @@ def _scored_pairs(
     between: bool,
 ) -> DensePairSet:
     """Pairs of a data set, of films, or of a dense set, whose frames are drawn."""
+    from phibench.benchmark.dense.dense_films import MOST_BETWEEN, DenseFilms
     from phibench.benchmark.dense.dense_score import chosen_pairs
-    from phibench.benchmark.export.dense_films import MOST_BETWEEN, DenseFilms
     from phibench.benchmark.sealed.dense_set import DENSE_SEAL, DENSE_SET, DenseSet
     from phibench.datasets.common.errors import DatasetError
     from phibench.datasets.store.schema import TruthFolder
@@ -272,8 +272,8 @@ def export(
     pairs
         Only so many pairs.
     """
-    from phibench.benchmark.dense.dense_export import export_dense
     from phibench.benchmark.dense.dense_score import chosen_pairs
+    from phibench.benchmark.export.dense_export import export_dense
     from phibench.datasets.common.progress import Steps, progress_console
 
     chosen = chosen_pairs(directory, preset, draws, pairs)

@@ -20,9 +20,9 @@ from helpers.strange_releases import TITLE, tiny_release
 from helpers.valid_files import ROOT, TEXT, Kind, compact, digest, png
 from PIL import Image
 
-from phibench.benchmark.dense.dense_export import read_dense_index
 from phibench.benchmark.dense.dense_records import COLUMN_TYPES
 from phibench.benchmark.dense.dense_score import records_so_far
+from phibench.benchmark.export.dense_export import read_dense_index
 from phibench.benchmark.isolation.method_references import resolve
 from phibench.benchmark.isolation.run_limits import MethodError
 from phibench.benchmark.release import fetch

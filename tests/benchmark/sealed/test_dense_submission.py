@@ -211,6 +211,13 @@ def test_a_changed_set_or_another_truth_is_refused(
     seal_dense_set(other / "set", other / "public")  # the same pairs, sealed again: another secret number
     with pytest.raises(DatasetError, match="is not the truth that was sealed"):
         open_dense(public, truth, answers["depths"], console=quiet())
+    shutil.copytree(answers["depths"], other / "answers")
+    (other / "answers" / "SHA256SUMS").unlink()
+    with pytest.raises(DatasetError, match="SHA256SUMS is missing; submit again"):
+        open_dense(public, true_set / DENSE_TRUTH, other / "answers", console=quiet())
+    shutil.copytree(public, other / "unlisted", ignore=shutil.ignore_patterns("SHA256SUMS"))
+    with pytest.raises(DatasetError, match="SHA256SUMS is missing; download the set again"):
+        SealedDensePairs(other / "unlisted")
     shutil.copy(true_set / DENSE_TRUTH, truth)
     (other / "set" / "pairs.jsonl").write_text("")
     _signed(other / "set")

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from phibench.benchmark.dense.dense_export import INDEX, PLANES, export_dense
 from phibench.benchmark.dense.dense_pairs import dense_pairs
+from phibench.benchmark.export.dense_export import INDEX, PLANES, export_dense
 from phibench.benchmark.scored_dataset import open_dataset
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.store.checksums import differing_files, read_checksums

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from phibench.benchmark.export.dense_films import DenseFilms, strokes_of
+from phibench.benchmark.dense.dense_films import DenseFilms, strokes_of
 from phibench.cli.main import main
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.film.film_read import Film
