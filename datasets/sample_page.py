@@ -1,4 +1,4 @@
-"""Interactive page of a sample: frames, truth of every pixel, epipolar lines, spot layers, and rig and room in 3-D.
+"""Interactive page of a sample: frames, truth of pixels, epipolar lines, 3-D room; and parts that other pages share.
 
 One HTML file with one script of its own. It opens from disk and fetches nothing. Truth planes travel as 16-bit numbers
 with a stated step, the same number of pixels as the image: what the page shows at a pixel is the truth plane's value

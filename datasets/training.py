@@ -1,4 +1,4 @@
-"""Data sets for training, as maps from an index to NumPy arrays; PyTorch's loaders take them as they are.
+"""Data sets for training: pairs of frames, or crops about spots, as maps from an index to NumPy arrays for PyTorch.
 
 `PairDataset` has whole pairs, with new noise in every epoch. `SpotCrops` has crops about the spot. It moves each spot
 by fractions of a pixel and over all places in the mosaic and in the blocks of JPEG, so that 10^5 crops of a few hundred

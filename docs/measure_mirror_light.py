@@ -17,7 +17,7 @@ from scipy import ndimage
 
 from phibench.datasets.read import Sample, open_finished
 from phibench.datasets.scene.scene_check import LoadedScene, light_layer
-from phibench.datasets.scene.scene_export import in_carried_pixels
+from phibench.datasets.scene.scene_export import in_exported_pixels
 from phibench.scenes.random_streams import seed_32
 
 POSITION = "down"
@@ -25,7 +25,7 @@ POSITION = "down"
 
 def parts(sample: Sample, margin: int) -> dict[str, NDArray[np.bool_]]:
     """Pixels of each part of the mirror's image, lamps left out, shape (H, W)."""
-    ids = in_carried_pixels(sample.rig.camera, sample.truth(POSITION)["object_id"], order=0)
+    ids = in_exported_pixels(sample.rig.camera, sample.truth(POSITION)["object_id"], order=0)
     shapes = (*sample.room.surfaces, *sample.room.furniture)
     lamps = [k for k, shape in enumerate(shapes) if np.any(np.array(getattr(shape, "radiance_w_m2_sr", 0.0)) > 0.0)]
     outline = sample.rig.outline_px()

@@ -1,4 +1,4 @@
-"""Coordinate frames, rigid poses, rotations, and the array, vector and matrix types that all modules share.
+"""Coordinate frames: rigid poses, rotations, a cross product, and the array, vector and matrix types that all share.
 
 Conventions, stated here once and obeyed everywhere:
 

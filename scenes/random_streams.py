@@ -1,4 +1,4 @@
-"""Named random streams: a seed is a function of names, never of the order of draws.
+"""Named random streams: a seed is a function of names, never of the order of draws; and nodes of a Sobol sequence.
 
 The names (data set, pose, stage, ...) and the recipe's seed are hashed with SHA-256 into the entropy of a
 `numpy.random.SeedSequence`, so that adding a view or a spot changes no other one. Seed 0 is legal.

@@ -27,7 +27,15 @@ from phibench.datasets.store.json_forms import to_json
 from phibench.datasets.store.provenance import code_behind
 from phibench.datasets.store.schema import RoomInfo
 from phibench.datasets.store.temporary_folders import remove_leftovers
-from phibench.render.room.light_map import ARRAYS, BakeSettings, LightMap, bake, encoded, fixed_shapes, texel_count
+from phibench.render.room.light_map import (
+    ARRAYS,
+    BakeSettings,
+    LightMap,
+    bake,
+    fixed_shapes,
+    light_map_bytes,
+    texel_count,
+)
 from phibench.render.setup.llvm_library import LlvmError, cache_root
 from phibench.render.setup.variant import renders_with
 from phibench.scenes.rig import Rig, View
@@ -145,7 +153,7 @@ def _read(path: Path, recipe: bytes) -> LightMap | None:
 
 
 def _write(path: Path, recipe: bytes, light: LightMap) -> None:
-    body = recipe + b"\n" + encoded(light)
+    body = recipe + b"\n" + light_map_bytes(light)
     with _held(path.parent):
         write_bytes(path, b"\n".join([_FORM, hashlib.sha256(body).hexdigest().encode(), body]))
         _shrink(path.parent)
@@ -267,7 +275,7 @@ def bake_room(out: Path, rig: Rig, room_id: str, source: RoomSource, ambient: Am
         (out / file).unlink(missing_ok=True)
         return Made((), info.model_dump(mode="json"))
     return_memory()  # a bake's arrays do not fit into what views have left, and would come on top of it
-    write_bytes(out / file, encoded(light_map(view, room, bake_settings(ambient))))
+    write_bytes(out / file, light_map_bytes(light_map(view, room, bake_settings(ambient))))
     return_memory()
     return Made((file,), info.model_dump(mode="json"))
 

@@ -1,4 +1,4 @@
-"""File of the draws that a folder keeps: the next start of its run need not draw and trace every sample anew.
+"""File of drawn samples that a folder keeps, written and read: the next start need not draw and trace each anew.
 
 It holds no truth and nothing that is signed: without it, or where it is damaged or of another recipe or code, samples
 are drawn anew, to the same plan. `verify`, `repair` and `merge` do not read it.

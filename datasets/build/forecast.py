@@ -1,4 +1,4 @@
-"""Forecast of the cost of a run: bytes on the disk, and seconds that every finished task corrects.
+"""Forecast of a run's cost: bytes on the disk, and seconds that finished tasks correct; and progress of its tasks.
 
 The constants are wall-clock seconds of one process on an idle core of a 2-core AMD EPYC virtual machine (`llvm_ad_rgb`,
 room `lab`). A first guess scales them by a short probe of this machine and its load; `make benchmark` shows how good it

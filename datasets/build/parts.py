@@ -1,4 +1,4 @@
-"""Parts of a folder, made (`bring_all`): unfinished tasks are run, in workers or here, and what is whole is kept.
+"""Tasks of a folder, run in workers or here in order of their needs (`bring_all`); what the journal proves is kept.
 
 `journal.txt` proves which parts are whole: a line for each, with its key (a hash of all that it depends on) and the
 SHA-256 of its files. `bring` makes the parts that are not. So a run that was killed goes on, more is added, and damage

@@ -105,7 +105,7 @@ def export_panorama(
     RoomError
         If the point is not inside the room, or the file cannot be a panorama.
     """
-    from phibench.render.room.equirectangular import equirectangular
+    from phibench.render.room.rendered_panorama import rendered_panorama
 
     if out.suffix.lower() != ".exr":
         raise RoomError(f"{out}: a panorama is written as OpenEXR; give a name that ends in .exr")
@@ -120,7 +120,7 @@ def export_panorama(
         raise RoomError(f"point_m = {point_m}: outside the room, {low.round(2)} to {high.round(2)} m; move it inside")
     view = default_rig().at(0.0)
     light = light_map(view, room, settings)
-    radiance, closed = equirectangular(view, room, light, settings, point_m, heading_deg, rows)
+    radiance, closed = rendered_panorama(view, room, light, settings, point_m, heading_deg, rows)
     if closed < _CLOSED or radiance.max() <= 0.0:
         text = "shows no light" if closed >= _CLOSED else f"is open in {100.0 * (1.0 - closed):.0f} % of all directions"
         raise RoomError(f"point_m = {point_m}: the room {text} from there; give a point inside a lit room, metres")

@@ -78,7 +78,7 @@ def films_forecast(plan: Plan, films: Sequence[FilmPlan]) -> FilmsForecast:
     )
 
 
-def dry_run(recipe: str | Path, out: Path, workers: int | None = None) -> Iterator[str]:
+def forecast_lines(recipe: str | Path, out: Path, workers: int | None = None) -> Iterator[str]:
     """Say what `make_films` would do, a line for each film and one for all; films that are there are left out.
 
     Raises

@@ -47,7 +47,7 @@ def renderer(plan: Plan, film: FilmPlan, room: Room) -> Render:
     from phibench.datasets.build.bake_task import bake_settings
     from phibench.datasets.build.view_task import start_renderer
     from phibench.render.room.ambient_layer import render_ambient
-    from phibench.render.room.light_map import between
+    from phibench.render.room.light_map import interpolated_light_map
     from phibench.render.room.noise_budget import BUDGETS
 
     start_renderer()
@@ -64,7 +64,7 @@ def renderer(plan: Plan, film: FilmPlan, room: Room) -> Render:
         light = maps[right]
         if right:
             share = (place - places[right - 1]) / (places[right] - places[right - 1])
-            light = between(maps[right - 1], light, float(np.clip(share, 0.0, 1.0)))
+            light = interpolated_light_map(maps[right - 1], light, float(np.clip(share, 0.0, 1.0)))
         layer = render_ambient(view, room, light, settings, ambient.cells_per_pixel, seed, crop=crop, budget=budget)
         return layer.electrons_per_s
 

@@ -32,7 +32,7 @@ from phibench.datasets.store.schema import Document, TruthFolder, described
 from phibench.render.film.room_image import LitRoom, Placement, quick_spot, room_image
 from phibench.render.optics.faces import TexelGrid
 from phibench.render.optics.room_tracer import blocked_by, own_geometry
-from phibench.render.room.light_map import ARRAYS, BakeSettings, encoded
+from phibench.render.room.light_map import ARRAYS, BakeSettings, light_map_bytes
 from phibench.render.sensor.camera_chain import Chain
 from phibench.render.sensor.electrons import NoiseStream
 from phibench.render.sensor.light import Light, OtherSpot, Region
@@ -147,7 +147,7 @@ def bake_drawn_room(
     source, room = _drawn_room(fits, *stream, number)
     light = light_map(Rig().at(0.0), room, settings)
     name = f"room{number:03d}"
-    write_bytes(out / f"{name}.npz", encoded(light))
+    write_bytes(out / f"{name}.npz", light_map_bytes(light))
     info = BakedRoomInfo(name=name, source=to_json(source), digest=room.digest, texel_m=settings.texel_m)
     return Made((f"{name}.npz",), info.model_dump(mode="json"))
 

@@ -130,7 +130,7 @@ def _found(sample: _Sample) -> tuple[Distractor, ...]:
     numbers = present(sample.stream_names, tables)
     if not numbers:
         return ()
-    room = sample.dataset.rooms.surfaces(sample.row.room)
+    room = sample.dataset.rooms.geometry(sample.row.room)
     placed = (_placed(sample, room, i, tables[i]) for i in numbers)
     return tuple(distractor for distractor in placed if distractor is not None)
 

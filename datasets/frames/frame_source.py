@@ -1,4 +1,4 @@
-"""FrameSource: the camera simulated on the stored layers of one sample.
+"""Camera simulated on the stored layers of one sample (`FrameSource`): frames of both positions, laser on and off.
 
 The layers are read once and kept. A frame is what the camera delivers for one draw of its noise, as an array and, for
 MJPEG, as the file. It is a pure function of (data set, seed, sample, position, laser on or off, draw) and of the

@@ -1,4 +1,4 @@
-"""Sensor card: a sensor's numbers that an estimator may know."""
+"""Sensor card: a sensor's numbers that an estimator may know; and names of presets by their output."""
 
 from __future__ import annotations
 

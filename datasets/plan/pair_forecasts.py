@@ -1,4 +1,4 @@
-"""Pairs of a plan as they will be seen, by their chief rays: nothing is rendered."""
+"""Forecast of how both images of a planned pair show its spot, by chief rays, without rendering; and a table of it."""
 
 from __future__ import annotations
 

@@ -25,8 +25,8 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from phibench.datasets.read import Dataset, Sample
-from phibench.datasets.scene.scene_export import expected_radiance, in_carried_pixels, sample_scene, write_scene
-from phibench.render.plugins.standard_scene import Light, carried, etendue, film_axes
+from phibench.datasets.scene.scene_export import expected_radiance, in_exported_pixels, sample_scene, write_scene
+from phibench.render.plugins.standard_scene import Light, etendue, exported_camera, film_axes
 from phibench.render.setup.variant import activate
 from phibench.scenes.frames import Array
 from phibench.scenes.random_streams import seed_32
@@ -134,7 +134,7 @@ class LoadedScene:
 
     def __init__(self, sample: Sample, position: str, folder: Path) -> None:
         self.sample, self.position, self.folder = sample, position, folder
-        self.camera = carried(sample.rig.camera)
+        self.camera = exported_camera(sample.rig.camera)
         self.mi = activate()
         self._scenes: dict[str, Any] = {}
 
@@ -206,7 +206,7 @@ def _free(scene: LoadedScene, ours: Array) -> dict[str, NDArray[np.bool_]]:
     """Pixels that may be compared, in the mirror and beside it, shape (H, W)."""
     sample, view = scene.sample, scene.sample.view(scene.position)
     truth = sample.truth(scene.position)
-    ids, depth_m = (in_carried_pixels(sample.rig.camera, truth[name], order=0) for name in ("object_id", "depth_m"))
+    ids, depth_m = (in_exported_pixels(sample.rig.camera, truth[name], order=0) for name in ("object_id", "depth_m"))
     own = len(sample.room.surfaces) + len(sample.room.furniture)
     with np.errstate(invalid="ignore"):
         shown = (ids >= 0) & (ids < own) & (depth_m > NEAREST_M)

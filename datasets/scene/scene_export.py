@@ -32,7 +32,7 @@ from phibench.datasets.store.files import require_writable, write_bytes, write_t
 from phibench.datasets.store.layers import write_exr
 from phibench.render.plugins.plugin_tree import BitmapPlugin, Plugin, Rgb, SceneSetting, Triangles, Value, mitsuba_dict
 from phibench.render.plugins.room_plugins import grid_triangles
-from phibench.render.plugins.standard_scene import LIGHTS, Light, carried, etendue, standard_scene
+from phibench.render.plugins.standard_scene import LIGHTS, Light, etendue, exported_camera, standard_scene
 from phibench.render.setup.variant import activate
 from phibench.scenes.camera import Camera
 from phibench.scenes.frames import Array
@@ -132,8 +132,8 @@ def expected_radiance(sample: Sample, position: str, light: Light) -> Array:
 
 
 def as_radiance(camera: Camera, electrons_per_s: Array) -> Array:
-    """Radiance in the pixels of the carried camera, shape (H, W, 3), of electrons/s in those of the camera."""
-    scene = carried(camera)
+    """Radiance in the pixels of the exported camera, shape (H, W, 3), of electrons/s in those of the camera."""
+    scene = exported_camera(camera)
     v, u = np.mgrid[: camera.height_px, : camera.width_px].astype(float)
     pixels = np.stack([u, v], axis=-1)
     if scene == camera:
@@ -142,15 +142,15 @@ def as_radiance(camera: Camera, electrons_per_s: Array) -> Array:
     cos2 = 1.0 / (1.0 + np.sum(xy * xy, axis=-1))
     area = np.pi * camera.aperture_radius_m**2 * camera.solid_angle_density(xy)
     ours = electrons_per_s / ((area * cos2**2)[..., None] * np.array(camera.detector.band_electrons_per_joule()))
-    return np.stack([in_carried_pixels(camera, ours[..., k]) for k in range(3)], axis=-1)
+    return np.stack([in_exported_pixels(camera, ours[..., k]) for k in range(3)], axis=-1)
 
 
-def in_carried_pixels(camera: Camera, plane: Array, order: int = 1) -> Array:
-    """Plane of an image, shape (H, W), in the pixels of the carried camera; NaN beyond the image.
+def in_exported_pixels(camera: Camera, plane: Array, order: int = 1) -> Array:
+    """Plane of an image, shape (H, W), in the pixels of the exported camera; NaN beyond the image.
 
     `order` 1 is bilinear, 0 takes the nearest pixel.
     """
-    scene = carried(camera)
+    scene = exported_camera(camera)
     if scene == camera:
         return plane
     v, u = np.mgrid[: camera.height_px, : camera.width_px].astype(float)
@@ -161,7 +161,7 @@ def in_carried_pixels(camera: Camera, plane: Array, order: int = 1) -> Array:
 
 def what_is_lost(view: View, room: Room) -> list[str]:
     """Sentences on what the scene of a view does not carry."""
-    camera, scene = view.rig.camera, carried(view.rig.camera)
+    camera, scene = view.rig.camera, exported_camera(view.rig.camera)
     lost = [f"The Gaussian blur of the lens, sigma {camera.blur_sigma_px:g} px: pixels are means over their square."]
     distortion = {name: getattr(camera, name) for name in ("k1", "k2", "k3", "p1", "p2")}
     if any(distortion.values()):
@@ -183,7 +183,7 @@ def what_is_lost(view: View, room: Room) -> list[str]:
 
 def _readme(sample: Sample, positions: Sequence[str], losses: Sequence[str]) -> str:
     position = positions[0]
-    camera = carried(sample.rig.camera)
+    camera = exported_camera(sample.rig.camera)
     middle = np.array([[camera.cx_px, camera.cy_px]])
     electrons = ", ".join(f"{value:.6g}" for value in etendue(camera, middle)[0])
     rows = "\n".join(

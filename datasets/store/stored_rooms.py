@@ -47,7 +47,7 @@ class Rooms:
             raise DatasetError(f"{text}; install the version that made it, and give it the same files")
         return room
 
-    def surfaces(self, name: str) -> Room:
+    def geometry(self, name: str) -> Room:
         """Room as rays meet it; a panorama's on a box is the box alone, whose picture is not read.
 
         Raises
@@ -70,7 +70,7 @@ class Rooms:
 
 
 @dataclass(frozen=True)
-class OldRooms(Rooms):
+class SingleRoom(Rooms):
     """The only room of a data set of version 4 or 5, whose description holds it shape by shape."""
 
     room: Room = field(kw_only=True)
@@ -79,7 +79,7 @@ class OldRooms(Rooms):
         self.info(name)
         return self.room
 
-    def surfaces(self, name: str) -> Room:
+    def geometry(self, name: str) -> Room:
         """Return the same: it is there already."""
         return self[name]
 
@@ -105,7 +105,7 @@ def read_rooms(folder: Path, info: DatasetInfo) -> Rooms:
         raise DatasetError(f"{folder / schema.INFO}: {error}; run `phibench dataset repair`") from error
     name = ONLY_ROOM
     row = RoomInfo(room=name, source={}, digest=room.digest, lit=room.lit, object_names=info.object_names)
-    return OldRooms({name: row}, room=room)
+    return SingleRoom({name: row}, room=room)
 
 
 def _once_each(path: Path) -> dict[str, RoomInfo]:

@@ -32,7 +32,7 @@ def make(
         Say what will be made, how many bytes and how long it takes; render nothing.
     """
     if dry_run:
-        from phibench.datasets.film.film_forecast import dry_run as lines
+        from phibench.datasets.film.film_forecast import forecast_lines as lines
 
         for line in lines(recipe, out, workers):
             print(line)
@@ -73,8 +73,8 @@ def show(
     out
         MP4 to write; the film's id with .mp4 in the folder by default.
     """
+    from phibench.datasets.film.film_preview import show_film
     from phibench.datasets.film.film_read import open_films
-    from phibench.datasets.film.film_show import show_film
 
     films = open_films(directory)
     print(f"{'film':32s} {'frames':>6s} {'region px':>11s} {'key views':>9s} {'of noise':>8s}")

@@ -1,4 +1,4 @@
-"""Commands `export`, `release`, `fetch`, `seal ...` and `submission ...`: what is handed on, and checks of it."""
+"""Commands `export`, `release`, `fetch`, `seal`, `submission`: sets for others, answers to sealed ones, checks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Truth of a film: the still of any instant, and how fast everything in it changes.
+"""Truth of a film at any instant: exact spot, phi, D, pose of the rig, and how fast each of them changes.
 
 `instant_truth` is `spot_truth` of the view and the spot of that instant, with derivatives by the time. The derivatives
 are central differences along the motion at that instant, over 0.1 mm of the way or 0.1 mrad: they err by about 1e-8 of

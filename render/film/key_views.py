@@ -1,4 +1,4 @@
-"""Room of a film from few rendered views: interpolation in the pose, and a proof by a view that was left out.
+"""Key views of a film: the room's image in any pose by interpolation of few rendered views, and the error of that.
 
 Views are smooth in the pose: where the image moves by less than its blur between two keys, a pixel's light is a smooth
 function of the pose. It is interpolated by the cubic through the four keys around (`key_weights`). Weights are linear

@@ -1,4 +1,4 @@
-"""Image of a spot in a frame of a film: rows at their own times, smeared over their exposures, lit by the code.
+"""Spot in a frame of a film under rolling shutter: each row at its own time, smeared, and lit by the blink code.
 
 In the rig's frame it is the spot that moves, so that the chief rays of all instants are one call: the shift of the
 spot's image is exact for every row and every node of the exposure. Shape and flux are those of the spot's layer at the

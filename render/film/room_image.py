@@ -1,4 +1,4 @@
-"""Room in a camera that stands anywhere, by one exact ray per pixel and a baked map, and a quick spot; in NumPy.
+"""Image of a room for a camera anywhere, by one ray per pixel into its baked light map; quick image of a spot; NumPy.
 
 The ray of a pixel's centre goes to the mirror and on into the room. The face that it meets sends out what
 `render.room.surfaces` says: albedo x irradiance / pi below its coat, what the coat mirrors, and what a lamp emits. The

@@ -1,4 +1,4 @@
-"""Camera-side ray tracer in float64: from the pixel to the mirror and away; `room_tracer` goes on to the room.
+"""Camera-side ray tracer in float64: pixel to mirror and away, through a glass tube; `room_tracer` goes on to the room.
 
 It shares no mathematics with the world-side solution (`reflection_point`), so that the two can certify each other. A
 form error enters by the values of the mirror's radius or height alone: neither its tensors nor its derivatives are

@@ -1,4 +1,4 @@
-"""Reflection points: the place on the mirror where light from a world point goes to a point of the lens.
+"""Reflection points: the place on the mirror where light from a world point goes to the lens, and the bundle's spread.
 
 **Perfect sphere: Alhazen's problem.** In the plane of the two points and the sphere centre one angle gamma is unknown.
 With c and p the distances of the points from the centre, beta the angle between them, and l_c and l_p the two path

@@ -300,7 +300,7 @@ class Axis:
         return cls(doubled + 2 * offset, offset, centre_px + 0.5 - 0.5 * doubled)
 
 
-def carried(camera: Camera) -> Camera:
+def exported_camera(camera: Camera) -> Camera:
     """Camera of the exported scene: no distortion, unlike fx and fy only as far as Mitsuba takes a scale.
 
     The Gaussian blur stays a number of the camera; the scene has none.
@@ -315,7 +315,7 @@ def carried(camera: Camera) -> Camera:
 
 
 def etendue(camera: Camera, uv_px: Array) -> Array:
-    """Electrons/s that a pixel of a carried camera gets of a radiance of 1 W/(m^2 sr), shape (..., 3), at (..., 2)."""
+    """Electrons/s that a pixel of such a camera gets of a radiance of 1 W/(m^2 sr), shape (..., 3), at (..., 2)."""
     cos = camera.rays(uv_px)[..., 2]
     area = math.pi * camera.aperture_radius_m**2 / (camera.fx_px * camera.fy_px)
     return (area * cos**4)[..., None] * np.array(camera.detector.band_electrons_per_joule())
@@ -323,7 +323,7 @@ def etendue(camera: Camera, uv_px: Array) -> Array:
 
 def sensor_plugin(view: View) -> Plugin:
     """Sensor of one view; film, image window and samples are settings."""
-    camera = carried(view.rig.camera)
+    camera = exported_camera(view.rig.camera)
     x, y = axes = film_axes(camera)
     sizes = (camera.width_px, camera.height_px)
     crops = {"width": x.size, "height": y.size, "crop_offset_x": x.offset, "crop_offset_y": y.offset}

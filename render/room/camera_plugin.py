@@ -25,7 +25,7 @@ _ROUNDED = 3e-7  # three times what float32 leaves
 _TAIL_SIGMAS = 6.0  # of the blur, beyond the image
 
 
-def sensor_dict(mi: ModuleType, view: View, crop: tuple[int, int, int, int] | None = None) -> dict[str, Any]:
+def camera_plugin_dict(mi: ModuleType, view: View, crop: tuple[int, int, int, int] | None = None) -> dict[str, Any]:
     """Mitsuba dictionary of the sensor for one view.
 
     Parameters

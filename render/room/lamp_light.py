@@ -1,4 +1,4 @@
-"""Light of lamps and of the sun on a room's texels: what arrives without a bounce.
+"""Light of lamps and the sun on a room's texels: what arrives without a diffuse bounce, also by way of glossy coats.
 
 Where nothing hides a lamp, its irradiance is Lambert's closed form for a polygon, cut by the horizon. Where a part of
 it is hidden, rays over the lamp give the part that is seen, and the closed form the rest. A few rays tell which texels

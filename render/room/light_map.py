@@ -1,10 +1,10 @@
-"""Light map of a room: irradiance of every texel, from lamps, the sun and all bounces. Baked once for a room.
+"""Light map of a room: irradiance of every texel from lamps, the sun and all bounces, smoothed. Baked once for a room.
 
 First what comes from lamps and the sun (`lamp_light`), then the bounces over a coarse grid (`bounced_light`). Last a
 gather over the fine grid from the full map, in two independent halves; what both agree on is smoothed (`smoothed`).
 Rays start all over a texel: it holds the mean of the light on what is free of it, and a shadow's edge moves by nothing.
 The mirror ball itself (12 cm), its holder and the carriage are left out of the room's light. Carriage and holder are
-lit by the map when a view is rendered.
+lit by the map when a view is rendered (`ambient_layer`).
 
 Smoothing: a texel's value may be replaced by a straight-line fit through its neighbours, along rows and columns. Let
 S_r be the fit over r texels to each side, and a, b the halves. The expectation of (S_r a - b)^2 is bias^2 + var(S_r a)
@@ -24,7 +24,6 @@ import io
 from dataclasses import dataclass
 from functools import lru_cache
 from types import ModuleType
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,70 +40,13 @@ from phibench.render.room.bounced_light import (
     rays_by_noise,
 )
 from phibench.render.room.lamp_light import direct_light, lamps_in_coats
-from phibench.render.room.mirror_intersection import MirrorBody, mirror_body
-from phibench.render.room.shading import mirror_bands
-from phibench.render.room.subpixel_grid import points, shifts
 from phibench.render.room.surfaces import Surfaces
-from phibench.render.room.texel_points import Texels, covered_texels, nearest_free, spread_out, transmitted
+from phibench.render.room.texel_points import Texels, covered_texels, nearest_free, spread_out
 from phibench.render.setup.variant import activate
 from phibench.scenes.frames import Array, BoolArray
 from phibench.scenes.rig import RobotPose, View
-from phibench.scenes.room import Room, Sun, chassis
+from phibench.scenes.room import Room, chassis
 from phibench.scenes.shapes import Shape
-
-# Light that the mirror takes from what stands beside it, and the light that it throws there.
-#
-# Light maps leave the mirror out: it is small for a room. It is not small for its holder, whose rods stand a quarter of
-# its radius away. Seen from a texel a ball around the mirror fills a cone. In that cone rays compare what is behind the
-# mirror with what the mirror shows, and the difference is added. Lamps and the sun behind the mirror are tested ray by
-# ray (`lamp_light`). A spherical mirror is perfect and smooth here: a form error moves what a black rod mirrors by less
-# than it matters. A mirror of revolution is closed by a black disc in the plane of its rim, its back.
-
-
-def mirror_light(mi: ModuleType, surfaces: Surfaces, texels: Texels, mirror: MirrorBody, rays: int, seed: int) -> Array:
-    """Change of the irradiance by the mirror, shape (texels, 3): what it shows, less what surfaces behind it send."""
-    import drjit as dr
-
-    bands = mirror_bands(mi, surfaces.view.rig)
-    point, normal, lanes = texels.points, texels.normals, dr.arange(mi.UInt32, len(texels))
-    way_there = mirror.centre - mi.Vector3f(point)
-    distance = dr.norm(way_there)
-    rim = dr.safe_sqrt(1.0 - dr.square(dr.minimum(mirror.radius / distance, 1.0)))  # cosine of the cone's half angle
-    rim = dr.select(distance > mirror.radius, rim, -1.0)
-    frame = mi.Frame3f(way_there / distance)
-    key, count = (dr.opaque(mi.UInt32, value) for value in (seed, rays))
-    shift = shifts(mi, lanes, 2, key)
-    dr.eval(shift, rim, frame)
-
-    def body(i: Any, total: Any) -> tuple[Any, Any]:
-        x, y = points(mi, shift, i)
-        c = 1.0 - x * (1.0 - rim)
-        sine, turn = dr.safe_sqrt(1.0 - c * c), 2.0 * dr.pi * y
-        way = frame.to_world(mi.Vector3f(sine * dr.cos(turn), sine * dr.sin(turn), c))
-        cos = dr.dot(way, normal)
-        met, near, facet, shows = mirror.meets(point, way)
-        met &= cos > 0.0
-        ray = mi.Ray3f(point, way)
-        t, patch, valid = surfaces.hit(ray, met, coherent=False)
-        met &= ~valid | (t > near)
-        behind = surfaces.radiance(patch, ray(t), way, met & valid, lamps=False)
-        at = point + near * way
-        cos_mirror = dr.maximum(-dr.dot(way, facet), 0.0)
-        onward = mi.Ray3f(at, way + 2.0 * cos_mirror * facet)
-        t, patch, valid = surfaces.hit(onward, met & shows, coherent=False)
-        mirrored = surfaces.radiance(patch, onward(t), onward.d, valid, lamps=True)
-        mirrored *= mi.Color3f(*(band(cos_mirror) for band in bands))
-        weight = dr.select(met, cos, 0.0)
-        if texels.coat is not None:
-            weight *= transmitted(surfaces, texels.coat, cos)
-        return i + 1, total + weight * (mirrored - behind)
-
-    start = (mi.UInt32(0), dr.zeros(mi.Color3f, len(texels)))
-    _, total = dr.while_loop(start, lambda i, _: i < count, body)
-    dr.eval(total)  # its bands together: each would run the loop anew
-    cone = 2.0 * np.pi * (1.0 - np.array(rim, dtype=float)) / rays
-    return cone[:, None] * np.stack([np.array(total[k], dtype=float) for k in range(3)], axis=-1)
-
 
 # texels along a side over which smoothing keeps the mean: light of surfaces changes slowly
 _KEPT_OF_LAMPS, _KEPT_OF_SURFACES = 5, 9
@@ -221,41 +163,7 @@ def _indirect(
     return finer(texels.grid, fine.grid, mean), finer(texels.grid, fine.grid, sigma)
 
 
-def light_carriage(
-    surfaces: Surfaces,
-    grid: TexelGrid,
-    fixed: int,
-    irradiance: NDArray[np.float32],
-    settings: BakeSettings,
-    sun: Sun | None = None,
-) -> NDArray[np.float32]:
-    """Irradiance of all texels of a view: the map for the `fixed` first patches, gathered now for the others.
-
-    With a holder, which stands close to it, the mirror takes and gives light as well (`mirror_light`).
-    """
-    mi = activate()
-    first = grid.texels_of(fixed)
-    full = np.zeros((grid.count, 3), dtype=np.float32)
-    full[:first] = irradiance
-    surfaces.set_light(grid, full)
-    if first < grid.count:
-        texels = Texels.of(mi, surfaces, grid, first)
-        body = mirror_body(mi, surfaces.view)
-        rays = _CARRIAGE_RAYS if body is None else _HOLDER_RAYS
-        direct = direct_light(mi, surfaces, texels, sun, settings.lamp_rays, _SEED, body)
-        light = 0.5 * (direct[0] + direct[1]) + gathered(mi, surfaces, texels, np.full(len(texels), rays), _SEED + 2)
-        if body is not None:
-            light = np.maximum(light + mirror_light(mi, surfaces, texels, body, rays, _SEED + 3), 0.0)
-        full[first:] = light
-        surfaces.set_light(grid, full)
-    return full
-
-
-_CARRIAGE_RAYS = 1024
-_HOLDER_RAYS = 256  # its texels are many and small; 1024 rays would take 3 CPU-s for each view
-
-
-def between(one: LightMap, other: LightMap, share: float) -> LightMap:
+def interpolated_light_map(one: LightMap, other: LightMap, share: float) -> LightMap:
     """Light map of a room between two places of its robot: irradiances in proportion."""
     if share in (0.0, 1.0):
         return other if share else one
@@ -271,7 +179,7 @@ ARRAYS = {"irradiance_w_m2": ("<f4", 2), "sigma_w_m2": ("<f4", 2), "covered": ("
 """Type and number of axes of each array of a file."""
 
 
-def encoded(light: LightMap) -> bytes:
+def light_map_bytes(light: LightMap) -> bytes:
     """Bytes of an `.npz` file."""
     buffer = io.BytesIO()
     np.savez(buffer, **{name: getattr(light, name) for name in ARRAYS})

@@ -1,8 +1,8 @@
-"""Rays that meet the mirror, in Dr.Jit: float64, in the scene's coordinates.
+"""Mirror in Dr.Jit: first points and normals on rays, float64, in the scene's coordinates; and its reflectance.
 
-These are millimetres, world axes, and the sphere centre or the vertex of a mirror of revolution at the origin. Numbers
-of a mirror are opaque: one kernel serves all mirrors of a kind. Rays come from outside; those that miss the mirror get
-finite numbers that mean nothing.
+The scene's coordinates are millimetres, world axes, and the sphere centre or the vertex of a mirror of revolution at
+the origin. Numbers of a mirror are opaque: one kernel serves all mirrors of a kind. Rays come from outside; those that
+miss the mirror get finite numbers that mean nothing.
 
 **Sphere.** Closed form.
 
@@ -18,8 +18,10 @@ before the surface: from where it is met Newton's method runs up to the first ro
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 from types import ModuleType
 from typing import Any
 
@@ -27,9 +29,10 @@ import numpy as np
 
 from phibench.render.room.camera_plugin import MM_PER_M
 from phibench.scenes.frames import Array
+from phibench.scenes.metals import BandReflectance
 from phibench.scenes.revolved_mirror import RevolvedMirror
 from phibench.scenes.revolved_profile import FormedProfile, Profile, disc_polynomials
-from phibench.scenes.rig import View
+from phibench.scenes.rig import Rig, View
 
 Meeting = Callable[[Any, Any], tuple[Any, Any, Any]]
 
@@ -354,3 +357,39 @@ def _revolved_body(mi: ModuleType, view: View, mirror: RevolvedMirror) -> Mirror
     return MirrorBody(
         mi.Vector3f(*(dr.opaque(mi.Float, float(c)) for c in centre)), dr.opaque(mi.Float, MM_PER_M * radius_m), meets
     )
+
+
+# Reflectance.
+
+
+def mirror_bands(mi: ModuleType, rig: Rig) -> list[Callable[[Any], Any]]:
+    """Reflectance of the mirror in each band, by the cosine of the angle of incidence: as `BandReflectance`."""
+    return [_band(mi, rig.mirror.band(nm)) for nm in rig.camera.detector.band_wavelength_nm]
+
+
+def _band(mi: ModuleType, band: BandReflectance) -> Callable[[Any], Any]:
+    import drjit as dr
+
+    numbers = (band.index.real, band.index.imag, band.gain, band.loss)
+    n, k, gain, loss = (dr.opaque(mi.Float, float(x)) for x in numbers)
+    start, *knots = ([dr.opaque(mi.Float, float(x)) for x in pair] for pair in _slopes(band))
+
+    def by_angle(cos: Any) -> Any:
+        angle, value = dr.safe_acos(cos), start[1]
+        for (low, slope), (high, _) in pairwise([*knots, (dr.opaque(mi.Float, math.pi), 0.0)]):
+            value = value + slope * dr.clip(angle - low, 0.0, high - low)
+        return value
+
+    if len(band.values):
+        return by_angle
+    if band.gain == band.loss == 1.0:
+        return lambda cos: mi.fresnel_conductor(cos, mi.Complex2f(n, k))
+    return lambda cos: 1.0 - loss * (1.0 - gain * mi.fresnel_conductor(cos, mi.Complex2f(n, k)))
+
+
+def _slopes(band: BandReflectance) -> list[tuple[float, float]]:
+    """Place and value of the first angle of a table, then place and slope of each part that is linear."""
+    if not len(band.values):
+        return [(0.0, 1.0)]
+    slopes = np.append(np.diff(band.values) / np.diff(band.angles_rad), 0.0)
+    return [(0.0, float(band.values[0])), *zip(band.angles_rad.tolist(), slopes.tolist(), strict=True)]

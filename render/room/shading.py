@@ -1,4 +1,4 @@
-"""Shading kernels (Dr.Jit): the camera's look into a room by way of the mirror, and the mirror's reflectance.
+"""Shading kernel (Dr.Jit): electrons that film positions of one view get from a room, seen directly or mirrored.
 
 The ray from the film to the mirror and its reflection are float64 (`mirror_intersection`). The mirror is convex and
 stands in no table of faces, so that a reflected ray needs no lift. Only where something may stand between lens and
@@ -7,20 +7,13 @@ mirror, such as a holder, the way to the mirror is a query of its own.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
-from itertools import pairwise
 from types import ModuleType
 from typing import Any
 
-import numpy as np
-
-from phibench.render.room.camera_plugin import sensor_dict
+from phibench.render.room.camera_plugin import camera_plugin_dict
 from phibench.render.room.glass_refraction import Tube
-from phibench.render.room.mirror_intersection import mirror_intersection
+from phibench.render.room.mirror_intersection import mirror_bands, mirror_intersection
 from phibench.render.room.surfaces import Surfaces
-from phibench.scenes.metals import BandReflectance
-from phibench.scenes.rig import Rig
 
 
 class Look:
@@ -38,7 +31,7 @@ class Look:
         self._mi, self._surfaces = mi, surfaces
         self.view = surfaces.view
         rig = self.view.rig
-        self._sensor = mi.load_dict(sensor_dict(mi, self.view))
+        self._sensor = mi.load_dict(camera_plugin_dict(mi, self.view))
         self._crossed = surfaces.cross_the_way()
         self._tube = None if self.view.tube is None else Tube(mi, self.view)
         self._meet = mirror_intersection(mi, self.view)
@@ -100,39 +93,6 @@ class Look:
     def _reflectance(self, cos: Any) -> Any:
         """Reflectance of the three bands."""
         return self._mi.Color3f(*(band(cos) for band in self._bands))
-
-
-def mirror_bands(mi: ModuleType, rig: Rig) -> list[Callable[[Any], Any]]:
-    """Reflectance of the mirror in each band, by the cosine of the angle of incidence: as `BandReflectance`."""
-    return [_band(mi, rig.mirror.band(nm)) for nm in rig.camera.detector.band_wavelength_nm]
-
-
-def _band(mi: ModuleType, band: BandReflectance) -> Callable[[Any], Any]:
-    import drjit as dr
-
-    numbers = (band.index.real, band.index.imag, band.gain, band.loss)
-    n, k, gain, loss = (dr.opaque(mi.Float, float(x)) for x in numbers)
-    start, *knots = ([dr.opaque(mi.Float, float(x)) for x in pair] for pair in _slopes(band))
-
-    def by_angle(cos: Any) -> Any:
-        angle, value = dr.safe_acos(cos), start[1]
-        for (low, slope), (high, _) in pairwise([*knots, (dr.opaque(mi.Float, math.pi), 0.0)]):
-            value = value + slope * dr.clip(angle - low, 0.0, high - low)
-        return value
-
-    if len(band.values):
-        return by_angle
-    if band.gain == band.loss == 1.0:
-        return lambda cos: mi.fresnel_conductor(cos, mi.Complex2f(n, k))
-    return lambda cos: 1.0 - loss * (1.0 - gain * mi.fresnel_conductor(cos, mi.Complex2f(n, k)))
-
-
-def _slopes(band: BandReflectance) -> list[tuple[float, float]]:
-    """Place and value of the first angle of a table, then place and slope of each part that is linear."""
-    if not len(band.values):
-        return [(0.0, 1.0)]
-    slopes = np.append(np.diff(band.values) / np.diff(band.angles_rad), 0.0)
-    return [(0.0, float(band.values[0])), *zip(band.angles_rad.tolist(), slopes.tolist(), strict=True)]
 
 
 def _facet(mi: ModuleType, alpha: Any, normal: Any, direction: Any, x: list[Any]) -> tuple[Any, Any]:

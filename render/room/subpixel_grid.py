@@ -1,4 +1,4 @@
-"""Image grid finer than the pixels: samples of its square cells, summed into pixels with the camera's blur.
+"""Image grid finer than pixels: samples of its square cells, summed into pixels with the blur; and quasi-random points.
 
 A cell holds the mean radiance over its area; a pixel is the sum of cells times weights. The weight of a cell is the
 pixel's square, blurred by a Gaussian of variance sigma^2 - h^2/12, at the cell's centre: with the cell's own square of

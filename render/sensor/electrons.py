@@ -1,4 +1,4 @@
-"""Stages of the sensor from light to electrons to DN. NumPy only.
+"""Stages of the sensor from light to electrons to DN, and the named noise streams that they draw from. NumPy only.
 
 Order: mosaic, exposure, vignetting, PRNU, shot noise, full well, DSNU and read noise, gain, black level, rounding,
 clipping. Shot noise is that of light and dark current together: a sum of Poisson numbers is a Poisson number.

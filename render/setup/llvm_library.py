@@ -1,4 +1,4 @@
-"""One LLVM shared library: version, loading, proof that Dr.Jit can compile with it; where those that were fetched lie.
+"""One LLVM shared library: version, loading, proof with Dr.Jit; and the cache folders, where fetched ones lie.
 
 The version is read out of the library itself, in a child process. A file name proves nothing (``libLLVM.so``), and a
 library that crashes while it is loaded must not take this process with it. Only the standard library is used here.

@@ -1,4 +1,4 @@
-"""Motion of the carriage along the stroke axis: legs with trapezoidal speed, vibration, encoder.
+"""Motion of the carriage along the stroke axis in time, its encoder, and vibration of the rig along any axis.
 
 All positions and velocities are closed forms of the time, shape of the times, seconds in and metres out. A leg starts
 and ends at rest: it speeds up with the acceleration a, goes on with the speed v, and slows down with a. Where the leg

@@ -1,4 +1,4 @@
-"""Moving parts of a film: robot, carriage, vibration, and the laser spot on its path, at any time.
+"""Scene of a film at any time: rig on robot and carriage, vibration, the laser spot on its path, and other lights.
 
 `FilmScene.view_at` and `spot_at` give the still of any instant: what holds for stills holds for every row of a film.
 `FilmScene.camera_at` is the same pose for many times at once.

@@ -1,4 +1,4 @@
-"""Printed and shining pictures: posters, notices, boxes, spines, charts, screens, views.
+"""Printed and shining pictures drawn at random: posters, notices, boxes, book spines, charts, screens, window views.
 
 Each fills one surface. A print has albedos, shape (rows, columns, 4): bands R, G, B and the laser; row 0 is the lowest.
 Screens and views are relative luminances with the same shape; who uses them scales them to radiances.

@@ -1,4 +1,4 @@
-"""Named materials: ranges of albedo from published tables, a pattern, and whether they may have a glossy coat.
+"""Materials by name: albedo ranges from published tables, patterns, glossy coats; and a room's surfaces made of them.
 
 Ranges are of the band mean, by name and material. Their sources:
 

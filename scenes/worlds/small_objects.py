@@ -1,4 +1,4 @@
-"""Small objects: what lies on the floor, and what stands or hangs near the robot."""
+"""Objects on the floor (rugs, buckets, cones, cables), and what stands or hangs near the robot (arms, side tables)."""
 
 from __future__ import annotations
 

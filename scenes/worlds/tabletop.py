@@ -1,4 +1,4 @@
-"""Small things on boards and tables: books, boxes, bottles, monitors, desk lamps; and the materials pieces share.
+"""Small things on boards and tables (books, boxes, monitors, lamps); names of materials and types that pieces share.
 
 Each piece is a function of a random generator and the room's materials that returns an `Assembly`.
 """

@@ -19,7 +19,7 @@ from phibench.render.optics.spot_layer import spot_layer
 from phibench.render.optics.truth import spot_truth, truth_layer
 from phibench.render.plugins.room_plugins import to_scene_mm
 from phibench.render.room.ambient_layer import render_ambient
-from phibench.render.room.camera_plugin import sensor_dict
+from phibench.render.room.camera_plugin import camera_plugin_dict
 from phibench.render.room.light_map import BakeSettings, bake
 from phibench.render.setup.variant import activate
 from phibench.scenes.camera import Camera, Detector
@@ -44,7 +44,7 @@ def mi() -> ModuleType:
 
 def _sensor_rays(mi: ModuleType, view: View, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Chief rays of the plugin, blur switched off, as arrays (N, 3)."""
-    sensor = mi.load_dict(sensor_dict(mi, view) | {"blur_sigma_px": 0.0})
+    sensor = mi.load_dict(camera_plugin_dict(mi, view) | {"blur_sigma_px": 0.0})
     camera = view.rig.camera
     position = mi.Point2f(*((uv[:, i] + 0.5) / size for i, size in enumerate((camera.width_px, camera.height_px))))
     centre = mi.Point2f(0.5, 0.5)  # of the aperture

@@ -63,7 +63,7 @@ from phibench.datasets.store.layers import write_exr
 from phibench.datasets.store.metadata import parse_info
 from phibench.datasets.store.pair_files import FRAMES_SET
 from phibench.datasets.store.pair_files import PAIRS as LINES
-from phibench.render.room.light_map import LightMap, encoded
+from phibench.render.room.light_map import LightMap, light_map_bytes
 from phibench.studies import run
 
 QUIET = Console(quiet=True)
@@ -144,7 +144,7 @@ def _baked(folder: Path) -> tuple[bytes, bytes]:
     source, room = moving_camera._drawn_room(None, "fuzz", 0)
     dark = moving_camera.BakedRoom("room000", room, 2.0, np.zeros((0, 3), np.float32))
     zeros = np.zeros((dark.lit.texels.count, 3), np.float32)
-    light = encoded(LightMap(zeros, zeros, np.zeros(len(zeros), bool)))
+    light = light_map_bytes(LightMap(zeros, zeros, np.zeros(len(zeros), bool)))
     info = {"name": "room000", "source": to_json(source), "digest": room.digest, "texel_m": 2.0}
     return compact({"kind": "phibench baked rooms", "version": 1, "rooms": [info]}), light
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from phibench.render.plugins.plugin_tree import mitsuba_dict
 from phibench.render.plugins.standard_scene import standard_scene
-from phibench.render.room.camera_plugin import sensor_dict
+from phibench.render.room.camera_plugin import camera_plugin_dict
 from phibench.render.room.surfaces import load_scene
 from phibench.render.setup.variant import activate
 from phibench.scenes.rig import View
@@ -23,7 +23,7 @@ _PASS = 16  # samples per pixel and pass: bounds the memory
 def traced_scene(mi: ModuleType, view: View, room: Room, crop: Crop | None = None) -> Any:
     """Scene of a view, with our sensor instead of the standard one."""
     scene = mitsuba_dict(mi, standard_scene(view, room, light="ambient"))
-    return load_scene(mi, scene | {"sensor": sensor_dict(mi, view, crop)})
+    return load_scene(mi, scene | {"sensor": camera_plugin_dict(mi, view, crop)})
 
 
 def path_trace(

@@ -12,7 +12,7 @@ from phibench.render.optics.spot_layer import spot_layer
 from phibench.render.optics.truth import spot_truth
 from phibench.render.plugins.plugin_tree import Plugin, mitsuba_dict
 from phibench.render.plugins.room_plugins import grid_plugin, mirror_bsdf, mirror_plugin, to_scene_mm
-from phibench.render.room.camera_plugin import MM_PER_M, sensor_dict
+from phibench.render.room.camera_plugin import MM_PER_M, camera_plugin_dict
 from phibench.render.room.surfaces import load_scene
 from phibench.scenes.frames import rotation_facing
 from phibench.scenes.laser import LaserSpot
@@ -35,7 +35,7 @@ def _spot_scene(mi: ModuleType, view: View, spot: LaserSpot, crop: tuple[int, in
         "emitter": {"type": "area", "radiance": radiance},
         "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.0, 0.0, 0.0]}},
     }
-    sensor = sensor_dict(mi, view, crop) | {"sampler": {"type": "independent"}}
+    sensor = camera_plugin_dict(mi, view, crop) | {"sampler": {"type": "independent"}}
     scene = mitsuba_dict(mi, Plugin("scene", "scene", {"mirror": _mirror(view, spot)}))
     return load_scene(mi, scene | {"sensor": sensor, "spot": disk})
 

@@ -53,7 +53,7 @@ from phibench.datasets.store.json_forms import to_json
 from phibench.datasets.store.layers import read_layer, write_exr
 from phibench.datasets.store.sensitivity_file import read_sensitivities
 from phibench.estimator.geometry.rig_parameters import PARAMETERS
-from phibench.render.room.light_map import LightMap, encoded
+from phibench.render.room.light_map import LightMap, light_map_bytes
 from phibench.scenes.rig import Rig
 from phibench.studies.framework import read_settings
 from phibench.studies.run import find_study, read_study
@@ -178,12 +178,15 @@ def kinds(folder: Path) -> dict[str, Kind]:
         Kind("frames.jsonl", compact(FRAME), lambda path: read_index(path.parent), compact),
         Kind(
             schema.light_map_file("room"),
-            encoded(LIGHT),
+            light_map_bytes(LIGHT),
             lambda path: read_light_map(path.parent, "room"),
             forge=forged_light,
         ),
         Kind(
-            "entry.lightmap", entry_bytes(encoded(LIGHT)), read_entry, forge=lambda rng: entry_bytes(forged_light(rng))
+            "entry.lightmap",
+            entry_bytes(light_map_bytes(LIGHT)),
+            read_entry,
+            forge=lambda rng: entry_bytes(forged_light(rng)),
         ),
         Kind(schema.SENSITIVITIES, *sensitivity_kind(folder)),
         Kind("journal.txt", journal_bytes(folder), lambda path: Journal(path.parent)),
@@ -219,7 +222,7 @@ def npz(members: dict[str, bytes], compression: int = zipfile.ZIP_STORED) -> byt
 
 
 def npy_members() -> dict[str, bytes]:
-    with zipfile.ZipFile(io.BytesIO(encoded(LIGHT))) as archive:
+    with zipfile.ZipFile(io.BytesIO(light_map_bytes(LIGHT))) as archive:
         return {name: archive.read(name) for name in archive.namelist()}
 
 

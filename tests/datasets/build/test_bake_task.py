@@ -17,7 +17,7 @@ from helpers.valid_files import LIGHT, npy_members, npz, reshaped
 from phibench.datasets.build.bake_task import read_light_map
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.store import schema
-from phibench.render.room.light_map import encoded
+from phibench.render.room.light_map import light_map_bytes
 
 
 def npy(array: np.ndarray) -> bytes:
@@ -40,9 +40,9 @@ def twice() -> bytes:
 
 
 def test_a_light_map_is_read_to_the_bit_and_can_be_written(tmp_path: Path) -> None:
-    (tmp_path / schema.light_map_file("room")).write_bytes(encoded(LIGHT))
+    (tmp_path / schema.light_map_file("room")).write_bytes(light_map_bytes(LIGHT))
     found = read_light_map(tmp_path, "room")
-    assert encoded(found) == encoded(LIGHT)
+    assert light_map_bytes(found) == light_map_bytes(LIGHT)
     assert found.irradiance_w_m2.flags.writeable
 
 

@@ -16,11 +16,11 @@ from helpers.remembered_spots import SPOTS, RememberedSpots
 
 from phibench.datasets.common.errors import DatasetError, RecipeError
 from phibench.datasets.film import film_room, film_task
-from phibench.datasets.film.film_forecast import dry_run, films_forecast
+from phibench.datasets.film.film_forecast import films_forecast, forecast_lines
 from phibench.datasets.film.film_make import make_films
 from phibench.datasets.film.film_plan import check_drives, film_plans
+from phibench.datasets.film.film_preview import picture
 from phibench.datasets.film.film_read import Film, open_films
-from phibench.datasets.film.film_show import picture
 from phibench.datasets.film.film_store import verify
 from phibench.datasets.film.film_video import read_frames, write_frames, write_lerobot, write_mp4, write_videos
 from phibench.datasets.recipe.load import parse_recipe
@@ -127,12 +127,12 @@ def test_other_lights_have_their_own_code_colour_and_path(film_images: Path) -> 
 
 def test_a_dry_run_tells_bytes_and_time_and_leaves_out_what_is_made(film_images: Path, tmp_path: Path) -> None:
     recipe, out = film_images / "recipe.toml", tmp_path / "new"
-    *lines, last = dry_run(recipe, out, workers=1)
+    *lines, last = forecast_lines(recipe, out, workers=1)
     assert [line.split(":")[0] for line in lines] == [FILM]
     assert "to make: 1 film of 10 frames with" in last
     assert " MB, " in last
     assert not out.exists()
-    assert list(dry_run(recipe, film_images)) == ["to make: nothing; 1 kept; nothing was rendered"]
+    assert list(forecast_lines(recipe, film_images)) == ["to make: nothing; 1 kept; nothing was rendered"]
     plan, films = film_plans(parse_recipe(recipe.read_text(encoding="utf-8")))
     folder = film_of(film_images)
     size = sum(path.stat().st_size for path in folder.folder.path.rglob("*") if path.is_file())

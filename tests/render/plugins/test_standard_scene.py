@@ -13,7 +13,7 @@ from phibench.datasets.scene.scene_export import as_radiance
 from phibench.render.optics.ray_tracer import trace_pixels
 from phibench.render.plugins.plugin_tree import BitmapPlugin, Plugin, Rgb, Triangles, mitsuba_dict
 from phibench.render.plugins.room_plugins import mirror_bsdf, to_scene_mm
-from phibench.render.plugins.standard_scene import carried, etendue, sensor_plugin, standard_scene
+from phibench.render.plugins.standard_scene import etendue, exported_camera, sensor_plugin, standard_scene
 from phibench.render.setup.variant import activate
 from phibench.scenes.camera import Camera
 from phibench.scenes.frames import Pose, rotation_xyz
@@ -37,7 +37,7 @@ CAMERAS = {
 
 @pytest.mark.parametrize("name", CAMERAS)
 def test_rays_of_the_standard_sensor(name: str) -> None:
-    """Rays of pixels, corners included, lead to the points that the carried camera projects to them, within 2e-3 px.
+    """Rays of pixels, corners included, lead to the points that the exported camera projects to them, within 2e-3 px.
 
     Mitsuba computes them in float32, from a film of up to 1400 pixels: 1400 x 6e-8 x some operations.
     """
@@ -52,18 +52,18 @@ def test_rays_of_the_standard_sensor(name: str) -> None:
     o, d = (np.array(part, dtype=float).T for part in (ray.o, ray.d))
     seen = o + 400.0 * d
     points = view.T_world_camera.inverse().points(seen / 1000.0 + view.sphere_centre_m)
-    assert np.abs(carried(camera).project(points) - uv).max() < 2e-3
+    assert np.abs(exported_camera(camera).project(points) - uv).max() < 2e-3
     lens = to_scene_mm(view, view.camera_centre_m)
     assert np.linalg.norm(np.cross(lens - o, d), axis=1).max() < 1e-3  # rays pass the lens's middle, mm
 
 
-def test_a_carried_camera_is_the_camera_without_what_it_cannot_have() -> None:
-    assert carried(Camera()) == Camera()
-    assert carried(c310_camera()) == replace(c310_camera(), k1=0.0, k2=0.0, k3=0.0, p1=0.0, p2=0.0)
-    assert carried(replace(Camera(), fy_px=1500.0)).fy_px == 1430.0
+def test_an_exported_camera_is_the_camera_without_what_it_cannot_have() -> None:
+    assert exported_camera(Camera()) == Camera()
+    assert exported_camera(c310_camera()) == replace(c310_camera(), k1=0.0, k2=0.0, k3=0.0, p1=0.0, p2=0.0)
+    assert exported_camera(replace(Camera(), fy_px=1500.0)).fy_px == 1430.0
     # a short focal length leaves no room for a quarter of a pixel
     short = replace(Camera(), fx_px=150.0, fy_px=150.0, cx_px=640.7)
-    assert carried(short).cx_px == 640.5
+    assert exported_camera(short).cx_px == 640.5
 
 
 def test_reflectance_of_the_conductor() -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from phibench.render.optics.ray_tracer import lens_rays
-from phibench.render.room.camera_plugin import sensor_dict, undistort_steps
+from phibench.render.room.camera_plugin import camera_plugin_dict, undistort_steps
 from phibench.render.room.surfaces import aligned
 from phibench.render.setup.variant import activate
 from phibench.scenes.room import c310_rig
@@ -25,5 +25,5 @@ def test_rays_through_the_middle_of_a_distorting_lens(lens: dict[str, float]) ->
     assert undistort_steps(view.rig.camera)[1] == 1
     uv = np.random.default_rng(1).uniform((-4.0, -4.0), (1284.0, 724.0), (500, 2))
     u, v = (mi.Float64(aligned(column, np.float64)) for column in uv.T)
-    _, direction, _ = mi.load_dict(sensor_dict(mi, view)).film_ray(u, v, mi.Point2f(0.0))
+    _, direction, _ = mi.load_dict(camera_plugin_dict(mi, view)).film_ray(u, v, mi.Point2f(0.0))
     assert np.abs(np.array(direction).T - lens_rays(view, uv)[1]).max() < 1e-11

@@ -17,8 +17,8 @@ from helpers.oracles import TARGETS
 
 from phibench.render.room.ambient_layer import render_ambient, view_film, view_surfaces
 from phibench.render.room.bounced_light import BrightTexels
-from phibench.render.room.equirectangular import equirectangular
 from phibench.render.room.light_map import BakeSettings, LightMap, bake
+from phibench.render.room.rendered_panorama import rendered_panorama
 from phibench.render.room.subpixel_grid import CellSampler, Samples
 from phibench.render.room.texel_points import Net
 from phibench.render.setup.variant import activate
@@ -143,5 +143,5 @@ def test_a_view_lights_its_holder_once(baked: tuple[LightMap, list[dict[str, Any
 
 def test_a_panorama_traces_every_ray_once(baked: tuple[LightMap, list[dict[str, Any]]]) -> None:
     place = (0.5, 0.2, 1.5)
-    _, found = kernels(lambda: equirectangular(RIG.at(0.0), ROOM, baked[0], SETTINGS, place, 0.0, 16))
+    _, found = kernels(lambda: rendered_panorama(RIG.at(0.0), ROOM, baked[0], SETTINGS, place, 0.0, 16))
     assert tracing(found) == 1

@@ -66,7 +66,7 @@ def test_without_angles_the_metal_says_how_it_depends_on_the_angle() -> None:
 def test_the_views_kernel_has_the_same_reflectance(table: ReflectanceTable | None) -> None:
     """Single precision near cos = 1, where the angle is its root: 3e-4 rad of an angle, 1e-4 of a slope of 0.5."""
     mi = activate()
-    from phibench.render.room.shading import mirror_bands
+    from phibench.render.room.mirror_intersection import mirror_bands
 
     rig = Rig(mirror=SphereMirror(reflectance_table=table))
     cos = np.cos(np.linspace(0.01, 1.55, 300))

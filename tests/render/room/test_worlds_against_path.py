@@ -14,8 +14,8 @@ from helpers.path_ambient import path_trace
 from helpers.revolved_rigs import revolved
 
 from phibench.render.optics.faces import TexelGrid
-from phibench.render.room.ambient_layer import render_ambient, view_surfaces
-from phibench.render.room.light_map import BakeSettings, LightMap, bake, fixed_shapes, light_carriage
+from phibench.render.room.ambient_layer import light_carriage, render_ambient, view_surfaces
+from phibench.render.room.light_map import BakeSettings, LightMap, bake, fixed_shapes
 from phibench.scenes.frames import Pose, rotation_xyz
 from phibench.scenes.holder import fitted
 from phibench.scenes.room import Room, Sun, default_rig

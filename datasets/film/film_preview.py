@@ -1,4 +1,4 @@
-"""Pictures of a film: every frame with the exact place of its spot, the way it takes, and the numbers below.
+"""Video (MP4) of a film for a person: each frame with the exact place of its spot, its path so far, and numbers below.
 
 Whole images are shown some 640 px wide. An enlarged square around the spot stands in the corner that hides least of the
 mirror and of the spot's way. Windows are enlarged.

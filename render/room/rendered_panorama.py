@@ -24,7 +24,7 @@ _SIDE = 4  # directions along a pixel's side: edges are as smooth as a sixteenth
 _AT_ONCE = 1 << 22  # rays
 
 
-def equirectangular(
+def rendered_panorama(
     view: View, room: Room, light: LightMap, settings: BakeSettings, point_m: Vector, heading_deg: float, rows: int
 ) -> tuple[NDArray[np.float32], float]:
     """Radiance, shape (rows, 2 rows, 3), W/(m^2 sr), and the part of all directions in which there is a surface.
