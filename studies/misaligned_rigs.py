@@ -17,7 +17,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from phibench.calibration.outline.limb_image import PoseMeasurement
+from phibench.calibration.outline.outline_result import PoseMeasurement
 from phibench.calibration.rig.bundle import Bundle, KnownSpot, apparent_outline, calibrate
 from phibench.datasets.common.errors import DatasetError
 from phibench.estimator.geometry.reflection import image_of

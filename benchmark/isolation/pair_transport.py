@@ -1,4 +1,4 @@
-"""Transport of pairs and answers between the runner and a method's process.
+"""Transport of pairs and answers between runner and a method's process: messages by socket, images in shared memory.
 
 Messages go over a socket: 8 bytes of length (big-endian), then so many bytes, with a deadline. Images go through
 shared memory, the rest of a pair in a short message with a nonce, which the reply repeats.

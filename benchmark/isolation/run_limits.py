@@ -1,4 +1,4 @@
-"""Limits under which a method or a policy runs (`RunLimits`): time, memory, a process for each pair, files it may read.
+"""Limits under which a method or a policy runs (`RunLimits`): time, memory, processes, files; and `MethodError`.
 
 They are the same wherever others' code runs. A method that cannot be found, loaded or started is a `MethodError`.
 """

@@ -1,4 +1,4 @@
-"""Supervisor of a method's process, ``python -m phibench.benchmark.isolation.supervisor SOCKET MEMORY``.
+"""Supervisor of a method's process, run as a module with SOCKET MEMORY: starts the worker, ends all that it leaves.
 
 It starts the worker and does nothing but wait. When the worker ends, or the runner hangs up or dies, it kills all that
 the worker has started and removes the working folder. On Linux it is a child subreaper: a daemon in a session of its

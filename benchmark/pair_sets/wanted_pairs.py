@@ -1,4 +1,4 @@
-"""Pairs that are scored: of a data set, of frames or of real pictures, as options choose them, or calibrated."""
+"""Pairs to be scored, as options (`PairChoice`) choose them from a data set, frames or pictures; calibrated ones."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Dense set: dense pairs and truth in files for `dense score`, or sealed; `dense_export` writes them for other tools.
+"""Dense set: dense pairs in files, written and read, with their truth for `dense score`, or sealed without it.
 
 dense_set.json   where the pairs come from
 pairs.jsonl      per pair: files, rig, stroke and sensor, and what the truth needs

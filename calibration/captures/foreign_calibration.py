@@ -1,4 +1,4 @@
-"""Calibrations of other programs that are given as a rig file: what to copy from them, or why that cannot be.
+"""Rig files that are another program's calibration, such as OpenCV's: a fault text that says what to copy, or why not.
 
 Known are OpenCV (YAML, XML, JSON), ROS (camera_info: file, message, INI), Kalibr (camchain and results), EuRoC,
 CamOdoCal, Basalt, ORB-SLAM, COLMAP, Nerfstudio, RealSense, Metashape, Bouguet's toolbox and OCamCalib. They are looked

@@ -20,9 +20,8 @@ from phibench.calibration.captures.measure import (
 )
 from phibench.calibration.captures.rig_doubts import outlines_as_one
 from phibench.calibration.captures.spot_shape import SHAPE, UNLIKE, SpotPicture, SpotShape, fit_shape
-from phibench.calibration.outline.limb_image import PoseMeasurement
 from phibench.calibration.outline.outline import find_outline
-from phibench.calibration.outline.outline_result import Outline, mean_measured
+from phibench.calibration.outline.outline_result import Outline, PoseMeasurement, mean_measured
 from phibench.calibration.rig.bundle import Bundle, KnownSpot, calibrate
 from phibench.calibration.rig.from_dataset import (
     OUTLINES,

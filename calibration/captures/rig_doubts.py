@@ -13,8 +13,8 @@ import numpy as np
 
 from phibench.calibration.outline.ball_circle import find_circle
 from phibench.calibration.outline.first_circle import SIZES_LOOKED_FOR, grey, rig_circle
-from phibench.calibration.outline.limb_image import PoseMeasurement, planes_of
-from phibench.calibration.outline.outline_result import Outline, mean_outline, mirror_moved
+from phibench.calibration.outline.limb_image import planes_of
+from phibench.calibration.outline.outline_result import Outline, PoseMeasurement, mean_outline, mirror_moved
 from phibench.calibration.rig.calibration_file import Calibration
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.estimator.interface import Image

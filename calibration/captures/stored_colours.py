@@ -1,4 +1,4 @@
-"""Colours of R, G, B of 8 bits that were stored with less before: chroma of half the columns, or codes of 5 or 6 bits.
+"""Test whether pictures of R, G, B of 8 bits were stored with less before: half the chroma, or codes of 5 or 6 bits.
 
 YUYV, NV12, I420, videos and most JPEG have a Cb and a Cr for two columns. Programs write each twice, or interpolate.
 Differences of the chroma within such two columns are then far less than those between them, and a spot's red is moved.

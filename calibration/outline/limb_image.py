@@ -1,4 +1,4 @@
-"""Images as planes of linear light, model of the light across a polished sphere's limb, and type `PoseMeasurement`.
+"""Images as planes of linear light, and the model of the light across a polished sphere's limb in them.
 
 Planes: a pixel of a demosaiced image is a weighted sum of mosaic pixels around it. The sum is kept as taps. So a model
 of the light goes through the same sum, and nothing has to be inverted. Integer (u, v) are pixel centres; RGGB mosaic,
@@ -324,11 +324,3 @@ def convolved(values: Array, kernel: Array) -> Array:
     length = fft.next_fast_len(len(values), real=True)
     product = fft.rfft(values, length) * fft.rfft(kernel, length)
     return np.asarray(fft.irfft(product, length)[len(kernel) - 1 : len(values)])
-
-
-@dataclass(frozen=True)
-class PoseMeasurement:
-    """A sphere centre or a vertical that was measured, with its covariance."""
-
-    value: Array
-    covariance: Array

@@ -1,4 +1,4 @@
-"""Outline of the rig's mirror in an image, whatever its shape.
+"""Fit of the outline of the rig's mirror, of any shape, in an image: from scratch (`find_outline`), or near a place.
 
 1. Circles with edges all around are looked for in the picture (`ball_circle`), and the outline through each.
 2. From there the light across the outline is fitted, sector by sector: Gauss-Newton with robust weights. What that

@@ -1,4 +1,4 @@
-"""Errors of an outline by JPEG, from the fit's own model, put through the camera's noise and compression.
+"""Correction of an outline fit to a JPEG frame: the fitted model is compressed again, and the fit's error taken off.
 
 JPEG removes the limb's fine waves. The limb becomes wider and moves, by an amount that depends on the quality, on the
 limb's place in the blocks, and on the noise. The fit's own model is known exactly. It goes through the camera's noise

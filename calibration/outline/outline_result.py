@@ -1,4 +1,4 @@
-"""Outline of a mirror in an image, as it was found: place, covariance, quality; and what all fits of outlines share."""
+"""Outline of a mirror found in an image: place, covariance, quality; `PoseMeasurement`; what outline fits share."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from phibench.calibration.outline.ball_circle import BallCircle
 from phibench.calibration.outline.edge_ring import TURNS
-from phibench.calibration.outline.limb_image import Plane, PoseMeasurement
+from phibench.calibration.outline.limb_image import Plane
 from phibench.estimator.spots.image_planes import ImageError
 from phibench.scenes.camera import Camera
 from phibench.scenes.frames import Array, BoolArray, as_vector
@@ -22,6 +22,14 @@ _BESIDE_LAMP_PX, _FEWEST_FULL = 4.0, 2  # pixels on both sides of an outline, an
 _SHARED = 0.55  # of the scatter, and the scatter from which on it counts: measured in 60 rooms, see `shared_px2`
 _SMOOTH, _SMOOTH_JPEG = 2.5, 10.0
 _FROM_EDGE_PX = 1.0  # the steepest place of the light is some tenths of a pixel inside the limb
+
+
+@dataclass(frozen=True)
+class PoseMeasurement:
+    """A sphere centre or a vertical that was measured, with its covariance."""
+
+    value: Array
+    covariance: Array
 
 
 @dataclass(frozen=True)

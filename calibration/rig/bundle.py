@@ -1,4 +1,4 @@
-"""Bundle: one least-squares fit of a rig to priors, outline, vertical, and spots at known places.
+"""Bundle fit of a rig: least squares over priors, outline, vertical, known spots; outline and vertical of a true rig.
 
 The unknowns are the parameters of `rig_parameters.PARAMETERS`, as deviations from the nominal rig, and the world point
 of every calibration spot. The data:
@@ -30,7 +30,7 @@ from scipy import optimize
 
 from phibench.calibration.outline.contour import place_of_outline, tilts_of_ellipse
 from phibench.calibration.outline.first_circle import sphere_from_rays
-from phibench.calibration.outline.limb_image import PoseMeasurement
+from phibench.calibration.outline.outline_result import PoseMeasurement
 from phibench.calibration.rig.vertical_edges import vertical_of
 from phibench.datasets.common.errors import DatasetError
 from phibench.estimator.geometry.reflection import image_of, reflect_both

@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from phibench.calibration.outline.edge_ring import Circle
-from phibench.calibration.outline.limb_image import PoseMeasurement
+from phibench.calibration.outline.outline_result import PoseMeasurement
 from phibench.calibration.rig.bundle import vertical_by_principal_point
 from phibench.calibration.rig.vertical_edges import agreeing, regression, require_edges
 from phibench.scenes.frames import Array

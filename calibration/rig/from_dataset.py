@@ -15,9 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc
 
-from phibench.calibration.outline.limb_image import PoseMeasurement
 from phibench.calibration.outline.outline import find_outline
-from phibench.calibration.outline.outline_result import Outline, mean_measured, mean_outline
+from phibench.calibration.outline.outline_result import Outline, PoseMeasurement, mean_measured, mean_outline
 from phibench.calibration.rig.bundle import Bundle, KnownSpot, calibrate
 from phibench.calibration.rig.calibration_file import write_calibration
 from phibench.calibration.rig.known_spots import Ruler, known_spot, measured_spot, one_per_pose

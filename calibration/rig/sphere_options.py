@@ -1,4 +1,4 @@
-"""Camera and mirror as numbers of a command line; nothing is imported that starts slowly."""
+"""Camera and spherical mirror as options of a command (`SphereOptions`); importing them starts nothing slow."""
 
 from __future__ import annotations
 

@@ -28,7 +28,8 @@ from skimage.transform import probabilistic_hough_line
 
 from phibench.calibration.outline.edge_ring import Circle
 from phibench.calibration.outline.first_circle import grey, rig_circle
-from phibench.calibration.outline.limb_image import PoseMeasurement, planes_of
+from phibench.calibration.outline.limb_image import planes_of
+from phibench.calibration.outline.outline_result import PoseMeasurement
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.estimator.geometry.reflection import reflect
 from phibench.estimator.spots.image_planes import ImageError

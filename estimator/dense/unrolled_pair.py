@@ -1,4 +1,4 @@
-"""Both images of a dense pair as panoramas on one grid, in codes of luma, and the way back to the image's pixels."""
+"""Dense pair unrolled: both images as panoramas on one grid (pixel maps, luma codes); matches back to pixels and D."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Posterior of a pair's point, (u, v) of the down image and 1 / D, from a likelihood map of each image.
+"""Posterior of a pair's point (u, v, 1 / D) from likelihood maps of both images, and of one spot's place by itself.
 
 Fits choose a place. Where a likelihood has a flat valley or several minima, the chosen place has a larger mean square
 error than the mean over the posterior, and a covariance at it says too little. Here both images' likelihoods are

@@ -1,4 +1,4 @@
-"""Angles phi of pixels, in the three senses that the paper does not tell apart, and in that of a user of the paper.
+"""Angles phi of pixels with derivative and variance, in four senses: ray, normal, incidence, radius over the outline.
 
 * ``ray``: theta / 2, theta between the ray that leaves the mirror and the downward vertical (eqs. 1 and 2 are exact);
 * ``normal``: between the outward normal at the reflection point and the downward vertical;

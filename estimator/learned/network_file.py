@@ -1,4 +1,4 @@
-"""Contents of an ONNX file, read without running it and without a package: what it is made of is known before it runs.
+"""Contents of an ONNX file, parsed without a package and without running it; refusal of other layers than expected.
 
 A model of a stranger can name other files for its weights, make tensors of any size, or lack what is asked of it. Here
 everything is compared with the layers of a network of phibench; only the numbers in the weights are free.

@@ -1,4 +1,4 @@
-"""Input of the networks: images of every processing brought to one form, electrons behind R, G and B.
+"""Input of the networks, a crop or a whole frame: images of every processing as planes of electrons behind R, G and B.
 
 Crops have 32 x 32 pixels and begin at an even column and row, so that red pixels of the mosaic come first. Raw pixels
 are interpolated bilinearly, which loses nothing; 8-bit codes go back through tone curve, colour matrix and white

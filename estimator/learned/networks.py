@@ -1,4 +1,4 @@
-"""Networks in ONNX files: read, checked, run by onnxruntime, written; and the spot of a pair by the network of crops.
+"""Networks in ONNX files: read, checked, run by onnxruntime, written; a position from a crop, and peaks of heat.
 
 One thread: the same bytes every time.
 

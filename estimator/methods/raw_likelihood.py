@@ -1,4 +1,4 @@
-"""Built-in methods on likelihoods: each spot by itself on raw pixels, and both spots as images of one point.
+"""Built-in methods by likelihood: each spot on raw pixels, both spots as one point; posteriors of faint spots.
 
 `raw_maximum_likelihood` takes as known the card's noise (PRNU and DSNU count as noise), the rig's detector for the
 filters' response at the laser line, and the oblique blur that the rig predicts at the pixel (`spot_blur`), with the

@@ -1,4 +1,4 @@
-"""Fit of a spot to the mean and covariance of quantised outputs, by a quasi-score.
+"""Window of quantised outputs with its model (`CoefficientWindow`), and the fit of a spot to it by a quasi-score.
 
 Outputs are codes of R, G, B (srgb8), of Y', Cb, Cr (yuyv), or a JPEG's coefficients (mjpeg).
 

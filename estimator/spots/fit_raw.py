@@ -1,4 +1,4 @@
-"""Maximum likelihood of a spot's position on raw pixels, mono or Bayer, for many spots at once.
+"""Maximum-likelihood fit of spots' positions on raw pixels (`fit_raw`), or on pixels of any law (`fit_law`).
 
 The mean of a pixel is that of `SpotPixels`; its noise is Poisson plus Gauss with the variance V(mu) of `PixelNoise`.
 The score sum (x - mu) / V(mu) dmu is unbiased. Without PRNU it is the exact one of the shifted Poisson law x + r^2 ~

@@ -1,4 +1,4 @@
-"""Positions of the spot in the frames of a film, with their noise, and with what frames share.
+"""Positions of the spot, fitted in each frame of a film, raw or processed; their noise, and errors that frames share.
 
 What is left of a frame when the room is taken off (`film_frames`) is fitted around the spot: place and flux. A fit
 errs by A (x - mu), with A = F^-1 d / V the influence of every pixel. Of frames k and l, whose spots share pixels p, the

@@ -1,4 +1,4 @@
-"""Policies of the loop: the paper's process, greedy information, random, and an oracle.
+"""Policies of the loop, and what a policy is: the paper's process, drive only, greedy information, random, an oracle.
 
 The paper's process (its Fig. 4) is detection and identification, orientation, depth estimation by a stroke, servoing.
 All policies that look for the target share the first part, a belief, and the way to the stand-off distance. They

@@ -1,4 +1,4 @@
-"""Readings of the paper's user from a real rig: true rig -> two pixels -> phi -> equation (4) or (5).
+"""Experiments of the paper, and D as its user reads it from a true rig: two pixels -> phi -> equation (4) or (5).
 
 Everything is closed form and vectorised, so that a sampler can afford a hundred thousand rigs. The mirror image is
 Alhazen's problem in the plane of lens, sphere centre and spot. It takes no Newton step in pixels, unlike

@@ -1,4 +1,4 @@
-"""Study `cause`: what makes the error curves that the paper has published.
+"""Study `cause`: why the paper's published depths are off: explanations compared by their Bayesian evidence.
 
 The run comes first, then the findings from its tables, the small tables of the report, and the drawings: predicted
 errors, evidence of each explanation, posterior of noise and tilt. Log evidences are natural logarithms; a finding gives

@@ -1,4 +1,4 @@
-"""Study `dense`: the whole room by two images: which stroke, which mirror, what a wrong rig costs, what is right."""
+"""Study `dense`: error of D over all pixels of a pair, by stroke, mirror, wrong rig and method, beside the bound."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from pydantic import Field
 from phibench.benchmark.dense.dense_pairs import dense_pairs
 from phibench.benchmark.scores.answer_errors import Rules
 from phibench.benchmark.scores.intervals import Clusters, Estimate, Statistic, estimates, mean_of, quantile_of, ratio_of
-from phibench.calibration.outline.limb_image import PoseMeasurement
+from phibench.calibration.outline.outline_result import PoseMeasurement
 from phibench.calibration.rig.bundle import calibrate
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.frames.sensor_card import sensor_card

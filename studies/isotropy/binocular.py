@@ -1,4 +1,4 @@
-"""The paper's horizontal binocular (H-binocular): two sensors side by side, each of which stands in the other's images.
+"""Two sensors side by side (the paper's H-binocular): error of D by distance, and what each hides from the other.
 
 To one sensor the other is matter of the room: its ball as a mesh, its camera's housing and its mast. So both sensors
 are rendered in the ordinary way, and what they hide from each other is read off rendered spots. The competitor's laws

@@ -1,4 +1,4 @@
-"""Study `mirror`: mirrors of other shapes beside each other, for the choice of one.
+"""Study `mirror`: mirrors of several shapes compared: field of view, resolution, bound of D, cost of misalignment.
 
 The drawing comes last: resolution, bound of D, measured places, and cost of deviations.
 """

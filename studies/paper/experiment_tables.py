@@ -1,4 +1,4 @@
-"""Experiments with misaligned rigs: each is calibrated from its own frames, measures, and is judged.
+"""Experiments with misaligned rigs as a table: each rig is calibrated from its own frames, measures D, and is judged.
 
 For every rig of a data set (recipe `paper-misaligned`, or any with experiments and calibration spots):
 

@@ -1,4 +1,4 @@
-"""Study `stroke`: the stroke that measures a distance best.
+"""Study `stroke`: the stroke of least error of D for each distance, what limits it, and a check on drawn frames.
 
 The drawings come last: the best stroke by distance, error by stroke, measured beside predicted.
 """
@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field
 
-from phibench.calibration.outline.limb_image import PoseMeasurement
+from phibench.calibration.outline.outline_result import PoseMeasurement
 from phibench.calibration.rig.bundle import calibrate
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.frames.sensor_card import SensorCard, sensor_card

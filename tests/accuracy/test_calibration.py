@@ -12,7 +12,7 @@ import pytest
 import scipy
 from helpers.calibration_cases import apparent
 
-from phibench.calibration.outline.limb_image import PoseMeasurement
+from phibench.calibration.outline.outline_result import PoseMeasurement
 from phibench.calibration.rig.bundle import KnownSpot, calibrate
 from phibench.calibration.rig.vertical_edges import vertical_of
 from phibench.datasets.common.parallel import parallel_map

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy import optimize
 
-from phibench.calibration.outline.limb_image import PoseMeasurement
+from phibench.calibration.outline.outline_result import PoseMeasurement
 from phibench.calibration.rig.bundle import KnownSpot, apparent_outline, calibrate
 from phibench.datasets.recipe.recipe_scene import build_rig
 from phibench.datasets.recipe.tables import RigTable

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import optimize
 
-from phibench.calibration.outline.limb_image import PoseMeasurement
+from phibench.calibration.outline.outline_result import PoseMeasurement
 from phibench.scenes.rig import Rig
 
 RIG, STROKE = Rig(), 0.5

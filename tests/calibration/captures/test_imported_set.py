@@ -15,8 +15,7 @@ from phibench.benchmark.pair_sets.wanted_pairs import PairChoice, wanted_pairs
 from phibench.benchmark.scores.score_files import read_score
 from phibench.calibration.captures.imported_set import import_pairs, imported_pairs, open_imported
 from phibench.calibration.captures.pair_list import read_pair_list
-from phibench.calibration.outline.limb_image import PoseMeasurement
-from phibench.calibration.outline.outline_result import Outline
+from phibench.calibration.outline.outline_result import Outline, PoseMeasurement
 from phibench.calibration.rig.bundle import apparent_vertical
 from phibench.calibration.rig.calibration_file import read_calibration
 from phibench.cli.main import main

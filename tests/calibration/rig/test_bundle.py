@@ -11,8 +11,7 @@ import scipy
 from helpers.calibration_cases import OUTLINE2, RIG, STROKE, apparent
 from helpers.oracles import true_pixel
 
-from phibench.calibration.outline.limb_image import PoseMeasurement
-from phibench.calibration.outline.outline_result import Outline, mean_outline
+from phibench.calibration.outline.outline_result import Outline, PoseMeasurement, mean_outline
 from phibench.calibration.rig.bundle import Bundle, KnownSpot, _Problem, calibrate, seen_at
 from phibench.calibration.rig.calibration_file import CalibrationError, read_calibration, write_calibration
 from phibench.cli import main as cli

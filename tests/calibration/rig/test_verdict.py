@@ -10,10 +10,10 @@ import pytest
 from helpers.limb_frames import limb_light
 from PIL import Image
 
-from phibench.calibration.outline.limb_image import PoseMeasurement, planes_of
+from phibench.calibration.outline.limb_image import planes_of
 from phibench.calibration.outline.outline import find_outline
 from phibench.calibration.outline.outline_least_squares import band, step_from
-from phibench.calibration.outline.outline_result import SECTORS, Outline
+from phibench.calibration.outline.outline_result import SECTORS, Outline, PoseMeasurement
 from phibench.calibration.rig.bundle import Bundle, calibrate
 from phibench.calibration.rig.from_dataset import BAD, DOUBTFUL, GOOD, verdict_of
 from phibench.calibration.rig.outline_picture import write_overlay
