@@ -61,7 +61,7 @@ class _Found:
     skew: float = 0.0
 
 
-def foreign_calibration(text: str) -> str:
+def foreign_calibration_fault(text: str) -> str:
     """Fault of a rig file that is a calibration of another program: what to do with it; "" if it is none."""
     if re.search(r'"kind":\s*"phibench calibration"', text):
         return "is a calibration of `phibench calibrate`: give it with --calibration, and a rig file with --rig"
@@ -94,7 +94,7 @@ def _no_toml(text: str) -> str:
     return f"is not valid TOML but {language}: write a line [rig], and below it a line for each key, as fx_px = 1430.0"
 
 
-def foreign_container(data: bytes) -> str:
+def foreign_container_fault(data: bytes) -> str:
     """Fault of a rig file that is no text but arrays of MATLAB or NumPy; "" if it is none."""
     if data.startswith(b"MATLAB"):
         return (

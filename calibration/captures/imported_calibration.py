@@ -18,10 +18,9 @@ from phibench.calibration.captures.measure import (
     widened_by_shape,
     with_blur_of,
 )
-from phibench.calibration.captures.rig_doubts import outlines_as_one
 from phibench.calibration.captures.spot_shape import SHAPE, UNLIKE, SpotPicture, SpotShape, fit_shape
 from phibench.calibration.outline.outline import find_outline
-from phibench.calibration.outline.outline_result import Outline, PoseMeasurement, mean_measured
+from phibench.calibration.outline.outline_result import Outline, PoseMeasurement, mean_measured, outlines_as_one
 from phibench.calibration.rig.bundle import Bundle, KnownSpot, calibrate
 from phibench.calibration.rig.from_dataset import (
     OUTLINES,

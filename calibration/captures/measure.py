@@ -20,36 +20,31 @@ from pathlib import Path
 
 import numpy as np
 
+from phibench.calibration.captures.measurement_doubts import (
+    DOUBTFUL_P,
+    SeenSpot,
+    apart_note,
+    calibration_note,
+    contradiction_note,
+    moved_off_notes,
+    other_size_note,
+    rays_gap_note,
+    too_far_note,
+    unlike_spot_notes,
+)
+from phibench.calibration.captures.pair_mistakes import exchanged_colours_error, missing_spot_error, no_distance_error
 from phibench.calibration.captures.pair_photos import (
     LARGEST_SIGMA,
     LEAST_STROKE_M,
     MOST_STROKE_M,
     PairPhotos,
     PositionPhotos,
-    contradiction,
-    exchanged_colours,
     frames_note,
-    nothing_found,
     pair_of_photos,
 )
 from phibench.calibration.captures.picture_files import Photo, SensorChoice, require_colour, sensor_choice
 from phibench.calibration.captures.raw_frames import PATTERNS
-from phibench.calibration.captures.rig_doubts import (
-    apart,
-    calibration_note,
-    contradicted,
-    of_another_size,
-    outlines_as_one,
-)
 from phibench.calibration.captures.rig_file import MeasuredRig, read_rig_file, require_camera_size
-from phibench.calibration.captures.spot_doubts import (
-    DOUBTFUL_P,
-    SeenSpot,
-    moved_offs,
-    rays_gap,
-    too_far,
-    unlike_spots,
-)
 from phibench.calibration.captures.spot_shape import (
     OUTLINE_SIGMA_PX,
     PRIOR_SIGMA,
@@ -58,12 +53,12 @@ from phibench.calibration.captures.spot_shape import (
     SpotShape,
     fit_shape,
     seen_through,
-    spot_images,
+    spot_pictures,
 )
 from phibench.calibration.captures.tested_chain import ChainTest, chain_test
 from phibench.calibration.captures.turned_pictures import require_alike
 from phibench.calibration.outline.outline import find_outline
-from phibench.calibration.outline.outline_result import Outline
+from phibench.calibration.outline.outline_result import Outline, outlines_as_one
 from phibench.calibration.rig.bundle import calibrate
 from phibench.calibration.rig.calibration_file import Calibration, read_calibration
 from phibench.datasets.common.errors import DatasetError
@@ -201,7 +196,7 @@ def measure(photos: PairPhotos, stroke_m: float, setting: KnownNumbers, told: To
         require_colour(photo)
         require_camera_size(setting.known.rig, photo.size_px, str(photo.path))
         sensor_choice(photo, setting.sensor)
-    require_alike(photos.of_one_room, setting.known.rig)
+    require_alike(photos.pictures_to_compare, setting.known.rig)
     told("trying what the files stand for")
     test = chain_test(
         photos,
@@ -245,14 +240,14 @@ def _measured(test: ChainTest, stroke_m: float, setting: KnownNumbers, told: Tol
     )
     if int(depth.status) != Status.OK:
         told(_LOOKING)
-        raise contradiction(found.pair, photos, describe(int(depth.status)))
-    if test.doubt and (fault := exchanged_colours(found.pair, photos)):
+        raise no_distance_error(found.pair, photos, describe(int(depth.status)))
+    if test.doubt and (fault := exchanged_colours_error(found.pair, photos)):
         raise fault
-    gap, is_one = rays_gap(depth), float(depth.p_value) >= DOUBTFUL_P
+    gap, is_one = rays_gap_note(depth), float(depth.p_value) >= DOUBTFUL_P
     # through another chain a sound spot has another shape, too: the laser is not to blame
-    torn = [] if test.doubt and not test.by_spots else unlike_spots(found.pair, photos, {"down": down, "up": up})
-    faults_of_spots = *torn, *moved_offs(found.pair, photos), _foreign(test)
-    faults_of_spots += (found.doubt, apart(found.limb[0]), too_far(depth))
+    torn = [] if test.doubt and not test.by_spots else unlike_spot_notes(found.pair, photos, {"down": down, "up": up})
+    faults_of_spots = *torn, *moved_off_notes(found.pair, photos), _foreign(test)
+    faults_of_spots += (found.doubt, apart_note(found.limb[0]), too_far_note(depth))
     notes = chosen.note, test.note, *found.notes, frames_note(photos), gap, *faults_of_spots
     doubts = "" if is_one else gap, *faults_of_spots
     said, doubted = (tuple(text for text in texts if text) for texts in (notes, doubts))
@@ -298,7 +293,7 @@ def _fitted(
     outlines, missing = limb
     rig, covariance, values, note, doubt = _corrected(setting, outlines, missing)
     if not outlines:
-        doubt = of_another_size(rig, _picture(pair, "down"), card)
+        doubt = other_size_note(rig, _picture(pair, "down"), card)
     stroke = float(stroke_of(np.array(stroke_m), values))
     told("fitting the spots")
     seen = replace(pair, rig=with_blur_of(rig, outlines), stroke_m=stroke)
@@ -310,7 +305,7 @@ def _fitted(
     answer = method_for(card)(shared)
     if any(spot.uv_px is None or spot.covariance_px2 is None for spot in (answer.down, answer.up)):
         told(_LOOKING)
-        raise nothing_found(ready, photos, answer, apart(outlines) or doubt)
+        raise missing_spot_error(ready, photos, answer, apart_note(outlines) or doubt)
     spots = seen_spots(kept(shared, answer, with_posteriors(shared, answer)))
     wide = {name: widened_by_shape(spots[name], images.get(name), shape) for name in POSITIONS}
     return _Fitted(ready, wide, rig, covariance, stroke, limb, (note, _shape_note(shape, setting)), doubt)
@@ -415,7 +410,7 @@ def _corrected(setting: KnownNumbers, outlines: Sequence[Outline], why: str) -> 
     bundle = calibrate(nominal, outline)
     kind = ", by its edge alone" if any(outline.by_edge for outline in outlines) else ""
     text = f"rig: corrected by the mirror's outline in these pictures{kind}; the rest has the errors of a ruler"
-    return bundle.rig, bundle.covariance, bundle.values, text, contradicted(nominal, outline, bundle.chi2)
+    return bundle.rig, bundle.covariance, bundle.values, text, contradiction_note(nominal, outline, bundle.chi2)
 
 
 def with_blur_of(rig: Rig, outlines: Sequence[Outline]) -> Rig:
@@ -430,7 +425,7 @@ def with_blur_of(rig: Rig, outlines: Sequence[Outline]) -> Rig:
 def seen_images(pair: Pair) -> dict[str, SpotPicture]:
     """Pictures of a pair, by position, in which `detect` sees the spot."""
     detection = detect(pair)
-    return spot_images(pair, *(Spot(None if spot is None else spot.uv_px) for spot in (detection.down, detection.up)))
+    return spot_pictures(pair, *(Spot(None if spot is None else spot.uv_px) for spot in (detection.down, detection.up)))
 
 
 def _shape(setting: KnownNumbers, pair: Pair, images: dict[str, SpotPicture], outlines: Sequence[Outline]) -> SpotShape:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont, ImageOps
 
 from phibench.calibration.captures.measure import Measurement
-from phibench.calibration.captures.spot_doubts import SeenSpot
+from phibench.calibration.captures.measurement_doubts import SeenSpot
 from phibench.calibration.rig.outline_picture import visible_picture
 from phibench.datasets.store.files import write_bytes
 from phibench.estimator.interface import Box

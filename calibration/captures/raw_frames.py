@@ -73,7 +73,7 @@ _NEAR, _FAR = ((0, 1), (1, 0), (1, 1), (0, 2), (2, 0)), (7, 7)
 _CUT = 3.0  # standard deviations: the spot, and edges of a room that moved by a hair, count no more
 
 
-def noise_likeness(images: Mapping[str, Image]) -> float:
+def neighbour_likeness(images: Mapping[str, Image]) -> float:
     """Largest correlation of the noise of neighbours, laser on less laser off, less that of pixels far away.
 
     Parameters

@@ -17,7 +17,7 @@ from typing import Any
 
 from pydantic import Field
 
-from phibench.calibration.captures.foreign_calibration import foreign_calibration, foreign_container
+from phibench.calibration.captures.foreign_calibration import foreign_calibration_fault, foreign_container_fault
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import SETTINGS_BYTES, InputFile
 from phibench.datasets.recipe.distributions import Table
@@ -262,13 +262,13 @@ def _pitch_um(raw: dict[str, Any]) -> float:
 def _tables(file: InputFile) -> dict[str, Any]:
     """Tables of the file; a calibration of another program is told what to copy from it."""
     data = file.read()
-    if fault := foreign_container(data):
+    if fault := foreign_container_fault(data):
         raise file.fault(fault)
     text = file.text(data, "utf-8-sig")
     try:
         return file.toml_of(text)
     except DatasetError:
-        if fault := foreign_calibration(text):
+        if fault := foreign_calibration_fault(text):
             raise file.fault(fault) from None
         raise
 

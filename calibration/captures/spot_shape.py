@@ -132,7 +132,7 @@ def with_shape(calibration: Calibration) -> Calibration:
     return replace(calibration, rig=SpotShape.of_document(document).rig(calibration.rig))
 
 
-def spot_images(pair: Pair, down: Spot, up: Spot) -> dict[str, SpotPicture]:
+def spot_pictures(pair: Pair, down: Spot, up: Spot) -> dict[str, SpotPicture]:
     """Pictures of a pair, by position, in which a spot was seen."""
     depth_m = seen_depth_m(pair, Answer(down, up))
     return {

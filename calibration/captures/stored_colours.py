@@ -23,7 +23,7 @@ _LEAST = 0.3  # mean square of differences in codes that rounding does not make:
 _RANGE, _FILLED = 100, 0.6  # codes from the darkest to the brightest, and their share that noise fills at least
 
 
-def stored_with_less(images: Sequence[Image]) -> str:
+def stored_with_less_note(images: Sequence[Image]) -> str:
     """Say what pictures of one camera, R, G, B of 8 bits and shape (H, W, 3), were stored as before; "" of none."""
     if _is_halved(images):
         return "their colour has half the columns: they were YUYV, NV12, a video or a fine JPEG"

@@ -23,8 +23,8 @@ from scipy.special import log_ndtr
 
 from phibench.calibration.captures.pair_photos import PairPhotos, PositionPhotos
 from phibench.calibration.captures.picture_files import Photo
-from phibench.calibration.captures.raw_frames import MOST_LIKENESS, PATTERNS, Phase, noise_likeness, raw_phase
-from phibench.calibration.captures.stored_colours import stored_with_less
+from phibench.calibration.captures.raw_frames import MOST_LIKENESS, PATTERNS, Phase, neighbour_likeness, raw_phase
+from phibench.calibration.captures.stored_colours import stored_with_less_note
 from phibench.datasets.common.camera_pictures import Subsampling
 from phibench.datasets.frames.sensor_card import SensorCard, sensor_card
 from phibench.estimator.interface import Image, Pair
@@ -367,7 +367,7 @@ def _of_raw(photos: PairPhotos, card: SensorCard, pair_of: PairOf) -> ChainTest:
         )
     phase = told if isinstance(told, tuple) else (0, 0)
     note = _phase_note({phase: 1.0})
-    if (likeness := noise_likeness(images)) > MOST_LIKENESS:
+    if (likeness := neighbour_likeness(images)) > MOST_LIKENESS:
         doubt = (
             f"the noise of neighbouring pixels is alike (correlation {likeness:.2f}): the DN were smoothed, sharpened, "
             f"scaled or compressed, and sigma does not hold; {_OWN_FILE}"
@@ -380,7 +380,7 @@ def _of_codes(photos: PairPhotos, card: SensorCard) -> ChainTest:
     images = [photo.pixels for photo in photos.all]
     tested = interpolation(images, card)
     phase = tested.phase
-    if not tested.exact and (less := stored_with_less(images)):
+    if not tested.exact and (less := stored_with_less_note(images)):
         return ChainTest(
             photos, dict.fromkeys(PATTERNS, 0.25), _LOST_PX, doubt=f"{less}; sigma does not hold; {_OWN_FILE}"
         )

@@ -34,7 +34,7 @@ from phibench.calibration.outline.first_circle import (
     sphere_from_rays,
 )
 from phibench.calibration.outline.limb_image import Plane, binned, full_pixels, limb_angle_rad, planes_of
-from phibench.calibration.outline.outline_jpeg import without_jpeg
+from phibench.calibration.outline.outline_jpeg import corrected_for_jpeg
 from phibench.calibration.outline.outline_least_squares import OutlinePixels, Step, band, step_from
 from phibench.calibration.outline.outline_result import (
     MIN_ARC,
@@ -361,7 +361,7 @@ def _settle(at: _Shaped, blur: float, again: tuple[NDArray[Any], SensorCard] | N
         if np.any(np.abs(move[:3]) > np.maximum(_UNREST_M, sigma)):
             raise ImageError(f"an image without a mirror: the fit of the {at.name} does not come to rest")
     here.require_light(step, arc)
-    change, covariance = (step.move, step.covariance) if again is None else without_jpeg(pixels, step, *again)
+    change, covariance = (step.move, step.covariance) if again is None else corrected_for_jpeg(pixels, step, *again)
     at, blur = at.moved(change[:size]), _blurred(blur, change[size])
     covariance = covariance[:size, :size]
     return here.result(pixels, step, at.place, covariance, blur, again is not None, count)

@@ -59,7 +59,7 @@ def units_of(pixels: OutlinePixels, size: tuple[int, int], subsampling: str) -> 
 
 
 @dataclass(frozen=True)
-class JpegAgain:
+class JpegSimulation:
     """A frame's processing, ready for other light in the pixels around an outline.
 
     Parameters
@@ -123,13 +123,13 @@ def _packed(codes: NDArray[np.uint8], rows: int) -> NDArray[np.uint8]:
     return whole.reshape(rows, _ROW, h, w, 3).transpose(0, 2, 1, 3, 4).reshape(rows * h, _ROW * w, 3)
 
 
-def without_jpeg(pixels: OutlinePixels, step: Step, frame: NDArray[Any], card: SensorCard) -> tuple[Array, Array]:
+def corrected_for_jpeg(pixels: OutlinePixels, step: Step, frame: NDArray[Any], card: SensorCard) -> tuple[Array, Array]:
     """Last step of the fit of a JPEG frame, shape (4,), and its covariance, less what JPEG does to the fit.
 
     The model of the light is drawn through the camera's noise and JPEG, and the fit's answer compared with what was
     put in: first with the blur that was found, which JPEG has made wider, then with the blur that this leaves.
     """
-    again, change = JpegAgain(frame, pixels, card), step.move
+    again, change = JpegSimulation(frame, pixels, card), step.move
     for draws in JPEG_DRAWS:
         off = np.mean(again.drawn(step.model + step.by_parameters @ change, draws), axis=0) - step.model
         change = step.move - (step.solution.move(off) - change)

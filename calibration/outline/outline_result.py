@@ -135,6 +135,16 @@ _MOVED_SIGMAS = 5.0  # of one outline against another: 1e-5 of rigs that did not
 _GROWN = 0.003  # of the outline's size: one rig's outlines in ten rooms differ by less
 
 
+def outlines_as_one(outlines: Sequence[Outline]) -> PoseMeasurement:
+    """Weighted mean of outlines of one rig, with the covariance of a single one.
+
+    What an outline claims is mostly what all of them share: the lens's blur, where the limb lies in its edge, the
+    nominal camera. Ten outlines of a rig in ten rooms were all 0.4 to 0.6 mm short, each within its sigma.
+    """
+    mean = mean_outline(outlines)
+    return replace(mean, covariance=mean.covariance * len(outlines))
+
+
 def mirror_moved(then: PoseMeasurement, now: PoseMeasurement) -> str:
     """Words on a mirror that is not where it was, or not as large; "" for one that is."""
     covariance = now.covariance + then.covariance

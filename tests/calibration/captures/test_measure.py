@@ -13,10 +13,10 @@ from helpers.camera_files import NAMES, write_pictures
 from PIL import Image
 
 from phibench.calibration.captures.measure import _corrected, measure, read_setting
+from phibench.calibration.captures.measurement_doubts import apart_note, calibration_note
 from phibench.calibration.captures.pair_photos import PairPhotos, PositionPhotos
 from phibench.calibration.captures.picture_files import read_photo
-from phibench.calibration.captures.rig_doubts import apart, calibration_note, outlines_as_one
-from phibench.calibration.outline.outline_result import Outline
+from phibench.calibration.outline.outline_result import Outline, outlines_as_one
 from phibench.cli.main import main
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.read import Sample, open_dataset
@@ -390,10 +390,10 @@ def _outline(x: float, y: float, z: float) -> Outline:
 def test_a_mirror_elsewhere_in_the_second_picture_is_told() -> None:
     """4 px aside, and 1 % larger: a camera that was pushed, or zoomed, from one position to the other."""
     first = _outline(0.0, 0.0, 0.26)
-    assert not apart([first, _outline(2e-5, -2e-5, 0.2601)])
-    assert not apart([first])
-    assert "moved by 0.73 mm (26 sigma) from the picture down" in apart([first, _outline(7.3e-4, 0.0, 0.26)])
-    assert "1.0 % larger" in apart([first, _outline(0.0, 0.0, 0.2574)])
+    assert not apart_note([first, _outline(2e-5, -2e-5, 0.2601)])
+    assert not apart_note([first])
+    assert "moved by 0.73 mm (26 sigma) from the picture down" in apart_note([first, _outline(7.3e-4, 0.0, 0.26)])
+    assert "1.0 % larger" in apart_note([first, _outline(0.0, 0.0, 0.2574)])
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from conftest import ROOT
 
-from phibench.calibration.captures.rig_doubts import of_another_size
+from phibench.calibration.captures.measurement_doubts import other_size_note
 from phibench.calibration.captures.rig_file import read_rig_file, unusual_numbers
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.frames.sensor_card import sensor_card
@@ -136,7 +136,7 @@ def test_a_circle_of_another_size_contradicts_the_rig_file(tmp_path: Path, keys:
     # f R / sqrt(z^2 - R^2) of 60 mm at 0.26 m, before a bright wall
     ball = np.hypot(u - 319.5, v - 179.5) < 715.0 * 0.06 / math.sqrt(0.26**2 - 0.06**2)
     picture = np.clip(np.where(ball, 60.0, 150.0) + rng.normal(0.0, 2.0, ball.shape), 0, 255).astype(np.uint8)
-    said = of_another_size(rig, np.repeat(picture[..., None], 3, axis=-1), sensor_card("srgb8"))
+    said = other_size_note(rig, np.repeat(picture[..., None], 3, axis=-1), sensor_card("srgb8"))
     assert words in said
     assert bool(said) == bool(words)
     if words:

@@ -14,7 +14,7 @@ from phibench.calibration.captures.spot_shape import (
     SpotShape,
     fit_shape,
     seen_through,
-    spot_images,
+    spot_pictures,
 )
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.read import Sample, open_dataset
@@ -40,7 +40,7 @@ def drawn(folder: Path, sample: Sample, preset: str, draws: int) -> list[SpotPic
     places = [Spot((side.u_px, side.v_px)) for side in (sample.row.down, sample.row.up)]
     pairs = pairs_of(open_dataset(folder), [sample], preset, draws)
     ready: list[Pair] = [replace(pairs.pair(k), rig=rig) for k in range(draws)]
-    return [image for pair in ready for image in spot_images(pair, *places).values()]
+    return [image for pair in ready for image in spot_pictures(pair, *places).values()]
 
 
 @pytest.mark.parametrize("preset", ["bayer-raw", "srgb8", "mjpeg"])

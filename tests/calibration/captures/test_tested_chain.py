@@ -16,8 +16,8 @@ from phibench.calibration.captures.imported_set import ImportedSet, import_pairs
 from phibench.calibration.captures.measure import Measurement, measure, read_setting
 from phibench.calibration.captures.pair_photos import PairPhotos, PositionPhotos
 from phibench.calibration.captures.picture_files import read_photo
-from phibench.calibration.captures.raw_frames import MOST_LIKENESS, PATTERNS, noise_likeness
-from phibench.calibration.captures.stored_colours import stored_with_less
+from phibench.calibration.captures.raw_frames import MOST_LIKENESS, PATTERNS, neighbour_likeness
+from phibench.calibration.captures.stored_colours import stored_with_less_note
 from phibench.calibration.captures.tested_chain import comb_quality, interpolation, jpeg_behind
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.frames.sensor_card import sensor_card
@@ -170,25 +170,25 @@ def test_pictures_that_were_stored_in_different_ways_are_refused(
 def test_colours_that_were_stored_with_less_are_told(case: Case) -> None:
     """Of a picture that was I420 the spot was 4.9 of its sigmas off, of one of 5 and 6 bits the mosaic was wrong."""
     drawn = case.pixels("srgb8", "down_off")
-    assert stored_with_less([drawn]) == ""
+    assert stored_with_less_note([drawn]) == ""
     chroma = np.array(Image.fromarray(drawn).convert("YCbCr"))
     chroma[:, 1::2, 1:] = chroma[:, ::2, 1:]
     halved = np.array(Image.fromarray(chroma, "YCbCr").convert("RGB"))
     for columns in (0, 1):
-        assert "half the columns" in stored_with_less([halved[:, columns:]])
+        assert "half the columns" in stored_with_less_note([halved[:, columns:]])
     rng = np.random.default_rng(5)
     wide = np.clip(rng.normal(np.linspace(30.0, 220.0, 320)[:, None], 3.0, (180, 320, 3)), 0, 255).astype(np.uint8)
-    assert stored_with_less([wide]) == ""
-    assert "fewer codes" in stored_with_less([wide & 0xFC])
+    assert stored_with_less_note([wide]) == ""
+    assert "fewer codes" in stored_with_less_note([wide & 0xFC])
 
 
 def test_dn_whose_noise_is_alike_are_not_raw(case: Case) -> None:
     """Of DN that were smoothed by 0.6 px a spot was 8.3 of its sigmas off without a word."""
     dn = {name: case.pixels("bayer-raw", name).astype(float) for name in NAMES}
-    assert noise_likeness(dn) < 0.03  # of 58 000 pixels: 0.004 is the standard deviation of each correlation
+    assert neighbour_likeness(dn) < 0.03  # of 58 000 pixels: 0.004 is the standard deviation of each correlation
     soft = {name: np.rint(gaussian_filter(image, 0.6)) for name, image in dn.items()}
-    assert noise_likeness(soft) > 5.0 * MOST_LIKENESS
-    assert noise_likeness({name: dn[name] for name in ("down", "up")}) == 0.0
+    assert neighbour_likeness(soft) > 5.0 * MOST_LIKENESS
+    assert neighbour_likeness({name: dn[name] for name in ("down", "up")}) == 0.0
 
 
 @pytest.mark.usefixtures("unaligned")

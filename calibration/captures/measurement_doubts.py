@@ -1,41 +1,42 @@
-"""Doubts of a rig that its mirror's outline shows: another rig file, an old calibration, a camera that was pushed.
+"""Doubts of a measurement as sentences: of the rig, by its mirror's outline; of the spots (`SeenSpot`) and their rays.
 
-A sentence begins with "doubtful: " and says what to look at; "" says that there is nothing.
+Of the rig: another rig file, an old calibration, a camera that was pushed. Of the spots: light that is no spot,
+laser-off pictures that moved, rays that do not meet. A sentence begins with "doubtful: " and says what to look at; ""
+says that there is nothing.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
+from phibench.calibration.captures.pair_mistakes import light_ratio, moved_note, moved_positions, relit_note
+from phibench.calibration.captures.pair_photos import PairPhotos
+from phibench.calibration.captures.spot_shape import UNLIKE
 from phibench.calibration.outline.ball_circle import find_circle
 from phibench.calibration.outline.first_circle import SIZES_LOOKED_FOR, grey, rig_circle
 from phibench.calibration.outline.limb_image import planes_of
-from phibench.calibration.outline.outline_result import Outline, PoseMeasurement, mean_outline, mirror_moved
+from phibench.calibration.outline.outline_result import Outline, PoseMeasurement, mirror_moved, outlines_as_one
 from phibench.calibration.rig.calibration_file import Calibration
 from phibench.datasets.frames.sensor_card import SensorCard
-from phibench.estimator.interface import Image
+from phibench.estimator.geometry.least_squares_depth import GeneralDepth
+from phibench.estimator.interface import Image, Pair
+from phibench.estimator.spots.detect import FARTHEST_M
 from phibench.estimator.spots.image_planes import ImageError
+from phibench.scenes.frames import Array
 from phibench.scenes.rig import POSITIONS, Rig
 
 _AS_SEEN = 0.05  # of a circle's radius: errors of a ruler in radius and distance
 _CONTRADICTED = 25.0  # chi^2 of three numbers beyond which is 1 of 7e4 rigs
+DOUBTFUL_P = 1e-3
+"""Probability of the two rays' gap below which the two spots are not taken for one point."""
+_RELIT = 0.03  # relative change of the room's median code from which on it may be what has not the shape of a spot
 
 
-def outlines_as_one(outlines: Sequence[Outline]) -> PoseMeasurement:
-    """Weighted mean of outlines of one rig, with the covariance of a single one.
-
-    What an outline claims is mostly what all of them share: the lens's blur, where the limb lies in its edge, the
-    nominal camera. Ten outlines of a rig in ten rooms were all 0.4 to 0.6 mm short, each within its sigma.
-    """
-    mean = mean_outline(outlines)
-    return replace(mean, covariance=mean.covariance * len(outlines))
-
-
-def contradicted(nominal: Rig, outline: PoseMeasurement, chi2: float) -> str:
+def contradiction_note(nominal: Rig, outline: PoseMeasurement, chi2: float) -> str:
     """Sentence on a rig file that the outline contradicts by more than the errors of a ruler."""
     if chi2 < _CONTRADICTED:
         return ""
@@ -49,7 +50,7 @@ def contradicted(nominal: Rig, outline: PoseMeasurement, chi2: float) -> str:
     )
 
 
-def of_another_size(rig: Rig, picture: Image, card: SensorCard) -> str:
+def other_size_note(rig: Rig, picture: Image, card: SensorCard) -> str:
     """Sentence on a picture without the rig's outline that has a clear circle of another size.
 
     The outline is looked for with about the size that the rig says; here circles of all sizes are.
@@ -97,11 +98,68 @@ def calibration_note(held: Calibration, outlines: Sequence[Outline]) -> tuple[st
     return f"{text}; the mirror is still where it was", ""
 
 
-def apart(outlines: Sequence[Outline]) -> str:
+def apart_note(outlines: Sequence[Outline]) -> str:
     """Sentence on a mirror that is elsewhere in the second picture: it and the camera move as one."""
     if len(outlines) < len(POSITIONS) or not (moved := mirror_moved(*(one.measured for one in outlines))):
         return ""
     return (
         f"doubtful: {moved} from the picture down to the picture up: the camera was pushed, or its picture is cut or "
         "scaled in another way; take both again"
+    )
+
+
+@dataclass(frozen=True)
+class SeenSpot:
+    """Position of a spot in one image; pixels, covariance of (u, v), and how unlike a spot its light is (0 to 1)."""
+
+    uv_px: Array
+    covariance_px2: Array = field(repr=False)
+    unlike: float = 0.0
+
+    @property
+    def sigma_px(self) -> float:
+        """Root mean square of both coordinates' standard deviations."""
+        return math.sqrt(0.5 * float(np.trace(self.covariance_px2)))
+
+
+def moved_off_notes(pair: Pair, photos: PairPhotos) -> Iterator[str]:
+    """Sentences on laser-off pictures that are shifted: edges of the room then count as light of the spot."""
+    for position, shift in moved_positions(pair):
+        yield f"doubtful: the spot {position} lies on edges: {moved_note(photos, position, shift)}"
+
+
+def unlike_spot_notes(pair: Pair, photos: PairPhotos, spots: Mapping[str, SeenSpot]) -> Iterator[str]:
+    """Sentences on lights that have not the shape of a spot, by position."""
+    for position, spot in spots.items():
+        if spot.unlike < UNLIKE:
+            continue
+        (u, v), percent = spot.uv_px, 100.0 * min(spot.unlike, 1.0)
+        remedy = "the beam may meet an edge or graze a surface, turn the laser a little"
+        ratio = light_ratio(pair, position)
+        if ratio is not None and abs(ratio - 1.0) > _RELIT:
+            remedy = relit_note(photos, position, ratio)
+        yield (
+            f"doubtful: the spot {position} at ({u:.0f}, {v:.0f}) px has not the shape of one, {percent:.0f} % "
+            f"of its light do not fit; {remedy}"
+        )
+
+
+def too_far_note(depth: GeneralDepth) -> str:
+    """Sentence on a D beyond the points that spots are looked for at."""
+    if float(depth.depth_m) <= FARTHEST_M:
+        return ""
+    return (
+        f"doubtful: D is beyond {FARTHEST_M:g} m, up to which spots are looked for: one of the two lights may be "
+        "another one, or the stroke is not in metres"
+    )
+
+
+def rays_gap_note(depth: GeneralDepth) -> str:
+    """Sentence on the test of both rays."""
+    p, chi2 = float(depth.p_value), float(depth.chi2)
+    if p >= DOUBTFUL_P:
+        return f"one point: chi^2 {chi2:.2f} for one degree of freedom (p = {p:.2g})"
+    return (
+        f"doubtful: the spots are not images of one point, chi^2 {chi2:.1f} for one degree of freedom (p = {p:.1e}); "
+        "one may be a reflection, the rig may have turned between the pictures, or the calibration is another rig's"
     )
