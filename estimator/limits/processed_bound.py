@@ -42,8 +42,8 @@ from phibench.estimator.processed.chain_model import (
     noise_factor,
     raw_variance_e2,
 )
-from phibench.estimator.processed.fit_chain import own_codes, unrounded
-from phibench.estimator.processed.fit_processed import grid_px
+from phibench.estimator.processed.fit_processed_images import codes_are_independent
+from phibench.estimator.processed.fit_processed_region import grid_px
 from phibench.estimator.processed.quasi_score import CoefficientWindow
 from phibench.estimator.spots.camera_codes import hidden_share, quantised
 from phibench.estimator.spots.gaussian_spot import (
@@ -56,7 +56,7 @@ from phibench.estimator.spots.gaussian_spot import (
 )
 from phibench.estimator.spots.image_planes import PROCESSED
 from phibench.estimator.spots.pixel_statistics import CodeLaw, code_law, code_table, cut_pixels
-from phibench.estimator.spots.raw_pixels import bayer_filters
+from phibench.estimator.spots.raw_pixels import bayer_filters, noise_before_rounding
 from phibench.scenes.frames import Array
 
 _REACH_PX = 10  # around the spot, for "srgb8"
@@ -102,7 +102,7 @@ def chain_limit(
     """
     uv = np.asarray(uv_px, float)
     theta = np.array([*uv, flux_e, *np.asarray(background_e, float)])
-    if own_codes(card):
+    if codes_are_independent(card):
         return _of_codes(card, theta, blur, response, pattern_known)
     if card.output in PROCESSED:
         return _of_window(card, theta, blur, response, pattern_known)
@@ -126,7 +126,9 @@ def spot_codes(
     corner = np.floor(theta[:2]).astype(np.int64) - _REACH_PX
     filters = bayer_filters(corner[None], (2 * _REACH_PX + 2, 2 * _REACH_PX + 2))
     mean, derivatives = SpotPixels.of(filters, blur, SpotModel(response)).at((theta - [*corner, 0, 0, 0, 0])[None])
-    law = code_law(np.zeros(filters.shape, np.uint8), filters, card, unrounded(card, pattern_known), code_table(card))
+    law = code_law(
+        np.zeros(filters.shape, np.uint8), filters, card, noise_before_rounding(card, pattern_known), code_table(card)
+    )
     return law, mean, derivatives
 
 
@@ -146,7 +148,7 @@ def limit_window(
     pattern_known: bool = False,
 ) -> tuple[CoefficientWindow, Array]:
     """Window of outputs, all 0, that holds a spot at (u, v), and its first raw pixel (u, v); rest as `chain_limit`."""
-    model = chain_model(card, unrounded(card, pattern_known))
+    model = chain_model(card, noise_before_rounding(card, pattern_known))
     units, sides = np.array(grid_px(card)[::-1]), np.array(model.shape[::-1])
     corner = np.rint((uv_px + 0.5 - sides / 2) / units) * units - model.margin
     pixels = SpotPixels.of(model.filters[None], blur, SpotModel(response))
@@ -317,7 +319,7 @@ def processed_on_off_limit(
         If the output is none of the three.
     """
     theta = np.array([*np.asarray(uv_px, float), flux_e, *np.asarray(background_e, float)])
-    if own_codes(card):
+    if codes_are_independent(card):
         return _off_frames_of_codes(card, theta, blur, response, frames)
     if card.output in PROCESSED:
         return _off_frames_of_window(card, theta, blur, response, frames, steps)

@@ -25,25 +25,23 @@ from phibench.estimator.methods.spot_search import (
     seen_depth_m,
     trusted_hints,
 )
-from phibench.estimator.processed.fit_chain import (
+from phibench.estimator.processed.fit_processed_images import (
     code_data,
+    codes_are_independent,
     first_fit,
     fit_jpeg,
     fit_srgb,
     fit_yuyv,
-    own_codes,
     spot_window,
-    undone_mean,
-    unrounded,
 )
-from phibench.estimator.processed.neighbour_filters import regained
+from phibench.estimator.processed.inverse_processing import electrons_before_chroma_loss, mean_unprocessed_electrons
 from phibench.estimator.processed.quasi_score import CoefficientWindow
 from phibench.estimator.spots.camera_codes import mcu_px
 from phibench.estimator.spots.detect import Detection
 from phibench.estimator.spots.fit_raw import MISFIT_SIGMAS, SpotData, SpotFit
 from phibench.estimator.spots.gaussian_spot import SpotBlur, SpotModel
 from phibench.estimator.spots.image_planes import PROCESSED
-from phibench.estimator.spots.raw_pixels import Background, PatternNoise, around, background_of
+from phibench.estimator.spots.raw_pixels import Background, PatternNoise, around, background_of, noise_before_rounding
 from phibench.scenes.frames import Array
 
 _HALF_PX = 8
@@ -141,7 +139,7 @@ def _srgb(
     card, square = pair.card, _square(start, pair.images[position])
     origin = np.array([[square.u0_px, square.v0_px]])
     on, dark = _parts(pair, position, square)
-    own = own_codes(card) and on.shape[1] == 1
+    own = codes_are_independent(card) and on.shape[1] == 1
 
     if dark is None:
         flat = fit_srgb(on, origin, card, blur, model, near_px=near)
@@ -162,10 +160,10 @@ def _background(
 
     For the law of a single frame's `own` codes, which counts the pattern of all its light itself.
     """
-    seen, rounding = undone_mean(frames, origin, card)
-    x = regained(seen, origin, card)
+    seen, rounding = mean_unprocessed_electrons(frames, origin, card)
+    x = electrons_before_chroma_loss(seen, origin, card)
     # the converter rounds each frame; codes of 8 bits are counted apart, as `rounding`
-    variance = unrounded(card, not own).variance_e2(x) + 1.0 / (12.0 * card.dn_per_e**2)
+    variance = noise_before_rounding(card, not own).variance_e2(x) + 1.0 / (12.0 * card.dn_per_e**2)
     everywhere = np.ones(x.shape) if known is None else known
     pattern = None if own else PatternNoise.of(card)
     background = background_of(x, variance / frames.shape[1] + rounding, everywhere, pattern)
@@ -203,10 +201,11 @@ def spot_outputs(
 ) -> SpotData | tuple[CoefficientWindow, Array, Array]:
     """Outputs of one image about a spot at (u, v), with their model: what a fit and a likelihood are made of.
 
-    Codes of their own where a single frame has such (`own_codes`); else a window, a start and the window's corner.
+    Codes where those of a single frame are independent (`codes_are_independent`); else a window, a start and the
+    window's corner.
     """
     card, image = pair.card, pair.images[position]
-    own = own_codes(card) and pair.count(position) == 1
+    own = codes_are_independent(card) and pair.count(position) == 1
     region = _square(uv, image) if own else _region(box_at((uv[0], uv[1]), image.shape, _AROUND_PX), card, image.shape)
     origin, (on, dark) = np.array([[region.u0_px, region.v0_px]]), _parts(pair, position, region)
     if dark is None:

@@ -19,12 +19,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
-from scipy.ndimage import convolve1d
 
 from phibench.datasets.frames.sensor_card import SensorCard
-from phibench.estimator.spots.camera_codes import CHROMA_STEP, RGB_FROM_YCC, YCC_FROM_RGB, averaged, light_of, tone_of
-from phibench.estimator.spots.image_planes import demosaiced, full_scale_e
-from phibench.estimator.spots.raw_pixels import bayer_filters
+from phibench.estimator.spots.camera_codes import YCC_FROM_RGB
 from phibench.scenes.frames import Array
 
 _LUMA = YCC_FROM_RGB[0]
@@ -176,88 +173,3 @@ def edge_sparing(sharp: sparse.csr_array, outer: tuple[int, int], card: SensorCa
     centre = places[inner[0], inner[1]].ravel()
     threshold = float(card.denoise_threshold_codes or 0.0)
     return EdgeSparing(luma, sparse.csr_array(luma.T), centre, np.stack(near), np.array(weights), threshold)
-
-
-# Raw pixels of a room behind an image whose chroma the camera has averaged (yuyv, and JPEG of 4:2:2 and 4:2:0).
-#
-# Bilinear demosaicing keeps each pixel's own colour, but the means of chroma over two or four pixels do not: where a
-# room changes within a pixel or two, the mosaic makes false colours, and an own colour comes back wrong by up to a
-# third of its step. A room that is taken for the image's own colours has lost its chroma twice after the model's chain,
-# and the difference looks like light of the spot: fits beside a steep edge were 0.3 to 0.6 px off, 6 claimed sigma.
-#
-# `regained` looks for the raw pixels whose own colours come out of demosaicing, curve and chroma means as the image has
-# them: x <- x + (seen - own colours of x) (P. H. van Cittert, Z. Phys. 69, 298, 1931). An own colour keeps 0.7 to 0.85
-# of its change in that way, so that the error falls by a factor of 3 to 6 in each round.
-
-
-_ROUNDS = 4  # 0.3 to the power of 4 is 1 % of the loss; more rounds add noise of the codes' rounding
-
-
-def chroma_step(card: SensorCard) -> tuple[int, int]:
-    """Rows and columns of pixels that share a chroma sample."""
-    if card.output == "yuyv":
-        return 1, 2
-    return CHROMA_STEP[card.jpeg_subsampling] if card.output == "mjpeg" else (1, 1)
-
-
-def regained(seen_e: Array, origin: NDArray[np.int64], card: SensorCard) -> Array:
-    """Electrons of the raw pixels, shape (n, h, w).
-
-    Parameters
-    ----------
-    seen_e : shape (n, h, w)
-        Electrons behind each pixel's own colour in the image.
-    origin : shape (n, 2)
-        Image pixel (u, v) of the first column and row.
-    """
-    if chroma_step(card) == (1, 1):
-        return seen_e
-    return np.stack([_regained(seen, corner, card) for seen, corner in zip(seen_e, origin, strict=True)])
-
-
-def _regained(seen: Array, corner: NDArray[np.int64], card: SensorCard) -> Array:
-    x = seen
-    for _ in range(_ROUNDS):
-        x = x + (seen - _own_colours(x, corner, card))
-    return x
-
-
-def _own_colours(raw: Array, corner: NDArray[np.int64], card: SensorCard) -> Array:
-    """Electrons behind each pixel's own colour after demosaicing, curve and chroma means, shape (h, w)."""
-    u, v = (int(k) for k in corner + np.asarray(card.mosaic_phase))
-    mix = np.asarray(card.colour_matrix) * np.asarray(card.white_balance) / full_scale_e(card)
-    linear = np.einsum("ij,jhw->ihw", mix, demosaiced(raw, (u, v)))
-    code = tone_of(np.clip(linear, 0.0, 1.0), card)
-    light = light_of(np.clip(_mean_chroma(code, corner, card), 0.0, 1.0), card)
-    filters = bayer_filters(np.array([[u, v]]), raw.shape)[0]
-    return np.asarray(np.einsum("hwj,jhw->hw", np.linalg.inv(mix)[filters], light))
-
-
-def _mean_chroma(rgb: Array, corner: NDArray[np.int64], card: SensorCard) -> Array:
-    """R, G, B, shape (3, h, w), with the chroma of each sample's pixels."""
-    down, across = chroma_step(card)
-    (u, v), (h, w) = corner, rgb.shape[1:]
-    top, left = int(v) % down, int(u) % across
-    pads = [(0, 0), (top, -(top + h) % down), (left, -(left + w) % across)]
-    ycc = np.einsum("ij,jhw->ihw", YCC_FROM_RGB, np.pad(rgb, pads, mode="edge"))
-    chroma = _weighted(ycc[1:], card) if card.output == "yuyv" else averaged(ycc[1:], (down, across))
-    for axis, step in ((1, down), (2, across)):
-        if step > 1:
-            chroma = _doubled(chroma, axis, smooth=card.output == "mjpeg")
-    ycc[1:] = chroma
-    return np.einsum("ij,jhw->ihw", RGB_FROM_YCC, ycc)[:, top : top + h, left : left + w]
-
-
-def _weighted(chroma: Array, card: SensorCard) -> Array:
-    """Chroma at even columns, as a camera of yuyv weights what is beside them."""
-    return np.asarray(convolve1d(chroma, card.chroma_taps, axis=2, mode="nearest")[:, :, ::2])
-
-
-def _doubled(samples: Array, axis: int, smooth: bool) -> Array:
-    """Samples on twice as many pixels: repeated as a decoder of yuyv does, or by libjpeg's triangle filter."""
-    each = np.repeat(samples, 2, axis)
-    if not smooth:
-        return each
-    padded = np.moveaxis(np.pad(each, [(2, 2) if k == axis else (0, 0) for k in range(3)], mode="edge"), axis, -1)
-    beside = np.where(np.arange(each.shape[axis]) % 2 == 0, padded[..., :-4], padded[..., 4:])
-    return 0.75 * each + 0.25 * np.moveaxis(beside, -1, axis)  # libjpeg's triangle filter between chroma samples

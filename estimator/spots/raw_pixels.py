@@ -67,6 +67,13 @@ def noise_of(card: SensorCard, pattern_known: bool = False) -> PixelNoise:
     return PixelNoise(card.read_noise_e**2 + fixed_e2 + rounding_e2, 0.0 if pattern_known else card.prnu)
 
 
+def noise_before_rounding(card: SensorCard, pattern_known: bool = False) -> PixelNoise:
+    """Noise of a sensor's pixels before the converter rounds; errors as `noise_of`."""
+    noise = noise_of(card, pattern_known)
+    # rounding is in `noise_of`
+    return PixelNoise(max(noise.gaussian_e2 - 1.0 / (12.0 * card.dn_per_e**2), 0.0), noise.prnu)
+
+
 @dataclass(frozen=True)
 class PatternNoise:
     """Fixed pattern of a camera, the same in all its frames: dsnu_e2 + (prnu mu)^2, electrons squared."""

@@ -40,9 +40,9 @@ from scipy.ndimage import gaussian_filter
 
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.estimator.geometry.status import Status
-from phibench.estimator.processed.fit_chain import spot_window, undone, unrounded
+from phibench.estimator.processed.fit_processed_images import spot_window
 from phibench.estimator.processed.interval_fit import interval_posterior
-from phibench.estimator.processed.neighbour_filters import regained
+from phibench.estimator.processed.inverse_processing import electrons_before_chroma_loss, unprocessed_electrons
 from phibench.estimator.processed.quasi_score import CoefficientWindow, fit_window
 from phibench.estimator.spots.camera_codes import mcu_px
 from phibench.estimator.spots.fit_raw import LEAST_SNR, fit_law
@@ -61,6 +61,7 @@ from phibench.estimator.spots.raw_pixels import (
     SpotRegions,
     background_of,
     bayer_filters,
+    noise_before_rounding,
     noise_of,
     spot_regions,
 )
@@ -356,9 +357,9 @@ def _room(frames: FilmFrames, weights: Array, corner: NDArray[np.int64], part: t
     """Room of one frame, and one frame with the laser off that shows how a JPEG rounds it."""
     used = np.flatnonzero(np.abs(weights) > _LEAST_WEIGHT)
     images, w = frames.off_e[used][:, *part], weights[used] / weights[used].sum()
-    x, rounding = undone(images, np.tile(corner, (len(used), 1)), frames.card)
-    mean = regained(np.tensordot(w, x, 1)[None], corner[None], frames.card)[0]
-    noise = unrounded(frames.card, True).variance_e2(mean)
+    x, rounding = unprocessed_electrons(images, np.tile(corner, (len(used), 1)), frames.card)
+    mean = electrons_before_chroma_loss(np.tensordot(w, x, 1)[None], corner[None], frames.card)[0]
+    noise = noise_before_rounding(frames.card, True).variance_e2(mean)
     variance = w @ w * noise + np.tensordot(w**2, rounding, 1)
     background = background_of(mean[None], variance[None], np.ones((1, *mean.shape)), PatternNoise.of(frames.card))
     return Background(background.mean_e, background.variance_e2, images[np.argmax(w)][None], holds_pattern=True)

@@ -281,13 +281,13 @@ def simulate(
 ) -> Array:
     """Printed estimates of as many worlds as there are points, shape (m, n), metres.
 
-    Parameters as for `unrounded`.
+    Parameters as for `unrounded_estimates`.
     """
     step = (experiments or model.experiments).rounding_m
-    return np.asarray(np.round(unrounded(model, points, random, experiments) / step) * step)
+    return np.asarray(np.round(unrounded_estimates(model, points, random, experiments) / step) * step)
 
 
-def unrounded(
+def unrounded_estimates(
     model: DepthModel, points: Array, random: np.random.Generator, experiments: Experiments | None = None
 ) -> Array:
     """Estimates of as many worlds as there are points, before they are printed, shape (m, n), metres.
@@ -319,7 +319,7 @@ def brute_force(model: DepthModel, point: Array, random: np.random.Generator, dr
     The simulated density is a kernel estimate in 1/D of `draws` worlds with the same parameters. The probability of a
     printed value over its step is the density of estimate plus a uniform error of one step, there.
     """
-    worlds = unrounded(model, np.repeat(point[None], draws, axis=0), random)
+    worlds = unrounded_estimates(model, np.repeat(point[None], draws, axis=0), random)
     worlds = 1.0 / (worlds + model.experiments.rounding_m * random.uniform(-0.5, 0.5, size=worlds.shape))
     seen = 1.0 / model.experiments.estimate_m
     simulated = np.array(

@@ -12,7 +12,7 @@ from phibench.datasets.frames.sensor_card import card_of
 from phibench.estimator.geometry.status import Status
 from phibench.estimator.limits.position_bound import NOISE_MODELS, spot_limit
 from phibench.estimator.limits.processed_bound import chain_limit
-from phibench.estimator.processed.fit_chain import fit_jpeg, fit_srgb
+from phibench.estimator.processed.fit_processed_images import fit_jpeg, fit_srgb
 from phibench.estimator.spots.fit_raw import fit_raw
 from phibench.estimator.spots.gaussian_spot import LASER_RESPONSE, SpotBlur, SpotModel
 from phibench.estimator.spots.raw_pixels import PixelNoise

@@ -10,7 +10,7 @@ from helpers.sensor_light import FILTERS, spot_at
 from phibench.datasets.frames.sensor_card import SensorCard, card_of
 from phibench.estimator.geometry.status import Status
 from phibench.estimator.limits.processed_bound import chain_limit, limit_window
-from phibench.estimator.processed.fit_chain import fit_jpeg, fit_srgb, fit_yuyv
+from phibench.estimator.processed.fit_processed_images import fit_jpeg, fit_srgb, fit_yuyv
 from phibench.estimator.spots.gaussian_spot import SpotBlur, covariance_bound
 from phibench.render.sensor.camera_chain import Chain
 from phibench.render.sensor.electrons import NoiseStream

@@ -19,7 +19,7 @@ from phibench.datasets.recipe.tables import RigTable
 from phibench.estimator.geometry.status import Status
 from phibench.estimator.limits.position_bound import spot_limit
 from phibench.estimator.limits.processed_bound import chain_limit
-from phibench.estimator.processed.fit_chain import fit_jpeg, fit_srgb
+from phibench.estimator.processed.fit_processed_images import fit_jpeg, fit_srgb
 from phibench.estimator.spots.fit_raw import SpotFit, fit_raw
 from phibench.estimator.spots.gaussian_spot import LASER_RESPONSE, SpotBlur, SpotModel
 from phibench.estimator.spots.raw_pixels import noise_of, raw_electrons

@@ -19,9 +19,9 @@ from phibench.estimator.limits.processed_bound import (
     processed_on_off_limit,
 )
 from phibench.estimator.processed.chain_model import chain_model, codes, raw_variance_e2
-from phibench.estimator.processed.fit_chain import unrounded
 from phibench.estimator.spots.camera_codes import quantised, step_correlation
 from phibench.estimator.spots.gaussian_spot import LASER_RESPONSE, SpotBlur, SpotModel, SpotPixels
+from phibench.estimator.spots.raw_pixels import noise_before_rounding
 from phibench.render.sensor.light import Light
 from phibench.render.sensor.settings import sensor
 
@@ -114,7 +114,7 @@ def test_jpeg_bound_is_that_of_explicit_unknowns(counts: tuple[int, int], steps:
     card, frames = sensor_card("mjpeg"), FrameCounts(*counts)
     uv, flux = np.array([100.3, 100.4]), 14e3
     found = processed_on_off_limit(card, uv, BLUR, flux, LEVELS, frames, steps=steps).fisher
-    model = chain_model(card, unrounded(card, True))
+    model = chain_model(card, noise_before_rounding(card, True))
     corner = np.array([80, 96]) - model.margin  # the units of 16 x 8 pixels that have it nearest to their middle
     pixels = SpotPixels.of(model.filters[None], BLUR, SpotModel(LASER_RESPONSE))
     mean, derivatives = pixels.at(np.array([[*(uv - corner), flux, *LEVELS]]))

@@ -10,7 +10,7 @@ from helpers.chain_scenes import MIDDLE, ROOM, SQUARE, scene
 from phibench.datasets.frames.sensor_card import card_of
 from phibench.estimator.geometry.status import Status
 from phibench.estimator.methods.likelihood_maps import likelihood_map, of_pixels
-from phibench.estimator.processed.fit_chain import code_data
+from phibench.estimator.processed.fit_processed_images import code_data
 from phibench.estimator.spots.fit_raw import fit_law
 from phibench.estimator.spots.gaussian_spot import SpotBlur, SpotModel
 from phibench.estimator.spots.raw_pixels import bayer_filters

@@ -9,8 +9,7 @@ from helpers.sensor_light import spot_at
 from scipy.ndimage import gaussian_filter
 
 from phibench.datasets.frames.sensor_card import card_of
-from phibench.estimator.processed.fit_chain import undone
-from phibench.estimator.processed.neighbour_filters import regained
+from phibench.estimator.processed.inverse_processing import electrons_before_chroma_loss, unprocessed_electrons
 from phibench.render.sensor.camera_chain import Chain
 from phibench.render.sensor.electrons import NoiseStream
 from phibench.render.sensor.light import Light, Region
@@ -31,24 +30,30 @@ def striped_room(s: Sensor) -> Light:
 def test_raw_pixels_come_back_from_averaged_chroma(preset: str, subsampling: str) -> None:
     """The simulator's own chain without noise: less than half of the error is left, that of rounding.
 
-    R, G, B are rounded, Y', Cb and Cr twice, R, G, B again: of R some 8 times the variance of `undone`. What gives an
-    own colour 0.7 of its change back makes 1.4 times of it, 4 deviations in all; 4:2:0 5. The loss is 6 to 14.
+    R, G, B are rounded, Y', Cb and Cr twice, R, G, B again: of R some 8 times the variance of
+    `unprocessed_electrons`. What gives an own colour 0.7 of its change back makes 1.4 times of it, 4
+    deviations in all; 4:2:0 5. The loss is 6 to 14.
     """
     quiet = {"shot_noise": False, "read_noise_e": 0.0, "prnu": 0.0, "dsnu_e": 0.0, "jpeg_quality": 100}
     s = sensor(preset, jpeg_subsampling=subsampling, **quiet)
     light = striped_room(s)
     origin = np.array([[PART.u0_px, PART.v0_px]])
-    seen, rounding = undone(Chain(s).frame(light, NoiseStream(("loss",)), PART)[None], origin, card_of(s))
+    seen, rounding = unprocessed_electrons(
+        Chain(s).frame(light, NoiseStream(("loss",)), PART)[None], origin, card_of(s)
+    )
     photo = Chain(s.replace(output="raw")).photo_electrons(light, PART)
     inner = (slice(6, -6), slice(6, -6))
 
     def rms(x: Array) -> float:
         return float(np.sqrt(np.mean(((x[0] - photo) / np.sqrt(rounding[0]))[inner] ** 2)))
 
-    assert rms(regained(seen, origin, card_of(s))) < 0.5 * rms(seen)
+    assert rms(electrons_before_chroma_loss(seen, origin, card_of(s))) < 0.5 * rms(seen)
 
 
 def test_other_outputs_lose_nothing() -> None:
     x = np.ones((1, 8, 8))
-    assert regained(x, np.zeros((1, 2), np.int64), card_of(sensor("srgb8"))) is x
-    assert regained(x, np.zeros((1, 2), np.int64), card_of(sensor("mjpeg", jpeg_subsampling="4:4:4"))) is x
+    assert electrons_before_chroma_loss(x, np.zeros((1, 2), np.int64), card_of(sensor("srgb8"))) is x
+    assert (
+        electrons_before_chroma_loss(x, np.zeros((1, 2), np.int64), card_of(sensor("mjpeg", jpeg_subsampling="4:4:4")))
+        is x
+    )

@@ -17,8 +17,7 @@ from phibench.datasets.frames.sensor_card import card_of
 from phibench.estimator.geometry.status import Status
 from phibench.estimator.limits.processed_bound import chain_limit
 from phibench.estimator.processed.chain_model import chain_model, codes
-from phibench.estimator.processed.fit_chain import unrounded
-from phibench.estimator.processed.fit_processed import grid_px
+from phibench.estimator.processed.fit_processed_region import grid_px
 from phibench.estimator.spots.camera_codes import (
     coefficients,
     light_of,
@@ -34,6 +33,7 @@ from phibench.estimator.spots.camera_codes import (
 from phibench.estimator.spots.gaussian_spot import SpotBlur
 from phibench.estimator.spots.image_planes import colour_planes, linear_planes, through_jpeg
 from phibench.estimator.spots.jpeg_recovery import recovered
+from phibench.estimator.spots.raw_pixels import noise_before_rounding
 from phibench.render.sensor import processing
 from phibench.render.sensor.camera_chain import Chain
 from phibench.render.sensor.electrons import NoiseStream
@@ -152,7 +152,7 @@ def test_model_of_the_outputs_against_the_chain(name: str) -> None:
     """
     s = CHAINS[name].replace(prnu=0.0, dsnu_e=0.0)
     card, n = card_of(s), 400
-    model = chain_model(card, unrounded(card))
+    model = chain_model(card, noise_before_rounding(card))
     (h, w), m, (down, across) = model.shape, model.margin, grid_px(card)
     v0, u0 = (round((c - side / 2) / step) * step for c, side, step in ((32, h, down), (48, w, across)))
     window, raw = Region(u0, v0, u0 + w, v0 + h), Region(u0 - m, v0 - m, u0 + w + m, v0 + h + m)

@@ -15,7 +15,8 @@ from phibench.datasets.frames.sensor_card import card_of
 from phibench.estimator.geometry.status import Status
 from phibench.estimator.limits.processed_bound import chain_limit
 from phibench.estimator.processed.chain_model import chain_model, codes
-from phibench.estimator.processed.fit_chain import fit_jpeg, fit_srgb, undone, unrounded
+from phibench.estimator.processed.fit_processed_images import fit_jpeg, fit_srgb
+from phibench.estimator.processed.inverse_processing import unprocessed_electrons
 from phibench.estimator.spots.camera_codes import (
     coefficients,
     linear_to_srgb,
@@ -30,7 +31,15 @@ from phibench.estimator.spots.fit_raw import fit_law
 from phibench.estimator.spots.gaussian_spot import SpotBlur, SpotModel, SpotPixels
 from phibench.estimator.spots.jpeg_recovery import recovered
 from phibench.estimator.spots.pixel_statistics import code_law, code_table
-from phibench.estimator.spots.raw_pixels import GaussLaw, PixelNoise, around, background_of, bayer_filters, spot_regions
+from phibench.estimator.spots.raw_pixels import (
+    GaussLaw,
+    PixelNoise,
+    around,
+    background_of,
+    bayer_filters,
+    noise_before_rounding,
+    spot_regions,
+)
 from phibench.render.sensor import processing
 from phibench.render.sensor.camera_chain import Chain
 from phibench.render.sensor.electrons import NoiseStream
@@ -99,7 +108,7 @@ def test_law_of_a_code_sums_to_one_and_gives_its_information(mean_e: float) -> N
     for colour in range(3):
         _, once = np.unique(table.low_e[colour], return_index=True)
         filters = np.full((1, 1, len(once)), colour)
-        law = code_law(once[None, None].astype(np.uint8), filters, card, unrounded(card), table)
+        law = code_law(once[None, None].astype(np.uint8), filters, card, noise_before_rounding(card), table)
         mean = np.full(filters.shape, mean_e)
         P, score = np.exp(-0.5 * law.misfit(mean, mean)), law.score(mean, mean)
         information = law.information(mean)[0, 0, 0]
@@ -168,7 +177,7 @@ def test_a_dark_room_comes_out_again(subsampling: str) -> None:
 def test_model_of_the_means_against_the_chain(changes: dict) -> None:
     """Mean codes of 600 frames: chi-square of 1536 values; a false alarm in 1e-6, a shift by 0.3 codes is noticed."""
     s = MJPEG.replace(prnu=0.0, dsnu_e=0.0, **changes)
-    model = chain_model(card_of(s), unrounded(card_of(s)))
+    model = chain_model(card_of(s), noise_before_rounding(card_of(s)))
     light, m = scene(MIDDLE + [0.3, -0.2], 0.7, FLUX_E, 100.0, s), model.margin
     from phibench.render.sensor.light import Region
 
@@ -215,7 +224,7 @@ def test_sharpening_and_matrix_are_undone() -> None:
     frame = Chain(s.replace(shot_noise=False, read_noise_e=0.0, prnu=0.0, dsnu_e=0.0)).frame(
         light, NoiseStream(("undone",)), SQUARE
     )
-    x, extra = undone(frame[None], np.array([[SQUARE.u0_px, SQUARE.v0_px]]), card_of(s))
+    x, extra = unprocessed_electrons(frame[None], np.array([[SQUARE.u0_px, SQUARE.v0_px]]), card_of(s))
     photo = Chain(s.replace(output="raw")).photo_electrons(light, SQUARE)
     inner = (slice(4, -4), slice(4, -4))
     # 5 deviations of 8 bits, and half a DN of the converter

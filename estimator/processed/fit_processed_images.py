@@ -1,4 +1,4 @@
-"""Fit of spots through the camera's own processing: mosaic, demosaicing, white balance, tone curve, 8 bits, JPEG.
+"""Fit of spots in processed images, through the camera's own chain: mosaic, demosaicing, tone curve, 8 bits, JPEG.
 
 `fit_srgb` takes processed 8-bit images, `fit_yuyv` Y'CbCr ones, `fit_jpeg` decoded MJPEG ones. Fits to the luminance
 have a floor of 0.1 to 0.25 px that does not fall with the signal, because a demosaiced, gamma-encoded spot is no
@@ -11,19 +11,26 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.ndimage import convolve1d, gaussian_filter
+from scipy.ndimage import gaussian_filter
 
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.estimator.geometry.status import Status, flag, keep
 from phibench.estimator.processed.chain_model import UNIT_MATRIX, ChainModel, chain_model, window_px
-from phibench.estimator.processed.fit_processed import JpegRegion, fit_region, grid_px, region_window
+from phibench.estimator.processed.fit_processed_region import JpegRegion, fit_region, grid_px, region_window
+from phibench.estimator.processed.inverse_processing import mean_unprocessed_electrons
 from phibench.estimator.processed.quasi_score import CoefficientWindow, WindowFit
-from phibench.estimator.spots.camera_codes import RGB_FROM_YCC, light_of, mcu_px, rgb_codes, tone_slope
+from phibench.estimator.spots.camera_codes import mcu_px
 from phibench.estimator.spots.fit_raw import LEAST_SNR, SpotData, SpotFit, fit_law, spot_data
 from phibench.estimator.spots.gaussian_spot import SpotBlur, SpotModel, covariance_bound
-from phibench.estimator.spots.image_planes import full_scale_e
 from phibench.estimator.spots.pixel_statistics import code_law, code_table
-from phibench.estimator.spots.raw_pixels import Background, GaussLaw, PixelNoise, bayer_filters, noise_of, spot_regions
+from phibench.estimator.spots.raw_pixels import (
+    Background,
+    GaussLaw,
+    PixelNoise,
+    bayer_filters,
+    noise_before_rounding,
+    spot_regions,
+)
 from phibench.scenes.frames import Array
 
 _CUT_PX = 15  # side of the square of the first fit
@@ -31,7 +38,6 @@ _MATCHED = (0.0, 0.8, 0.8)  # px, of (image, v, u): a spot in focus has 0.7 px a
 _LEVEL_PX = 2.0  # over which the level is taken that a pixel's noise is reckoned from
 _ASTRAY_PX = 2.0  # from where the spot was seen
 _ROUGH_CODES2 = 4.0  # variance of a decoded code that the first fit reckons with, codes squared
-_UNSHARP_STEPS = 24  # each multiplies the error by amount / (1 + amount): 4e-12 in all at 0.5
 
 
 def fit_srgb(
@@ -46,8 +52,8 @@ def fit_srgb(
 ) -> SpotFit:
     """Fit one spot in each region of processed 8-bit images.
 
-    Where each pixel's own colour is an interval of electrons (`own_codes`), the likelihood of a single frame is exact
-    (`pixel_statistics`). Otherwise mean and covariance of all codes are fitted, as `fit_jpeg` does it.
+    Where each pixel's own colour is an interval of electrons (`codes_are_independent`), the likelihood of a single
+    frame is exact (`pixel_statistics`). Otherwise mean and covariance of all codes are fitted, as `fit_jpeg` does it.
 
     Parameters
     ----------
@@ -70,7 +76,7 @@ def fit_srgb(
     """
     planes = _checked(images, card)
     origin = np.broadcast_to(np.asarray(origin_px, np.int64), (len(planes), 2))
-    if not own_codes(card) or planes.shape[1] > 1:
+    if not codes_are_independent(card) or planes.shape[1] > 1:
         known, shape = None if model is None else model.background_e, (len(planes), *planes.shape[2:4])
         levels = np.zeros(shape) if known is None else np.broadcast_to(known, shape)
         background = background or Background(levels, np.full(levels.shape, extra_e2))
@@ -87,9 +93,9 @@ def code_data(
     model: SpotModel | None = None,
     extra_e2: float = 0.0,
 ) -> SpotData:
-    """Likelihood of each pixel's own code, of one frame and for cards of `own_codes`; the rest as `fit_srgb`."""
+    """Likelihood of each pixel's own code, of one frame, for `codes_are_independent`; the rest as `fit_srgb`."""
     filters = bayer_filters(origin + card.mosaic_phase, planes.shape[1:3])
-    noise = unrounded(card)
+    noise = noise_before_rounding(card)
     noise = PixelNoise(noise.gaussian_e2 + extra_e2, noise.prnu)
     table = code_table(card)
     codes = np.take_along_axis(planes, filters[..., None], axis=3)[..., 0]
@@ -172,7 +178,7 @@ def fit_jpeg(
     return _fit_windows(planes, origin, card, blur, model, background, size_px, near_px)
 
 
-def own_codes(card: SensorCard) -> bool:
+def codes_are_independent(card: SensorCard) -> bool:
     """True if each pixel's own colour alone decides about its code."""
     smooth = max(card.sharpen_amount, card.denoise_luma, card.denoise_chroma) == 0.0
     return card.output == "srgb8" and smooth and card.colour_matrix == UNIT_MATRIX
@@ -208,7 +214,7 @@ def _fit_windows(
 
 def _chain(card: SensorCard, background: Background | None) -> ChainModel:
     """Model of the processing; the room's pattern is the background's, where that holds it."""
-    return chain_model(card, unrounded(card, background is not None and background.holds_pattern))
+    return chain_model(card, noise_before_rounding(card, background is not None and background.holds_pattern))
 
 
 def _region(
@@ -273,8 +279,8 @@ def first_fit(
     if response is None:
         raise ValueError("the fit through the chain needs the response of the filters: SpotModel(response=...)")
     filters = bayer_filters(origin + card.mosaic_phase, images.shape[2:4])
-    x, extra = undone_mean(images, origin, card)
-    rough, spread = _ROUGH_CODES2 * 12.0 * extra, unrounded(card)
+    x, extra = mean_unprocessed_electrons(images, origin, card)
+    rough, spread = _ROUGH_CODES2 * 12.0 * extra, noise_before_rounding(card)
     variance = spread.variance_e2(gaussian_filter(np.maximum(x, 0.0), (0.0, _LEVEL_PX, _LEVEL_PX))) + rough
     x = x - (0.0 if background is None else background.mean_e)
     if near_px is None:
@@ -342,56 +348,6 @@ def _on_grid(origin: NDArray[np.int64], shape: tuple[int, int], card: SensorCard
         )
 
 
-def unrounded(card: SensorCard, pattern_known: bool = False) -> PixelNoise:
-    """Noise of a sensor's pixels before the converter rounds; errors as `noise_of`."""
-    noise = noise_of(card, pattern_known)
-    # rounding is in `noise_of`
-    return PixelNoise(max(noise.gaussian_e2 - 1.0 / (12.0 * card.dn_per_e**2), 0.0), noise.prnu)
-
-
-def undone(images: NDArray[Any], origin: NDArray[np.int64], card: SensorCard) -> tuple[Array, Array]:
-    """Electrons of each pixel's own colour and the variance that 8 bits add, electrons squared, shape (n, h, w) each.
-
-    Undoes, from the end: Y'CbCr, sharpening, tone curve, colour matrix, white balance. Denoising and the loss of chroma
-    stay.
-
-    Parameters
-    ----------
-    images : shape (n, h, w, 3), codes 0 to 255, whole or not; (n, h, w, 2) of "yuyv"
-    origin : shape (n, 2)
-        Image pixel (u, v) of the first column and row.
-    """
-    filters = bayer_filters(origin + card.mosaic_phase, images.shape[1:3])
-    rgb = np.stack([rgb_codes(image, card, corner) for image, corner in zip(images, origin, strict=True)])
-    code = np.clip(_unsharpened(np.asarray(rgb, float), card.sharpen_amount) / 255.0, 0.0, 1.0)
-    linear = light_of(code, card)
-    spread = np.sqrt(np.sum(RGB_FROM_YCC**2, axis=1)) if card.output == "yuyv" else np.ones(3)
-    # a cut code has slope 0: its light is not known
-    width = spread / (255.0 * np.maximum(tone_slope(linear, card), 1e-3))
-    inverse = np.linalg.inv(np.asarray(card.colour_matrix)) / np.asarray(card.white_balance)[:, None]
-    own = inverse[filters] * full_scale_e(card)  # (n, h, w, 3): row of the inverse for the pixel's filter
-    return np.sum(own * linear, axis=3), np.sum((own * width) ** 2, axis=3) / 12.0
-
-
-def undone_mean(images: NDArray[Any], origin: NDArray[np.int64], card: SensorCard) -> tuple[Array, Array]:
-    """Mean over frames of what `undone` gives, and the variance that 8 bits add to it; images (n, f, h, w, c)."""
-    frames = [undone(images[:, k], origin, card) for k in range(images.shape[1])]
-    x, variance = (sum(parts) / len(frames) for parts in zip(*frames, strict=True))
-    return np.asarray(x), np.asarray(variance) / len(frames)
-
-
-def _unsharpened(codes: Array, amount: float) -> Array:
-    """Solution x of x + amount (x - blur x) = codes, shape (n, h, w, 3), by fixed-point iteration."""
-    x = codes
-    if amount > 0.0:
-        for _ in range(_UNSHARP_STEPS):
-            blurred = convolve1d(
-                convolve1d(x, (0.25, 0.5, 0.25), axis=1, mode="mirror"), (0.25, 0.5, 0.25), 2, mode="mirror"
-            )
-            x = (codes + amount * blurred) / (1.0 + amount)
-    return x
-
-
 def _frames_of(images: NDArray[Any]) -> NDArray[Any]:
     """Images with an axis of frames, shape (n, f, h, w, c); of single ones it has the length 1."""
     return images[:, None] if images.ndim == 4 else images
@@ -404,7 +360,7 @@ def _checked(images: NDArray[Any], card: SensorCard, count: int = 3) -> NDArray[
             f"images have the shape {np.shape(images)} and are {planes.dtype}: (n, h, w, {count}) or, of f frames, "
             f"(n, f, h, w, {count}) of uint8 is needed"
         )
-    least = 0 if own_codes(card) or card.output == "mjpeg" else window_px(card)[0] + 1
+    least = 0 if codes_are_independent(card) or card.output == "mjpeg" else window_px(card)[0] + 1
     if min(planes.shape[2:4]) < least:
         raise ValueError(f"images have the shape {np.shape(images)}: {least} x {least} pixels or more are needed")
     if card.mosaic != "bayer":
