@@ -17,7 +17,7 @@ import yaml
 
 import phibench
 from phibench.benchmark.isolation.run_limits import MethodError
-from phibench.benchmark.isolation.runner import asked_here
+from phibench.benchmark.isolation.runner import outcomes_here
 from phibench.datasets.common.errors import DatasetError
 from phibench.estimator import interface
 from phibench.scenes.rig import Rig
@@ -210,7 +210,7 @@ def test_mistakes_of_a_function_are_failures_of_its_pairs(bench_dataset: Path) -
     with pytest.raises(MethodError, match="FILE"):
         phibench.score(dataset, extract, "mono-raw", workers=2)
     with pytest.raises(MethodError, match="must take one pair"):
-        asked_here(lambda: extract)  # type: ignore[arg-type, misc]
+        outcomes_here(lambda: extract)  # type: ignore[arg-type, misc]
     with pytest.raises(DatasetError, match="there is no folder"):
         phibench.score("nowhere", extract)
 

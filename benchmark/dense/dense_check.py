@@ -15,7 +15,7 @@ from functools import partial
 import numpy as np
 
 from phibench.benchmark.dense.dense_easy import EasyDensePairs, EasyTruth, points_of
-from phibench.benchmark.isolation.method_check import Check
+from phibench.benchmark.isolation.method_check import MethodCheck
 from phibench.benchmark.isolation.method_references import DENSE, resolve
 from phibench.benchmark.isolation.run_limits import RunLimits
 from phibench.benchmark.isolation.runner import Harness
@@ -44,7 +44,7 @@ def check_dense(
     limits: RunLimits | None = None,
     count: int = PAIRS,
     told: Callable[[int], None] = lambda done: None,
-) -> Check:
+) -> MethodCheck:
     """Run a dense method on easy pairs; parameters and errors as for `isolation.method_check.check_method`."""
     pairs, done = EasyDensePairs(preset, count), list[Outcome]()
     with Harness([resolve(reference, DENSE)], limits) as harness:
@@ -52,14 +52,14 @@ def check_dense(
             done.append(outcome)
             told(len(done))
         isolation = harness.isolations[0]
-        check = judged_dense(done, [pairs.truth(outcome.number) for outcome in done])
+        check = check_of_dense_outcomes(done, [pairs.truth(outcome.number) for outcome in done])
         if not check.ok:
             ((other,),) = harness.outcomes(_Exchanged(pairs), [0])
             check = replace(check, faults=with_exchanged(check.faults, done[0], other, pairs.truth(0)))
     return check if isolation.startswith("isolated") else replace(check, notes=(*check.notes, isolation))
 
 
-def judged_dense(done: Sequence[Outcome], truths: Sequence[EasyTruth]) -> Check:
+def check_of_dense_outcomes(done: Sequence[Outcome], truths: Sequence[EasyTruth]) -> MethodCheck:
     """Faults and notes of outcomes on easy pairs, and the truth of each."""
     failed = Counter(outcome.failure for outcome in done if outcome.failure)
     faults = [
@@ -73,7 +73,7 @@ def judged_dense(done: Sequence[Outcome], truths: Sequence[EasyTruth]) -> Check:
         faults += _faults(answered)
         notes += _notes(answered, [outcome.seconds for outcome in done if outcome.dense is not None])
     printed = tuple((outcome.number, outcome.output) for outcome in done if outcome.output)
-    return Check(tuple(faults), tuple(notes), printed)
+    return MethodCheck(tuple(faults), tuple(notes), printed)
 
 
 @dataclass(frozen=True)
@@ -93,12 +93,12 @@ def with_exchanged(faults: tuple[str, ...], outcome: Outcome, other: Outcome, tr
 
     Parameters
     ----------
-    faults : as of `judged_dense`
+    faults : as of `check_of_dense_outcomes`
     outcome, other : the method's answers for a pair, and for the pair with down and up exchanged
     truth : of the pair
     """
-    asked = judged_dense([outcome], [truth]).faults
-    if not asked or other.dense is None or judged_dense([other], [truth]).faults:
+    asked = check_of_dense_outcomes([outcome], [truth]).faults
+    if not asked or other.dense is None or check_of_dense_outcomes([other], [truth]).faults:
         return faults
     return (f"down and up are exchanged inside the method: with both images exchanged {_RIGHT}",)
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from phibench.benchmark.pair_sets.dataset_pairs import DatasetPairs, dataset_pairs
-from phibench.benchmark.pair_sets.wanted_pairs import of_calibration
+from phibench.benchmark.pair_sets.wanted_pairs import samples_of_calibration
 from phibench.calibration.rig.calibration_file import Calibration
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.exposures.pair_draws import PairDraw
@@ -311,7 +311,7 @@ def dense_pairs(
         )
     if frames < 1:
         raise DatasetError(f"frames = {frames}: must be 1 or above")
-    chosen = dataset if calibration is None else of_calibration(dataset, calibration)
+    chosen = dataset if calibration is None else samples_of_calibration(dataset, calibration)
     for sample in chosen:
         require_curve(sample.nominal_rig, sample.row.nominal_stroke_m, sample.row.sample_id)
     draws_of_spots = dataset_pairs(chosen, preset, draws).pair_draws

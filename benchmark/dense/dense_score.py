@@ -25,7 +25,7 @@ from phibench.benchmark.dense.dense_pairs import DensePairs, DensePairSet, Dense
 from phibench.benchmark.dense.dense_records import COLUMN_TYPES, TruthErrors, pair_records
 from phibench.benchmark.isolation.method_references import DENSE, code_of_function, resolve
 from phibench.benchmark.isolation.run_limits import MethodError, RunLimits
-from phibench.benchmark.isolation.runner import Harness, Ran, asked_here, function_name, ran_here
+from phibench.benchmark.isolation.runner import Harness, RunProvenance, function_name, outcomes_here, provenance_here
 from phibench.benchmark.pair_sets.wanted_pairs import open_scored
 from phibench.benchmark.scores.answer_errors import Rules
 from phibench.benchmark.scores.compare import Difference, compared, rules_of
@@ -110,10 +110,10 @@ def score_dense(
             raise MethodError("limits are for methods in a process of their own: give FILE.py:FUNCTION")
         card = MethodCard.of(function_name(method), kind="function", **code_of_function(method))
         with Steps(console, "dense pairs", len(chosen)) as steps:
-            asked = asked_here(method)(_Shown(chosen), range(len(chosen)))
+            asked = outcomes_here(method)(_Shown(chosen), range(len(chosen)))
             (table,) = _records(chosen, asked, [[]], steps.reach)
         alone = "not isolated: a function runs in this process"
-        scored = _scored(card, chosen, table, seed, {}, alone, ran_here(), "")
+        scored = _scored(card, chosen, table, seed, {}, alone, provenance_here(), "")
     return scored if out is None else saved_dense(scored, Path(out))
 
 
@@ -295,7 +295,7 @@ def _scored(
     seed: int,
     limits: Mapping[str, Any],
     isolation: str,
-    ran: Ran,
+    ran: RunProvenance,
     output: str,
 ) -> DenseScored:
     card = card.model_copy(update=vars(ran))

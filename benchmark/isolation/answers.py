@@ -27,19 +27,19 @@ _LARGEST_INTEGER = 10**300  # a float holds it; a longer one does not fit into a
 def answer_text(value: object) -> dict[str, Any]:
     """Document of an answer; {"wrong": sentence} of anything else."""
     if not isinstance(value, Answer):
-        return {"wrong": f"the method returned {described(value)}: an Answer(down, up) is needed"}
+        return {"wrong": f"the method returned {value_description(value)}: an Answer(down, up) is needed"}
     for name in ("down", "up"):
         if not isinstance(getattr(value, name), Spot):
-            return {"wrong": f"{name} is {described(getattr(value, name))}: a Spot is needed"}
-    numbers = {name: plain(getattr(value, name)) for name in ("depth_m", "sigma_depth_m", "interval_depth_m")}
+            return {"wrong": f"{name} is {value_description(getattr(value, name))}: a Spot is needed"}
+    numbers = {name: plain_values(getattr(value, name)) for name in ("depth_m", "sigma_depth_m", "interval_depth_m")}
     return {"down": _spot_document(value.down), "up": _spot_document(value.up), **numbers}
 
 
 def _spot_document(spot: Spot) -> dict[str, Any]:
-    return {name: plain(getattr(spot, name)) for name in Spot.__dataclass_fields__}
+    return {name: plain_values(getattr(spot, name)) for name in Spot.__dataclass_fields__}
 
 
-def plain(value: Any, depth: int = 0) -> Any:
+def plain_values(value: Any, depth: int = 0) -> Any:
     """Numbers, texts and lists of them as they are, arrays as lists; {"type": ...} of what is neither.
 
     Arrays and tensors of any library that NumPy reads are taken, and every kind of float.
@@ -53,13 +53,17 @@ def plain(value: Any, depth: int = 0) -> Any:
     if isinstance(value, str):
         return value[: 8 * _MOST]
     if isinstance(value, (list, tuple)):
-        return [plain(x, depth + 1) for x in value] if _is_small(value, depth) else {"type": described(value)}
+        return (
+            [plain_values(x, depth + 1) for x in value]
+            if _is_small(value, depth)
+            else {"type": value_description(value)}
+        )
     shape = getattr(value, "shape", ())
     if not isinstance(shape, tuple) or len(shape) > _DEEPEST or math.prod(shape) > _MOST:
-        return {"type": described(value)}
+        return {"type": value_description(value)}
     listed = value.tolist() if hasattr(value, "tolist") else value
     # NumPy's longdouble lists itself
-    return plain(listed, depth) if isinstance(listed, (int, float, str, list)) else _converted(value)
+    return plain_values(listed, depth) if isinstance(listed, (int, float, str, list)) else _converted(value)
 
 
 def _is_small(value: list[Any] | tuple[Any, ...], depth: int) -> bool:
@@ -73,11 +77,11 @@ def _converted(value: Any) -> Any:
         with np.errstate(over="ignore"):  # infinity, which is refused later
             kind, listed = array.dtype.kind, np.asarray(array, float).tolist()
     except (TypeError, ValueError, OverflowError):  # ragged lists and objects of a method: told by their kind
-        return {"type": described(value)}
-    return listed if kind in "fiu" else {"type": described(value)}
+        return {"type": value_description(value)}
+    return listed if kind in "fiu" else {"type": value_description(value)}
 
 
-def described(value: object) -> str:
+def value_description(value: object) -> str:
     """A value in a few words: "None", "a tuple of 2", "an array of shape (720, 1280)"."""
     if value is None:
         return "None"
@@ -108,7 +112,7 @@ class AnswerError(ValueError):
     """Not an answer; the message says what is wrong and what is needed."""
 
 
-def checked(document: dict[str, Any]) -> Answer:
+def checked_answer(document: dict[str, Any]) -> Answer:
     """Answer of a document of `answer_text`.
 
     Where a status is not "ok" whatever position comes with it is dropped. The document may be forged: any JSON ends in
@@ -264,10 +268,10 @@ def most_bytes(shape: tuple[int, int]) -> int:
     return 3 * 8 * math.prod(shape) * 4 // 3 + (1 << 16)
 
 
-def planes_text(value: object) -> dict[str, Any]:
+def dense_answer_text(value: object) -> dict[str, Any]:
     """Document of a dense answer; {"wrong": sentence} of anything else."""
     if not isinstance(value, DenseAnswer):
-        return {"wrong": f"the method returned {described(value)}: a DenseAnswer(depth_m=...) is needed"}
+        return {"wrong": f"the method returned {value_description(value)}: a DenseAnswer(depth_m=...) is needed"}
     planes = {name: getattr(value, name) for name in _PLANES}
     return {"planes": {name: _encoded(plane) for name, plane in planes.items() if plane is not None}}
 
@@ -277,8 +281,8 @@ def _encoded(plane: Any) -> dict[str, Any]:
     return {"type": array.dtype.str, "shape": list(array.shape), "base64": base64.b64encode(array.data).decode()}
 
 
-def checked_planes(document: dict[str, Any], shape: tuple[int, int]) -> DenseAnswer:
-    """Answer of a document of `planes_text`, for an image of this shape; the document may be forged.
+def checked_dense_answer(document: dict[str, Any], shape: tuple[int, int]) -> DenseAnswer:
+    """Answer of a document of `dense_answer_text`, for an image of this shape; the document may be forged.
 
     Raises
     ------
@@ -321,8 +325,8 @@ def outcome_of(pair: Pair | DensePair, reply: dict[str, Any], seconds: float) ->
         return Outcome(pair.number, None, seconds, failure, printable_line(message, MESSAGE_LENGTH))
     try:
         if isinstance(pair, DensePair):
-            return Outcome(pair.number, None, seconds, dense=checked_planes(reply["answer"], pair.shape))
-        return Outcome(pair.number, checked(reply["answer"]), seconds)
+            return Outcome(pair.number, None, seconds, dense=checked_dense_answer(reply["answer"], pair.shape))
+        return Outcome(pair.number, checked_answer(reply["answer"]), seconds)
     except (AnswerError, KeyError) as error:
         text = str(error) if isinstance(error, AnswerError) else "the reply holds neither answer nor failure"
         return Outcome(pair.number, None, seconds, "invalid", text)

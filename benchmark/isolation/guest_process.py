@@ -36,9 +36,9 @@ from phibench.benchmark.isolation.pair_transport import (
     Connection,
     MemoryFile,
     TransportError,
-    again,
     needed_bytes,
     pack,
+    repeat_message,
 )
 from phibench.benchmark.isolation.printed_output import OutputTail, advised, last_lines, stack_place
 from phibench.benchmark.isolation.readable_files import access_of
@@ -309,7 +309,7 @@ class GuestProcess:
     def ask(self, pair: AnyPair, limits: RunLimits, file: str, method: int = 0) -> Outcome:
         """Answer or failure of a method for one pair."""
         nonce, before, self.stages = secrets.token_hex(8), self._output.count(), {}
-        message = again(nonce, method) if self._held is pair else pack(pair, self._memory, nonce, method)
+        message = repeat_message(nonce, method) if self._held is pair else pack(pair, self._memory, nonce, method)
         self._held = pair if self._shares else _NO_PAIR
         start = time.monotonic()  # by this clock alone: the method's process could tell any time
         try:

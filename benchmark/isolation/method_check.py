@@ -41,7 +41,7 @@ _GIVE_UP = 3  # pairs in a row without an answer in time
 
 
 @dataclass(frozen=True)
-class Check:
+class MethodCheck:
     """Result of a check.
 
     Attributes
@@ -80,7 +80,7 @@ def check_method(
     limits: RunLimits | None = None,
     count: int = PAIRS,
     told: Callable[[int], None] = lambda done: None,
-) -> Check:
+) -> MethodCheck:
     """Run a method on easy pairs.
 
     Parameters
@@ -107,15 +107,15 @@ def check_method(
             done.append(outcome)
             told(len(done))
         isolation = harness.isolations[0]
-    check = judged(done, pairs)
+    check = check_of_outcomes(done, pairs)
     return check if isolation.startswith("isolated") else replace(check, notes=(*check.notes, isolation))
 
 
-def judged(done: Sequence[Outcome], pairs: EasyPairs) -> Check:
+def check_of_outcomes(done: Sequence[Outcome], pairs: EasyPairs) -> MethodCheck:
     """Faults and notes of outcomes on easy pairs."""
     faults = [*_failures(done, pairs), *_missing(done, pairs), *_wrong(done, pairs)]
     printed = tuple((outcome.number, outcome.output) for outcome in done if outcome.output)
-    return Check(tuple(faults), tuple(_notes(done, pairs)), printed)
+    return MethodCheck(tuple(faults), tuple(_notes(done, pairs)), printed)
 
 
 def _until_hopeless(run: Iterator[Outcome]) -> Iterator[Outcome]:
@@ -175,7 +175,7 @@ def _wrong(done: Sequence[Outcome], pairs: EasyPairs) -> Iterator[str]:
     fault = fault or colour_fault(answered, pairs)
     error_px = answer_px - truth_px
     if not fault:
-        fault = position_fault(answer_px, truth_px, views) or whole_fault(error_px, boxed) or wild_fault(error_px)
+        fault = position_fault(answer_px, truth_px, views) or no_boxes_fault(error_px, boxed) or wild_fault(error_px)
     errors, covariances = _claimed(answered, truths)
     # a covariance says nothing about positions that are wrong by a rule
     yield from filter(None, [fault or covariance_fault(errors, covariances)])
@@ -294,7 +294,7 @@ def colour_fault(answered: Sequence[Outcome], pairs: EasyPairs) -> str:
     )
 
 
-def whole_fault(error_px: Array, boxed: Sequence[bool]) -> str:
+def no_boxes_fault(error_px: Array, boxed: Sequence[bool]) -> str:
     """Sentence if spots are found in boxes and not without them; "" if not.
 
     Parameters

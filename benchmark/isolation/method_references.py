@@ -88,7 +88,7 @@ class Reference:
 
 
 @dataclass(frozen=True)
-class Seat:
+class MethodTask:
     """Task that methods are written for.
 
     Attributes
@@ -113,7 +113,7 @@ class Seat:
     file: str
 
 
-SPOTS = Seat(
+SPOTS = MethodTask(
     "phibench method",
     "extract",
     "phibench.methods",
@@ -121,7 +121,7 @@ SPOTS = Seat(
     "example_method.py",
     "my_phi.py",
 )
-DENSE = Seat(
+DENSE = MethodTask(
     "phibench dense",
     "depth",
     "phibench.dense_methods",
@@ -132,7 +132,7 @@ DENSE = Seat(
 GROUP = SPOTS.group
 
 
-def resolve(reference: str, seat: Seat = SPOTS) -> Reference:
+def resolve(reference: str, seat: MethodTask = SPOTS) -> Reference:
     """Find a method.
 
     Raises
@@ -144,7 +144,7 @@ def resolve(reference: str, seat: Seat = SPOTS) -> Reference:
         return _of_file(reference, seat)
     # a second of imports that a method in a file does not need
     known = importlib.import_module(seat.registry).KNOWN
-    points = [point for point in installed(seat) if point.name == reference]
+    points = [point for point in installed_methods(seat) if point.name == reference]
     if reference in known:
         if points:
             raise MethodError(f"method '{reference}' is built in, and {_owner(points[0])} registers another")
@@ -157,19 +157,19 @@ def resolve(reference: str, seat: Seat = SPOTS) -> Reference:
     return Reference(reference, "package", points[0].value, sha256=hashed, version=_owner(points[0]))
 
 
-def installed(seat: Seat = SPOTS) -> tuple[EntryPoint, ...]:
+def installed_methods(seat: MethodTask = SPOTS) -> tuple[EntryPoint, ...]:
     """Entry points of installed packages, by name; none of them is imported."""
     return tuple(sorted(entry_points(group=seat.group), key=lambda point: point.name))
 
 
-def _built_in(method: Any, seat: Seat) -> Reference:
+def _built_in(method: Any, seat: MethodTask) -> Reference:
     if not method.installed:
         raise MethodError(f"method '{method.name}' {method.needs}")
     sees: Literal["image", "pair"] = "image" if seat is SPOTS and not method.joint else "pair"
     return Reference(method.name, "built-in", seat.registry, sha256=code_behind(seat.registry), sees=sees)
 
 
-def _of_file(reference: str, seat: Seat) -> Reference:
+def _of_file(reference: str, seat: MethodTask) -> Reference:
     text, colon, function = reference.rpartition(":")
     if not colon or not function.isidentifier():
         file = Path(text if colon else reference).name
@@ -275,15 +275,15 @@ def _owner(point: EntryPoint) -> str:
     return "an unknown package" if point.dist is None else f"{point.dist.name} {point.dist.version}"
 
 
-def _unknown(name: str, built_in: list[str], seat: Seat) -> str:
-    known = [*built_in, *(point.name for point in installed(seat))]
+def _unknown(name: str, built_in: list[str], seat: MethodTask) -> str:
+    known = [*built_in, *(point.name for point in installed_methods(seat))]
     guess = close_names(name, known)
     advice = f"did you mean '{guess[0]}'?" if guess else f"`{seat.command} list` lists what there is."
     own = f"{seat.file}:{seat.function}"
     return f"no method '{name}': {advice} A method of your own is given as file and function, {own}"
 
 
-def write_example(path: Path, seat: Seat = SPOTS) -> Path:
+def write_example(path: Path, seat: MethodTask = SPOTS) -> Path:
     """Write the example method to a file that is not there yet.
 
     Raises

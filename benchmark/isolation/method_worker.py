@@ -31,7 +31,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-from phibench.benchmark.isolation.answers import answer_text, planes_text, to_bytes
+from phibench.benchmark.isolation.answers import answer_text, dense_answer_text, to_bytes
 from phibench.benchmark.isolation.method_provenance import loaded_names
 from phibench.benchmark.isolation.method_references import Reference
 from phibench.benchmark.isolation.pair_transport import Connection, ReceivedPair, SharedPages, TransportError, unpack
@@ -54,7 +54,7 @@ def size_bytes() -> int:
 
 
 @contextmanager
-def limited(limit_bytes: int) -> Iterator[None]:
+def memory_limit(limit_bytes: int) -> Iterator[None]:
     """Keep RLIMIT_AS at a limit; taken off afterwards, so that what went wrong can be told."""
     if not _STATM.is_file():
         yield
@@ -71,7 +71,7 @@ def limited(limit_bytes: int) -> Iterator[None]:
 _MODULE = "phibench_method"
 
 
-def load(reference: Reference) -> Method:
+def load_method(reference: Reference) -> Method:
     """Import the method of a reference; runs the code of its file or package.
 
     Raises
@@ -244,7 +244,7 @@ def main(line: int, reader: int, isolation: dict[str, Any]) -> None:
         return
     nonce, references = order["nonce"], [Reference.of(one) for one in order["references"]]
     try:
-        methods = [load(reference) for reference in references]
+        methods = [load_method(reference) for reference in references]
     except MethodError as error:
         connection.send(to_bytes({"nonce": nonce, "fault": str(error)[:_LONGEST_MESSAGE]}))
         return
@@ -296,10 +296,10 @@ def _reply(method: Method, received: ReceivedPair, limits: RunLimits, limit_byte
     pair: Any = received.pair
 
     def ask() -> Any:
-        with limited(limit_bytes):
+        with memory_limit(limit_bytes):
             return method(pair)
 
-    work, text = getattr(pair, "work", None), text_of(pair)
+    work, text = getattr(pair, "work", None), answer_encoder(pair)
     reply = reply_of(ask, file, BaseException, limits, text) if work is None else _reply_with_stages(ask, work, limits)
     for stream in (sys.stdout, sys.stderr):  # what belongs to this pair must be in the pipe before the reply
         with suppress(Exception):  # the method has closed or replaced it
@@ -317,9 +317,9 @@ def _reply_with_stages(ask: Callable[[], Any], work: SharedWork, limits: RunLimi
     return {**reply, "stages": work.stages, "own_seconds": own, "reused_seconds": work.reused_seconds}
 
 
-def text_of(pair: object) -> Callable[[object], dict[str, Any]]:
+def answer_encoder(pair: object) -> Callable[[object], dict[str, Any]]:
     """Encoder of the answers that a kind of pair asks for."""
-    return planes_text if isinstance(pair, DensePair) else answer_text
+    return dense_answer_text if isinstance(pair, DensePair) else answer_text
 
 
 def reply_of(

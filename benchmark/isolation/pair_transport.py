@@ -258,13 +258,13 @@ def pack(pair: AnyPair, memory: MemoryFile, nonce: str = "", method: int = 0) ->
     return pickle.dumps((rest, layout, memory.write(views), nonce, method), protocol=5)
 
 
-def again(nonce: str, method: int) -> bytes:
+def repeat_message(nonce: str, method: int) -> bytes:
     """Message that asks another method of the same process for the pair that it got last."""
     return pickle.dumps((nonce, method), protocol=5)
 
 
 def unpack(message: bytes, shared: SharedPages, held: ReceivedPair | None = None) -> ReceivedPair:
-    """Pair of a message, with images that cannot be written to; of `again` the one that is held."""
+    """Pair of a message, with images that cannot be written to; of `repeat_message` the one that is held."""
     parts = pickle.loads(message)
     if held is not None and len(parts) == 2:
         return replace(held, nonce=parts[0], method=parts[1])

@@ -23,7 +23,7 @@ from phibench.benchmark.isolation.guest_process import MethodProcess
 from phibench.benchmark.isolation.isolation import Isolation
 from phibench.benchmark.isolation.method_provenance import loaded_names, packages_of
 from phibench.benchmark.isolation.method_references import Reference, resolve
-from phibench.benchmark.isolation.method_worker import reply_of, require_method, text_of
+from phibench.benchmark.isolation.method_worker import answer_encoder, reply_of, require_method
 from phibench.benchmark.isolation.pair_transport import AnyPair
 from phibench.benchmark.isolation.run_limits import MethodError, RunLimits
 from phibench.estimator.interface import Outcome
@@ -40,7 +40,7 @@ class ShownPairs(Protocol):
 
 
 @dataclass(frozen=True)
-class Ran:
+class RunProvenance:
     """Packages and files with which a method's process ran.
 
     Attributes
@@ -131,7 +131,7 @@ class Harness:
         return list(told)
 
     @property
-    def ran(self) -> list[Ran]:
+    def ran(self) -> list[RunProvenance]:
         """Packages and files of each method, so far; those of one process together have the same packages."""
         told = self._in_order([[pool.ran] * len(at) for pool, at in self._pooled()])
         return list(told)
@@ -252,11 +252,11 @@ class _MethodPool:
         self._processes[0].start()
 
     @property
-    def ran(self) -> Ran:
+    def ran(self) -> RunProvenance:
         names = set[str]().union(*(process.loaded for process in self._processes))
         reference = self._processes[0].reference
         files = self._opened.hashes(reference.files())
-        return Ran(packages_of(names), files, self._opened.complete)
+        return RunProvenance(packages_of(names), files, self._opened.complete)
 
     @property
     def isolation(self) -> Isolation:
@@ -307,7 +307,7 @@ def _outcomes(harness: Harness, pairs: PairSet, numbers: Sequence[int]) -> Itera
             yield outcome
 
 
-def asked_here(method: Callable[[Any], Any]) -> Callable[[ShownPairs, Sequence[int]], Iterator[tuple[Outcome]]]:
+def outcomes_here(method: Callable[[Any], Any]) -> Callable[[ShownPairs, Sequence[int]], Iterator[tuple[Outcome]]]:
     """Ask a function in this process, without limits: `Harness.outcomes` for one method in a notebook or debugger.
 
     What it raises is the failure of that pair; Ctrl-C ends the run.
@@ -320,7 +320,7 @@ def asked_here(method: Callable[[Any], Any]) -> Callable[[ShownPairs, Sequence[i
     require_method(method, function_name(method))
 
     def one(pair: AnyPair) -> tuple[Outcome]:
-        reply = reply_of(lambda: method(pair), text=text_of(pair))
+        reply = reply_of(lambda: method(pair), text=answer_encoder(pair))
         return (outcome_of(pair, reply, reply["seconds"]),)
 
     return lambda pairs, numbers: (one(pairs.pair(number)) for number in numbers)
@@ -331,6 +331,6 @@ def function_name(method: Callable[[Any], Any]) -> str:
     return str(getattr(method, "__name__", type(method).__name__))
 
 
-def ran_here() -> Ran:
+def provenance_here() -> RunProvenance:
     """Packages of a function in this process; files that it opened before are not known."""
-    return Ran(packages_of(loaded_names()), {}, False)
+    return RunProvenance(packages_of(loaded_names()), {}, False)

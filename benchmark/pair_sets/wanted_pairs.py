@@ -121,7 +121,7 @@ def wanted_pairs(dataset: Dataset | ImportedSet | FramesSet, choice: PairChoice)
     from phibench.calibration.rig.calibration_file import read_calibration
 
     read = read_calibration(choice.calibration)
-    return CalibratedPairs(_of_track(dataset_pairs(of_calibration(dataset, read), *taken), choice), read)
+    return CalibratedPairs(_of_track(dataset_pairs(samples_of_calibration(dataset, read), *taken), choice), read)
 
 
 def _of_track(pairs: DatasetPairs, choice: PairChoice) -> DatasetPairs:
@@ -167,7 +167,7 @@ class CalibratedPairs:
     Parameters
     ----------
     pairs : PairSet
-        All of one true rig: see `of_calibration`.
+        All of one true rig: see `samples_of_calibration`.
     """
 
     def __init__(self, pairs: PairSet, calibration: Calibration) -> None:
@@ -213,7 +213,7 @@ class CalibratedPairs:
         return float(stroke_of(np.array(nominal_m), self.calibration.values))
 
 
-def of_calibration(dataset: Dataset, calibration: Calibration) -> Dataset:
+def samples_of_calibration(dataset: Dataset, calibration: Calibration) -> Dataset:
     """The samples of a data set that a calibration is for: those of the rig that it was made from.
 
     Raises

@@ -49,12 +49,12 @@ def archive_tasks(title: str, folder: Path, files: Mapping[str, str], most_bytes
     tasks = {}
     for number, names in enumerate(_shares(folder, files, most_bytes)):
         name, share = f"{title}-{number:03d}.tar", {name: files[name] for name in names}
-        key = digest_of([title, list(share.items())])
+        key = json_digest([title, list(share.items())])
         tasks[name] = BuildTask(f"archive {name}", key, write_archive, (name, title, folder, share))
     return tasks
 
 
-def digest_of(document: object) -> str:
+def json_digest(document: object) -> str:
     """SHA-256 of a document as JSON."""
     return hashlib.sha256(json.dumps(document).encode()).hexdigest()
 

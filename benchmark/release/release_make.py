@@ -16,7 +16,7 @@ from pathlib import Path
 from rich.console import Console
 
 from phibench.benchmark.export.export_make import export_frames_sets
-from phibench.benchmark.release.release_archives import archive_tasks, digest_of, packed_files
+from phibench.benchmark.release.release_archives import archive_tasks, json_digest, packed_files
 from phibench.benchmark.release.release_parts import (
     DENSE_PAIRS,
     FORMAT,
@@ -153,7 +153,7 @@ def release(request: ReleaseRequest, seal: Seal) -> Released:
     return Released(out, manifest, made, kept)
 
 
-def dry_run(request: ReleaseRequest) -> Iterator[str]:
+def forecast_lines(request: ReleaseRequest) -> Iterator[str]:
     """Lines that say what a release takes and holds; nothing is rendered or written."""
     _check_folders(request)
     used = _assigned(request)
@@ -321,7 +321,7 @@ def _dataset(request: ReleaseRequest, part: ReleasePart, used: Mapping[str, Path
 def _frames(request: ReleaseRequest, part: ReleasePart, folder: Path) -> Path:
     """Frames sets of the first samples; another data set, or another number of samples, has a folder of its own."""
     pairs = request.frames_of(part)
-    digest = digest_of([sha256(folder / schema.CHECKSUMS), pairs])[:12]
+    digest = json_digest([sha256(folder / schema.CHECKSUMS), pairs])[:12]
     out = request.work / f"{part.title}-{digest}"
     if not (out / schema.CHECKSUMS).is_file() and (faults := differing_files(folder, read_checksums(folder))):
         raise DatasetError(f"{folder}: {faults[0]}; run `phibench dataset repair {folder}`")
@@ -331,7 +331,7 @@ def _frames(request: ReleaseRequest, part: ReleasePart, folder: Path) -> Path:
 def _dense(request: ReleaseRequest, part: ReleasePart, folder: Path) -> Path:
     """Dense set of the first samples; of a sealed part its public form."""
     most = min(DENSE_PAIRS, request.samples_of(part) or DENSE_PAIRS)
-    digest = digest_of([sha256(folder / schema.CHECKSUMS), most])[:12]
+    digest = json_digest([sha256(folder / schema.CHECKSUMS), most])[:12]
     dataset, out = open_finished(folder), request.work / f"{part.title}-{digest}"
     if not (out / schema.CHECKSUMS).is_file() and (faults := differing_files(folder, read_checksums(folder))):
         raise DatasetError(f"{folder}: {faults[0]}; run `phibench dataset repair {folder}`")

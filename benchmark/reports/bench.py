@@ -19,14 +19,14 @@ from typing import TYPE_CHECKING
 
 from rich.console import Console
 
-from phibench.benchmark.isolation.method_references import installed, write_example
+from phibench.benchmark.isolation.method_references import installed_methods, write_example
 from phibench.benchmark.isolation.run_limits import RunLimits
 from phibench.benchmark.pair_sets.dataset_pairs import TRACKS, Track, tracks_of
 from phibench.benchmark.pair_sets.frames_set import FramesSet
 from phibench.benchmark.pair_sets.wanted_pairs import PairChoice, open_scored, wanted_pairs
 from phibench.benchmark.reports.report_page import write_report
 from phibench.benchmark.reports.report_sections import time_section
-from phibench.benchmark.scores.score import Scored, run_and_score, saved_each
+from phibench.benchmark.scores.score import Scored, run_and_score, saved_scores
 from phibench.benchmark.scores.score_files import records_kept
 from phibench.benchmark.scores.score_tables import failure_line
 from phibench.datasets.common.errors import DatasetError
@@ -91,7 +91,7 @@ def bench(
     """
     dataset, out = open_scored(folder), Path(out)
     console = console or progress_console()
-    chosen = _chosen(list(dict.fromkeys([*METHODS, *(point.name for point in installed())])), methods)
+    chosen = _chosen(list(dict.fromkeys([*METHODS, *(point.name for point in installed_methods())])), methods)
     if out.resolve() == dataset.folder.resolve() or dataset.folder.resolve() in out.resolve().parents:
         raise DatasetError(f"{out} lies inside the data set, whose files are signed; give a folder outside, --out")
     require_writable(out / REPORT)
@@ -99,7 +99,7 @@ def bench(
     for preset, track in product(_presets(dataset), _runs(dataset, tracks)):
         taken = wanted_pairs(dataset, PairChoice(preset, pairs=pairs, calibration=calibration, track=track))
         # what a package's method takes is known to nobody: it is asked, and its answers say so
-        refusals = {name: refusal(METHODS[name], taken) if name in METHODS else "" for name in chosen}
+        refusals = {name: refusal_reason(METHODS[name], taken) if name in METHODS else "" for name in chosen}
         run = f"{preset}, localise" if track == "localise" else preset
         notes += [f"{name} is left out on {run}: {why}" for name, why in refusals.items() if why]
         names = [name for name, why in refusals.items() if not why]
@@ -109,7 +109,7 @@ def bench(
         with records_kept(paths):
             done = run_and_score(names, taken, workers, console, run, limits=limits, stages=stages)
         times[run] = {stage: seconds / len(taken) for stage, seconds in stages.items()}
-        saved_each(done, paths)
+        saved_scores(done, paths)
         failures += [f"{one.document.method.name} {line}" for one in done if (line := failure_line(one.records))]
         scores += paths
     if not scores:
@@ -118,14 +118,14 @@ def bench(
     return Benched(page, tuple(scores), tuple(notes), tuple(failures))
 
 
-def refusal(method: BuiltIn, pairs: PairSet) -> str:
+def refusal_reason(method: BuiltIn, pairs: PairSet) -> str:
     """Reason for which a built-in method cannot take the pairs of a preset; "" if it can."""
     pair = pairs.pair(0)
     whole = "find" in tracks_of(pairs.document())
     return method.refusal(pair if whole else replace(pair, box_down=_PROBE_BOX, box_up=_PROBE_BOX))
 
 
-def show(page: Path) -> bool:
+def open_in_browser(page: Path) -> bool:
     """Open a page in a browser, where somebody sits before one; return whether it was opened."""
     display = sys.platform in ("darwin", "win32") or any(
         os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY")
@@ -196,7 +196,7 @@ def demo(out: Path, console: Console | None = None) -> Demo:
     references = [*DEMO_METHODS, f"{example}:extract"]
     scored = run_and_score(references, FramesSet(pairs).of_track("find"), 1, console or progress_console(), "pairs")
     files = [out / name for name in _SCORES]
-    saved = saved_each(scored, files)
+    saved = saved_scores(scored, files)
     return Demo(write_report(files, out / REPORT), tuple(saved), pairs, example)
 
 

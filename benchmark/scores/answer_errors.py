@@ -194,7 +194,7 @@ class _ByValue:
         return cls((value.shape, value.dtype.str, value.tobytes()) if isinstance(value, np.ndarray) else value, value)
 
 
-def kept(function: Callable[P, T]) -> Callable[P, T]:
+def with_kept_results(function: Callable[P, T]) -> Callable[P, T]:
     """The function with its last results kept: what follows from a truth alone is the same for all methods.
 
     Arguments go by position, arrays are compared by their bytes. Arrays in the results are read only.
@@ -216,7 +216,7 @@ def kept(function: Callable[P, T]) -> Callable[P, T]:
     return once
 
 
-@kept
+@with_kept_results
 def from_centre_px(rig: Rig, uv_px: Array) -> Array:
     """Distance from the image of the sphere centre, shape (n,)."""
     return np.asarray(np.linalg.norm(uv_px - outline_circle(rig)[0], axis=-1))
@@ -227,7 +227,7 @@ def phi_of(convention: str, rig: Rig, uv_px: Array) -> Array:
     return CONVENTIONS[convention](rig.at(0.0), uv_px)
 
 
-@kept
+@with_kept_results
 def phi_variance(rig: Rig, uv_px: Array, covariance_px2: Array, convention: str = "ray") -> Array:
     """Variance of phi, shape (n,), rad^2: g C g^T; NaN for covariances, shape (n, 2, 2), that are NaN."""
     return estimate_phi(convention, rig.at(0.0), uv_px, covariance_px2).variance_rad2

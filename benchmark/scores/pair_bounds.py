@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from phibench.benchmark.scores.answer_errors import kept, phi_variance
+from phibench.benchmark.scores.answer_errors import phi_variance, with_kept_results
 from phibench.benchmark.scores.beyond_images import clipped, least_px2, squares
 from phibench.estimator.geometry.least_squares_depth import JointBound, information, joint_bound
 from phibench.scenes.frames import Array
@@ -93,7 +93,7 @@ def _or(covariance_px2: Array, alone_px2: Array) -> Array:
     return np.where(joint[:, None, None], covariance_px2, alone_px2)
 
 
-_joint_bound = kept(joint_bound)
+_joint_bound = with_kept_results(joint_bound)
 
 
 def _projected(joint: JointBound, covariances_px2: list[Array], errors_px: tuple[Array, Array]) -> Array:

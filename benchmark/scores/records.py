@@ -19,13 +19,13 @@ from phibench.benchmark.scores.answer_errors import (
     best_constant,
     from_centre_px,
     in_ray_units,
-    kept,
     phi_of,
     phi_variance,
     pixel_errors,
     rank_squares,
     usable_covariance,
     whitened,
+    with_kept_results,
 )
 from phibench.benchmark.scores.beyond_images import searched_px2
 from phibench.benchmark.scores.intervals import NORMAL_95
@@ -303,7 +303,7 @@ def _pair_columns(
     }
 
 
-_true_phi, _bound_depth = kept(phi_of), kept(depth_exact)
+_true_phi, _bound_depth = with_kept_results(phi_of), with_kept_results(depth_exact)
 
 
 def _spot(outcome: Outcome, position: str) -> Spot | None:

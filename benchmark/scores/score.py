@@ -18,7 +18,7 @@ from rich.console import Console
 from phibench.benchmark.isolation.method_references import code_of_function, resolve
 from phibench.benchmark.isolation.prefetched_pairs import PrefetchedPairs
 from phibench.benchmark.isolation.run_limits import MethodError, RunLimits
-from phibench.benchmark.isolation.runner import Harness, Ran, asked_here, function_name, ran_here
+from phibench.benchmark.isolation.runner import Harness, RunProvenance, function_name, outcomes_here, provenance_here
 from phibench.benchmark.pair_sets.dataset_pairs import DatasetPairs
 from phibench.benchmark.pair_sets.frames_set import FramesSet
 from phibench.benchmark.pair_sets.wanted_pairs import (
@@ -301,17 +301,19 @@ def score(
         with Steps(console, "pairs", len(chosen)) as steps:
             code = code_of_function(method) | declared.fields("function")
             card = MethodCard.of(function_name(method), kind="function", **code)
-            (scored,) = score_methods([card], chosen, asked_here(method), None, seed, None, steps.reach)
-        scored = ran_with(isolated(scored, "not isolated: a function runs in this process"), ran_here())
-    return scored if out is None else saved(scored, Path(out))
+            (scored,) = score_methods([card], chosen, outcomes_here(method), None, seed, None, steps.reach)
+        scored = with_provenance(
+            with_isolation(scored, "not isolated: a function runs in this process"), provenance_here()
+        )
+    return scored if out is None else saved_score(scored, Path(out))
 
 
-def saved(scored: Scored, file: Path) -> Scored:
+def saved_score(scored: Scored, file: Path) -> Scored:
     """The score, written with its records; its document then names their hash."""
     return replace(scored, document=write_score(file, scored.document, scored.records))
 
 
-def saved_each(scores: Sequence[Scored], files: Sequence[Path]) -> list[Scored]:
+def saved_scores(scores: Sequence[Scored], files: Sequence[Path]) -> list[Scored]:
     """The scores, each written for itself: a file that cannot be written costs no other method its score.
 
     Raises
@@ -322,7 +324,7 @@ def saved_each(scores: Sequence[Scored], files: Sequence[Path]) -> list[Scored]:
     written, faults = [], []
     for score, file in zip(scores, files, strict=True):
         try:
-            written.append(saved(score, file))
+            written.append(saved_score(score, file))
         except (DatasetError, OSError) as error:  # the others are written all the same
             faults.append(f"{file} could not be written: {error}")
     if faults:
@@ -372,7 +374,10 @@ def run_and_score(
         stages["draw"] -= stages["bounds"] - stages.pop(_LATE)
         stages |= {stage: stages[stage] + seconds for stage, seconds in making.items()}
     told = zip(scored, harness.failed_outputs, harness.isolations, harness.ran, strict=True)
-    return [replace(ran_with(isolated(one, isolation), ran), output=output) for one, output, isolation, ran in told]
+    return [
+        replace(with_provenance(with_isolation(one, isolation), ran), output=output)
+        for one, output, isolation, ran in told
+    ]
 
 
 _WORTH_A_PROCESS = 40  # pairs; a process that makes them starts in 2 s
@@ -392,12 +397,12 @@ def _ahead(pairs: PairSet, workers: int) -> Iterator[tuple[PairSet, dict[str, fl
         yield CalibratedPairs(made, pairs.calibration) if isinstance(pairs, CalibratedPairs) else made, made.seconds
 
 
-def isolated(scored: Scored, isolation: str) -> Scored:
+def with_isolation(scored: Scored, isolation: str) -> Scored:
     """The score with how its method was isolated."""
     return replace(scored, document=scored.document.model_copy(update={"isolation": isolation}))
 
 
-def ran_with(scored: Scored, ran: Ran) -> Scored:
+def with_provenance(scored: Scored, ran: RunProvenance) -> Scored:
     """The score with packages and files of its method."""
     card = scored.document.method.model_copy(update=vars(ran))
     return replace(scored, document=scored.document.model_copy(update={"method": card}))

@@ -73,7 +73,7 @@ def rebuilt(
 _CODES = 2.0  # mean difference of two coders' JPEG pictures of one frame
 
 
-def alike(given: EncodedPicture | None, right: EncodedPicture | None) -> bool:
+def pictures_alike(given: EncodedPicture | None, right: EncodedPicture | None) -> bool:
     """Tell whether two pictures show the same: coders of other versions write other bytes."""
     if given is None or right is None or given.base64 == right.base64:
         return given == right
@@ -138,7 +138,7 @@ RELATIVE, ABSOLUTE = 1e-6, 1e-12
 """Tolerance of a number that is computed again: other processors and versions of libraries round otherwise."""
 
 
-def differences(table: pl.DataFrame, right: pl.DataFrame, names: Sequence[str], source: str) -> Iterator[str]:
+def column_differences(table: pl.DataFrame, right: pl.DataFrame, names: Sequence[str], source: str) -> Iterator[str]:
     """Columns that are not as they have to be, a sentence each with its first row."""
     for name in names:
         if name not in table.columns:
@@ -149,7 +149,7 @@ def differences(table: pl.DataFrame, right: pl.DataFrame, names: Sequence[str], 
             number, image = table.select("number", "image").row(int(rows[0]))
             a, b = table[name][int(rows[0])], right[name][int(rows[0])]
             more = f", and {len(rows) - 1} more" if len(rows) > 1 else ""
-            yield f"records.{name} of pair {number} {image} is {short(a)}, not {short(b)}, {source}{more}"
+            yield f"records.{name} of pair {number} {image} is {short_value(a)}, not {short_value(b)}, {source}{more}"
 
 
 def _same(given: pl.Series, right: pl.Series) -> Any:
@@ -161,7 +161,7 @@ def _same(given: pl.Series, right: pl.Series) -> Any:
     return np.isclose(a, b, rtol=RELATIVE, atol=ABSOLUTE, equal_nan=True)
 
 
-def short(value: Any) -> str:
+def short_value(value: Any) -> str:
     """A value in at most 60 signs."""
     text = f"{value:.6g}" if isinstance(value, float) else repr(value)
     return text if len(text) <= 60 else f"{text[:57]}..."
@@ -175,14 +175,14 @@ _ALWAYS = "numpy"
 
 
 @dataclass(frozen=True)
-class Told:
+class CheckNotes:
     """Faults, and what could not be checked, a sentence each."""
 
     faults: tuple[str, ...]
     unchecked: tuple[str, ...]
 
 
-def check_card(document: ScoreDocument, method: str | None = None) -> Told:
+def check_card(document: ScoreDocument, method: str | None = None) -> CheckNotes:
     """Check what a score says of its method and of the program that scored it.
 
     Parameters
@@ -205,7 +205,7 @@ def check_card(document: ScoreDocument, method: str | None = None) -> Told:
         unchecked.append("method.sha256, modules, files and packages: give the method itself, --method")
     if document.program != program_version() or "changed" in document.program:
         unchecked.append(f"code_sha256: it was scored by {document.program or 'a program that is not told'}")
-    return Told(tuple(faults), tuple(unchecked))
+    return CheckNotes(tuple(faults), tuple(unchecked))
 
 
 def _of_form(card: MethodCard) -> Iterator[str]:
@@ -268,7 +268,7 @@ def check_run(
     limits: RunLimits,
     workers: int,
     console: Console,
-) -> Told:
+) -> CheckNotes:
     """Run the method again and compare its answers, packages and files; parameters as for `check_score`.
 
     Raises
@@ -278,7 +278,7 @@ def check_run(
     """
     (again,) = run_and_score([method], pairs, workers, console, "pairs again", document.seed, limits)
     names = [name for name in again.records.columns if name not in GIVEN]
-    faults = list(differences(table, again.records, names, "what the method answers here"))
+    faults = list(column_differences(table, again.records, names, "what the method answers here"))
     given, right = document.method, again.document.method
     if right.files_complete:
         faults += _of_files("files", given.files, right.files)
@@ -288,4 +288,4 @@ def check_run(
     unchecked = [
         f"method.packages.{name}: {given.packages[name]} there, {right.packages.get(name)} here" for name in other
     ]
-    return Told(tuple(faults), tuple(unchecked))
+    return CheckNotes(tuple(faults), tuple(unchecked))

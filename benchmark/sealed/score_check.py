@@ -32,13 +32,13 @@ from phibench.benchmark.sealed.rebuilt_score import (
     ABSOLUTE,
     GIVEN,
     RELATIVE,
-    Told,
-    alike,
+    CheckNotes,
     check_card,
     check_run,
-    differences,
+    column_differences,
+    pictures_alike,
     rebuilt,
-    short,
+    short_value,
 )
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import InputFile
@@ -159,7 +159,7 @@ def _of_document(document: ScoreDocument) -> Iterator[str]:
         yield f"the method was {document.isolation}: score it as FILE.py:FUNCTION on a machine that isolates it"
 
 
-def _of_calibration(document: ScoreDocument, table: pl.DataFrame, calibration: Path | None) -> Told:
+def _of_calibration(document: ScoreDocument, table: pl.DataFrame, calibration: Path | None) -> CheckNotes:
     """Faults of what is said of the rig: the hash of the calibration, and whether D of scored samples went into it."""
     from phibench.calibration.rig.calibration_file import read_calibration  # 25 modules, which most scores do without
 
@@ -167,7 +167,7 @@ def _of_calibration(document: ScoreDocument, table: pl.DataFrame, calibration: P
     if stated is None:
         if calibration is not None:
             raise DatasetError(f"the score was made without a calibration: leave --calibration {calibration} out")
-        return Told((), ())
+        return CheckNotes((), ())
     samples = set(table["sample_id"])
     shared = len(samples & set(made_from.get("samples", ())))
     unchecked = []
@@ -176,8 +176,10 @@ def _of_calibration(document: ScoreDocument, table: pl.DataFrame, calibration: P
     if calibration is None:
         unchecked.append("pair_set.calibration: give the file of `phibench calibrate`, --calibration")
     elif read_calibration(calibration).sha256 != stated:
-        return Told((f"pair_set.calibration is not the hash of {calibration}: give the file that was scored with",), ())
-    return Told((), tuple(unchecked))
+        return CheckNotes(
+            (f"pair_set.calibration is not the hash of {calibration}: give the file that was scored with",), ()
+        )
+    return CheckNotes((), tuple(unchecked))
 
 
 def _of_release(document: ScoreDocument, release: Path | None) -> Iterator[str]:
@@ -262,7 +264,7 @@ def _of_errors(table: pl.DataFrame, document: ScoreDocument) -> Iterator[str]:
         depth_relative=pl.col("depth_error_m") / pl.col("depth_m"),
         depth_pull=pl.when(pl.col("depth_sigma_m") > 0.0).then(pl.col("depth_error_m") / pl.col("depth_sigma_m")),
     )
-    yield from differences(table, right, right.columns, "what follows from the other columns")
+    yield from column_differences(table, right, right.columns, "what follows from the other columns")
 
 
 def _arrays(table: pl.DataFrame, *names: str) -> Array:
@@ -302,7 +304,7 @@ def _built_again(
     except DatasetError as error:
         return _Again((str(error),))
     names = [name for name in right.records.columns if name not in GIVEN]
-    faults = list(differences(table, right.records, names, "what answers and data set give"))
+    faults = list(column_differences(table, right.records, names, "what answers and data set give"))
     faults += [] if faults else _of_parts(document, right.document, table)
     stated, found = (_but(described, "provenance") for described in (document.pair_set, pairs.document()))
     faults += _unequal(stated, found, "pair_set", "the data set gives")
@@ -324,7 +326,7 @@ def _of_worst(given: Sequence[Worst], right: Sequence[Worst]) -> Iterator[str]:
         return  # other images: their pixels need not be compared
     for place, (a, b) in enumerate(zip(given, right, strict=True)):
         for name in ("crop", "frame"):
-            if not alike(getattr(a, name), getattr(b, name)):
+            if not pictures_alike(getattr(a, name), getattr(b, name)):
                 yield f"worst.{place}.{name} is not the picture that the data set gives"
 
 
@@ -336,7 +338,7 @@ def _of_statistics(document: ScoreDocument, table: pl.DataFrame) -> Iterator[str
     plain = table.drop("depth_counted", "rank_depth2")
     missed = missed_relative(plain, rules)
     counted = with_missed(plain, missed)
-    yield from differences(table, counted, ("depth_counted", "rank_depth2"), "what a missed pair costs")
+    yield from column_differences(table, counted, ("depth_counted", "rank_depth2"), "what a missed pair costs")
     again = document_of(document.method, document.pair_set, counted, rules, document.seed, document.limits, missed)
     yield from _of_parts(document, again, table)
 
@@ -357,7 +359,7 @@ def _unequal(given: Any, right: Any, place: str, source: str = "the records give
     """Leaves that differ; the first ones of a place, because one number in the records changes many."""
     leaves = list(_leaves(given, right, place))
     for where, a, b in leaves[:_MOST]:
-        yield f"{where} is {short(a)}, and {source} {short(b)}"
+        yield f"{where} is {short_value(a)}, and {source} {short_value(b)}"
     if len(leaves) > _MOST:
         yield f"{place}: {len(leaves) - _MOST} more are not what {source}"
 

@@ -19,10 +19,10 @@ from typing import Annotated, Any, Protocol
 
 from pydantic import Field
 
-from phibench.benchmark.isolation.answers import AnswerError, checked
+from phibench.benchmark.isolation.answers import AnswerError, checked_answer
 from phibench.benchmark.isolation.method_references import Reference, resolve
 from phibench.benchmark.isolation.run_limits import RunLimits
-from phibench.benchmark.isolation.runner import Harness, Ran
+from phibench.benchmark.isolation.runner import Harness, RunProvenance
 from phibench.benchmark.pair_sets.frames_set import pair_of_files, read_truth_file
 from phibench.benchmark.scores.score_document import Declared, MethodCard
 from phibench.benchmark.sealed.sealed_set import SEAL, Seal, read_seal
@@ -222,7 +222,7 @@ def submission(
     method: Reference,
     outcomes: Sequence[Outcome],
     isolation: str = "",
-    ran: Ran | None = None,
+    ran: RunProvenance | None = None,
     declared: Declared | None = None,
 ) -> Submission:
     """Document of a method's outcomes on a sealed set, by number."""
@@ -365,7 +365,7 @@ def _outcome(line: AnswerLine) -> Outcome:
     if line.down is None or line.up is None:
         return Outcome(line.number, None, line.seconds, line.failure, line.message)
     try:
-        answer = checked({**_plain(line), "down": _plain(line.down), "up": _plain(line.up)})
+        answer = checked_answer({**_plain(line), "down": _plain(line.down), "up": _plain(line.up)})
     except AnswerError as error:
         return Outcome(line.number, None, line.seconds, "invalid", str(error))
     return Outcome(line.number, answer, line.seconds)

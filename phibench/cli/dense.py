@@ -44,13 +44,13 @@ DenseMethods = Annotated[
 @dense.command(name="list")
 def list_() -> int:
     """List the dense methods: built in, and of installed packages."""
-    from phibench.benchmark.isolation.method_references import DENSE, installed
+    from phibench.benchmark.isolation.method_references import DENSE, installed_methods
     from phibench.estimator.dense.dense_methods import KNOWN
 
     for method in KNOWN.values():
         missing = "" if method.installed else f" ({method.needs})"
         print(f"{method.name}: {method.description}{missing}")
-    for point in installed(DENSE):
+    for point in installed_methods(DENSE):
         print(f"{point.name}: {point.value}")
     print("your own: a file and a function in it, my_depth.py:depth; `phibench dense new my_depth.py` writes one")
     return 0

@@ -136,7 +136,7 @@ def release(
 
     request = release_make.ReleaseRequest(chosen_parts(part), out, work, secret_seed, samples, use, workers=workers)
     if dry_run:
-        for line in release_make.dry_run(request):
+        for line in release_make.forecast_lines(request):
             print(line)
         return 0
     done = release_make.release(request, seal)
@@ -258,7 +258,7 @@ def open_(public: Path, *, truth: Path, submission: Path, out: Path | None = Non
         JSON file for the score.
     """
     from phibench.benchmark.scores.answer_errors import Rules
-    from phibench.benchmark.scores.score import isolated, saved, score_outcomes
+    from phibench.benchmark.scores.score import saved_score, score_outcomes, with_isolation
     from phibench.benchmark.scores.score_tables import nothing_answered, print_scores
     from phibench.benchmark.sealed.dense_submission import is_dense_seal
     from phibench.benchmark.sealed.submission import unseal as unseal_set
@@ -276,8 +276,8 @@ def open_(public: Path, *, truth: Path, submission: Path, out: Path | None = Non
         print(f"note: {opened.pairs.note}", file=sys.stderr)
     print(f"seal {opened.seal.id}: the truth is the sealed one, the submission has each of {opened.seal.pairs} pairs")
     scored = score_outcomes(opened.submission.method, opened.pairs, opened.outcomes, Rules())
-    scored = isolated(scored, opened.submission.isolation)
-    print_scores([scored if out is None else saved(scored, out)], "terminal", "phi", wide=False)
+    scored = with_isolation(scored, opened.submission.isolation)
+    print_scores([scored if out is None else saved_score(scored, out)], "terminal", "phi", wide=False)
     if out is not None:
         print(f"written: {out}")
     return int(nothing_answered([scored]))

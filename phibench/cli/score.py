@@ -147,7 +147,7 @@ def score(
         JSON file for the score, records beside it as Parquet; with several methods their names are added to it.
     """
     from phibench.benchmark.isolation.method_references import resolve
-    from phibench.benchmark.scores.score import run_and_score, saved_each
+    from phibench.benchmark.scores.score import run_and_score, saved_scores
     from phibench.benchmark.scores.score_document import MethodCard
     from phibench.benchmark.scores.score_files import records_kept, score_files
     from phibench.benchmark.scores.score_tables import nothing_answered, print_scores
@@ -168,7 +168,7 @@ def score(
     with records_kept(files):
         scored = run_and_score(method, pair_set, workers, console, "pairs", number, run_limits, None, declared)
     if targets := [file for file in files if file is not None]:
-        scored = saved_each(scored, targets)
+        scored = saved_scores(scored, targets)
     print_scores(scored, form, rank, output.wide, choice.calibration is not None)
     for file in filter(None, files):
         print(f"written: {file}", file=sys.stdout if form == "terminal" else sys.stderr)
@@ -334,7 +334,7 @@ def bench(
         Tracks that are run, by default all: find and depth are one run on whole frames. May be given several times.
     """
     from phibench.benchmark.reports.bench import bench as run_bench
-    from phibench.benchmark.reports.bench import show
+    from phibench.benchmark.reports.bench import open_in_browser
 
     done = run_bench(
         directory, out, method, workers, pairs, calibration=calibration, limits=limits.of_run, tracks=track
@@ -343,5 +343,5 @@ def bench(
         print(f"note: {note}", file=sys.stderr)
     count = len(done.scores)
     print(f"{done.report}: the report on {count} score{'s' * (count != 1)}")
-    show(done.report)
+    open_in_browser(done.report)
     return int(bool(done.failures))

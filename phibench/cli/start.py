@@ -44,7 +44,7 @@ def demo(*, out: Path = Path("phibench-demo")) -> int:
         Folder to write: pairs, example, scores, and report.html. An example that you have changed is scored again.
     """
     from phibench.benchmark.reports.bench import demo as run_demo
-    from phibench.benchmark.reports.bench import show
+    from phibench.benchmark.reports.bench import open_in_browser
     from phibench.benchmark.reports.track_tables import track_tables
     from phibench.benchmark.scores.score_tables import method_lines, nothing_answered
     from phibench.datasets.common.shown_text import show_grid, table_console
@@ -55,7 +55,7 @@ def demo(*, out: Path = Path("phibench-demo")) -> int:
         show_grid(console, table)
     for line in (*_MEANINGS, *(line for one in done.scores for line in method_lines(one))):
         console.print(line, emoji=False, highlight=False, markup=False)
-    print(f"The page: {done.page}{' is opened' if show(done.page) else '; open it in a browser'}")
+    print(f"The page: {done.page}{' is opened' if open_in_browser(done.page) else '; open it in a browser'}")
     print(f"Your method: change {done.example} and give the same command again")
     print(f"The best built-in fit, a second a pair: phibench score {done.pairs} --track find --method chain_fit")
     return int(nothing_answered(done.scores))
@@ -106,7 +106,7 @@ method = App(name="method", group=START, help="Write, check and list methods, wh
 @method.command(name="list")
 def list_methods() -> int:
     """List the methods: built in, optional, and of installed packages."""
-    from phibench.benchmark.isolation.method_references import installed
+    from phibench.benchmark.isolation.method_references import installed_methods
     from phibench.datasets.common.shown_text import TextTable, show_grid, wide_console
     from phibench.estimator.methods.registry import KNOWN
     from phibench.estimator.spots.image_planes import KINDS
@@ -117,7 +117,7 @@ def list_methods() -> int:
         takes = " + ".join(["every image" if known.accepts == KINDS else ", ".join(known.accepts), *needs])
         origin = (known.package or "built in") + ("" if known.installed else ": not installed")
         rows.append((known.name, origin, takes, known.description))
-    for point in installed():  # a package that is not imported: what it takes is not known
+    for point in installed_methods():  # a package that is not imported: what it takes is not known
         owner = point.value if point.dist is None else f"{point.dist.name} {point.dist.version}"
         rows.append((point.name, owner, "", point.value))
     heads = ("method", "from", "takes", "what it does")

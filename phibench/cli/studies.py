@@ -113,7 +113,7 @@ def paper(
 
 
 def _tables(directory: Path, calibration: Path | None, wide: bool, out: Path | None) -> int:
-    from phibench.benchmark.pair_sets.wanted_pairs import of_calibration
+    from phibench.benchmark.pair_sets.wanted_pairs import samples_of_calibration
     from phibench.calibration.rig.calibration_file import read_calibration
     from phibench.datasets.common.shown_text import show_grid, table_console
     from phibench.datasets.read import open_finished
@@ -122,7 +122,7 @@ def _tables(directory: Path, calibration: Path | None, wide: bool, out: Path | N
 
     dataset = open_finished(directory)
     calibrated = None if calibration is None else read_calibration(calibration)
-    scores = score_dataset(dataset if calibrated is None else of_calibration(dataset, calibrated), calibrated)
+    scores = score_dataset(dataset if calibrated is None else samples_of_calibration(dataset, calibrated), calibrated)
     console = table_console(wide)
     for grid in (table(scores, "truth", wide), table(scores, "frame", wide), bias_table(scores)):
         show_grid(console, grid)

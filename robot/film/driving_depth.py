@@ -26,8 +26,9 @@ from phibench.datasets.film.film_read import Film
 from phibench.estimator.geometry.reflection import image_of, room_rays
 from phibench.estimator.geometry.rig_parameters import PARAMETERS, STROKE_PARAMETERS
 from phibench.estimator.spots.spot_prediction import spot_blur
-from phibench.robot.film.film_frames import LENGTH_PX, FilmFrames, Index, RoomWeights, film_frames
+from phibench.robot.film.film_frames import FilmFrames, Index, film_frames
 from phibench.robot.film.film_positions import FilmPositions, fit_positions, stepped_positions
+from phibench.robot.film.room_interpolation import LENGTH_PX, RoomWeights
 from phibench.scenes.frames import Array
 from phibench.scenes.laser import Beam
 from phibench.scenes.misalignment import PARAMETERS as MISALIGNMENT

@@ -20,8 +20,9 @@ from phibench.estimator.spots.raw_pixels import raw_electrons
 from phibench.estimator.spots.spot_prediction import spot_blur
 from phibench.robot.film.blink_identity import TargetCode, TargetTracker
 from phibench.robot.film.film_bundle import FilmDepth, deviations2, expected_sigma_m, film_depth, most_agree
-from phibench.robot.film.film_frames import LIT, FilmFrames, Index, room_known, room_weights
+from phibench.robot.film.film_frames import LIT, FilmFrames, Index
 from phibench.robot.film.film_positions import FilmPositions, fit_positions, stepped_positions
+from phibench.robot.film.room_interpolation import has_near_off_frame, room_weights
 from phibench.scenes.frames import Array, BoolArray
 from phibench.scenes.laser import Beam
 from phibench.scenes.motion.carriage import Carriage
@@ -78,7 +79,7 @@ def seen_film(frames: FilmFrames) -> SeenFilm:
     for number in range(_ROUNDS):
         here, off = places[:count], places[count:]
         positions = fit_positions(frames, blur, room_weights(here, off))
-        positions.uv_px[~room_known(here, off)] = np.nan
+        positions.uv_px[~has_near_off_frame(here, off)] = np.nan
         offsets = frames.offsets_m(frames.on, np.where(positions.good, positions.uv_px[:, 1], here[:, 1]))
         positions.uv_px[~most_agree(frames.rig, positions, offsets)] = np.nan
         depth = film_depth(frames.rig, positions, offsets, frames.encoder_sigma_m)

@@ -1,16 +1,8 @@
-"""Frames of a film as a robot has them, laser on and off: carriage at a spot's row, motion blur, room interpolated.
+"""Frames of a film, as depth estimators read them: laser on and off, carriage offsets, motion blur of the spot.
 
 The laser is on in every other frame, switched as the spot's row is read, or blinks by the film's own code. Positions
 belong to the time at which the spot's row is in the middle of its exposure. The encoder is read at the frame's time;
 from there to the row's time the carriage goes as it was told to.
-
-In the pose of a frame each pixel sees of the room what it sees in frames with the laser off of nearly the same pose.
-Kriging interpolates between them (`room_weights`): a pixel's room is a constant plus a Gaussian process of the place of
-the spot's image, to which the room around it keeps, with the covariance S^2 exp(-d^2 / 2 l^2) for places d px apart.
-Where the carriage rests all frames are averaged; where it moves, the neighbours count. The weights of a frame have the
-sum 1, so that DSNU cancels, and PRNU of the room as well: what is left of the pattern is that of the spot's own light.
-The film proves it: frames with the laser off, each interpolated from the others, agree within their noise
-(`held_out_chi2`).
 
 A spot that moves during an exposure is drawn out along its way. Its image is made of parts, as those of a wide lens
 are: where the spot is at the nodes of a quadrature over the exposure. Rows within a spot differ in time by 0.2 ms, and
@@ -32,9 +24,9 @@ from phibench.datasets.frames.sensor_card import SensorCard, card_of
 from phibench.estimator.geometry.reflection import image_of
 from phibench.estimator.geometry.triangulate import depth_of
 from phibench.estimator.spots.gaussian_spot import SpotBlur, SpotParts
-from phibench.estimator.spots.raw_pixels import PixelNoise, raw_electrons
+from phibench.estimator.spots.raw_pixels import raw_electrons
 from phibench.estimator.spots.spot_prediction import spot_blur
-from phibench.scenes.frames import Array, BoolArray
+from phibench.scenes.frames import Array
 from phibench.scenes.laser import Beam
 from phibench.scenes.motion.carriage import Carriage
 from phibench.scenes.motion.film_times import FilmTimes
@@ -43,10 +35,6 @@ from phibench.scenes.rig import Rig
 _NODES = 4  # of an exposure: exact to the seventh power of a motion of 2 px over a blur of 0.7 px
 _SIDE_PX, _UNIT_PX, _MARGIN_PX = 48, 16, 32  # of what is kept around all spots
 LIT = 0.99  # of an exposure: a frame with less, and more than none, is no frame of either kind
-LENGTH_PX = 1.5  # l: edges of the room, blurred by 0.9 px, are interpolated to a tenth of their noise
-STRUCTURE = 300.0  # S^2 over the noise of a pixel: edges of 800 e behind 50 e
-_FARTHEST_PX = 2.0 * LENGTH_PX  # from a frame with the laser off: beyond it the room is not known
-_ANY_LEVEL = 1e6  # variance of an even level, over the noise: it is free, and kriging leaves it out
 Index = NDArray[np.int64]
 
 
@@ -231,72 +219,3 @@ def lit_frames(film: Film, numbers: Index) -> tuple[Index, Index, bool]:
             "on and one off are the least: take more frames, or a code whose bits are longer than two frames"
         )
     return on, off, blinks
-
-
-# Room behind the spot.
-
-
-@dataclass(frozen=True)
-class RoomWeights:
-    """Interpolation of the room between M frames with the laser off, for N frames.
-
-    Attributes
-    ----------
-    weights : array, shape (N, M)
-        Each row has the sum 1.
-    moved_px : array, shape (N,)
-        Standard deviation of what the room's image has moved by beyond the interpolation.
-    """
-
-    weights: Array
-    moved_px: Array
-
-
-def room_weights(places_px: Array, off_px: Array) -> RoomWeights:
-    """Kriging of the room.
-
-    Parameters
-    ----------
-    places_px, off_px : arrays, shape (N, 2) and (M, 2)
-        Of the spot's image in each frame, seen or not.
-    """
-    between, to = _correlation(off_px, off_px), _correlation(places_px, off_px)
-    K = _ANY_LEVEL + STRUCTURE * between + np.eye(len(off_px))
-    weights = np.linalg.solve(K, (_ANY_LEVEL + STRUCTURE * to).T).T
-    weights = weights / weights.sum(axis=1, keepdims=True)
-    unknown = 1.0 - 2.0 * np.sum(weights * to, axis=1) + np.sum((weights @ between) * weights, axis=1)
-    return RoomWeights(weights, LENGTH_PX * np.sqrt(np.maximum(unknown, 0.0)))
-
-
-def room_known(places_px: Array, off_px: Array) -> BoolArray:
-    """Frames with the laser off in nearly the same pose, shape (N,): arguments as of `room_weights`."""
-    apart = np.linalg.norm(places_px[:, None] - off_px, axis=2)
-    return np.asarray(apart.min(axis=1) < _FARTHEST_PX)
-
-
-def _correlation(a: Array, b: Array) -> Array:
-    apart2 = np.sum((a[:, None] - b[None]) ** 2, axis=-1)
-    return np.asarray(np.exp(-0.5 * apart2 / LENGTH_PX**2))
-
-
-def held_out_chi2(off_e: Array, off_px: Array, noise: PixelNoise) -> Array:
-    """Squared differences of every frame with the laser off to what the others say, over their variance: means (M,).
-
-    The first and the last frame have neighbours on one side only.
-
-    Parameters
-    ----------
-    off_e : array, shape (M, h, w)
-        Windows of equal pixels.
-    off_px : array, shape (M, 2)
-    noise : PixelNoise
-        Of one frame, without a fixed pattern.
-    """
-    result = []
-    for k in range(len(off_e)):
-        others = np.delete(np.arange(len(off_e)), k)
-        (weights,) = room_weights(off_px[k : k + 1], off_px[others]).weights
-        room = np.tensordot(weights, off_e[others], 1)
-        variance = noise.variance_e2(room) * (1.0 + weights @ weights)
-        result.append(float(np.mean((off_e[k] - room) ** 2 / variance)))
-    return np.array(result)

@@ -17,7 +17,7 @@ A faint spot behind a mosaic has several minima in one frame. `stepped_positions
 that all frames together predict: repeated with the bundle, these are Gauss-Newton steps of the joint likelihood.
 
 **Processed frames** go through the camera's chain, one frame at a time. The room behind a frame's spot comes from
-frames with the laser off, undone to electrons each, put together with the weights of `film_frames.room_weights`, and
+frames with the laser off, undone to electrons each, put together with the weights of `room_interpolation`, and
 smoothed as `background_of` does it for stills. Where all frames together predict the spot, the interval fit of a JPEG's
 coefficients (`processed.interval_fit`) or the quasi-score of other outputs gives the place. Motion blur is part of the
 spot's model. Frames at rest are better fitted as a burst.
@@ -65,7 +65,8 @@ from phibench.estimator.spots.raw_pixels import (
     noise_of,
     spot_regions,
 )
-from phibench.robot.film.film_frames import FilmFrames, Index, RoomWeights, room_known, room_weights
+from phibench.robot.film.film_frames import FilmFrames, Index
+from phibench.robot.film.room_interpolation import RoomWeights, has_near_off_frame, room_weights
 from phibench.scenes.frames import Array, BoolArray
 
 SIDE_PX = 11  # a spot of 0.9 px that moves by 2 px, and its tails
@@ -168,7 +169,7 @@ def stepped_positions(frames: FilmFrames, blur: SpotBlur, at_px: Array, from_px:
     """
     count = len(frames.on)
     here, room = at_px[:count], room_weights(at_px[:count], at_px[count:])
-    known = room_known(here, at_px[count:])
+    known = has_near_off_frame(here, at_px[count:])
     here = here if from_px is None else np.where(np.isfinite(from_px), from_px, here)
     windows = _windows(frames, np.rint(here).astype(np.int64), room)
     pixels = SpotPixels.of(windows.regions.filters, blur, _model(frames, windows))
@@ -305,7 +306,10 @@ def processed_positions(frames: FilmFrames, point_world_m: Array, which: Index) 
     """
     count = len(frames.on)
     places, offsets = frames.positions_px(point_world_m, np.concatenate([frames.on, frames.off]))
-    weights, known = room_weights(places[:count], places[count:]).weights, room_known(places[:count], places[count:])
+    weights, known = (
+        room_weights(places[:count], places[count:]).weights,
+        has_near_off_frame(places[:count], places[count:]),
+    )
     blur = frames.blur(point_world_m, places[:count])
     r, g, b = frames.rig.camera.detector.laser_filter_response
     size = frames.rig.camera.width_px, frames.rig.camera.height_px

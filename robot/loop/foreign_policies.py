@@ -16,11 +16,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
-from phibench.benchmark.isolation.answers import plain, to_bytes
+from phibench.benchmark.isolation.answers import plain_values, to_bytes
 from phibench.benchmark.isolation.guest_process import GuestProcess
 from phibench.benchmark.isolation.isolation import Isolation
 from phibench.benchmark.isolation.method_references import Reference, parsed, resolve
-from phibench.benchmark.isolation.method_worker import function_of_file, limited, sentence_of, size_bytes
+from phibench.benchmark.isolation.method_worker import function_of_file, memory_limit, sentence_of, size_bytes
 from phibench.benchmark.isolation.pair_transport import Connection, TransportError
 from phibench.benchmark.isolation.printed_output import advised
 from phibench.benchmark.isolation.readable_files import access_of
@@ -208,7 +208,7 @@ def serve(connection: Connection, order: dict[str, Any]) -> None:
             nonce, number, content = pickle.loads(connection.receive())
             reply: dict[str, Any] = {"failure": ""}
             try:
-                with limited(most):
+                with memory_limit(most):
                     if number == _BEGINS:
                         policy = policy_of(make, content, reference.function)
                     elif policy is not None:
@@ -241,4 +241,4 @@ def _numbers(action: Any) -> Any:
     """Numbers of an action as JSON holds them."""
     if not isinstance(action, tuple) or len(action) != len(Action._fields):
         raise SceneError(f"act answered {type(action).__name__}, not an Action; give simulator.Action(...)")
-    return plain(list(action))
+    return plain_values(list(action))

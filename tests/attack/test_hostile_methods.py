@@ -24,7 +24,7 @@ from phibench.benchmark.isolation.run_limits import RunLimits
 from phibench.benchmark.isolation.runner import run_method
 from phibench.benchmark.reports.report_page import write_report
 from phibench.benchmark.scores.answer_errors import Rules
-from phibench.benchmark.scores.score import Scored, saved, score_outcomes
+from phibench.benchmark.scores.score import Scored, saved_score, score_outcomes
 from phibench.benchmark.scores.score_document import MethodCard
 from phibench.benchmark.scores.score_tables import print_scores
 from phibench.estimator.interface import Outcome
@@ -106,7 +106,7 @@ def scored(runs: dict[str, Run]) -> Scored:
 
 
 def test_a_score_of_all_is_written_printed_and_reported(scored: Scored, tmp_path: Path) -> None:
-    written = saved(scored, tmp_path / "score.json")
+    written = saved_score(scored, tmp_path / "score.json")
     assert json.loads((tmp_path / "score.json").read_text(encoding="utf-8"))["pairs"] == len(ALL)
     for form in ("terminal", "csv", "markdown", "latex", "json"):
         with redirect_stdout(io.StringIO()) as out:

@@ -197,7 +197,7 @@ def _in_a_score(path: Path) -> object:
     fields = {"kind": "png", "first_px": (0, 0), "step_px": 1, "size": (64, 48)}
     given = EncodedPicture.model_validate({**fields, "base64": path.read_bytes().decode("latin-1")})
     right = EncodedPicture.model_validate({**fields, "base64": base64.b64encode(of_other_bytes()).decode()})
-    if not rebuilt_score.alike(given, right):
+    if not rebuilt_score.pictures_alike(given, right):
         raise DatasetError("another picture")
     return rebuilt_score._pixels(given)
 

@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from phibench.benchmark.dense.dense_check import judged_dense, with_exchanged
+from phibench.benchmark.dense.dense_check import check_of_dense_outcomes, with_exchanged
 from phibench.benchmark.dense.dense_easy import EasyDensePairs, EasyTruth, points_of
-from phibench.benchmark.isolation.method_check import Check
+from phibench.benchmark.isolation.method_check import MethodCheck
 from phibench.estimator.dense.dense_interface import DenseAnswer
 from phibench.estimator.geometry.reflection import image_of
 from phibench.estimator.geometry.triangulate import depth_exact
@@ -34,8 +34,8 @@ def plane(truth: EasyTruth, values: np.ndarray) -> np.ndarray:
     return whole
 
 
-def judged(truths: list[EasyTruth], answers: list[DenseAnswer]) -> Check:
-    return judged_dense([Outcome(k, None, 0.1, dense=answer) for k, answer in enumerate(answers)], truths)
+def judged(truths: list[EasyTruth], answers: list[DenseAnswer]) -> MethodCheck:
+    return check_of_dense_outcomes([Outcome(k, None, 0.1, dense=answer) for k, answer in enumerate(answers)], truths)
 
 
 def noisy(values: np.ndarray, seed: int = 0) -> np.ndarray:
@@ -219,7 +219,9 @@ def test_a_wrong_sigma_is_named(sigma: Callable[[EasyTruth], np.ndarray], words:
 
 def test_failures_and_silence_are_told(truths: list[EasyTruth]) -> None:
     outcomes = [Outcome(k, None, 0.1, "error", "ValueError: takes colour") for k in range(1)]
-    assert judged_dense(outcomes, truths).faults == ("1 of 1 pairs failed (error): ValueError: takes colour",)
+    assert check_of_dense_outcomes(outcomes, truths).faults == (
+        "1 of 1 pairs failed (error): ValueError: takes colour",
+    )
     silent = [DenseAnswer(np.full(SHAPE, np.nan))] * 1
     (found,) = judged(truths, silent).faults
     assert found.endswith("pixels are answered, although all have a pattern")

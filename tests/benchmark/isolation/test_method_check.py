@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from helpers.sandbox_pairs import HEADER, method_file
 
-from phibench.benchmark.isolation.answers import AnswerError, answer_text, checked
+from phibench.benchmark.isolation.answers import AnswerError, answer_text, checked_answer
 from phibench.benchmark.isolation.easy_pairs import EasyPairs
-from phibench.benchmark.isolation.method_check import PAIRS, Check, check_method, judged
+from phibench.benchmark.isolation.method_check import PAIRS, MethodCheck, check_method, check_of_outcomes
 from phibench.benchmark.isolation.run_limits import MethodError, RunLimits
 from phibench.cli import main as cli
 from phibench.estimator.geometry.phi import phi_normal, phi_ray
@@ -65,17 +65,17 @@ def coarse(pair: Pair) -> Answer:
     return of_the_method("brightest_pixel", pair.number)
 
 
-def tried(method: Method, pairs: list[Pair], of: EasyPairs = SET) -> Check:
+def tried(method: Method, pairs: list[Pair], of: EasyPairs = SET) -> MethodCheck:
     """Judge a method in this process; answers go the way that they go from the method's process."""
     done = []
     for pair in pairs:
         try:
-            done.append(Outcome(pair.number, checked(answer_text(method(pair))), 0.01))
+            done.append(Outcome(pair.number, checked_answer(answer_text(method(pair))), 0.01))
         except AnswerError as error:
             done.append(Outcome(pair.number, None, 0.01, "invalid", str(error)))
         except AttributeError as error:
             done.append(Outcome(pair.number, None, 0.01, "error", str(error)))
-    return judged(done, of)
+    return check_of_outcomes(done, of)
 
 
 def each(change: Change, method: Method = right) -> Method:

@@ -13,7 +13,7 @@ from helpers.sandbox_pairs import GOOD, HEADER, SmallPairs, method_file
 from phibench.benchmark.isolation.method_provenance import OpenedFiles, package_sha256, packages_of
 from phibench.benchmark.isolation.method_references import code_of_function
 from phibench.benchmark.isolation.run_limits import RunLimits
-from phibench.benchmark.isolation.runner import Harness, ran_here
+from phibench.benchmark.isolation.runner import Harness, provenance_here
 
 LIMITS = RunLimits(seconds=60.0)
 linux = pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells of opened files")
@@ -158,7 +158,7 @@ def test_a_function_in_this_process_has_the_hash_of_its_file(tmp_path: Path) -> 
 
     assert code_of_function(extract)["sha256"] == hashlib.sha256(Path(__file__).read_bytes()).hexdigest()
     assert code_of_function(eval("lambda pair: None")) == {"sha256": None}
-    assert ran_here().packages["pytest"] == pytest.__version__
+    assert provenance_here().packages["pytest"] == pytest.__version__
 
 
 @linux

@@ -12,7 +12,7 @@ from helpers.sandbox_pairs import GOOD, SmallPairs, method_file
 
 from phibench.benchmark.isolation import method_references as resolving
 from phibench.benchmark.isolation.method_references import resolve
-from phibench.benchmark.isolation.method_worker import load
+from phibench.benchmark.isolation.method_worker import load_method
 from phibench.benchmark.isolation.run_limits import MethodError
 
 
@@ -35,7 +35,7 @@ def test_a_file_is_found_hashed_and_not_run(tmp_path: Path) -> None:
     assert found.sha256 == hashlib.sha256((tmp_path / "my_phi.py").read_bytes()).hexdigest()
     assert not (tmp_path / "ran").exists()  # the parent knows the truth and must not run the file
     assert str(tmp_path) not in str(found.document())
-    assert load(found)(None) == 1  # type: ignore[arg-type, comparison-overlap]
+    assert load_method(found)(None) == 1  # type: ignore[arg-type, comparison-overlap]
     assert (tmp_path / "ran").exists()
 
 
@@ -48,17 +48,17 @@ def test_a_file_with_a_strange_name_is_refused_by_a_printable_one(tmp_path: Path
     (tmp_path / "[b].py").write_text("def extract(pair):\n    return 1\n")
     found = resolve(f"{tmp_path / '[b].py'}:extract")
     assert found.name == "[b]:extract"
-    assert load(found)(None) == 1  # type: ignore[arg-type, comparison-overlap]
+    assert load_method(found)(None) == 1  # type: ignore[arg-type, comparison-overlap]
 
 
 def test_a_file_that_was_edited_in_the_meantime_is_refused(tmp_path: Path) -> None:
     found = resolve(written(tmp_path, "def extract(pair):\n    return 1\n"))
     written(tmp_path, "def extract(pair):\n    return 2\n")
     with pytest.raises(MethodError, match="was changed or removed"):
-        load(found)
+        load_method(found)
     (tmp_path / "my_phi.py").unlink()
     with pytest.raises(MethodError, match="was changed or removed"):
-        load(found)
+        load_method(found)
 
 
 def test_a_relative_path_is_made_absolute(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -73,7 +73,7 @@ def test_a_file_may_import_its_neighbour_and_define_a_dataclass(tmp_path: Path) 
         "from __future__ import annotations\nfrom dataclasses import dataclass\nfrom beside_my_phi import WORD\n"
         "@dataclass\nclass A:\n    x: int\ndef extract(pair): return A(WORD).x\n"
     )
-    assert load(resolve(written(tmp_path, text)))(None) == 5  # type: ignore[arg-type, comparison-overlap]
+    assert load_method(resolve(written(tmp_path, text)))(None) == 5  # type: ignore[arg-type, comparison-overlap]
 
 
 @pytest.mark.parametrize(
@@ -126,7 +126,7 @@ def test_what_is_not_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name
 )
 def test_what_is_wrong_with_a_file(tmp_path: Path, text: str, words: str) -> None:
     with pytest.raises(MethodError) as caught:
-        load(resolve(written(tmp_path, text)))
+        load_method(resolve(written(tmp_path, text)))
     assert words in str(caught.value)
     assert "\n" not in str(caught.value)
 
@@ -140,7 +140,7 @@ def test_what_is_wrong_with_a_file(tmp_path: Path, text: str, words: str) -> Non
     ],
 )
 def test_what_takes_one_pair_is_taken(tmp_path: Path, text: str) -> None:
-    assert load(resolve(written(tmp_path, text)))(None) == 1  # type: ignore[arg-type, comparison-overlap]
+    assert load_method(resolve(written(tmp_path, text)))(None) == 1  # type: ignore[arg-type, comparison-overlap]
 
 
 def test_built_in_methods_have_a_hash_of_the_code_behind_them() -> None:
@@ -148,7 +148,7 @@ def test_built_in_methods_have_a_hash_of_the_code_behind_them() -> None:
     assert found.kind == "built-in"
     assert found.sha256 is not None
     assert len(found.sha256) == 64
-    assert callable(load(found))
+    assert callable(load_method(found))
 
 
 class FakeDistribution:
@@ -166,9 +166,9 @@ def test_installed_packages_register_by_entry_point(tmp_path: Path, monkeypatch:
     registered(monkeypatch, ("theirs", "their_module:find"), ("broken", "no_such_module:find"))
     found = resolve("theirs")
     assert (found.kind, found.version) == ("package", "their-package 2.1")
-    assert load(found)(None) == 7  # type: ignore[arg-type, comparison-overlap]
+    assert load_method(found)(None) == 7  # type: ignore[arg-type, comparison-overlap]
     with pytest.raises(MethodError, match="method 'broken' cannot be imported: ModuleNotFoundError"):
-        load(resolve("broken"))
+        load_method(resolve("broken"))
     with pytest.raises(MethodError, match="did you mean 'theirs'"):
         resolve("their")
 

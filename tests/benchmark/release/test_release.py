@@ -17,7 +17,7 @@ from helpers.small_release import SMALL, STARTER, Made, ask, flip, snapshot
 
 from phibench.benchmark.export.export_make import export_frames_sets
 from phibench.benchmark.pair_sets.frames_set import FramesSet
-from phibench.benchmark.release.release_make import ReleaseRequest, _card, _misfit, dry_run, release
+from phibench.benchmark.release.release_make import ReleaseRequest, _card, _misfit, forecast_lines, release
 from phibench.benchmark.release.release_parts import PARTS, VERSION, ReleasePart, content_sha256
 from phibench.benchmark.release.release_source import SOURCE
 from phibench.benchmark.scored_dataset import open_dataset
@@ -217,7 +217,7 @@ def test_the_starter_part_takes_the_first_samples_of_dev(tmp_path: Path, smalles
 
 def test_a_dry_run_says_sizes_and_writes_nothing(made: Made, tmp_path: Path) -> None:
     request = ask(tmp_path, list(made.request.parts), use=made.request.use)
-    lines = list(dry_run(request))
+    lines = list(forecast_lines(request))
     assert [line.split(":")[0] for line in lines] == [part.title for part in made.request.parts]
     assert all(re.search(r"\d+ MB", line) for line in lines)
     assert "CPU-hours" in lines[1]

@@ -12,7 +12,7 @@ import pytest
 import scipy
 from helpers.bench_cases import RIG, Cases, cases, records
 
-from phibench.benchmark.pair_sets.wanted_pairs import CalibratedPairs, of_calibration
+from phibench.benchmark.pair_sets.wanted_pairs import CalibratedPairs, samples_of_calibration
 from phibench.benchmark.reports import bench as benching
 from phibench.benchmark.scores.answer_errors import Rules
 from phibench.benchmark.scores.metrics import measure, prepared
@@ -155,11 +155,11 @@ def truth_of_rig(dataset: Dataset) -> np.ndarray:
 def test_a_calibration_of_another_rig_is_refused(misaligned: Dataset) -> None:
     zero = np.zeros(len(PARAMETERS))
     with pytest.raises(CalibrationError, match="did not start from the nominal rig of sample seen-near"):
-        of_calibration(misaligned, calibration(zero, RIG))
+        samples_of_calibration(misaligned, calibration(zero, RIG))
     nominal = misaligned.samples[0].nominal_rig
-    assert of_calibration(misaligned, calibration(zero, nominal)) is misaligned
+    assert samples_of_calibration(misaligned, calibration(zero, nominal)) is misaligned
     with pytest.raises(CalibrationError, match="has 1 true rig and the calibration was made from none"):
-        of_calibration(misaligned, calibration(zero, nominal, dataset="another", samples=["seen-near-h0.500"]))
+        samples_of_calibration(misaligned, calibration(zero, nominal, dataset="another", samples=["seen-near-h0.500"]))
 
 
 def test_of_several_true_rigs_the_calibrated_one_is_taken(misaligned: Dataset) -> None:
@@ -167,10 +167,10 @@ def test_of_several_true_rigs_the_calibrated_one_is_taken(misaligned: Dataset) -
     both = replace(misaligned, rows=(first, second.model_copy(update={"rig": "other"})))
     nominal = misaligned.samples[0].nominal_rig
     made = calibration(np.zeros(len(PARAMETERS)), nominal, dataset=misaligned.info.name, samples=[first.sample_id])
-    assert of_calibration(both, made).rows == (first,)
+    assert samples_of_calibration(both, made).rows == (first,)
     stranger = replace(made, made_from={})
     with pytest.raises(CalibrationError, match="has 2 true rigs and the calibration was made from none"):
-        of_calibration(both, stranger)
+        samples_of_calibration(both, stranger)
 
 
 # -- Estimators and the command

@@ -11,7 +11,7 @@ from helpers.bench_cases import RIG, Cases, cases, change, outcomes, records, sa
 from helpers.oracles import random_rig, true_pixel
 from scipy.linalg import cholesky, solve_triangular
 
-from phibench.benchmark.scores.answer_errors import MATCH_PX, Rules, kept, phi_of
+from phibench.benchmark.scores.answer_errors import MATCH_PX, Rules, phi_of, with_kept_results
 from phibench.benchmark.scores.record_columns import COLUMNS, COUNTED
 from phibench.benchmark.scores.records import record_table, with_missed
 from phibench.datasets.common.errors import DatasetError
@@ -315,7 +315,7 @@ def test_rules_without_sense_are_refused(changes):
 def test_kept_results_are_those_of_equal_arguments_and_cannot_be_changed():
     calls = []
 
-    @kept
+    @with_kept_results
     def total(name, values):
         calls.append(name)
         return values.sum(axis=0) + len(name)

@@ -18,7 +18,7 @@ from PIL import Image
 import phibench
 from phibench.benchmark.scores.answer_errors import Rules
 from phibench.benchmark.scores.metrics import METRICS
-from phibench.benchmark.scores.score import saved_each, score_methods, score_outcomes
+from phibench.benchmark.scores.score import saved_scores, score_methods, score_outcomes
 from phibench.benchmark.scores.score_document import MethodCard, ScoreDocument, results_sha256
 from phibench.benchmark.scores.score_files import read_records, read_score, write_score
 from phibench.benchmark.scores.score_tables import leaderboard, number, ranked
@@ -46,7 +46,7 @@ def test_a_score_that_cannot_be_written_costs_no_other_method_its_own(mine, tmp_
     files = [tmp_path / f"{name}.json" for name in "abc"]
     (tmp_path / "b.parquet").mkdir()
     with pytest.raises(DatasetError, match=r"b\.json could not be written: .*; 2 of 3 scores are written$") as caught:
-        saved_each([mine] * 3, files)
+        saved_scores([mine] * 3, files)
     assert "\n" not in str(caught.value)
     assert [file.exists() for file in files] == [True, False, True]
     assert read_score(files[2]).records == "c.parquet"

@@ -16,7 +16,7 @@ from phibench.benchmark.scores.compare import compare_records, print_comparison
 from phibench.benchmark.scores.failure_causes import KINDS
 from phibench.benchmark.scores.intervals import Estimate
 from phibench.benchmark.scores.metrics import METRICS
-from phibench.benchmark.scores.score import isolated, score_outcomes
+from phibench.benchmark.scores.score import score_outcomes, with_isolation
 from phibench.benchmark.scores.score_document import MethodCard
 from phibench.benchmark.scores.score_tables import (
     HEADS,
@@ -67,7 +67,7 @@ def test_tables_fit_eighty_columns_and_wide_ones_have_all(scored, capsys, monkey
 
 @pytest.mark.parametrize("sentence", ["not isolated: this kernel has no Landlock", "isolated: read ...", ""])
 def test_a_score_without_isolation_says_so(scored, capsys, sentence):
-    one = isolated(scored[0], sentence)
+    one = with_isolation(scored[0], sentence)
     print_scores([one], "terminal", "phi", wide=True)
     assert ("isolated" in capsys.readouterr().out) == sentence.startswith("not")
     print_scores([one], "json", "phi", wide=False)

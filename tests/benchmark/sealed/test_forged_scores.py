@@ -19,7 +19,7 @@ from phibench.benchmark.scores.record_columns import COLUMN_TYPES
 from phibench.benchmark.scores.score import Scored, score
 from phibench.benchmark.scores.score_files import read_records, read_score, write_score
 from phibench.benchmark.sealed import score_check
-from phibench.benchmark.sealed.rebuilt_score import GIVEN, differences, outcomes_of_records, rebuilt
+from phibench.benchmark.sealed.rebuilt_score import GIVEN, column_differences, outcomes_of_records, rebuilt
 from phibench.benchmark.sealed.score_check import check_score
 from phibench.cli import main as cli
 from phibench.datasets.read import open_finished
@@ -142,7 +142,7 @@ def test_every_column_that_is_no_answer_is_compared(honest: Honest, bench_datase
     names = [name for name in right.columns if name not in GIVEN]
     assert set(OTHERS) <= set(names)
     for name in OTHERS:
-        told = list(differences(table.with_columns(other(table[name])), right, names, "what the data give"))
+        told = list(column_differences(table.with_columns(other(table[name])), right, names, "what the data give"))
         assert [text.split(" ")[0] for text in told] == [f"records.{name}"]
     assert len(OTHERS) > 70
 

@@ -14,7 +14,7 @@ from helpers.processes import quiet
 
 from phibench.benchmark.pair_sets.dataset_pairs import Track, dataset_pairs
 from phibench.benchmark.scores.answer_errors import Rules
-from phibench.benchmark.scores.score import isolated, saved, score, score_outcomes
+from phibench.benchmark.scores.score import saved_score, score, score_outcomes, with_isolation
 from phibench.benchmark.scores.score_document import MethodCard, ScoreDocument
 from phibench.benchmark.scores.score_files import read_records, read_score, write_score
 from phibench.benchmark.sealed.score_check import check_score, schema_text
@@ -48,7 +48,7 @@ def honest(bench_dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
 
     scored = score_outcomes(CARD, pairs, [outcome(number) for number in range(len(pairs))], Rules())
     path = tmp_path_factory.mktemp("handed-in") / "mine.json"
-    saved(isolated(scored, "isolated: read its own folder and the packages only, without network"), path)
+    saved_score(with_isolation(scored, "isolated: read its own folder and the packages only, without network"), path)
     return path
 
 
@@ -73,7 +73,7 @@ def test_a_score_of_a_track_is_built_again_as_that_track(bench_dataset: Path, tm
     answers = [Outcome(number, Answer(*2 * (Spot.missing("-"),)), 0.01) for number in range(len(pairs))]
     scored = score_outcomes(CARD, pairs, answers, Rules())
     path = tmp_path / "mine.json"
-    saved(isolated(scored, "isolated: read its own folder and the packages only, without network"), path)
+    saved_score(with_isolation(scored, "isolated: read its own folder and the packages only, without network"), path)
     assert check_score(path, bench_dataset).faults == ()
     document = read_score(path)
     other = {"localise": "find", "find": "localise"}[track]

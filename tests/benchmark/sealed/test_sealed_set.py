@@ -19,7 +19,7 @@ from PIL import Image
 
 from phibench.benchmark.pair_sets.dataset_pairs import dataset_pairs
 from phibench.benchmark.pair_sets.frames_set import TruthRow, truth_document, truth_of
-from phibench.benchmark.reports.bench import show
+from phibench.benchmark.reports.bench import open_in_browser
 from phibench.benchmark.scores.score_files import read_score
 from phibench.benchmark.sealed.sealed_set import (
     Sealed,
@@ -345,7 +345,7 @@ def test_the_commands_say_what_they_did(
     assert "mine:extract" in said
     document = read_score(score)
     assert (document.pairs, document.failures["error"], document.method.place) == (3, 1, "mine.py")
-    assert not show(score)  # no terminal here
+    assert not open_in_browser(score)  # no terminal here
 
 
 def test_seal_on_the_command_line(secret_dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -25,8 +25,9 @@ from phibench.render.sensor.light import Light, Region
 from phibench.render.sensor.settings import Sensor, sensor
 from phibench.robot.film.film_bundle import expected_sigma_m, film_depth, most_agree
 from phibench.robot.film.film_estimates import bundle_depth, joint_positions, seen_film
-from phibench.robot.film.film_frames import FilmFrames, RoomWeights, held_out_chi2, room_weights
+from phibench.robot.film.film_frames import FilmFrames
 from phibench.robot.film.film_positions import FilmPositions, fit_positions, processed_positions, stepped_positions
+from phibench.robot.film.room_interpolation import RoomWeights, held_out_chi2, room_weights
 from phibench.robot.film.spot_tracks import FrameSearch, SpotTrack, fitted_positions
 from phibench.robot.loop.sensing import SpotReading
 from phibench.robot.loop.smoothing import film_beliefs
