@@ -27,7 +27,7 @@ from phibench.scenes.frames import Array
 from phibench.scenes.rig import Rig
 from phibench.scenes.room import TargetBoard, lab
 from phibench.studies.isotropy.azimuth_errors import sideways
-from phibench.studies.isotropy.binocular import Binocular, Laws, tried
+from phibench.studies.isotropy.binocular import Binocular, Laws, binocular_results
 from phibench.studies.misaligned_rigs import spot_of
 
 APART_M, DEPTH_M, HEIGHT_M, AZIMUTH_DEG = 0.425, 2.5, 0.50, 105.0
@@ -86,7 +86,7 @@ def main() -> None:
     )
     found = float(depth_exact(sideways(Rig()), APART_M, *pixels).depth_m)
     print(f"D from both pictures {found:.4f} m, true {DEPTH_M:.4f} m", flush=True)
-    for finding in tried(both, HEIGHTS_M, Laws(DRAWS), np.array(LIGHT_E_PER_S), sensor("bayer-raw")):
+    for finding in binocular_results(both, HEIGHTS_M, Laws(DRAWS), np.array(LIGHT_E_PER_S), sensor("bayer-raw")):
         interval = "" if finding.low is None else f" ({finding.low:.2f} to {finding.high:.2f})"
         print(f"{finding.label}: {finding.value:.2f}{interval} {finding.unit}", flush=True)
 

@@ -16,7 +16,7 @@ from PIL import Image
 
 from phibench.benchmark.dense.dense_pairs import DenseTruth, dense_pairs
 from phibench.benchmark.dense.dense_pictures import DensePicture
-from phibench.benchmark.reports.figures import encoded, styled
+from phibench.benchmark.reports.figures import encoded_figure, styled_figure
 from phibench.datasets.read import open_dataset
 from phibench.estimator.dense.dense_bound import dense_bound
 from phibench.estimator.dense.dense_interface import DensePair
@@ -42,7 +42,7 @@ def curves(unrolled: UnrolledPair) -> bytes:
     low, high = np.degrees(grid.high_rad - grid.height_px * grid.step_rad), np.degrees(grid.high_rad)
     extent = (180.0, -180.0, float(low), float(high))
     outlined: dict[str, Any] = {"markeredgecolor": "white", "markeredgewidth": 0.8, "linestyle": "none"}
-    with styled({"axes.grid": False}, (7.5, 6.6), layout="constrained") as figure:
+    with styled_figure({"axes.grid": False}, (7.5, 6.6), layout="constrained") as figure:
         axes = figure.subplots(2, 1)
         for one, image, name in zip(axes, (unrolled.down, unrolled.up), ("down", "up"), strict=True):
             one.imshow(codes_8bit(image), cmap="gray", interpolation="nearest", extent=extent, aspect="auto")
@@ -59,7 +59,7 @@ def curves(unrolled: UnrolledPair) -> bytes:
                 label = f"D = {depth:g} m" if azimuth == _COLUMNS_DEG[0] else None
                 axes[1].plot(*place, marker=marker, color=colour, markersize=7, label=label, **outlined)
         axes[1].legend(loc="lower center", ncols=len(_AT_M), fontsize=9)
-        return encoded(figure, "png")
+        return encoded_figure(figure, "png")
 
 
 def _seen(unrolled: UnrolledPair, row: int, column: int, depth_m: float) -> Any:
@@ -75,7 +75,7 @@ def sweep(unrolled: UnrolledPair) -> bytes:
     levels = inverse_levels(unrolled.maps)
     row = int(np.argmin(np.abs(grid.elevations_rad - np.radians(_PIXEL_DEG[1]))))
     column = int(np.argmin(np.abs(grid.azimuths_rad - np.radians(_PIXEL_DEG[0]))))
-    with styled({"axes.grid": False}, (6.0, 7.4), layout="constrained") as figure:
+    with styled_figure({"axes.grid": False}, (6.0, 7.4), layout="constrained") as figure:
         axes = figure.subplots(4, 1, height_ratios=(1, 1, 1, 0.7))
         for one, depth in zip(axes, _SWEPT_M, strict=False):
             there = at_places(unrolled.up_spline, unrolled.maps.up_px(1.0 / depth))
@@ -87,7 +87,7 @@ def sweep(unrolled: UnrolledPair) -> bytes:
         for depth in _SWEPT_M:
             axes[3].axvline(1.0 / depth, color="#7f7f7f", linewidth=0.8, linestyle="--")
         axes[3].set(xlabel="1 / D, 1/m", ylabel="cost of the pixel", yticks=[])
-        return encoded(figure, "png")
+        return encoded_figure(figure, "png")
 
 
 def bound(pair: DensePair, truth: DenseTruth, planes_e: Any, depth_m: Any) -> bytes:
@@ -99,7 +99,7 @@ def bound(pair: DensePair, truth: DenseTruth, planes_e: Any, depth_m: Any) -> by
     picture = DensePicture(pair, truth, depth_m, "dense_sweep")
     error = np.abs(depth_m / truth.depth_m - 1.0) * 100.0
     known = truth.scored & np.isfinite(error) & np.isfinite(relative)
-    with styled({"axes.grid": False}, (7.5, 5.4), layout="constrained") as figure:
+    with styled_figure({"axes.grid": False}, (7.5, 5.4), layout="constrained") as figure:
         above, below = figure.subplots(2, 1, height_ratios=(1.0, 1.1))
         shown = above.imshow(
             picture.unrolled(np.minimum(relative, 1e3)),
@@ -119,7 +119,7 @@ def bound(pair: DensePair, truth: DenseTruth, planes_e: Any, depth_m: Any) -> by
         below.set(xlabel="least sigma of D in a window of 15 px, %", ylabel="median |error| of D, %")
         below.grid(True, alpha=0.35)
         below.legend()
-        return encoded(figure, "png")
+        return encoded_figure(figure, "png")
 
 
 def main() -> None:

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from phibench.calibration.outline.ball_circle import BallCircle, find_circle, shrunk
+from phibench.calibration.outline.ball_circle import BallCircle, find_circle, shrunk_picture
 from phibench.calibration.outline.edge_ring import TURNS, EdgeRing
 from phibench.calibration.rig.from_dataset import photograph
 from phibench.datasets.read import open_dataset
@@ -51,7 +51,7 @@ def frames(folder: Path, most: int) -> Iterator[tuple[str, Array]]:
 def at_one_size(light: Array) -> tuple[Array, BallCircle]:
     """The picture in squares that make the outline's radius about `RADIUS_PX`, and its outline."""
     block = max(1, round(find_circle(light).circle_px[2] / RADIUS_PX))
-    small = shrunk(light, block)
+    small = shrunk_picture(light, block)
     return small, find_circle(small)
 
 

@@ -267,19 +267,19 @@ class Drawing:
 
     def picture(self) -> EmbeddedFigure:
         """The drawing as a data address, for a report."""
-        return figures.picture(self.data, self.kind, self.alt)
+        return figures.embedded_figure(self.data, self.kind, self.alt)
 
 
 @contextmanager
 def canvas(width_in: float = 9.0, height_in: float = 4.0) -> Iterator[Figure]:
     """A figure in the style of all studies; draw and call `drawn` inside of the block."""
-    with figures.styled(figures.STYLE, (width_in, height_in), layout="constrained", dpi=130) as figure:
+    with figures.styled_figure(figures.STYLE, (width_in, height_in), layout="constrained", dpi=130) as figure:
         yield figure
 
 
 def drawn(name: str, figure: Figure, alt: str, kind: str = "svg") -> Drawing:
     """The finished drawing; the same marks give the same bytes."""
-    return Drawing(name, figures.encoded(figure, kind), alt, kind)
+    return Drawing(name, figures.encoded_figure(figure, kind), alt, kind)
 
 
 @dataclass(frozen=True)

@@ -33,7 +33,14 @@ from phibench.estimator.interface import Box
 from phibench.estimator.learned.network_file import read_model
 from phibench.estimator.learned.network_graphs import CROP, DETECT, DETECTOR, Weights
 from phibench.estimator.learned.network_input import frame_input
-from phibench.estimator.learned.networks import Network, NetworkError, heat_peaks, refined, shipped, write_network
+from phibench.estimator.learned.networks import (
+    Network,
+    NetworkError,
+    heat_peaks,
+    refined_position,
+    shipped_network,
+    write_network,
+)
 from phibench.estimator.spots.detect import mirror_box, outline_mask
 from phibench.estimator.spots.image_planes import kind_of
 from phibench.scenes.frames import Array
@@ -296,7 +303,7 @@ def thresholds_of(weights: Weights, maps: Sequence[FrameMap]) -> dict[str, tuple
 
 def answers_at_found(detector: Path, crops: SpotCrops, thresholds: Mapping[str, tuple[float, float]]) -> Answers:
     """Answers of the shipped network of crops at the places where a detector found the spot, its own scale left out."""
-    finder, crop, errors, covariances = Network(detector, DETECT), shipped(CROP), [], []
+    finder, crop, errors, covariances = Network(detector, DETECT), shipped_network(CROP), [], []
     for on, off, card, response, uv in _cut(crops):
         planes, red = frame_input(on, off, card)
         heat = np.asarray(finder.run(planes=planes[None])[0][0, 0], float)
@@ -304,7 +311,7 @@ def answers_at_found(detector: Path, crops: SpotCrops, thresholds: Mapping[str, 
         if not len(peaks.heat):
             continue
         place = 2.0 * peaks.cells[np.argmax(peaks.red_e)] + 0.5
-        spot = refined(crop, on, off, card, response, (float(place[0]), float(place[1])), 1.0)
+        spot = refined_position(crop, on, off, card, response, (float(place[0]), float(place[1])), 1.0)
         if spot.uv_px is None or np.hypot(*(error := np.array(spot.uv_px) - uv)) > _NEAR_PX:
             continue
         errors.append(error)

@@ -14,7 +14,7 @@ from functools import partial
 
 import numpy as np
 
-from phibench.benchmark.dense.dense_easy import EasyDensePairs, EasyTruth, points_of
+from phibench.benchmark.dense.easy_dense_pairs import EasyDensePairs, EasyTruth, points_of
 from phibench.benchmark.isolation.method_check import MethodCheck
 from phibench.benchmark.isolation.method_references import DENSE, resolve
 from phibench.benchmark.isolation.run_limits import RunLimits

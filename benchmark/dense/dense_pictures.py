@@ -18,7 +18,7 @@ from phibench.benchmark.dense.dense_records import depths_of
 from phibench.benchmark.isolation.method_references import DENSE, resolve
 from phibench.benchmark.isolation.run_limits import RunLimits
 from phibench.benchmark.isolation.runner import Harness
-from phibench.benchmark.reports.figures import encoded, styled
+from phibench.benchmark.reports.figures import encoded_figure, styled_figure
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.read import place_of
 from phibench.estimator.dense.dense_interface import DensePair
@@ -105,7 +105,7 @@ class DensePicture:
 
         error, known = self.error, self.known
         grey = luma_codes(self.pair.down, self.pair.card)
-        with styled({"axes.grid": False}, (8.0, 10.4), layout="constrained") as figure:
+        with styled_figure({"axes.grid": False}, (8.0, 10.4), layout="constrained") as figure:
             axes = figure.subplots(4, 1)
             share = known.sum() / max(int(self.truth.scored.sum()), 1)
             self._panel(axes[0], grey, "down image, laser off", cmap="gray")
@@ -130,7 +130,7 @@ class DensePicture:
             )
             bar = figure.colorbar(shown, ax=axes[3], ticks=range(len(CAUSE_GROUPS)))
             bar.ax.set_yticklabels(CAUSE_GROUPS)
-            return encoded(figure, "png")
+            return encoded_figure(figure, "png")
 
     def _panel(self, axes: Axes, plane: NDArray[Any], title: str, **options: Any) -> Any:
         grid = self.maps.grid
@@ -145,7 +145,7 @@ class DensePicture:
     def from_above_png(self) -> bytes:
         """Room from above: points of the answer in a robot's way by their error, and free space of answer and truth."""
         given, true = self._obstacles(self.depth_m), self._obstacles(self.truth.depth_m)
-        with styled({}, (7.0, 6.2), layout="constrained") as figure:
+        with styled_figure({}, (7.0, 6.2), layout="constrained") as figure:
             axes = figure.add_subplot()
             axes.plot(*_closed(free_space(true)), color="black", linewidth=1.0, label="free space, true")
             axes.fill(
@@ -169,7 +169,7 @@ class DensePicture:
                 xlim=(-_RANGE_M, _RANGE_M), ylim=(-_RANGE_M, _RANGE_M), xlabel="x, m", ylabel="y, m", aspect="equal"
             )
             axes.legend(loc="upper right", fontsize=8.0)
-            return encoded(figure, "png")
+            return encoded_figure(figure, "png")
 
     def points_m(self, depth_m: Array) -> Array:
         """Room points of the pixels at a D, shape (H, W, 3), world, as the given rig sees them."""

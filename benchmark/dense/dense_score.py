@@ -28,7 +28,7 @@ from phibench.benchmark.isolation.run_limits import MethodError, RunLimits
 from phibench.benchmark.isolation.runner import Harness, RunProvenance, function_name, outcomes_here, provenance_here
 from phibench.benchmark.pair_sets.wanted_pairs import open_scored
 from phibench.benchmark.scores.answer_errors import Rules
-from phibench.benchmark.scores.compare import Difference, compared, rules_of
+from phibench.benchmark.scores.compare import Difference, metric_differences, rules_of
 from phibench.benchmark.scores.score_document import MethodCard
 from phibench.benchmark.scores.score_files import read_document, read_records, write_score
 from phibench.calibration.rig.calibration_file import read_calibration
@@ -348,7 +348,7 @@ def compare_dense(first: Path, second: Path, seed: int = 0) -> list[Difference]:
         raise DatasetError(f"{first} and {second} have no pair in common: score both on the same pairs")
     metrics = {name: DENSE_METRICS[name] for name in COMPARED}
     pairs = {name: _both(ours, theirs, metric.column) for name, metric in metrics.items()}
-    return compared(
+    return metric_differences(
         {name: (*pairs[name], partial(statistic_of_dense, metric)) for name, metric in metrics.items()},
         {name: metric.better for name, metric in metrics.items()},
         rules_of(a.rules),

@@ -11,8 +11,8 @@ from collections.abc import Mapping
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
-from phibench.benchmark.export.containers import FOLDER, hugging_face_features
 from phibench.benchmark.export.pair_rows import INDEX, POSITION_FIELDS, SPLITS, ExportRequest
+from phibench.benchmark.export.shard_files import FOLDER, hugging_face_features
 from phibench.datasets.common.shown_text import markdown_text, table_lines
 from phibench.datasets.frames.frame_files import VALUES, FrameRow
 from phibench.datasets.read import Dataset

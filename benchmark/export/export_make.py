@@ -15,7 +15,6 @@ from typing import Any
 
 from rich.console import Console
 
-from phibench.benchmark.export.containers import NEEDS_PYARROW, image_name, shard_name, write_shard
 from phibench.benchmark.export.dataset_card import card, croissant
 from phibench.benchmark.export.pair_rows import (
     INDEX,
@@ -27,6 +26,7 @@ from phibench.benchmark.export.pair_rows import (
     pair_table,
     splits,
 )
+from phibench.benchmark.export.shard_files import NEEDS_PYARROW, image_name, shard_name, write_shard
 from phibench.benchmark.pair_sets.dataset_pairs import DatasetPairs, dataset_pairs
 from phibench.benchmark.pair_sets.frames_set import frames_row, frames_set_documents
 from phibench.benchmark.sealed.dense_set import DENSE_SEAL, DENSE_TRUTH
@@ -252,7 +252,7 @@ def _shards(dataset: Dataset, request: ExportRequest) -> tuple[list[Shard], list
 
 def _tasks(dataset: Dataset, request: ExportRequest, shards: Sequence[Shard]) -> dict[str, BuildTask]:
     listed = read_checksums(dataset.folder)
-    modules = ["export.pair_rows", "export.containers", *(["pair_sets.frames_set"] if request.scored else [])]
+    modules = ["export.pair_rows", "export.shard_files", *(["pair_sets.frames_set"] if request.scored else [])]
     code = [code_behind(f"phibench.benchmark.{name}") for name in modules]
     tasks = [
         BuildTask(f"shard {shard.name}", _key(dataset, listed, code, shard), make_shard, (shard,)) for shard in shards

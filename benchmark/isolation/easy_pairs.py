@@ -26,7 +26,7 @@ from phibench.estimator.geometry.phi import phi_incidence, phi_normal, phi_ray
 from phibench.estimator.geometry.reflection import image_of
 from phibench.estimator.interface import Box, Pair
 from phibench.estimator.limits.position_bound import raw_snr, spot_limit
-from phibench.estimator.methods.spot_search import around, clipped
+from phibench.estimator.methods.spot_search import box_at, clipped_box
 from phibench.estimator.pair_set import ImageTruth, PairTruth
 from phibench.estimator.spots.camera_codes import tone_of, yuyv_image
 from phibench.estimator.spots.gaussian_spot import outer, profile
@@ -109,7 +109,7 @@ class EasyCamera:
 
     def expected(self, spot: EasySpot, flux_e: float, blue: bool = False) -> ExpectedRegion:
         """Means and derivatives on 41 x 41 pixels around a spot of the laser, or of blue light."""
-        box = around(spot.uv_px, self.shape, _WINDOW_PX)
+        box = box_at(spot.uv_px, self.shape, _WINDOW_PX)
         sigma = np.array([spot.sigma_px])
         across = profile(np.array([spot.uv_px[0] - box.u0_px]), sigma, box.width_px)
         down = profile(np.array([spot.uv_px[1] - box.v0_px]), sigma, box.height_px)
@@ -324,7 +324,7 @@ class EasyPairs(ShortForm):
     def _box(self, number: int, name: str, spot: EasySpot) -> Box:
         shift = generator("easy pairs", "box", number, name).integers(-_SPAN_PX, _SPAN_PX, 2, endpoint=True)
         u, v = (round(x) + int(d) - BOX_PX // 2 for x, d in zip(spot.uv_px, shift, strict=True))
-        return clipped(Box(u, v, BOX_PX, BOX_PX), (self.rig.camera.height_px, self.rig.camera.width_px))
+        return clipped_box(Box(u, v, BOX_PX, BOX_PX), (self.rig.camera.height_px, self.rig.camera.width_px))
 
 
 def _spots(scene: EasyScene) -> tuple[tuple[str, EasySpot], ...]:

@@ -40,7 +40,7 @@ from phibench.benchmark.isolation.pair_transport import (
     pack,
     repeat_message,
 )
-from phibench.benchmark.isolation.printed_output import OutputTail, advised, last_lines, stack_place
+from phibench.benchmark.isolation.printed_output import OutputTail, advised_message, last_lines, stack_place
 from phibench.benchmark.isolation.readable_files import access_of
 from phibench.benchmark.isolation.run_limits import MethodError, RunLimits
 from phibench.benchmark.isolation.supervisor import HUNG_UP, KILL_SECONDS, processes_in
@@ -173,7 +173,7 @@ class MethodProcess:
             self.end()
         message = printable_line(outcome.message, MESSAGE_LENGTH)
         if outcome.failure == "error":
-            message = advised(message, self._isolation, outcome.output, self._access.hidden)
+            message = advised_message(message, self._isolation, outcome.output, self._access.hidden)
         return replace(outcome, message=message)
 
     def ask_each(self, pair: AnyPair) -> tuple[Outcome, ...]:
@@ -298,7 +298,7 @@ class GuestProcess:
             why = f"{self.death(reference.place)}{self._last_line()}"
             raise MethodError(f"{self._kind} '{reference.name}' cannot be imported: {why}") from None
         if fault != "":
-            raise MethodError(advised(printable_line(str(fault), MESSAGE_LENGTH), isolation))
+            raise MethodError(advised_message(printable_line(str(fault), MESSAGE_LENGTH), isolation))
         self.loaded = _names(reply)
         return isolation
 

@@ -182,7 +182,7 @@ def _of_file(reference: str, seat: MethodTask) -> Reference:
         raise MethodError(f"method '{reference}': the file {path} is not there; {advice}")
     if path.name != printable_line(path.name):
         raise MethodError(f"method '{printable_line(path.name)}': give the file a name of at most 200 printable signs")
-    parsed(path)
+    parsed_file(path)
     hashed, modules = sha256(path), tuple((name, sha256(path.parent / name)) for name in modules_beside(path))
     # names of files may hold bytes that are no text, and what a terminal obeys
     return Reference(f"{printable_line(path.stem)}:{function}", "file", str(path), function, hashed, modules=modules)
@@ -220,7 +220,7 @@ def modules_beside(path: Path) -> list[str]:
 def _imported(file: Path, folder: Path) -> Iterator[Path]:
     """Files below a folder that a file imports, packages with their `__init__.py`."""
     try:
-        nodes = list(ast.walk(parsed(file)))
+        nodes = list(ast.walk(parsed_file(file)))
     except (MethodError, OSError):
         return  # the worker says what is wrong with it
     package = file.parent.relative_to(folder).parts
@@ -250,7 +250,7 @@ def _files_of(name: tuple[str, ...], folder: Path) -> Iterator[Path]:
 _MOST_BYTES = 16 * MIB  # of a method's file
 
 
-def parsed(path: Path) -> ast.Module:
+def parsed_file(path: Path) -> ast.Module:
     """Syntax tree of a Python file that can be compiled; nothing of it is run.
 
     Raises

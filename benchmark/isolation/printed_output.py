@@ -116,7 +116,7 @@ _OUT_OF_REACH = re.compile(r"PermissionError|permission denied|system error numb
 _UNREAD = "can't open/read file"  # printed by OpenCV, which then gives None and raises nothing
 
 
-def advised(message: str, isolation: Isolation, output: str = "", hidden: Sequence[str] = ()) -> str:
+def advised_message(message: str, isolation: Isolation, output: str = "", hidden: Sequence[str] = ()) -> str:
     """A message with what helps, if the rules of the isolation are what it or the printed lines may be about.
 
     A hidden place is empty for the process where the system allows that: its files "do not exist" then.

@@ -183,7 +183,7 @@ class _PacedAdapter(HTTPAdapter):
 
 
 @contextmanager
-def answer(url: str, headers: dict[str, str], pace: TransferPace) -> Iterator[requests.Response]:
+def server_answer(url: str, headers: dict[str, str], pace: TransferPace) -> Iterator[requests.Response]:
     """Server's answer after its redirects, the body not yet read, and not to be packed for the way.
 
     Raises
@@ -251,7 +251,7 @@ def shown_address(url: str) -> str:
         return "an address that cannot be read"
 
 
-def body(response: requests.Response, pace: TransferPace) -> Iterator[bytes]:
+def body_pieces(response: requests.Response, pace: TransferPace) -> Iterator[bytes]:
     """Pieces of a body, unpacked where the server has packed it with gzip unasked; together they are bounded.
 
     Raises

@@ -166,16 +166,16 @@ class _Transfer:
 
     def download(self, url: str, target: str, _pooch: Any) -> None:
         """Put what a server sends into the file `target`."""
-        from phibench.benchmark.release.paced_http import answer, body
+        from phibench.benchmark.release.paced_http import body_pieces, server_answer
 
         if self._partial is not None:
             self._partial.download(url, target, self._new_pace)
             return
         pace = self._new_pace()
-        with answer(url, {}, pace) as response, Path(target).open("wb") as file:
+        with server_answer(url, {}, pace) as response, Path(target).open("wb") as file:
             _require_file(response)
             try:
-                for piece in body(response, pace):
+                for piece in body_pieces(response, pace):
                     file.write(piece)
             except ValueError as error:
                 raise ValueError(f"has more than {self._most} bytes, the most that are read of its kind") from error
@@ -232,11 +232,11 @@ class Partial:
         ValueError
             If the server sends more than the archive has.
         """
-        from phibench.benchmark.release.paced_http import answer
+        from phibench.benchmark.release.paced_http import server_answer
 
         if not (self.size and self.validator.is_file() and self._completed(url, new_pace())):
             pace = new_pace()
-            with answer(url, {}, pace) as response:
+            with server_answer(url, {}, pace) as response:
                 _require_file(response)
                 self._take_whole(response, pace)
         self.path.replace(target)
@@ -244,12 +244,12 @@ class Partial:
 
     def _completed(self, url: str, pace: TransferPace) -> bool:
         """Ask for the bytes that are missing; False if the server does not give them, or if they do not fit."""
-        from phibench.benchmark.release.paced_http import answer
+        from phibench.benchmark.release.paced_http import server_answer
 
         begun = self.size
         if begun < self._archive.size:
             asked = {"Range": f"bytes={begun}-", "If-Range": self.validator.read_text("ascii", "ignore")}
-            with answer(url, {key: value for key, value in asked.items() if value}, pace) as response:
+            with server_answer(url, {key: value for key, value in asked.items() if value}, pace) as response:
                 if response.status_code == 200:  # no ranges here, or another file by now
                     self._take_whole(response, pace)
                     return True
@@ -272,10 +272,10 @@ class Partial:
     def _take(self, response: requests.Response, pace: TransferPace, mode: str) -> None:
         import requests
 
-        from phibench.benchmark.release.paced_http import body
+        from phibench.benchmark.release.paced_http import body_pieces
 
         with self.path.open(mode) as file:
-            for piece in body(response, pace):
+            for piece in body_pieces(response, pace):
                 file.write(piece)
                 if file.tell() > self._archive.size:
                     self.validator.unlink(missing_ok=True)

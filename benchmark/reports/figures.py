@@ -65,7 +65,7 @@ def error_bars(ends: ArrayLike) -> Array:
 
 
 @contextmanager
-def styled(style: Any, size_in: tuple[float, float], **options: Any) -> Iterator[Figure]:
+def styled_figure(style: Any, size_in: tuple[float, float], **options: Any) -> Iterator[Figure]:
     """An empty figure; the style holds inside of the block."""
     import matplotlib as mpl
     from matplotlib.figure import Figure
@@ -74,14 +74,14 @@ def styled(style: Any, size_in: tuple[float, float], **options: Any) -> Iterator
         yield Figure(figsize=size_in, **options)
 
 
-def encoded(figure: Figure, kind: str, transparent: bool = False) -> bytes:
+def encoded_figure(figure: Figure, kind: str, transparent: bool = False) -> bytes:
     """A figure as a file, "svg" or "png"."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format=kind, metadata=_METADATA[kind], transparent=transparent)
     return buffer.getvalue()
 
 
-def picture(data: bytes, kind: str, alt: str) -> EmbeddedFigure:
+def embedded_figure(data: bytes, kind: str, alt: str) -> EmbeddedFigure:
     """An encoded figure as a picture."""
     return EmbeddedFigure(f"data:{_MIME[kind]};base64,{base64.b64encode(data).decode('ascii')}", alt)
 
@@ -105,7 +105,7 @@ Named = Mapping[str, ScoreDocument]
 Tables = Mapping[str, pl.DataFrame]
 
 
-def keys(names: Sequence[str]) -> dict[str, EmbeddedFigure]:
+def method_keys(names: Sequence[str]) -> dict[str, EmbeddedFigure]:
     """Line and marker of each method, to be shown beside its name."""
     return {name: _key(i) for i, name in enumerate(names)}
 
@@ -118,7 +118,7 @@ def error_panels(scores: Named) -> list[EmbeddedFigure]:
         for stratum, below in _COLUMNS:
             if not any(_points(score, stratum, metric) for score in scores.values()):
                 continue  # nothing found, or nothing off
-            with styled(_PANEL, _SIZE) as figure:
+            with styled_figure(_PANEL, _SIZE) as figure:
                 axes = figure.add_axes(_PLACE)
                 _curves(axes, scores, stratum, metric, factor)
                 if bound is not None:
@@ -144,7 +144,7 @@ def error_maps(tables: Tables) -> dict[str, EmbeddedFigure]:
         return maps
     scale = _scale(tables)
     for name, table in tables.items():
-        with styled(_PANEL, _SIZE, dpi=150) as figure:
+        with styled_figure(_PANEL, _SIZE, dpi=150) as figure:
             axes = figure.add_axes(_MAP_PLACE)
             marks = _map(axes, table, scale)
             place = figure.add_axes(_BAR_PLACE)
@@ -164,7 +164,7 @@ def radius_panels(tables: Tables) -> list[EmbeddedFigure]:
     panels: list[EmbeddedFigure] = []
     tables = _placed(tables)
     for column, label in (("radial_px", "radial"), ("tangential_px", "tangential")) if tables else ():
-        with styled(_PANEL, _SIZE) as figure:
+        with styled_figure(_PANEL, _SIZE) as figure:
             axes = figure.add_axes(_PLACE)
             for i, (name, table) in enumerate(tables.items()):
                 radius, rms = _binned(table, column)
@@ -185,7 +185,7 @@ def cause_bars(scores: Named) -> EmbeddedFigure:
     """Images without a right position by cause, one bar per method."""
     causes = [c for c in next(iter(scores.values())).causes if any(sum(s.causes[c].values()) for s in scores.values())]
     height = 1.2 + 0.32 * len(scores) + 0.25 * math.ceil(len(causes) / 2)
-    with styled(_PANEL, (1.4 * _SIZE[0], height), layout="constrained") as figure:
+    with styled_figure(_PANEL, (1.4 * _SIZE[0], height), layout="constrained") as figure:
         axes = figure.subplots()
         start = np.zeros(len(scores))
         for i, cause in enumerate(causes):
@@ -209,7 +209,7 @@ def pull_histogram(tables: Tables) -> EmbeddedFigure | None:
         return None
     edges = np.linspace(-5.0, 5.0, 41)  # a quarter of a deviation each
     legend = 0.2 * math.ceil((len(pulls) + 1) / 2)  # inches below the axes, where it covers no curve
-    with styled(_PANEL, (1.4 * _SIZE[0], 1.2 * _SIZE[1] + legend), layout="constrained") as figure:
+    with styled_figure(_PANEL, (1.4 * _SIZE[0], 1.2 * _SIZE[1] + legend), layout="constrained") as figure:
         axes = figure.subplots()
         for i, (name, values) in enumerate(pulls.items()):
             density = np.histogram(np.clip(values, -5.0, 5.0), edges, density=True)[0]
@@ -336,7 +336,7 @@ def plain_number(x: float) -> str:
 
 
 def _key(i: int) -> EmbeddedFigure:
-    with styled(_PANEL, (0.5, 0.2)) as figure:
+    with styled_figure(_PANEL, (0.5, 0.2)) as figure:
         axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
         axes.plot([0.0, 0.5, 1.0], [0.0, 0.0, 0.0], markevery=[1], **line_style(i))
         axes.set(xlim=(-0.05, 1.05), ylim=(-1.0, 1.0))
@@ -357,8 +357,8 @@ def _shares(score: ScoreDocument) -> str:
 
 
 def _svg(figure: Figure, alt: str) -> EmbeddedFigure:
-    return picture(encoded(figure, "svg", True), "svg", alt)
+    return embedded_figure(encoded_figure(figure, "svg", True), "svg", alt)
 
 
 def _png(figure: Figure, alt: str) -> EmbeddedFigure:
-    return picture(encoded(figure, "png", True), "png", alt)
+    return embedded_figure(encoded_figure(figure, "png", True), "png", alt)

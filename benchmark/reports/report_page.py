@@ -22,7 +22,7 @@ from phibench.benchmark.reports.figures import (
     error_maps,
     error_panels,
     has_open_marks,
-    keys,
+    method_keys,
     pull_histogram,
     radius_panels,
 )
@@ -45,7 +45,7 @@ from phibench.benchmark.scores.score_tables import (
     light_line,
     rank_key,
     rank_words,
-    refused,
+    refusal_text,
     shown_parts,
 )
 from phibench.benchmark.scores.worst_images import EncodedPicture
@@ -205,7 +205,7 @@ def _groups(scores: Sequence[tuple[ScoreDocument, pl.DataFrame]]) -> list[list[t
 def _ranking(
     number: int, group: list[tuple[ScoreDocument, pl.DataFrame]], every: Sequence[ScoreDocument], by: str
 ) -> Ranking:
-    refusals = {document.method.name: why for document, table in group if (why := refused(table))}
+    refusals = {document.method.name: why for document, table in group if (why := refusal_text(table))}
     left_out = [f"{name} is not compared: it {why}." for name, why in refusals.items()]
     compared = [item for item in group if item[0].method.name not in refusals] or group
     failed = [f"{document.method.name} {line}." for document, table in compared if (line := failure_line(table))]
@@ -224,7 +224,7 @@ def _ranking(
         verdict=" ".join([verdict(scores, by), *left_out, *failed]),
         pair_set=pair_set,
         scores=scores,
-        keys=keys(names),
+        keys=method_keys(names),
         curves=error_panels(scores),
         maps=error_maps(tables),
         by_radius=radius_panels(tables),

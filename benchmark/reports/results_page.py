@@ -42,7 +42,7 @@ from phibench.benchmark.scores.score_tables import (
     head,
     light_line,
     ranked,
-    refused,
+    refusal_text,
     shown_parts,
     starred,
 )
@@ -119,7 +119,7 @@ def _part(
     seed: int,
 ) -> ScoreGroup:
     tables = {document.method.name: table for document, table in group}
-    refusals = {name: why for name, table in tables.items() if (why := refused(table))}
+    refusals = {name: why for name, table in tables.items() if (why := refusal_text(table))}
     documents = [document for document, _ in group]
     order = ranked([one for one in documents if one.method.name not in refusals] or documents, by)
     base = next((one for one in order if one.method.name == against), order[0])

@@ -93,7 +93,7 @@ def least_px2(bound_px2: Array, raw_px2: Array) -> Array:
     return np.where(larger[:, None, None], model, raw)
 
 
-def clipped(covariance_px2: Array) -> Array:
+def clipped_covariances(covariance_px2: Array) -> Array:
     """Covariances, shape (n, 2, 2), with no variance above 0.5 px^2 along any axis; NaN stays."""
     good = np.asarray(np.isfinite(covariance_px2).all(axis=(1, 2)))
     values, axes = np.linalg.eigh(np.where(good[:, None, None], covariance_px2, np.eye(2)))
@@ -159,7 +159,7 @@ def excesses(records: pl.DataFrame) -> list[Excess]:
 
     Parameters
     ----------
-    records : `metrics.prepared`
+    records : `metrics.prepared_records`
     """
     suspicious = [one for one in _tried(records) if one.pairs and one.ratio > 1.0 and one.chance < FALSE_ALARM]
     named = ([one for one in suspicious if one.quantity == quantity] for quantity in QUANTITIES)

@@ -24,7 +24,14 @@ import polars as pl
 from phibench.benchmark.pair_sets.dataset_pairs import tracks_of
 from phibench.benchmark.scores.answer_errors import Rules
 from phibench.benchmark.scores.intervals import AT_ONCE, NO_SPREAD, Clusters, Estimate, Statistic, estimates, mean_of
-from phibench.benchmark.scores.metrics import FAMILIES, METRICS, Metric, prepared, statistic_of, trusted
+from phibench.benchmark.scores.metrics import (
+    FAMILIES,
+    METRICS,
+    Metric,
+    prepared_records,
+    statistic_of,
+    trusted_estimate,
+)
 from phibench.benchmark.scores.records import missed_relative, with_missed
 from phibench.benchmark.scores.score_document import ScoreDocument
 from phibench.benchmark.scores.score_files import read_records, read_score
@@ -118,7 +125,7 @@ def compare_records(first: pl.DataFrame, second: pl.DataFrame, rules: Rules, *st
 StatisticOf = Callable[[Clusters, pl.DataFrame], Statistic]
 
 
-def compared(
+def metric_differences(
     metrics: Mapping[str, tuple[pl.DataFrame, pl.DataFrame, StatisticOf]],
     better: Mapping[str, str],
     rules: Rules,
@@ -278,7 +285,7 @@ def _common(first: pl.DataFrame, second: pl.DataFrame, rules: Rules) -> tuple[pl
     if not a.select(_TRUTH).equals(b.select(_TRUTH), null_equal=True):
         raise DatasetError("the two scores have other truths for the same pairs: score both methods on the same pairs")
     missed = missed_relative(a, rules)
-    return prepared(with_missed(a, missed)), prepared(with_missed(b, missed))
+    return prepared_records(with_missed(a, missed)), prepared_records(with_missed(b, missed))
 
 
 def _difference(name: str, a: pl.DataFrame, b: pl.DataFrame, rules: Rules, *stream: Name) -> Difference:
@@ -290,7 +297,7 @@ def _difference(name: str, a: pl.DataFrame, b: pl.DataFrame, rules: Rules, *stre
         return Difference(name, np.nan, np.nan, _NOTHING, 0, 0, np.nan, "too few samples")
     ours, theirs = (statistic_of(metric, clusters, table) for table in (a, b))
     drawn = _drawn(name, ours, theirs, clusters, rules, *stream)
-    item = replace(drawn, difference=trusted(metric, drawn.difference, clusters.n), n=len(a))
+    item = replace(drawn, difference=trusted_estimate(metric, drawn.difference, clusters.n), n=len(a))
     if clusters.n < rules.least_compared:
         return item
     tested = _tested(metric, clusters, pl.concat([a, b], how="vertical_relaxed"))

@@ -338,7 +338,7 @@ class MetricEstimate:
     share: float = math.nan
 
 
-def prepared(records: pl.DataFrame) -> pl.DataFrame:
+def prepared_records(records: pl.DataFrame) -> pl.DataFrame:
     """Records with what the metrics take besides: roots of the bounds, samples as numbers, which bounds are sharp."""
     return track_columns(records).with_columns(
         root_bound_px=pl.col("bound_px2").sqrt(),
@@ -360,7 +360,7 @@ def measure(
 
     Parameters
     ----------
-    records : `prepared`
+    records : `prepared_records`
     *stream : names of the random stream of the resamples
     """
     wanted = {name: METRICS[name] for name in names or METRICS}
@@ -387,7 +387,7 @@ def _with_share(metric: Metric, measured: MetricEstimate, every: Mapping[str, in
     return replace(measured, share=measured.n / count if count else math.nan)
 
 
-def trusted(metric: Metric, estimate: Estimate, samples: int) -> Estimate:
+def trusted_estimate(metric: Metric, estimate: Estimate, samples: int) -> Estimate:
     """The estimate, without its interval where that would not hold what it says.
 
     With two images of each of n samples the interval of a 95th percentile covers in 56 % of the cases at n = 10, 88 %
@@ -432,7 +432,7 @@ def _resampled(ready: dict[str, _Ready], rules: Rules, rng: np.random.Generator)
     samples = next(iter(ready.values())).samples
     numbers = estimates([item.statistic for item in ready.values()], samples, rules, rng)
     return {
-        name: MetricEstimate(trusted(item.metric, number, item.samples), item.n, item.samples)
+        name: MetricEstimate(trusted_estimate(item.metric, number, item.samples), item.n, item.samples)
         for (name, item), number in zip(ready.items(), numbers, strict=True)
     }
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from phibench.benchmark.scores.answer_errors import phi_variance, with_kept_results
-from phibench.benchmark.scores.beyond_images import clipped, least_px2, squares
+from phibench.benchmark.scores.beyond_images import clipped_covariances, least_px2, squares
 from phibench.estimator.geometry.least_squares_depth import JointBound, information, joint_bound
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import Rig
@@ -70,7 +70,7 @@ def pair_bounds(
     possible_px2 = [least_px2(bound.image_px2, bound.raw_px2) for bound in bounds]
     possible = _joint_bound(*at, *possible_px2)
     of_both = possible.covariance_down_px2, possible.covariance_up_px2
-    least = [clipped(_or(C, alone)) for C, alone in zip(of_both, possible_px2, strict=True)]
+    least = [clipped_covariances(_or(C, alone)) for C, alone in zip(of_both, possible_px2, strict=True)]
     down, up = (
         (np.trace(V, axis1=1, axis2=2), squares(e, V), phi_variance(rig, uv, V))
         for uv, e, V in zip(true_px, errors_px, least, strict=True)

@@ -28,8 +28,8 @@ from phibench.benchmark.scores.strata import (
     count_pairs,
     frame_numbers,
     light_distances,
-    measured,
     strata,
+    stratum_metrics,
 )
 from phibench.benchmark.scores.worst_images import Worst
 from phibench.datasets.common.errors import DatasetError
@@ -283,7 +283,7 @@ def document_of(
         code_sha256=code_behind(SCORER),
         missed_relative=missed,
         flags=[Flag(**{**asdict(excess), "ratio": finite(excess.ratio)}) for excess in excesses(whole.images)],
-        metrics={name: _metric(name, value) for name, value in measured(whole, rules, "score", seed).items()},
+        metrics={name: _metric(name, value) for name, value in stratum_metrics(whole, rules, "score", seed).items()},
         strata=[_stratum(stratum, rules, seed) for stratum in others],
         causes=count(table),
         failures=count_failures(table),
@@ -314,7 +314,7 @@ def _metric(name: str, value: MetricEstimate) -> MetricDescription:
 
 def _stratum(stratum: Stratum, rules: Rules, seed: int) -> StratumScore:
     # the same stream for every method: on the same pairs they are resampled alike, so that their intervals compare
-    values = measured(stratum, rules, "score", seed)
+    values = stratum_metrics(stratum, rules, "score", seed)
     return StratumScore(
         by=stratum.by,
         label=stratum.label,

@@ -104,7 +104,7 @@ def division_and_rig(document: ScoreDocument) -> tuple[str, str]:
     return document.method.division, rig_known(document)
 
 
-def refused(records: pl.DataFrame) -> str:
+def refusal_text(records: pl.DataFrame) -> str:
     """Reason for which a built-in method took none of the pairs, such as "takes srgb8, not bayer-raw"; "" if it did.
 
     Parameters
@@ -285,7 +285,7 @@ def failure_line(records: pl.DataFrame) -> str:
 
 def nothing_answered(scored: Sequence[HasScore]) -> bool:
     """True if some method failed on every pair, or all methods refuse the pairs."""
-    return any(failure_line(one.records) for one in scored) or all(refused(one.records) for one in scored)
+    return any(failure_line(one.records) for one in scored) or all(refusal_text(one.records) for one in scored)
 
 
 def pair_in_words(row: Mapping[str, Any]) -> str:
@@ -350,7 +350,7 @@ def print_scores(scored: Sequence[HasScore], form: str, by: str, wide: bool, cal
     calibrated : bool
         Say how well the predicted error of D holds.
     """
-    refusals = {id(each): f"not compared: it {why}" for each in scored if (why := refused(each.records))}
+    refusals = {id(each): f"not compared: it {why}" for each in scored if (why := refusal_text(each.records))}
     every = [each.document for each in scored]
     documents = [each.document for each in scored if id(each) not in refusals] or every
     board = leaderboard(documents, by, wide)
@@ -381,7 +381,7 @@ def print_scores(scored: Sequence[HasScore], form: str, by: str, wide: bool, cal
 
 def method_lines(one: HasScore) -> list[str]:
     """Sentences on a method: it failed or refused every pair, it knows too much, what its false answers are."""
-    why = refused(one.records)
+    why = refusal_text(one.records)
     failure = f"not compared: it {why}" if why else failure_line(one.records)
     told = filter(None, (failure, *(flag.text for flag in one.document.flags), _false_line(one)))
     return [f"{one.document.method.name}: {line}" for line in told]

@@ -15,7 +15,7 @@ from itertools import pairwise
 import polars as pl
 
 from phibench.benchmark.scores.answer_errors import Rules
-from phibench.benchmark.scores.metrics import METRICS, OF_PAIRS, MetricEstimate, measure, prepared
+from phibench.benchmark.scores.metrics import METRICS, OF_PAIRS, MetricEstimate, measure, prepared_records
 from phibench.datasets.store.schema import Document
 from phibench.scenes.random_streams import Name
 
@@ -71,7 +71,7 @@ def strata(records: pl.DataFrame) -> Iterator[Stratum]:
         pl.when(~pl.col("visible")).then(pl.lit("not visible")).otherwise(clear.otherwise(pl.lit("visible, fainter")))
     )
     full = pl.when(~pl.col("visible")).then(None).when(pl.col("saturated")).then(pl.lit("saturated"))
-    table = prepared(records).with_columns(
+    table = prepared_records(records).with_columns(
         azimuth_deg=pl.col("azimuth_rad").degrees(),
         hint=hint,
         shown=shown,
@@ -95,7 +95,7 @@ def light_shift() -> pl.Expr:
     return (du**2 + dv**2).sqrt()
 
 
-def measured(stratum: Stratum, rules: Rules, *stream: Name) -> dict[str, MetricEstimate]:
+def stratum_metrics(stratum: Stratum, rules: Rules, *stream: Name) -> dict[str, MetricEstimate]:
     """Metrics of a stratum, resampled from a stream of its own."""
     names = (*stream, stratum.by, stratum.label)
     if stratum.pairs is None:

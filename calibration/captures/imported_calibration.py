@@ -39,7 +39,7 @@ from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.estimator.interface import Pair
 from phibench.estimator.methods.raw_likelihood import with_posteriors
 from phibench.estimator.methods.registry import method_for
-from phibench.estimator.methods.spot_search import SharedPair, kept
+from phibench.estimator.methods.spot_search import SharedPair, joint_or_separate
 from phibench.estimator.spots.image_planes import ImageError
 from phibench.scenes.rig import POSITIONS, Rig
 
@@ -193,7 +193,7 @@ def _known(imported: ImportedSet, rows: Sequence[ImportedRow], rig: Rig, shape: 
         if spot.uv_px is None or spot.covariance_px2 is None:
             why = spot.status if spot.uv_px is None else "a light is there, but no fit of it stays at its place"
             raise DatasetError(f"no spot {position}: {why}")
-    spots = seen_spots(kept(pair, answer, with_posteriors(pair, answer)))
+    spots = seen_spots(joint_or_separate(pair, answer, with_posteriors(pair, answer)))
     row = rows[0]
     if row.depth_m is None or row.depth_sigma_m is None:
         raise DatasetError("no measured D")

@@ -70,7 +70,7 @@ from phibench.estimator.geometry.status import Status, describe
 from phibench.estimator.interface import Answer, Image, Pair, Spot
 from phibench.estimator.methods.raw_likelihood import with_posteriors
 from phibench.estimator.methods.registry import method_for
-from phibench.estimator.methods.spot_search import SharedPair, kept
+from phibench.estimator.methods.spot_search import SharedPair, joint_or_separate
 from phibench.estimator.spots.detect import detect
 from phibench.estimator.spots.image_planes import ImageError
 from phibench.scenes.frames import Array
@@ -306,7 +306,7 @@ def _fitted(
     if any(spot.uv_px is None or spot.covariance_px2 is None for spot in (answer.down, answer.up)):
         told(_LOOKING)
         raise missing_spot_error(ready, photos, answer, apart_note(outlines) or doubt)
-    spots = seen_spots(kept(shared, answer, with_posteriors(shared, answer)))
+    spots = seen_spots(joint_or_separate(shared, answer, with_posteriors(shared, answer)))
     wide = {name: widened_by_shape(spots[name], images.get(name), shape) for name in POSITIONS}
     return _Fitted(ready, wide, rig, covariance, stroke, limb, (note, _shape_note(shape, setting)), doubt)
 

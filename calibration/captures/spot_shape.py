@@ -31,7 +31,7 @@ from phibench.estimator.methods.raw_likelihood import raw_spot_data
 from phibench.estimator.methods.spot_search import pair_blur, seen_depth_m
 from phibench.estimator.processed.quasi_score import CoefficientWindow, fit_window
 from phibench.estimator.spots.fit_raw import SpotData, fit_law
-from phibench.estimator.spots.gaussian_spot import SpotModel, SpotPixels, limited
+from phibench.estimator.spots.gaussian_spot import SpotModel, SpotPixels, limited_step
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import POSITIONS, Rig
 
@@ -223,7 +223,7 @@ class _Linear:
     def advanced(self, step: Array) -> Array:
         """Hypothesis that belongs to a changed shape."""
         own: Array = np.asarray(np.linalg.solve(self.A, self.g - self.B @ step), float)
-        return limited(self.theta[None], own[None])[0]
+        return limited_step(self.theta[None], own[None])[0]
 
 
 def _outputs(image: SpotPicture) -> _Outputs:

@@ -33,7 +33,7 @@ from phibench.calibration.outline.edge_ring import (
     log_colours,
 )
 from phibench.calibration.outline.limb_circle import limb_circle
-from phibench.calibration.outline.limb_image import block_sums
+from phibench.calibration.outline.limb_image import square_sums
 from phibench.estimator.spots.image_planes import ImageError
 from phibench.scenes.frames import Array
 
@@ -135,22 +135,22 @@ def find_circle(light: NDArray[Any], radii_px: tuple[float, float] | None = None
     ImageError
         If there is none, if several curves are as clear, or if its place is too uncertain.
     """
-    best = next(circles(light, radii_px), None)
+    best = next(possible_circles(light, radii_px), None)
     if best is None:
         raise ImageError("no outline of a ball was found: the picture has no edges on a circle")
     best.require_clear()
-    circle = beside_limb(light, refined(light, best))
+    circle = edge_or_limb_circle(light, refined_circle(light, best))
     circle.require_clear()
     return circle
 
 
-def beside_limb(light: NDArray[Any], found: BallCircle) -> BallCircle:
+def edge_or_limb_circle(light: NDArray[Any], found: BallCircle) -> BallCircle:
     """The circle by edges, or by the fall of the light where that is another one and describes the light better.
 
     Where neither describes it clearly better, the middle of the two. What they are apart counts in the covariance.
     """
     block = max(1, math.ceil(max(light.shape[:2]) / LONGEST_PX))
-    small = shrunk(light if light.ndim == 2 else light.mean(axis=-1), block)
+    small = shrunk_picture(light if light.ndim == 2 else light.mean(axis=-1), block)
     u, v, radius = found.circle_px
     near = ((u + 0.5) / block - 0.5, (v + 0.5) / block - 0.5, radius / block)
     limb = limb_circle(small, near, (found.ellipse_px[0] / block, found.ellipse_px[1] / block))
@@ -177,7 +177,7 @@ def beside_limb(light: NDArray[Any], found: BallCircle) -> BallCircle:
     return replace(found, circle_px=whole, covariance_px2=covariance * block**2)
 
 
-def refined(light: NDArray[Any], found: BallCircle, floor_px: float = _FLOOR_PX) -> BallCircle:
+def refined_circle(light: NDArray[Any], found: BallCircle, floor_px: float = _FLOOR_PX) -> BallCircle:
     """An outline that was found in a picture made smaller, in the squares of one twice as long.
 
     Finer ones say no more: the pixels of long photographs are finer than what lens and sharpening leave of an edge.
@@ -202,23 +202,23 @@ def _finer(channels: NDArray[Any], found: BallCircle, block: int, floor_px: floa
     return _with_covariance(found.contrast, ring, curve, _SCALES, (floor_px,) * 3, block, found.lead)
 
 
-def circles(
+def possible_circles(
     light: NDArray[Any], radii_px: tuple[float, float] | None = None, count: int = _CANDIDATES
 ) -> Iterator[BallCircle]:
     """Outlines that a ball may have, the clearest first, clear or not; `count` circles are tried."""
     block = max(1, math.ceil(max(light.shape[:2]) / LONGEST_PX))
     radii = None if radii_px is None else _over(radii_px, block)
-    curves = _settled(log_colours(shrunk(light, block)), radii, count)
+    curves = _settled(log_colours(shrunk_picture(light, block)), radii, count)
     for curve in curves:
         others = [other[0] for other in curves if other is not curve]
         yield _measured(_clearer(curve), max(others, default=0.0), block)
 
 
-def shrunk(light: NDArray[Any], block: int) -> NDArray[Any]:
+def shrunk_picture(light: NDArray[Any], block: int) -> NDArray[Any]:
     """Means over squares of `block` pixels; what is left over at the right and below is cut off."""
     if block == 1:
         return light
-    return block_sums(light, block) / block**2
+    return square_sums(light, block) / block**2
 
 
 def _over(radii_px: tuple[float, float], block: int) -> tuple[float, float]:
@@ -228,10 +228,12 @@ def _over(radii_px: tuple[float, float], block: int) -> tuple[float, float]:
 # Candidates.
 
 
-def candidates(channels: Array, radii_px: tuple[float, float] | None = None, count: int = _CANDIDATES) -> list[Circle]:
+def circle_candidates(
+    channels: Array, radii_px: tuple[float, float] | None = None, count: int = _CANDIDATES
+) -> list[Circle]:
     """Circles with the most votes, the best first."""
     block = max(1, round(max(channels.shape[1:]) / _VOTE_PX))
-    small = np.moveaxis(shrunk(np.moveaxis(channels, 0, -1), block), -1, 0)
+    small = np.moveaxis(shrunk_picture(np.moveaxis(channels, 0, -1), block), -1, 0)
     rows, columns = small.shape[1:]
     if min(rows, columns) < _LEAST_SIDE:
         return []
@@ -292,7 +294,7 @@ _Curve = tuple[float, EdgeRing, Array]  # contrast, ring around it, curve from t
 def _settled(channels: Array, radii_px: tuple[float, float] | None, count: int) -> list[_Curve]:
     """Curves around the best candidates, the clearest first."""
     rough: list[_Curve] = []
-    for circle in candidates(channels, radii_px, count):
+    for circle in circle_candidates(channels, radii_px, count):
         ring = EdgeRing(channels, circle, max(12.0, 0.05 * circle[2]), 1.0, 1.5)
         rough.append(_rated(*ring.moved(_climbed(ring, np.zeros(3), (6.0, 3.0)))))
         if len(rough) >= _SETTLED and max(one[0] for one in rough) > _OVERWHELMING * LEAST_CONTRAST:
@@ -454,7 +456,7 @@ def _with_covariance(
 # Limbs.
 
 
-def on_limb(light: NDArray[Any], near: Circle, blur_px: float) -> BallCircle | None:
+def limb_beside_circle(light: NDArray[Any], near: Circle, blur_px: float) -> BallCircle | None:
     """The limb of a reflection beside a circle, where the room's edges inside it may be the clearer ones.
 
     Long pictures are made smaller first, to at most 2048 px.
@@ -471,7 +473,7 @@ def on_limb(light: NDArray[Any], near: Circle, blur_px: float) -> BallCircle | N
     block = max(1, math.ceil(max(light.shape[:2]) / (2 * LONGEST_PX)))
     # squares of pixels blur as a square of their side does; the pixel's own 1/12 is in both
     blur_px = math.sqrt(blur_px**2 / block**2 + (1.0 - 1.0 / block**2) / 12.0)
-    small = shrunk(light, block)
+    small = shrunk_picture(light, block)
     channels = small[None] if small.ndim == 2 else np.moveaxis(small, -1, 0)
     u, v, radius = near
     start = ((u + 0.5) / block - 0.5, (v + 0.5) / block - 0.5, radius / block)

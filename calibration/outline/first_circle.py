@@ -12,7 +12,7 @@ from collections.abc import Iterator
 import numpy as np
 from scipy import ndimage
 
-from phibench.calibration.outline.ball_circle import BallCircle, circles
+from phibench.calibration.outline.ball_circle import BallCircle, possible_circles
 from phibench.calibration.outline.edge_ring import Circle
 from phibench.calibration.outline.limb_image import Plane
 from phibench.estimator.spots.image_planes import ImageError
@@ -53,7 +53,7 @@ def circles_by_size(picture: Array, rig: Rig) -> Iterator[Iterator[BallCircle]]:
     """
     low, high = radii_px(rig)
     near = (low * _NEAR[0] / SIZES_LOOKED_FOR[0], high * _NEAR[1] / SIZES_LOOKED_FOR[1])
-    return (circles(picture, radii, count) for radii, count in ((near, _FEW), ((low, high), _CANDIDATES)))
+    return (possible_circles(picture, radii, count) for radii, count in ((near, _FEW), ((low, high), _CANDIDATES)))
 
 
 def radii_px(rig: Rig) -> tuple[float, float]:

@@ -101,21 +101,21 @@ def full_pixels(planes: tuple[Plane, ...]) -> BoolArray:
     return ~np.logical_or.reduce([plane.usable for plane in planes])
 
 
-def binned(planes: tuple[Plane, ...], block: int) -> tuple[Plane, ...]:
+def binned_planes(planes: tuple[Plane, ...], block: int) -> tuple[Plane, ...]:
     """Planes of squares of `block` pixels: means of what is usable there; a pixel's sum has no neighbours then."""
     return tuple(_binned(plane, block) for plane in planes)
 
 
 def _binned(plane: Plane, block: int) -> Plane:
-    count = block_sums(plane.usable.astype(np.uint16), block)
-    sums = block_sums(np.where(plane.usable, plane.values, 0.0), block)
+    count = square_sums(plane.usable.astype(np.uint16), block)
+    sums = square_sums(np.where(plane.usable, plane.values, 0.0), block)
     shares = [sum(t.weight for t in taps if t.filter_index == i) for taps in plane.taps for i in range(3)]
     share = np.array(shares, float).reshape(4, 3).mean(axis=0)
     taps = tuple(Tap(float(one), i) for i, one in enumerate(share) if one)
     return Plane(sums / np.maximum(count, 1), count > 0, (taps, taps, taps, taps))
 
 
-def block_sums(values: NDArray[Any], block: int) -> NDArray[Any]:
+def square_sums(values: NDArray[Any], block: int) -> NDArray[Any]:
     """Sums over squares of `block` pixels, shape (H // block, W // block, ...); what is left over is cut off.
 
     Slices are added up: five times as fast as `skimage.measure.block_reduce`, which sums along short axes.
@@ -288,9 +288,9 @@ def limb_of(rig: Rig, s: Array, blur_px2: float) -> Limb:
     turn = 2.0 * np.arcsin(cos_i)
     for wavelength_nm in camera.detector.band_wavelength_nm:
         sharp = np.where(d < 0.0, rig.mirror.reflectance(cos_i, wavelength_nm), 1.0)
-        light.append(blurred(sharp, kernel))
-        turned.append(blurred(sharp * turn, kernel))
-        squared.append(blurred(sharp * turn**2, kernel))
+        light.append(blurred_light(sharp, kernel))
+        turned.append(blurred_light(sharp * turn, kernel))
+        squared.append(blurred_light(sharp * turn**2, kernel))
     table = np.array(light)
     slope = np.gradient(table, STEP_PX, axis=-1)
     return Limb(d, table, slope, np.gradient(slope, STEP_PX, axis=-1), np.array(turned), np.array(squared))
@@ -312,7 +312,7 @@ def line_spread(camera: Camera, depth_m: float, blur_px2: float) -> Array:
     return np.asarray(kernel / kernel.sum())
 
 
-def blurred(sharp: Array, kernel: Array) -> Array:
+def blurred_light(sharp: Array, kernel: Array) -> Array:
     """Light of a table, shape (n,), through a line spread."""
     half = len(kernel) // 2
     padded = np.concatenate([np.full(half, sharp[0]), sharp, np.full(half, sharp[-1])])

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
-from phibench.calibration.outline.ball_circle import LONGEST_PX, BallCircle, find_circle, shrunk
+from phibench.calibration.outline.ball_circle import LONGEST_PX, BallCircle, find_circle, shrunk_picture
 from phibench.calibration.outline.edge_ring import Circle
 from phibench.calibration.outline.first_circle import sphere_from_circle, sphere_from_rays
 from phibench.datasets.common.errors import DatasetError
@@ -347,7 +347,7 @@ def _example(given: Vector | None) -> str:
 def write_outline(path: Path, light: NDArray[np.float32], ball: Ball) -> Path:
     """Write a small copy of the photograph with the outline that was taken; PNG."""
     block = max(1, math.ceil(max(light.shape[:2]) / LONGEST_PX))
-    small = shrunk(light, block)
+    small = shrunk_picture(light, block)
     bright = max(1.0, float(np.percentile(small, 99.0)))  # lamps may be cut in the picture
     picture = Image.fromarray(np.rint(255.0 * linear_to_srgb(small / bright)).astype(np.uint8))
     points = (ball.view.rig.outline_px() + 0.5) / block - 0.5

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from phibench.calibration.outline.ball_circle import BallCircle, on_limb
+from phibench.calibration.outline.ball_circle import BallCircle, limb_beside_circle
 from phibench.calibration.outline.edge_ring import TURNS
 from phibench.calibration.outline.first_circle import (
     PICTURE_BLUR_PX2,
@@ -33,7 +33,7 @@ from phibench.calibration.outline.first_circle import (
     radii_px,
     sphere_from_rays,
 )
-from phibench.calibration.outline.limb_image import Plane, binned, full_pixels, limb_angle_rad, planes_of
+from phibench.calibration.outline.limb_image import Plane, binned_planes, full_pixels, limb_angle_rad, planes_of
 from phibench.calibration.outline.outline_jpeg import corrected_for_jpeg
 from phibench.calibration.outline.outline_least_squares import OutlinePixels, Step, band, step_from
 from phibench.calibration.outline.outline_result import (
@@ -106,7 +106,7 @@ class SphereSearch:
             seen = True
             if edge.contrast < _LEAST_CONTRAST:
                 continue
-            circle = on_limb(unknown, edge.circle_px, blur_px) or edge
+            circle = limb_beside_circle(unknown, edge.circle_px, blur_px) or edge
             start, contrast = OutlineStart(_sphere(rig, circle), circle, edge), circle.contrast
             rated.append((not _as_far(rig, start.place), not _at_edge(circle, edge), -contrast, start))
             if len(rated) == _MOST_TRIED or (_as_far(rig, start.place) and contrast > _CLEAR_LIMB):
@@ -283,7 +283,7 @@ def find_outline(image: NDArray[Any], rig: Rig, card: SensorCard | None = None) 
     require_size(planes[0].values, rig.camera)
     again = (image, card) if card and card.output == "mjpeg" else None
     block = max(max(rig.camera.width_px, rig.camera.height_px) // _BINNED_PX, 1)
-    small, small_rig = (planes, rig) if block == 1 else (binned(planes, block), binned_rig(rig, block))
+    small, small_rig = (planes, rig) if block == 1 else (binned_planes(planes, block), binned_rig(rig, block))
     low, high = radii_px(rig)
     search = (RimSearch if rig.mirror.has_rim else SphereSearch)(planes, rig)
     fault = ImageError(search.nothing)

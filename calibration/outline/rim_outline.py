@@ -21,11 +21,11 @@ from typing import ClassVar, Self
 
 import numpy as np
 
-from phibench.calibration.outline.ball_circle import BallCircle, refined
+from phibench.calibration.outline.ball_circle import BallCircle, refined_circle
 from phibench.calibration.outline.contour import Contour, contour_of, place_of_outline, place_of_rig
 from phibench.calibration.outline.edge_ring import CURVES, TURN_RAD, TURNS
 from phibench.calibration.outline.first_circle import circles_by_size, grey
-from phibench.calibration.outline.limb_image import STEP_PX, Plane, blurred, distances_px, line_spread
+from phibench.calibration.outline.limb_image import STEP_PX, Plane, blurred_light, distances_px, line_spread
 from phibench.calibration.outline.limb_sectors import Sectors
 from phibench.calibration.outline.outline_least_squares import OutlinePixels, Place, Step, pixels_near, solution_of
 from phibench.calibration.outline.outline_result import (
@@ -94,7 +94,7 @@ class RimSearch:
         rig, circle = self.rig, start.circle
         try:
             circle.require_clear()
-            circle = refined(self._picture, circle, _RIM_FLOOR_PX)
+            circle = refined_circle(self._picture, circle, _RIM_FLOOR_PX)
             place = place_of_outline(rig, circle.points_px, _start(rig, circle), ellipse=False)
             at = RimOutline(self.planes, rig, place)
             J = _by_curve(at.contour)
@@ -300,7 +300,7 @@ def rim_light(rig: Rig, contour: Contour, blur_px2: float) -> EdgeLight:
     d = distances_px()
     kernel = line_spread(rig.camera, contour.depth_m, blur_px2)
     outside = np.where(np.abs(d) < 0.25 * STEP_PX, 0.5, (d > 0.0).astype(float))  # the middle of a step is half of it
-    columns = [blurred(column, kernel) for column in (outside, 1.0 - outside, outside * d, (1.0 - outside) * d)]
+    columns = [blurred_light(column, kernel) for column in (outside, 1.0 - outside, outside * d, (1.0 - outside) * d)]
     return EdgeLight(np.broadcast_to(_with_derivatives(columns), (3, len(d), 3 * _COLUMNS)))
 
 
@@ -313,7 +313,7 @@ def grazing_light(rig: Rig, contour: Contour, blur_px2: float) -> EdgeLight:
     turn, tables = 2.0 * np.arcsin(cos_i), []
     for wavelength_nm in camera.detector.band_wavelength_nm:
         sharp = np.where(d < 0.0, rig.mirror.reflectance(cos_i, wavelength_nm), 1.0)
-        columns = [blurred(column, kernel) for column in (sharp, sharp * turn, sharp * turn**2)]
+        columns = [blurred_light(column, kernel) for column in (sharp, sharp * turn, sharp * turn**2)]
         tables.append(_with_derivatives([*columns, np.zeros_like(d)]))
     return EdgeLight(np.stack(tables))
 

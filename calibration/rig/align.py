@@ -27,7 +27,7 @@ from phibench.calibration.outline.limb_image import planes_of
 from phibench.calibration.outline.outline import find_outline
 from phibench.calibration.outline.outline_result import Outline
 from phibench.calibration.rig.edge_meeting import CameraTilt, EdgeMeeting, edge_meeting, stated_tilt, with_vertical
-from phibench.calibration.rig.outline_picture import overlay, shown, write_picture
+from phibench.calibration.rig.outline_picture import overlay, shown_picture, write_picture
 from phibench.calibration.rig.sphere_options import SphereOptions
 from phibench.calibration.rig.vertical_edges import MIN_EDGES, edges_about, measured_vertical
 from phibench.datasets.common.errors import DatasetError
@@ -284,7 +284,7 @@ def write_circle_picture(
     path: Path, image: NDArray[np.uint8], card: SensorCard, circle: BallCircle, meeting: EdgeMeeting | None = None
 ) -> Path:
     """Draw an outline, and vertical edges with their lines, into a copy of the image of at most 1600 px; PNG."""
-    picture, block = shown(rgb_picture(image, card))
+    picture, block = shown_picture(rgb_picture(image, card))
     points = [tuple(point) for point in (circle.points_px + 0.5) / block - 0.5]
     draw = ImageDraw.Draw(picture)
     draw.line([*points, points[0]], fill=_CENTRE, width=2)

@@ -34,7 +34,7 @@ from phibench.calibration.outline.outline_result import PoseMeasurement
 from phibench.calibration.rig.vertical_edges import vertical_of
 from phibench.datasets.common.errors import DatasetError
 from phibench.estimator.geometry.reflection import image_of, reflect_both
-from phibench.estimator.geometry.rig_parameters import PARAMETERS, changed, has_effect, prior_sigmas, stroke_of
+from phibench.estimator.geometry.rig_parameters import PARAMETERS, changed_rig, has_effect, prior_sigmas, stroke_of
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.scenes.frames import Array, as_vector, cross
 from phibench.scenes.misalignment import Misalignment
@@ -179,7 +179,7 @@ def calibrate(
     values, covariance = problem.values(fit.x), np.zeros((len(PARAMETERS),) * 2)
     covariance[np.ix_(free, free)] = fit.covariance * np.outer(prior[free], prior[free])
     weak = _undetermined(fit.covariance, [PARAMETERS[i] for i in free])
-    return Bundle(changed(nominal, values), values, covariance, fit.chi2, degrees, weak)
+    return Bundle(changed_rig(nominal, values), values, covariance, fit.chi2, degrees, weak)
 
 
 @dataclass(frozen=True)
@@ -208,7 +208,7 @@ class _Problem:
 
     def residuals(self, x: Array) -> Array:
         values = self.values(x)
-        rig = changed(self.nominal, values)
+        rig = changed_rig(self.nominal, values)
         parts = [x[: self.free.size]]
         if self.outline is not None:
             seen = apparent_outline(self.nominal, rig)[:3]
@@ -264,7 +264,7 @@ def _with_ellipse(problem: _Problem, fit: _Fit, vertex_rows: Array) -> _Fit:
     """
     assert problem.outline is not None
     C = problem.outline.covariance
-    rig = changed(problem.nominal, problem.values(fit.x))
+    rig = changed_rig(problem.nominal, problem.values(fit.x))
     seen = apparent_outline(problem.nominal, rig)
     off = seen - problem.outline.value
     # regression of the ellipse on the vertex: what is left is independent of the fit so far
@@ -324,7 +324,7 @@ def _ellipse_slopes(problem: _Problem, x: Array) -> tuple[Array, Array]:
         return np.asarray(a[:2] / a[2] - c[:2] / c[2] / (1.0 - (profile.rim_radius_m / c[2]) ** 2))
 
     def at(x: Array) -> Rig:
-        return changed(problem.nominal, problem.values(x))
+        return changed_rig(problem.nominal, problem.values(x))
 
     by_turn = []
     for name in _TURNS:
@@ -352,7 +352,7 @@ def _spot_residuals(rig: Rig, values: Array, spots: Sequence[KnownSpot], points:
     for where, name in ((points, "down"), (up_points, "up")):
         seen_px = np.array([getattr(spot, f"uv_{name}_px") for spot in spots], float)
         covariance = np.array([getattr(spot, f"covariance_{name}_px2") for spot in spots], float)
-        off = (seen_at(view, where, seen_px) - seen_px)[..., None]
+        off = (mirror_pixels(view, where, seen_px) - seen_px)[..., None]
         seen.append(np.linalg.solve(np.linalg.cholesky(covariance), off).ravel())
     flat = points[:, :2] - view.sphere_centre_m[:2]
     turn = np.arctan2(flat[:, 1], flat[:, 0]) - [spot.azimuth_rad for spot in spots]
@@ -381,7 +381,7 @@ def _spot_of_rows(spots: Sequence[KnownSpot]) -> NDArray[np.intp]:
     return np.concatenate([pixels, pixels, places[np.isfinite(_place_sigmas(spots))]])
 
 
-def seen_at(view: View, points: Array, near_px: Array) -> Array:
+def mirror_pixels(view: View, points: Array, near_px: Array) -> Array:
     """Pixels (K, 2) at which world points (K, 3) are seen in the mirror, by Newton's method from pixels nearby."""
     uv = np.asarray(near_px, float)
     for _ in range(_NEWTON):

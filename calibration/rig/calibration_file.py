@@ -20,7 +20,7 @@ from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import MIB, InputFile
 from phibench.datasets.store.files import write_text
 from phibench.datasets.store.json_forms import alike, from_json, to_json
-from phibench.estimator.geometry.rig_parameters import PARAMETERS, RENAMED, changed
+from phibench.estimator.geometry.rig_parameters import PARAMETERS, RENAMED, changed_rig
 from phibench.scenes.frames import IDENTITY, Array
 from phibench.scenes.mirror import OF_REVOLVED
 from phibench.scenes.misalignment import PARAMETERS as MISALIGNMENT
@@ -179,7 +179,7 @@ def _require_sound(path: Path, nominal: Rig, rig: Rig, values: Array, covariance
         )
     try:
         # another machine rounds the last bits otherwise, another Python or program may print fewer digits
-        same = alike(_document(changed(nominal, values)), _document(rig), relative=1e-9)
+        same = alike(_document(changed_rig(nominal, values)), _document(rig), relative=1e-9)
     except SceneError as error:
         raise CalibrationError(f"{path} corrects the rig to one that cannot be: {error}; make it again") from error
     if not same:

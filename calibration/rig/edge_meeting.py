@@ -22,7 +22,7 @@ import numpy as np
 from phibench.calibration.outline.edge_ring import Circle
 from phibench.calibration.outline.outline_result import PoseMeasurement
 from phibench.calibration.rig.bundle import vertical_by_principal_point
-from phibench.calibration.rig.vertical_edges import agreeing, regression, require_edges
+from phibench.calibration.rig.vertical_edges import agreeing_edges, require_edges, shift_regression
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import Rig
 
@@ -81,13 +81,13 @@ def edge_meeting(edges: Sequence[Array], circle: Circle) -> EdgeMeeting:
     require_edges(len(edges))
     lines = np.array([_line(edge - centre_px, _LEAST_SIGMA * radius_px) for edge in edges])
     azimuth, place, weight = lines.T
-    chosen = agreeing(azimuth, place, weight, MOST_OFF * radius_px)
+    chosen = agreeing_edges(azimuth, place, weight, MOST_OFF * radius_px)
     require_edges(len(chosen))
     azimuth, place, weight = lines[chosen].T
     along = np.stack([np.cos(azimuth), np.sin(azimuth)], axis=-1)
     if np.linalg.eigvalsh(along.T @ along / len(along))[0] < _LEAST_SPREAD:
         require_edges(1)  # they are one edge, seen on both sides of a post
-    fit = regression(azimuth, place, weight)
+    fit = shift_regression(azimuth, place, weight)
     return EdgeMeeting(centre_px + fit.shift, fit.covariance, centre_px, tuple(edges[k] for k in chosen))
 
 

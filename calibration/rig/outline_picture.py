@@ -59,7 +59,7 @@ def write_picture(path: Path, picture: Image.Image) -> Path:
     return write_bytes(path, buffer.getvalue())
 
 
-def shown(codes: NDArray[np.uint8]) -> tuple[Image.Image, int]:
+def shown_picture(codes: NDArray[np.uint8]) -> tuple[Image.Image, int]:
     """RGB picture of codes, shape (H, W, 3) or (H, W), of at most 1600 px, and how many pixels are one of its."""
     block = max(1, math.ceil(max(codes.shape[:2]) / _LONGEST_PX))
     return Image.fromarray(np.ascontiguousarray(codes)).reduce(block).convert("RGB"), block
@@ -76,7 +76,7 @@ def overlay(codes: NDArray[np.uint8], rig: Rig, outline: Outline) -> Overlay:
     outline : Outline
         Found in the frame.
     """
-    picture, block = shown(codes)
+    picture, block = shown_picture(codes)
     there = binned_rig(outline.rig(rig), block)
     legend = _draw_outline(picture, there, replace(outline, shifts_px=outline.shifts_px / block))
     return Overlay(picture, there, 1.0 / block, legend)

@@ -262,11 +262,11 @@ def vertical_of(edges: Sequence[Array], rig: Rig) -> Vertical:
     """
     up = rig.T_world_camera.R.T[:, 2]
     rays = [_rays(edge, rig) for edge in edges]
-    chosen = agreeing(*_slopes(rays, up), MAX_TILT_RAD) if len(rays) >= MIN_EDGES else list(range(len(rays)))
+    chosen = agreeing_edges(*_slopes(rays, up), MAX_TILT_RAD) if len(rays) >= MIN_EDGES else list(range(len(rays)))
     require_edges(len(chosen))
     kept = [rays[k] for k in chosen]
     for _ in range(_ROUNDS):
-        fit = regression(*_slopes(kept, up))
+        fit = shift_regression(*_slopes(kept, up))
         up = up + fit.shift @ np.stack(_horizontal(up))
         up = up / np.linalg.norm(up)
     x, y = _horizontal(up)
@@ -330,10 +330,11 @@ def _slopes(rays: Sequence[EdgeRays], up: Array) -> tuple[Array, Array, Array]:
     return azimuth, slope, 1.0 / (1.0 / weight + (nearer - slope) ** 2 + _LEAST_SLOPE_RAD**2)
 
 
-def agreeing(azimuth: Array, value: Array, weight: Array, most: float) -> list[int]:
+def agreeing_edges(azimuth: Array, value: Array, weight: Array, most: float) -> list[int]:
     """Numbers of the edges whose values belong to one shift of at most `most`: the pair that most others agree with.
 
-    An edge at the azimuth a has the value shift . (-sin a, cos a), besides its error. Arguments as for `regression`.
+    An edge at the azimuth a has the value shift . (-sin a, cos a), besides its error. Arguments as for
+    `shift_regression`.
     """
     across = np.stack([-np.sin(azimuth), np.cos(azimuth)], axis=-1)
     i, j = np.triu_indices(len(value), 1)
@@ -370,7 +371,7 @@ class Regression:
     scale: float
 
 
-def regression(azimuth: Array, value: Array, weight: Array) -> Regression:
+def shift_regression(azimuth: Array, value: Array, weight: Array) -> Regression:
     """Shift from the edges' values shift . (-sin a, cos a), with Tukey's weights.
 
     Azimuths a, values, and one over the variances that the edges' own points give, shape (K,) each.

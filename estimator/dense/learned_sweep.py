@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from phibench.estimator.dense.dense_interface import DenseAnswer, DensePair
 from phibench.estimator.dense.panorama_matchers import opencv
-from phibench.estimator.dense.sweep import SweepParts, hidden
+from phibench.estimator.dense.sweep import SweepParts, hidden_points
 from phibench.estimator.dense.unrolled_pair import Float32, UnrolledPair
 from phibench.scenes.frames import Array
 
@@ -63,7 +63,7 @@ def features_of(parts: SweepParts, row: NDArray[np.intp], column: NDArray[np.int
         unrolled.maps.grid.elevations_rad[row],
         np.full(len(row), unrolled.maps.stroke_m),
         unrolled.down[point] / 128.0,
-        hidden(unrolled.maps, fit.inverse)[point].astype(float),
+        hidden_points(unrolled.maps, fit.inverse)[point].astype(float),
         *near,
     ]
     curves = [curve - curve.min(axis=1, keepdims=True) for curve in (raw, total)]

@@ -14,7 +14,7 @@ from scipy.ndimage import map_coordinates
 
 from phibench.datasets.common.errors import DatasetError
 from phibench.estimator.dense.dense_interface import DenseAnswer, DensePair
-from phibench.estimator.dense.unrolled_pair import NEAREST_M, WIDTH_PX, UnrolledPair, depths
+from phibench.estimator.dense.unrolled_pair import NEAREST_M, WIDTH_PX, UnrolledPair, depths_of_matches
 from phibench.scenes.frames import Array
 
 NEEDS_OPENCV = "needs OpenCV: pip install 'phibench[dense]'"
@@ -133,7 +133,7 @@ def dense_sift(pair: DensePair, width_px: int = WIDTH_PX) -> DenseAnswer:
     uv_down, uv_up = _pixels(maps.down_px, down[along]), _pixels(maps.up_far_px, up[along])
     u, v = np.rint(uv_down).astype(int).T
     inside = pair.rig.camera.contains(uv_down)
-    plane[v[inside], u[inside]] = depths(pair, uv_down, uv_up, central=False)[inside]
+    plane[v[inside], u[inside]] = depths_of_matches(pair, uv_down, uv_up, central=False)[inside]
     return DenseAnswer(depth_m=plane)
 
 

@@ -101,9 +101,9 @@ class SweepParts:
         """Sweep over the levels, then fit."""
         levels = inverse_levels(heights[0].maps)
         raw = mean_costs(heights, levels)
-        total = aggregated(raw)
-        start = least(total, levels)
-        return cls(heights, levels, raw, total, start, fitted(heights, start, float(levels[1] - levels[0])))
+        total = aggregated_costs(raw)
+        start = least_cost_levels(total, levels)
+        return cls(heights, levels, raw, total, start, fitted_planes(heights, start, float(levels[1] - levels[0])))
 
     @property
     def step(self) -> float:
@@ -114,7 +114,7 @@ class SweepParts:
     def both_show(self) -> BoolArray:
         """Mask of the directions whose point both images may show, by the fit: neither hidden nor robot nor holder."""
         unrolled = self.heights[0]
-        return unrolled.seen & ~_stands_still(unrolled, self.fit) & ~hidden(unrolled.maps, self.fit.inverse)
+        return unrolled.seen & ~_stands_still(unrolled, self.fit) & ~hidden_points(unrolled.maps, self.fit.inverse)
 
 
 def _swept(heights: Heights) -> DenseAnswer:
@@ -166,7 +166,7 @@ def mean_costs(heights: Heights, levels: Array) -> Costs:
     return total
 
 
-def aggregated(cost: Costs) -> Costs:
+def aggregated_costs(cost: Costs) -> Costs:
     """Sum over four directions of the least cost of the paths to each pixel, shape (H, levels, W)."""
     total = np.zeros_like(cost)
     _along(cost, total)
@@ -192,7 +192,7 @@ def _along(cost: Costs, total: Costs) -> None:
         total[k] += path
 
 
-def least(total: Costs, levels: Array) -> Array:
+def least_cost_levels(total: Costs, levels: Array) -> Array:
     """1 / D of the least sum, shape (H, W), between levels by a parabola, and without lone pixels."""
     k = np.clip(total.argmin(axis=1), 1, len(levels) - 2)
     before, here, after = (
@@ -232,14 +232,14 @@ class PlaneFit:
         return PlaneFit(*(np.where(agrees, new, old) for new, old in pairs)), agrees
 
 
-def fitted(heights: Heights, start: Array, step: float) -> PlaneFit:
+def fitted_planes(heights: Heights, start: Array, step: float) -> PlaneFit:
     """Planes that explain the differences between the images best, from a start; `step` is a level of 1 / D."""
     inverse, maps = start, heights[0].maps
     windows = windows_px(maps)
     for _ in range(_ROUNDS):
         differences = []
         for one in heights:
-            there, slope = seen_at(one, inverse, step)
+            there, slope = up_codes_at(one, inverse, step)
             differences.append((heights[0].down.astype(float) - there, slope))
         fit = _planes(maps, inverse, differences, windows[0], step)
         larger_may = np.ones(inverse.shape, bool)
@@ -256,7 +256,7 @@ def windows_px(maps: PanoramaMaps) -> tuple[int, ...]:
     return tuple(max(2 * int(angle / maps.grid.step_rad / 2.0) + 1, _LEAST_WINDOW_PX) for angle in _WINDOWS_RAD)
 
 
-def seen_at(unrolled: UnrolledPair, inverse: Array, step: float) -> tuple[Array, Array]:
+def up_codes_at(unrolled: UnrolledPair, inverse: Array, step: float) -> tuple[Array, Array]:
     """Codes of the up image where points at a 1 / D are seen, and their slope by 1 / D, shape (H, W) each.
 
     The slope is a central difference over a pixel along the epipolar curve.
@@ -319,7 +319,7 @@ def _inverse3(a: Array, b: Array, c: Array, d: Array, e: Array, f: Array) -> lis
 # -- what is no match --------------------------------------------------------------------------------------------------
 
 
-def hidden(maps: PanoramaMaps, inverse: Array) -> BoolArray:
+def hidden_points(maps: PanoramaMaps, inverse: Array) -> BoolArray:
     """Mask of the grid points whose place in the up image shows another point, nearer to it, shape (H, W)."""
     up = maps.up_px_of(np.clip(inverse, 1e-3, 1.0 / maps.nearest_m))
     place = maps.grid.place(room_rays(maps.rig.at(maps.stroke_m), up).direction_world)

@@ -286,10 +286,10 @@ class UnrolledPair:
         where = np.where(known, row, 0.0), np.where(known, column, 0.0) % self.maps.grid.width_px
         target = [map_coordinates(wrapped[..., k], where, order=1, mode="nearest") for k in (0, 1)]
         up = np.stack([self.at_pixels(np.where(known, part, np.nan)) for part in target], axis=-1)
-        return DenseAnswer(depth_m=self.plane(depths(self.pair, self._places[1], up, central)))
+        return DenseAnswer(depth_m=self.plane(depths_of_matches(self.pair, self._places[1], up, central)))
 
 
-def depths(pair: DensePair, down_px: Array, up_px: Array, central: bool) -> Array:
+def depths_of_matches(pair: DensePair, down_px: Array, up_px: Array, central: bool) -> Array:
     """D of matches (n, 2), shape (n,), by the pair's rig or by the central model; NaN where the rays do not meet."""
     known = np.flatnonzero(np.isfinite(up_px).all(axis=-1))
     result = np.full(len(down_px), np.nan)

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 from scipy import special
 
 from phibench.estimator.geometry.epipolar_line import up_image
-from phibench.estimator.geometry.rig_parameters import PARAMETERS, changed, moves_rays, steps, stroke_of
+from phibench.estimator.geometry.rig_parameters import PARAMETERS, changed_rig, difference_steps, moves_rays, stroke_of
 from phibench.estimator.geometry.status import DepthEstimate, Status, first_fault, flag, keep, stroke_status
 from phibench.estimator.geometry.triangulate import Meeting, depth_exact, meeting, meeting_gradients
 from phibench.scenes.frames import Array, BoolArray
@@ -220,14 +220,16 @@ def _rig_gradients(rig: Rig, h: Array, z: Array) -> tuple[Array, Array, Array]:
     """Derivatives of gap, D and point by the parameters and this pair's stroke, by central differences."""
     slopes: dict[str, list[Array]] = {"gap_m": [], "depth_m": [], "point_world_m": []}
     moving = moves_rays(rig)
-    for i, size in enumerate(steps()):
+    for i, size in enumerate(difference_steps()):
         if not moving[i]:
             for name, found in slopes.items():
                 found.append(np.zeros_like(slopes[name][0]))  # the first, a stroke, moves rays of every rig
             continue
         values = np.zeros(len(PARAMETERS))
         values[i] = size
-        plus, minus = (meeting(changed(rig, v), stroke_of(h, v), z[..., :2], z[..., 2:4]) for v in (values, -values))
+        plus, minus = (
+            meeting(changed_rig(rig, v), stroke_of(h, v), z[..., :2], z[..., 2:4]) for v in (values, -values)
+        )
         for name, found in slopes.items():
             found.append((getattr(plus, name) - getattr(minus, name)) / (2.0 * size))
     own = PARAMETERS.index("stroke_offset_m")

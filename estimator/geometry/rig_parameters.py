@@ -81,7 +81,7 @@ def moves_rays(rig: Rig) -> BoolArray:
     return has_effect(rig) & np.array([name != "rim_radius_m" for name in PARAMETERS])
 
 
-def changed(rig: Rig, values: Array) -> Rig:
+def changed_rig(rig: Rig, values: Array) -> Rig:
     """Rig with every parameter larger by its value, shape (p,); the strokes' own are left to `stroke_of`.
 
     Raises
@@ -126,7 +126,7 @@ def stroke_of(stroke_m: Array, values: Array) -> Array:
     return np.asarray(stroke_m, float) * (1.0 + scale) + offset
 
 
-def steps() -> Array:
+def difference_steps() -> Array:
     """Steps for differences, shape (p,), about the size of a real error."""
     return np.array([MISALIGNMENT[name].step for name in PARAMETERS])
 
@@ -251,7 +251,7 @@ class RigBias:
         return (math.nan, math.nan) if image is None else (image.u_px, image.v_px)
 
     def _deviated(self, values: Array) -> _Deviated:
-        rig = changed(self._rig, values)
+        rig = changed_rig(self._rig, values)
         return _Deviated(SphereImager(rig), np.array(rig.stroke_axis_world), values)
 
     def _principal(self, covariance: Array) -> Array:

@@ -59,7 +59,7 @@ SHIPPED = {
 """SHA-256 that the files of this release state; part of the code, so that a method's hash changes with its weights."""
 
 
-def shipped(name: str) -> Network:
+def shipped_network(name: str) -> Network:
     """Network that comes with phibench.
 
     Raises
@@ -70,7 +70,7 @@ def shipped(name: str) -> Network:
     return network(Path(__file__).with_name(f"{name}.onnx"), name, SHIPPED[name])
 
 
-def sealed(model: bytes) -> bytes:
+def sealed_model(model: bytes) -> bytes:
     """Model with the SHA-256 of its bytes at its end."""
     return model + _HASH + hashlib.sha256(model).hexdigest().encode()
 
@@ -288,7 +288,7 @@ def write_network(path: Path, name: str, weights: Weights, metadata: Mapping[str
     entries = {"name": name, "version": VERSIONS[name], **{key: str(value) for key, value in metadata.items()}}
     onnx.helper.set_model_props(model, entries)
     onnx.checker.check_model(model)
-    write_bytes(path, sealed(model.SerializeToString(deterministic=True)))
+    write_bytes(path, sealed_model(model.SerializeToString(deterministic=True)))
     Network(path, name)
     return path
 
@@ -301,7 +301,7 @@ _LOOKS = 3  # a crop about the place that the last one gave; the second is nearl
 _REACH_PX = 7.0  # of the crop's middle: farther away there are no cells
 
 
-def refined(
+def refined_position(
     found: Network,
     image: Image,
     dark: Image | None,

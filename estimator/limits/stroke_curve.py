@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from phibench.estimator.geometry.least_squares_depth import depth_general
 from phibench.estimator.geometry.line_of_sight import first_blocker
 from phibench.estimator.geometry.reflection import MirrorImage, image_of, reflect
-from phibench.estimator.geometry.rig_parameters import PARAMETERS, changed, stroke_of
+from phibench.estimator.geometry.rig_parameters import PARAMETERS, changed_rig, stroke_of
 from phibench.estimator.geometry.status import Status
 from phibench.estimator.limits.processed_bound import SpotSigma
 from phibench.estimator.spots.spot_prediction import Laser, spot_electrons_per_s
@@ -319,7 +319,7 @@ def _between(strokes_m: Array, known_m: Array, values: Array) -> Array:
 
 def _seen(rig: Rig, values: Array, strokes_m: Array, points_m: Array) -> tuple[Array, Array, Array]:
     """Down pixels (1, m, 2), up pixels (n, m, 2) and true D (1, m) of a rig that deviates."""
-    true = changed(rig, values)
+    true = changed_rig(rig, values)
     view, axis = true.at(0.0), np.array(true.stroke_axis_world)
     offsets = np.append(0.0, stroke_of(strokes_m, values))
     pixels = image_of(view, points_m - offsets[:, None, None] * axis).uv_px  # both at once: a call's own time counts

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.estimator.geometry.status import Status, describe
 from phibench.estimator.interface import Answer, Box, Pair, Spot
-from phibench.estimator.methods.likelihood_maps import SpotLikelihood, claimed_px2, of_pixels, of_window
-from phibench.estimator.methods.spot_search import around as box_at
+from phibench.estimator.methods.likelihood_maps import SpotLikelihood, claimed_px2, pixels_likelihood, window_likelihood
 from phibench.estimator.methods.spot_search import (
     at_detection,
     box_around,
@@ -25,6 +24,7 @@ from phibench.estimator.methods.spot_search import (
     seen_depth_m,
     trusted_hints,
 )
+from phibench.estimator.methods.spot_search import box_at as box_at
 from phibench.estimator.processed.fit_processed_images import (
     code_data,
     codes_are_independent,
@@ -41,7 +41,13 @@ from phibench.estimator.spots.detect import Detection
 from phibench.estimator.spots.fit_raw import MISFIT_SIGMAS, SpotData, SpotFit
 from phibench.estimator.spots.gaussian_spot import SpotBlur, SpotModel
 from phibench.estimator.spots.image_planes import PROCESSED
-from phibench.estimator.spots.raw_pixels import Background, PatternNoise, around, background_of, noise_before_rounding
+from phibench.estimator.spots.raw_pixels import (
+    Background,
+    PatternNoise,
+    background_of,
+    noise_before_rounding,
+    outside_spot,
+)
 from phibench.scenes.frames import Array
 
 _HALF_PX = 8
@@ -103,7 +109,7 @@ def _spot(pair: Pair, position: str, box: Box | None, depth_m: float | None, nea
     if pair.card.output == "srgb8":
         return answer(_srgb(pair, position, start, blur, model, near))
     if background is None:
-        known = around(start[None], origin, (region.height_px, region.width_px))
+        known = outside_spot(start[None], origin, (region.height_px, region.width_px))
         background = _background(on, known, origin, pair.card)
     if pair.card.output == "yuyv":
         return answer(fit_yuyv(on, origin, pair.card, blur, model, background, near_px=near))
@@ -145,7 +151,7 @@ def _srgb(
         flat = fit_srgb(on, origin, card, blur, model, near_px=near)
         if flat.chi2[0] < _FLAT_CHI2:
             return flat
-        known = around(start[None], origin, (2 * _HALF_PX + 1, 2 * _HALF_PX + 1))
+        known = outside_spot(start[None], origin, (2 * _HALF_PX + 1, 2 * _HALF_PX + 1))
         background = _background(on, known, origin, card, own)
     else:
         background = _background(dark, None, origin, card, own)
@@ -193,7 +199,7 @@ def spot_likelihood(pair: Pair, position: str, spot: Spot, depth_m: float | None
     """Likelihood of one image about a spot that `chain_fit` has found; None where its outputs say nothing."""
     uv = np.array(spot.uv_px, float)
     outputs = spot_outputs(pair, position, uv, depth_m)
-    return of_pixels(outputs, uv) if isinstance(outputs, SpotData) else of_window(*outputs)
+    return pixels_likelihood(outputs, uv) if isinstance(outputs, SpotData) else window_likelihood(*outputs)
 
 
 def spot_outputs(
@@ -209,7 +215,7 @@ def spot_outputs(
     region = _square(uv, image) if own else _region(box_at((uv[0], uv[1]), image.shape, _AROUND_PX), card, image.shape)
     origin, (on, dark) = np.array([[region.u0_px, region.v0_px]]), _parts(pair, position, region)
     if dark is None:
-        background = _background(on, around(uv[None], origin, on.shape[2:4]), origin, card, own)
+        background = _background(on, outside_spot(uv[None], origin, on.shape[2:4]), origin, card, own)
     else:
         background = _background(dark, None, origin, card, own)
     blur, model = pair_blur(pair, uv, depth_m), SpotModel(_response(pair))

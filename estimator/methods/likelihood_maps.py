@@ -17,7 +17,7 @@ import scipy
 from phibench.estimator.geometry.joint_posterior import MISFIT_RANGE, LikelihoodMap, single_posterior
 from phibench.estimator.processed.interval_fit import interval_posterior
 from phibench.estimator.processed.quasi_score import CoefficientWindow, fit_window
-from phibench.estimator.spots.fit_raw import SpotData, polished
+from phibench.estimator.spots.fit_raw import SpotData, scored_unknowns
 from phibench.estimator.spots.gaussian_spot import covariance_bound, scoring_step
 from phibench.scenes.frames import Array
 
@@ -67,7 +67,7 @@ class SpotLikelihood:
     excess: float
 
 
-def of_window(window: CoefficientWindow, start: Array, corner_px: Array) -> SpotLikelihood | None:
+def window_likelihood(window: CoefficientWindow, start: Array, corner_px: Array) -> SpotLikelihood | None:
     """Likelihood of a window of outputs; None where they say nothing."""
     if window.of_intervals:
         posterior = interval_posterior(window, start)
@@ -92,7 +92,7 @@ def of_window(window: CoefficientWindow, start: Array, corner_px: Array) -> Spot
     return SpotLikelihood(scores, theta, corner_px, excess) if np.isfinite(excess) else None
 
 
-def of_pixels(data: SpotData, uv_px: Array) -> SpotLikelihood:
+def pixels_likelihood(data: SpotData, uv_px: Array) -> SpotLikelihood:
     """Likelihood of one region's pixels or codes about a place (u, v) in the image, where a fit has put the spot."""
     corner = np.asarray(data.regions.origin_px[0], float)
 
@@ -110,7 +110,7 @@ def of_pixels(data: SpotData, uv_px: Array) -> SpotLikelihood:
     levels = [_median(above[used & (level > 0.0)]) for level in data.pixels.levels[0]]
     above = used * (above - np.einsum("c,chw->hw", levels, data.pixels.levels[0])) * data.pixels.response[0]
     start = np.array([*(uv_px - corner), max(float(above.sum()), 100.0), *levels])
-    return SpotLikelihood(scores, polished(data, start[None])[0][0], corner, 1.0)
+    return SpotLikelihood(scores, scored_unknowns(data, start[None])[0][0], corner, 1.0)
 
 
 def _median(values: Array) -> float:

@@ -30,13 +30,19 @@ from phibench.estimator.geometry.least_squares_depth import CombinedEstimate, co
 from phibench.estimator.geometry.status import Status, describe
 from phibench.estimator.interface import Answer, Image, Matrix2, Pair, Spot
 from phibench.estimator.methods.chain_fit import chain_fit, spot_likelihood
-from phibench.estimator.methods.likelihood_maps import FAINT_PX, SpotLikelihood, claimed_px2, likelihood_map, of_pixels
+from phibench.estimator.methods.likelihood_maps import (
+    FAINT_PX,
+    SpotLikelihood,
+    claimed_px2,
+    likelihood_map,
+    pixels_likelihood,
+)
 from phibench.estimator.methods.spot_search import (
     SearchRegion,
     SharedPair,
     at_detection,
     each_spot_twice,
-    kept,
+    joint_or_separate,
     once,
     pair_blur,
     seen_depth_m,
@@ -49,9 +55,9 @@ from phibench.estimator.spots.raw_pixels import (
     GaussLaw,
     PatternNoise,
     PixelNoise,
-    around,
     background_of,
     noise_of,
+    outside_spot,
     raw_electrons,
     spot_regions,
 )
@@ -127,7 +133,9 @@ def _background(near: SearchRegion, x: Array, noise: PixelNoise, flat: SpotFit) 
     origin = np.array([near.origin_px], float)
     middle = origin + (np.array([x.shape[2], x.shape[1]]) - 1.0) / 2.0
     uv = np.where(np.isfinite(flat.uv_px), flat.uv_px, middle)
-    return background_of(x, noise.variance_e2(x) / frames[0], around(uv, origin, (x.shape[1], x.shape[2])), pattern)
+    return background_of(
+        x, noise.variance_e2(x) / frames[0], outside_spot(uv, origin, (x.shape[1], x.shape[2])), pattern
+    )
 
 
 def _fitted_spot(fit: SpotFit, data: SpotData) -> Spot:
@@ -136,7 +144,7 @@ def _fitted_spot(fit: SpotFit, data: SpotData) -> Spot:
         return Spot.missing(describe(status))
     chi2, covariance = float(fit.chi2[0]), fit.covariance_px2[0]
     if not data.pixels.free_width:
-        covariance = claimed_px2(fit.uv_px[0], covariance, lambda: of_pixels(data, fit.uv_px[0]))
+        covariance = claimed_px2(fit.uv_px[0], covariance, lambda: pixels_likelihood(data, fit.uv_px[0]))
     if covariance is None:
         return Spot((float(fit.uv_px[0, 0]), float(fit.uv_px[0, 1])))
     if chi2 > 1.0 + MISFIT_SIGMAS * math.sqrt(2.0 / data.regions.x_e.size):
@@ -162,11 +170,11 @@ def raw_likelihood(pair: Pair) -> Answer:
 def joint_fit(pair: Pair) -> Answer:
     """Positions and depth of a pair; the separate answers where one image has no spot or the two are not one point.
 
-    Nor are they taken from a spot that left the place where it was seen (`locate`).
+    Nor are they taken from a spot that left the place where it was seen (`spot_boxes`).
     """
     shared = pair if isinstance(pair, SharedPair) else SharedPair.of(pair)
     separate = raw_likelihood(shared) if pair.card.output == "raw" else chain_fit(shared)
-    return kept(shared, separate, joint_of(shared, separate))
+    return joint_or_separate(shared, separate, joint_of(shared, separate))
 
 
 def joint_of(pair: Pair, separate: Answer) -> Answer:
@@ -196,7 +204,7 @@ def _likelihood(pair: Pair, position: str, spot: Spot, depth_m: float | None) ->
     if pair.card.output != "raw":
         return spot_likelihood(pair, position, spot, depth_m)
     uv = np.array(spot.uv_px, float)
-    return of_pixels(_over_known_room(pair, position, uv, depth_m), uv)
+    return pixels_likelihood(_over_known_room(pair, position, uv, depth_m), uv)
 
 
 def _over_known_room(pair: Pair, position: str, start: Array, depth_m: float | None) -> SpotData:
@@ -220,7 +228,7 @@ def _raw(pair: Pair, separate: Answer) -> Answer:
     starts = [np.array([spot.uv_px], float) for spot in (separate.down, separate.up)]
     depth_m = seen_depth_m(pair, separate)
     down, up = (raw_spot_data(pair, p, start[0], depth_m) for p, start in zip(POSITIONS, starts, strict=True))
-    likelihoods = [of_pixels(data, start[0]) for data, start in zip((down, up), starts, strict=True)]
+    likelihoods = [pixels_likelihood(data, start[0]) for data, start in zip((down, up), starts, strict=True)]
     if _of_other_shape(separate, likelihoods):
         return _combined(pair, separate)
     posterior = _posterior(pair, likelihoods)

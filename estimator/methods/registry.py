@@ -18,7 +18,7 @@ from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.estimator.interface import Answer, Box, Method, Pair, Spot
 from phibench.estimator.learned.network_graphs import CROP, DETECT
 from phibench.estimator.learned.network_input import ACCEPTED, frame_input
-from phibench.estimator.learned.networks import Network, heat_peaks, network, refined, shipped
+from phibench.estimator.learned.networks import Network, heat_peaks, network, refined_position, shipped_network
 from phibench.estimator.methods.chain_fit import chain_fit
 from phibench.estimator.methods.raw_likelihood import joint_fit, raw_likelihood
 from phibench.estimator.methods.spot_search import SearchRegion, at_detection, detected, each_spot, red_peak, spot_of
@@ -35,7 +35,7 @@ from phibench.scenes.rig import POSITIONS
 
 
 def _named(name: str, file: Path | None) -> Network:
-    return shipped(name) if file is None else network(file, name)
+    return shipped_network(name) if file is None else network(file, name)
 
 
 def learned_crop(file: Path | None = None) -> Method:
@@ -58,7 +58,7 @@ def learned_crop(file: Path | None = None) -> Method:
         pair, name = region.pair, region.position
         place = (peak[0] + u0, peak[1] + v0)
         images = pair.images[name], pair.images.get(f"{name}_off")
-        spot = refined(_named(CROP, file), *images, pair.card, _response(pair), place)
+        spot = refined_position(_named(CROP, file), *images, pair.card, _response(pair), place)
         return at_detection(region.found, spot)
 
     return each_spot(find)
@@ -122,7 +122,7 @@ def _spot(crop: Network, scale: float, pair: Pair, position: str, found: Candida
         return Spot.missing("no spot found")
     u, v = (float(x) for x in found.uv_px[row])
     images = pair.images[position], pair.images[f"{position}_off"]
-    return refined(crop, *images, pair.card, _response(pair), (u, v), scale)
+    return refined_position(crop, *images, pair.card, _response(pair), (u, v), scale)
 
 
 def _response(pair: Pair) -> tuple[float, ...]:

@@ -1,7 +1,8 @@
 """Search for a spot by the built-in methods: shared work, boxes around detections, search regions, and its distance.
 
 A fit begins at a detection and may walk off along noise, to a lamp's edge or to another light. Its covariance is that
-of the place where it ended, and says nothing of this: `at_detection` and `kept` test how far it lies from there.
+of the place where it ended, and says nothing of this: `at_detection` and `joint_or_separate` test how far it
+lies from there.
 
 Integer (u, v) are pixel centres, u along the columns, v along the rows.
 """
@@ -119,7 +120,7 @@ def detected(pair: Pair) -> PairDetection:
 # -- boxes -----------------------------------------------------------------------------------------------------------
 
 
-def locate(pair: Pair, hints: bool = False) -> tuple[Box | None, Box | None]:
+def spot_boxes(pair: Pair, hints: bool = False) -> tuple[Box | None, Box | None]:
     """Boxes around the spots that `detect` sees; where it sees none, those of `trusted_hints`, or all if `hints`.
 
     Raises
@@ -158,7 +159,7 @@ def box_around(found: Detection | None, image: Image) -> Box | None:
     return Box(u0, v0, side[0], side[1])
 
 
-def around(uv_px: tuple[float, float], shape: tuple[int, ...], side_px: int = SIDE_PX) -> Box:
+def box_at(uv_px: tuple[float, float], shape: tuple[int, ...], side_px: int = SIDE_PX) -> Box:
     """Square box with the nearest pixel of a position in its middle, cut at the image's border.
 
     Parameters
@@ -169,10 +170,10 @@ def around(uv_px: tuple[float, float], shape: tuple[int, ...], side_px: int = SI
     """
     half = side_px // 2
     u, v = (round(x) for x in uv_px)
-    return clipped(Box(u - half, v - half, 2 * half + 1, 2 * half + 1), shape)
+    return clipped_box(Box(u - half, v - half, 2 * half + 1, 2 * half + 1), shape)
 
 
-def clipped(box: Box, shape: tuple[int, ...]) -> Box:
+def clipped_box(box: Box, shape: tuple[int, ...]) -> Box:
     """Part of a box that lies in an image of the shape (H, W, ...)."""
     u0, v0 = max(box.u0_px, 0), max(box.v0_px, 0)
     u1, v1 = min(box.u0_px + box.width_px, shape[1]), min(box.v0_px + box.height_px, shape[0])
@@ -233,7 +234,7 @@ class SearchRegion:
     ----------
     position : "down" or "up"
     box : Box
-        In the image; from the hint, or from `locate`.
+        In the image; from the hint, or from `spot_boxes`.
     depth_m : float or None
         Of the spot, where it is known already.
     found : Detection or None
@@ -313,14 +314,14 @@ class SearchRegion:
         if peak is None:
             return None
         uv = (peak[0] + self.box.u0_px, peak[1] + self.box.v0_px)
-        return replace(self, box=around(uv, self.pair.images[self.position].shape))
+        return replace(self, box=box_at(uv, self.pair.images[self.position].shape))
 
 
 # -- methods on search regions ---------------------------------------------------------------------------------------
 
 
 def each_spot(find: Callable[[SearchRegion], Spot], hints: bool = False) -> Method:
-    """Method that looks at each image by itself, where `locate` sees a spot, or else at its hint if `hints`."""
+    """Method that looks at each image by itself, where `spot_boxes` sees a spot, or else at its hint if `hints`."""
     return lambda pair: _both(find, pair, detected(pair), hints, None)
 
 
@@ -352,7 +353,7 @@ def _seen(
 ) -> Spot:
     if box is None:
         return Spot.missing("nothing spot-like in the mirror")
-    inside = clipped(box, pair.images[position].shape)
+    inside = clipped_box(box, pair.images[position].shape)
     if min(inside.width_px, inside.height_px) < LEAST_PX:
         return Spot.missing("the box lies outside the image")
     return find(SearchRegion(pair, position, inside, depth_m, found))
@@ -429,7 +430,7 @@ def at_detection(found: Detection | None, spot: Spot) -> Spot:
     return Spot(found.uv_px)
 
 
-def kept(pair: Pair, separate: Answer, together: Answer) -> Answer:
+def joint_or_separate(pair: Pair, separate: Answer, together: Answer) -> Answer:
     """The answer for both images together; the separate one where a spot of it left its detection."""
     detections = detected(pair)
     for position in POSITIONS:

@@ -32,7 +32,7 @@ from phibench.estimator.spots.camera_codes import (
     mcu_px,
     noisy_code,
     qtables_of,
-    steps,
+    quantiser_steps,
     transform,
     ycbcr_transform,
 )
@@ -365,7 +365,7 @@ def _output(shape: tuple[int, int], card: SensorCard, whole: bool) -> _Output:
 def _steps(shape: tuple[int, int], card: SensorCard) -> Array:
     """Quantiser's steps, shape (n,)."""
     if card.output == "mjpeg":
-        return steps(shape, card.jpeg_subsampling, qtables_of(card))
+        return quantiser_steps(shape, card.jpeg_subsampling, qtables_of(card))
     return np.ones((2 if card.output == "yuyv" else 3) * shape[0] * shape[1])
 
 

@@ -24,7 +24,7 @@ from phibench.estimator.processed.interval_fit import QuantiserSteps, fit_interv
 from phibench.estimator.processed.quasi_score import CoefficientWindow, WindowFit, fit_window
 from phibench.estimator.spots.camera_codes import hidden_share, mcu_px, qtables_of, room_variance, ycbcr_codes
 from phibench.estimator.spots.gaussian_spot import SpotBlur, SpotModel, SpotPixels
-from phibench.estimator.spots.jpeg_recovery import recovered
+from phibench.estimator.spots.jpeg_recovery import recovered_coefficients
 from phibench.scenes.frames import Array
 
 _WEAK = 4.0  # by which the variance of a background counts that is made of the same frames
@@ -181,7 +181,9 @@ def coefficients_at(region: JpegRegion, chain: ChainModel, row: int, column: int
         region.ends[2] and left == 0,
         region.ends[3] and right == width,
     )
-    decoded = recovered(region.image[:, top:bottom, left:right], qtables_of(card), card.jpeg_subsampling, ends)
+    decoded = recovered_coefficients(
+        region.image[:, top:bottom, left:right], qtables_of(card), card.jpeg_subsampling, ends
+    )
     v, u = row - top, column - left
     luma = decoded.luma[:, v // 8 : (v + h) // 8, u // 8 : (u + w) // 8]
     chroma = decoded.chroma[:, :, v // down : (v + h) // down, u // across : (u + w) // across]

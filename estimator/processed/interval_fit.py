@@ -23,7 +23,7 @@ from scipy.linalg import solve_triangular
 from scipy.special import erfcx, log_ndtr, ndtr
 
 from phibench.estimator.processed.quasi_score import CoefficientWindow, Inputs, Rows, WindowFit, fit_window
-from phibench.estimator.spots.gaussian_spot import limited
+from phibench.estimator.spots.gaussian_spot import limited_step
 from phibench.scenes.frames import Array
 
 # Gaussians that stand for the intervals of outputs: one frame's, and the mean of several frames'.
@@ -393,7 +393,7 @@ def interval_posterior(
         sites, change = _scattered(part, index, len(step)), mean - theta
         # about a wide posterior whole changes go to and fro
         change *= 0.5 if change[:2] @ last[:2] < 0.0 else 1.0
-        theta = limited(theta[None], change[None], most_px=_STEP_PX, free_width=window.pixels.free_width)[0]
+        theta = limited_step(theta[None], change[None], most_px=_STEP_PX, free_width=window.pixels.free_width)[0]
         last = change
         settled = bool(k and (np.abs(change[:2]) < _SETTLED * np.sqrt(np.diagonal(covariance)[:2])).all())
         if settled:

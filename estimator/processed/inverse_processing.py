@@ -26,7 +26,7 @@ from phibench.estimator.spots.camera_codes import (
     CHROMA_STEP,
     RGB_FROM_YCC,
     YCC_FROM_RGB,
-    averaged,
+    block_means,
     light_of,
     rgb_codes,
     tone_of,
@@ -132,7 +132,7 @@ def _mean_chroma(rgb: Array, corner: NDArray[np.int64], card: SensorCard) -> Arr
     top, left = int(v) % down, int(u) % across
     pads = [(0, 0), (top, -(top + h) % down), (left, -(left + w) % across)]
     ycc = np.einsum("ij,jhw->ihw", YCC_FROM_RGB, np.pad(rgb, pads, mode="edge"))
-    chroma = _weighted(ycc[1:], card) if card.output == "yuyv" else averaged(ycc[1:], (down, across))
+    chroma = _weighted(ycc[1:], card) if card.output == "yuyv" else block_means(ycc[1:], (down, across))
     for axis, step in ((1, down), (2, across)):
         if step > 1:
             chroma = _doubled(chroma, axis, smooth=card.output == "mjpeg")

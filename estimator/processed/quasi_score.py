@@ -29,7 +29,7 @@ from phibench.estimator.processed.chain_model import (
     raw_variance_e2,
 )
 from phibench.estimator.spots.camera_codes import quantised, step_correlation
-from phibench.estimator.spots.gaussian_spot import SpotPixels, limited, scoring_step
+from phibench.estimator.spots.gaussian_spot import SpotPixels, limited_step, scoring_step
 from phibench.estimator.spots.pixel_statistics import CutPixels, cut_pixels
 from phibench.scenes.frames import Array
 
@@ -365,4 +365,4 @@ def _newton(r: Array, J: Array) -> Array:
 
 def _moved(window: CoefficientWindow, theta: Array, step: Array) -> Array:
     """Hypotheses after limited steps."""
-    return limited(theta, step, most_px=_STEP_PX, free_width=window.pixels.free_width)
+    return limited_step(theta, step, most_px=_STEP_PX, free_width=window.pixels.free_width)

@@ -91,7 +91,7 @@ def blocks(plane: Array) -> Array:
     return np.asarray(dctn(np.moveaxis(cut, -2, -3), axes=(-2, -1), norm="ortho"))
 
 
-def averaged(plane: Array, step: tuple[int, int]) -> Array:
+def block_means(plane: Array, step: tuple[int, int]) -> Array:
     """Means of `step` pixels, shape (..., h / down, w / across)."""
     *lead, h, w = plane.shape
     return np.asarray(plane.reshape(*lead, h // step[0], step[0], w // step[1], step[1]).mean(axis=(-3, -1)))
@@ -107,7 +107,7 @@ def coefficients(rgb: Array, subsampling: str) -> Array:
     """
     ycc = np.einsum("ij,...jhw->i...hw", YCC_FROM_RGB, rgb)
     step = CHROMA_STEP[subsampling]
-    planes = (ycc[0], averaged(ycc[1], step), averaged(ycc[2], step))
+    planes = (ycc[0], block_means(ycc[1], step), block_means(ycc[2], step))
     lead = rgb.shape[:-3]
     return np.concatenate([blocks(plane).reshape(*lead, -1) for plane in planes], axis=-1)
 
@@ -121,7 +121,7 @@ def transform(shape: tuple[int, int], subsampling: str) -> Array:
     return matrix
 
 
-def steps(shape: tuple[int, int], subsampling: str, quality: int | Tables) -> Array:
+def quantiser_steps(shape: tuple[int, int], subsampling: str, quality: int | Tables) -> Array:
     """Quantiser's step of each of `coefficients`, shape (n,); quality as in `quantisation`."""
     luma, chroma = quantisation(quality)
     down, across = CHROMA_STEP[subsampling]

@@ -19,7 +19,7 @@ from phibench.estimator.geometry.epipolar_line import up_image
 from phibench.estimator.geometry.least_squares_depth import combine
 from phibench.estimator.geometry.status import DepthEstimate, Status, StatusArray, first_fault, flag, keep
 from phibench.estimator.spots.fit_raw import AT_ONCE, DAMPING, DECREMENT, LEAST_SNR, START_PX, SpotData
-from phibench.estimator.spots.gaussian_spot import covariance_bound, limited, scoring_step
+from phibench.estimator.spots.gaussian_spot import covariance_bound, limited_step, scoring_step
 from phibench.scenes.frames import Array, BoolArray
 from phibench.scenes.rig import Rig
 
@@ -167,7 +167,7 @@ def _in_region(data: SpotData, theta: Array) -> Array:
 
 def _step(theta: Array, score: Array, fisher: Array) -> Array:
     """One limited step of Fisher scoring."""
-    return limited(theta, scoring_step(fisher, score))
+    return limited_step(theta, scoring_step(fisher, score))
 
 
 # -- both images: psi = u, v, 1 / D, flux and levels of the down image, flux and levels of the up image --------------
@@ -239,7 +239,7 @@ def _limited(psi: Array, step: Array, G: Array, damping: float, k: int) -> Array
     """Psi after a step that moves neither spot by more than half a pixel."""
     up_px = np.einsum("nij,nj->ni", np.nan_to_num(G), step[:, :3])
     largest = np.maximum(np.abs(step[:, :2]).max(axis=1), np.abs(up_px).max(axis=1))
-    new = limited(psi, step, damping, moved_px=largest, fluxes=(3, k + 1))
+    new = limited_step(psi, step, damping, moved_px=largest, fluxes=(3, k + 1))
     low, high = (change * psi[:, 2] for change in _INVERSE_DEPTH_CHANGE)
     new[:, 2] = np.clip(new[:, 2], low, high)
     return new

@@ -21,7 +21,7 @@ from phibench.estimator.spots.gaussian_spot import (
     SpotModel,
     SpotPixels,
     covariance_bound,
-    limited,
+    limited_step,
     profile,
     scoring_step,
 )
@@ -165,7 +165,7 @@ def fit_law(
 def _fit(data: SpotData, near_px: Array | None) -> SpotFit:
     with np.errstate(all="ignore"):
         theta = _screened(data, _first_guess(data, near_px))
-        theta, converged = polished(data, theta)
+        theta, converged = scored_unknowns(data, theta)
         return _result(data, theta, converged)
 
 
@@ -250,10 +250,10 @@ def _step(data: SpotData, theta: Array, damping: float = 1.0) -> tuple[Array, Ar
     """One limited step, and the squared distance in standard deviations that the whole step had."""
     score, fisher = _scores(data, theta)
     step = scoring_step(fisher, score)
-    return limited(theta, step, damping, free_width=data.pixels.free_width), np.sum(step * score, axis=1)
+    return limited_step(theta, step, damping, free_width=data.pixels.free_width), np.sum(step * score, axis=1)
 
 
-def polished(data: SpotData, theta: Array) -> tuple[Array, BoolArray]:
+def scored_unknowns(data: SpotData, theta: Array) -> tuple[Array, BoolArray]:
     """Unknowns, shape (n, k), after scoring from a start until steps are small, and whether they became so.
 
     Full steps may go round in circles, beside full codes above all: later ones are damped. Only what moves is computed.

@@ -328,7 +328,7 @@ def scoring_step(fisher: Array, score: Array) -> Array:
     return np.asarray(np.linalg.solve(matrix, np.nan_to_num(score)[..., None])[..., 0])
 
 
-def limited(
+def limited_step(
     theta: Array,
     step: Array,
     damping: float = 1.0,

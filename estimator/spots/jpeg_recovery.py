@@ -43,7 +43,7 @@ _TINY = 1e-9  # of sums that are whole numbers
 
 
 @dataclass(frozen=True)
-class Recovered:
+class RecoveredCoefficients:
     """Coefficients of images, level shift taken off.
 
     Attributes
@@ -59,9 +59,9 @@ class Recovered:
     wrong: BoolArray
 
 
-def recovered(
+def recovered_coefficients(
     images: NDArray[Any], quality: int | Tables, subsampling: str, ends: tuple[bool, bool, bool, bool] = (False,) * 4
-) -> Recovered:
+) -> RecoveredCoefficients:
     """Coefficients of decoded images of whole units.
 
     The chroma at sides that are not the image's own is interpolated with samples outside: leave a unit there.
@@ -90,7 +90,7 @@ def recovered(
             break
     luma, chroma = _searched(*recovery, rgb, decoder) if ((rgb <= 0.0) | (rgb >= 255.0)).any() else recovery
     again = decoder.image(luma, chroma)
-    return Recovered(luma * tables[0], chroma * tables[1], (np.abs(again - rgb) > _SAME_CODES).any(axis=1))
+    return RecoveredCoefficients(luma * tables[0], chroma * tables[1], (np.abs(again - rgb) > _SAME_CODES).any(axis=1))
 
 
 # -- decoder -----------------------------------------------------------------------------------------------------------

@@ -290,7 +290,7 @@ def background_of(x_e: Array, variance_e2: Array, known: Array, pattern: Pattern
     return Background(mean, variance, holds_pattern=pattern is not None)
 
 
-def around(uv_px: Array, origin_px: Array, shape: tuple[int, int]) -> Array:
+def outside_spot(uv_px: Array, origin_px: Array, shape: tuple[int, int]) -> Array:
     """Pixels farther than 5 px from (u, v), shape (n, h, w), 0 or 1; positions and origins of shape (n, 2)."""
     v = np.arange(shape[0]) + origin_px[:, 1, None] - uv_px[:, 1, None]
     u = np.arange(shape[1]) + origin_px[:, 0, None] - uv_px[:, 0, None]

@@ -128,7 +128,7 @@ def film_depth(
     return _result(rig, X, readings, y, S, sigma_m, covariance_rig is not None, places)
 
 
-def most_agree(rig: Rig, positions: FilmPositions, encoder_m: Array) -> BoolArray:
+def consensus_frames(rig: Rig, positions: FilmPositions, encoder_m: Array) -> BoolArray:
     """Frames whose positions agree with the point that most of them agree with, shape (N,).
 
     A fit of one frame may settle anywhere within reach. Each of some frames low on the stroke gives a point with each

@@ -19,7 +19,7 @@ from phibench.datasets.recipe.film_tables import TARGET
 from phibench.estimator.spots.raw_pixels import raw_electrons
 from phibench.estimator.spots.spot_prediction import spot_blur
 from phibench.robot.film.blink_identity import TargetCode, TargetTracker
-from phibench.robot.film.film_bundle import FilmDepth, deviations2, expected_sigma_m, film_depth, most_agree
+from phibench.robot.film.film_bundle import FilmDepth, consensus_frames, deviations2, expected_sigma_m, film_depth
 from phibench.robot.film.film_frames import LIT, FilmFrames, Index
 from phibench.robot.film.film_positions import FilmPositions, fit_positions, stepped_positions
 from phibench.robot.film.room_interpolation import has_near_off_frame, room_weights
@@ -81,7 +81,7 @@ def seen_film(frames: FilmFrames) -> SeenFilm:
         positions = fit_positions(frames, blur, room_weights(here, off))
         positions.uv_px[~has_near_off_frame(here, off)] = np.nan
         offsets = frames.offsets_m(frames.on, np.where(positions.good, positions.uv_px[:, 1], here[:, 1]))
-        positions.uv_px[~most_agree(frames.rig, positions, offsets)] = np.nan
+        positions.uv_px[~consensus_frames(frames.rig, positions, offsets)] = np.nan
         depth = film_depth(frames.rig, positions, offsets, frames.encoder_sigma_m)
         if number + 1 < _ROUNDS:
             places = predicted_px(frames, depth.point_world_m)[0]
@@ -296,7 +296,7 @@ def tracked_positions(
     DatasetError
         If its code is on in fewer than two frames or off in none, or the positions give no depth, or do not agree.
     """
-    frames = agreeing(tracked_frames(tracker, name, carriage, encoder_m, encoder_sigma_m))
+    frames = frames_of_one_place(tracked_frames(tracker, name, carriage, encoder_m, encoder_sigma_m))
     depth = _of_one_place(bundle_depth(seen_film(frames)), _MOST_CHI2)
     positions, offsets = joint_positions(frames, depth.point_world_m)
     positions.uv_px[np.isnan(depth.places_px)] = np.nan  # frames that the bundle left out
@@ -330,7 +330,7 @@ def tracked_frames(
     return FilmFrames(*told, *parts, reach_px=_TRACKED_WITHIN_PX)
 
 
-def agreeing(frames: FilmFrames) -> FilmFrames:
+def frames_of_one_place(frames: FilmFrames) -> FilmFrames:
     """Frames whose fits, each by itself, agree with one place: the worst is left out while it is beyond chance.
 
     On edges of the room, or behind something, a fit in one frame may find anything.

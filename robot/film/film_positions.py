@@ -112,7 +112,7 @@ class FilmPositions:
         return total.reshape(2 * count, 2 * count)
 
 
-def joined(first: FilmPositions, second: FilmPositions) -> FilmPositions:
+def joined_positions(first: FilmPositions, second: FilmPositions) -> FilmPositions:
     """Positions of both, which share nothing."""
     a, b = len(first.uv_px), len(second.uv_px)
     shared = np.zeros((a + b, 2, a + b, 2))

@@ -25,7 +25,7 @@ from typing import Any, Self
 import numpy as np
 
 from phibench.estimator.geometry.sphere_image import SphereImager
-from phibench.robot.loop.sensing import Direction, wrapped
+from phibench.robot.loop.sensing import Direction, wrapped_angle
 from phibench.scenes.frames import Array
 from phibench.scenes.motion.vehicle import PlanarPose, Stance, Vehicle, arc_covariance, rig_placement
 from phibench.scenes.rig import Rig
@@ -152,7 +152,7 @@ class Belief(abc.ABC):
     @property
     def bearing_rad(self) -> float:
         """Azimuth, ahead is 0, to the left counts."""
-        return wrapped(float(self.mean[0]))
+        return wrapped_angle(float(self.mean[0]))
 
     def nees(self, point_m: Array) -> float:
         """Normalised estimation error squared of azimuth, rise and inverse distance: chi squared of 3.
@@ -165,7 +165,7 @@ class Belief(abc.ABC):
         D = math.hypot(point_m[0], point_m[1])
         truth = np.array([math.atan2(point_m[1], point_m[0]), (point_m[2] - self._z0) / D, 1.0 / D])
         error = self.mean[:PLACE] - truth
-        error[0] = wrapped(error[0])
+        error[0] = wrapped_angle(error[0])
         return float(error @ np.linalg.solve(self.covariance[:PLACE, :PLACE], error))
 
     def point_m(self, x: Array) -> Array:
@@ -196,7 +196,7 @@ class Belief(abc.ABC):
         X, Y = c * dx + s * dy - self.vehicle.sensor_x_m, c * dy - s * dx
         D = math.hypot(X, Y)
         expected = about_rad - arc.turn_rad
-        after[:3] = expected + wrapped(math.atan2(Y, X) - expected), (point[2] - self._z0) / D, 1.0 / D
+        after[:3] = expected + wrapped_angle(math.atan2(Y, X) - expected), (point[2] - self._z0) / D, 1.0 / D
         if self.prior.moves:
             vx, vy, vz = x[VELOCITY] / (D * max(float(x[2]), LEAST_Q))
             after[VELOCITY] = c * vx + s * vy, c * vy - s * vx, vz
@@ -302,7 +302,7 @@ class TargetBelief(Belief):
     def distance2(self, seen: Direction, stroke_m: float, held: Stance | None = None) -> float:
         """Squared Mahalanobis distance of a direction from what is expected: chi squared of 2 for the target's own."""
         values = self._seen(self._filter.sigmas_f, stroke_m, held)
-        values[:, 0] = [wrapped(a - seen.azimuth_rad) for a in values[:, 0]]
+        values[:, 0] = [wrapped_angle(a - seen.azimuth_rad) for a in values[:, 0]]
         values[:, 1] -= seen.rise
         mean = self._filter.Wm @ values
         S = (values - mean).T @ np.diag(self._filter.Wc) @ (values - mean) + seen.covariance
@@ -336,7 +336,7 @@ class TargetBelief(Belief):
     @staticmethod
     def _residual(a: Array, b: Array) -> Array:
         difference = np.subtract(a, b)
-        difference[0] = wrapped(difference[0])
+        difference[0] = wrapped_angle(difference[0])
         return np.asarray(difference)
 
 
@@ -366,5 +366,5 @@ def _unscented(n: int, residual_z: Any) -> Any:
 def _direction_mean(values: Array, weights: Array) -> Array:
     """Weighted mean of directions, shape (m, 2), about the first one's azimuth."""
     first = values[0, 0]
-    turned = np.array([wrapped(a - first) for a in values[:, 0]])
+    turned = np.array([wrapped_angle(a - first) for a in values[:, 0]])
     return np.array([first + weights @ turned, weights @ values[:, 1]])

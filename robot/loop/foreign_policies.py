@@ -19,10 +19,10 @@ from typing import Any, cast
 from phibench.benchmark.isolation.answers import plain_values, to_bytes
 from phibench.benchmark.isolation.guest_process import GuestProcess
 from phibench.benchmark.isolation.isolation import Isolation
-from phibench.benchmark.isolation.method_references import Reference, parsed, resolve
+from phibench.benchmark.isolation.method_references import Reference, parsed_file, resolve
 from phibench.benchmark.isolation.method_worker import function_of_file, memory_limit, sentence_of, size_bytes
 from phibench.benchmark.isolation.pair_transport import Connection, TransportError
-from phibench.benchmark.isolation.printed_output import advised
+from phibench.benchmark.isolation.printed_output import advised_message
 from phibench.benchmark.isolation.readable_files import access_of
 from phibench.benchmark.isolation.run_limits import MethodError, RunLimits
 from phibench.robot.loop.policies import Policy
@@ -82,7 +82,7 @@ def _names(path: Path) -> set[str]:
         If it is no Python.
     """
     try:
-        tree = parsed(path)
+        tree = parsed_file(path)
     except MethodError as error:
         raise SceneError(f"policy in {error}") from error
     return set(_bound(tree))
@@ -165,7 +165,7 @@ class PolicyProcess:
             self.close()
             raise SceneError(f"the policy ended its own process: {death}") from None
         if failure := reply.get("failure"):
-            text = advised(printable_line(str(failure), _MESSAGE_LENGTH), self.isolation)
+            text = advised_message(printable_line(str(failure), _MESSAGE_LENGTH), self.isolation)
             raise SceneError(f"the policy raised {text}")
         return reply
 

@@ -88,7 +88,7 @@ class _Seen(NamedTuple):
     facing: float
 
 
-def unseen(cause: str) -> SpotReading:
+def unseen_reading(cause: str) -> SpotReading:
     """Reading of a spot that is not seen."""
     return SpotReading(0.0, 0.0, 0.0, 0.0, cause)
 
@@ -219,16 +219,16 @@ class Sensing:
         self, seen: _Seen | None, power: float, exposure: int, rng: np.random.Generator | None, hidden: bool
     ) -> SpotReading:
         if seen is None:
-            return unseen(OUTSIDE)
+            return unseen_reading(OUTSIDE)
         if hidden or seen.facing <= 0.0:
-            return unseen(HIDDEN)
+            return unseen_reading(HIDDEN)
         image = seen.image
         light = self._electrons_per_etendue_s * self.imager.reflectance(image.cos_incidence)
         electrons = power * light * image.etendue_m2_sr_per_m2 * seen.facing * EXPOSURES_S[exposure]
         sigma = self._tables[exposure].at(electrons)
         # NaN is a spot brighter than the table, infinity one that is fainter
         if not sigma <= FAINTEST_PX:
-            return unseen(BRIGHT if math.isnan(sigma) else FAINT)
+            return unseen_reading(BRIGHT if math.isnan(sigma) else FAINT)
         # the bound is that of one coordinate; both are drawn by themselves
         du, dv = (0.0, 0.0) if rng is None else (sigma * rng.standard_normal(2)).tolist()
         return SpotReading(image.u_px + du, image.v_px + dv, sigma, electrons, SEEN)
@@ -325,7 +325,7 @@ def direction_with(rig: Rig, u_px: float, v_px: float, covariance_px2: Array) ->
     return Direction(math.atan2(r[1], r[0]), float(r[2] / across), covariance, uv, covariance_px2)
 
 
-def wrapped(angle_rad: float) -> float:
+def wrapped_angle(angle_rad: float) -> float:
     """Angle between -pi and pi."""
     return math.remainder(angle_rad, 2.0 * math.pi)
 
@@ -335,7 +335,7 @@ def angles(d: Array) -> Array:
     return np.stack([np.arctan2(d[:, 1], d[:, 0]), d[:, 2] / np.hypot(d[:, 0], d[:, 1])], axis=-1)
 
 
-def turned(difference: Array) -> Array:
+def wrapped_differences(difference: Array) -> Array:
     """Differences with their azimuth between -pi and pi."""
     # sine and cosine know no jump at half a turn
     azimuth = np.arctan2(np.sin(difference[:, 0]), np.cos(difference[:, 0]))

@@ -26,11 +26,18 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from phibench.estimator.geometry.reflection import reflect
-from phibench.estimator.geometry.rig_parameters import RigBias, changed, stroke_of
+from phibench.estimator.geometry.rig_parameters import RigBias, changed_rig, stroke_of
 from phibench.robot.film.film_positions import FilmPositions
 from phibench.robot.loop.belief import ANY_TARGET, LEAST_Q, SKID, SLIP, VELOCITY, Belief, TargetBelief, TargetPrior
 from phibench.robot.loop.frame_history import Course, FrameHistory, TrackSteps, shared_by_motion, shared_px2
-from phibench.robot.loop.sensing import Direction, angle_slopes, angles, direction_with, turned, wrapped
+from phibench.robot.loop.sensing import (
+    Direction,
+    angle_slopes,
+    angles,
+    direction_with,
+    wrapped_angle,
+    wrapped_differences,
+)
 from phibench.scenes.frames import Array
 from phibench.scenes.motion.vehicle import Stance, Vehicle
 from phibench.scenes.rig import Rig, View
@@ -193,7 +200,7 @@ class SmoothedBelief(Belief):
             size = float(np.max(np.abs(step) / np.sqrt(np.diag(P))))
             if not self._stepped(step, factor, r) or size < _AT_REST:
                 break
-        self._x = np.concatenate([[wrapped(float(self._x[0]))], self._x[1:]])
+        self._x = np.concatenate([[wrapped_angle(float(self._x[0]))], self._x[1:]])
 
     def _stepped(self, step: Array, factor: Array, r: Array) -> bool:
         """Take a step, or the part of it that makes chi squared smaller with the covariance as it is."""
@@ -278,7 +285,7 @@ class SmoothedBelief(Belief):
 
     def _rig(self, theta: Array) -> _DeviatedView:
         values = self._bias.deviations @ theta
-        rig = changed(self.rig, values)
+        rig = changed_rig(self.rig, values)
         return _DeviatedView(rig.at(0.0), np.array(rig.stroke_axis_world), values)
 
     def _residuals(self, x: Array, frames: FrameHistory) -> Array:
@@ -333,13 +340,13 @@ class SmoothedBelief(Belief):
 
 def _residual(p: Array, origin: Array, direction: Array, raised: Array) -> Array:
     """Azimuth and rise of points by those of rays, shape (N, 2)."""
-    return turned(angles(p - origin - raised) - angles(direction))
+    return wrapped_differences(angles(p - origin - raised) - angles(direction))
 
 
 def _pixel_residual(p: Array, rays: Array) -> tuple[Array, Array]:
     """Residuals of pixels, shape (N, 2), and slopes of the angles by the pixel, (N, 2, 2), for `rays_beside`."""
     r, *aside = (_residual(p, *rays[:, k]) for k in range(3))
-    per_px = np.stack([turned(one - r) for one in aside], axis=-1) / _PIXEL_STEP_PX
+    per_px = np.stack([wrapped_differences(one - r) for one in aside], axis=-1) / _PIXEL_STEP_PX
     return np.asarray(np.linalg.solve(per_px, r[..., None])[..., 0], float), per_px
 
 

@@ -115,7 +115,7 @@ def _rendered(recipe: str, datasets: StudyDatasets) -> pl.DataFrame:
     rig = dataset.samples[0].nominal_rig
     wrong = Misalignment(**dataset.info.recipe["misalignment"])
     points, strokes = np.array([row.spot_world_m for row in rows]), np.array([row.nominal_stroke_m for row in rows])
-    down, up, true = tables.seen(rig, wrong, points, strokes)
+    down, up, true = tables.seen_pixels(rig, wrong, points, strokes)
     spots_px = [
         np.array(
             [
@@ -203,12 +203,12 @@ def notes(rendered: Sequence[str], fit_draws: int, table: pl.DataFrame) -> tuple
 
 def _error_findings(table: pl.DataFrame) -> Iterator[Finding]:
     """Relative errors of D, rms over the experiments, with exact geometry."""
-    own = _own(table, "exact")
+    own = _rows_of_sense(table, "exact")
     published = (own["published_m"] / own["depth_m"] - 1.0).to_numpy()
     bound = (own["bound_m"] / own["depth_m"]).to_numpy()
     yield rms_finding("error of the published estimates, rms", published, "published")
     for method in table["method"].unique(maintain_order=True):
-        rows = _own(table, "exact", method)
+        rows = _rows_of_sense(table, "exact", method)
         error, sd = ((rows[name] / rows["depth_m"]).to_numpy() for name in ("mean_m", "sd_m"))
         yield rms_finding(f"error of the mean reading, {method}, rms", error - 1.0, "error", method)
         if np.isfinite(sd).any():
@@ -235,11 +235,11 @@ def _table_findings(table: pl.DataFrame) -> Iterator[Finding]:
 
 def _sense_findings(table: pl.DataFrame) -> Iterator[Finding]:
     """Published minus noise-free estimate in each sense of phi, and the sum of squares that the sense leaves."""
-    own = _own(table, "ray")
+    own = _rows_of_sense(table, "ray")
     alone = rms(((own["published_m"] - own["depth_m"]) / own["depth_m"]).to_numpy())
     for sense in NAMED:
-        rows = _own(table, sense)
-        apart = _apart(rows)
+        rows = _rows_of_sense(table, sense)
+        apart = _published_differences(rows)
         yield rms_finding(f"published minus noise-free estimate, phi_{sense}, rms", apart, "sense", sense)
         share = Finding(
             f"sum of squares that phi_{sense} leaves of the published errors",
@@ -251,7 +251,7 @@ def _sense_findings(table: pl.DataFrame) -> Iterator[Finding]:
 
 def _band_findings(table: pl.DataFrame, bands: pl.DataFrame) -> Iterator[Finding]:
     for sense in NAMED:
-        inside = _inside(table, bands, sense)
+        inside = _inside_band(table, bands, sense)
         label = f"published points in the central 95 % of misaligned rigs, phi_{sense}"
         yield Finding(label, int(inside.sum()), unit=f"of {len(inside)}")
 
@@ -291,9 +291,9 @@ def _title(experiment: str) -> str:
 
 def senses_shown(table: pl.DataFrame, bands: pl.DataFrame) -> tuple[Row, ...]:
     """Relative errors by sense of phi: rms and extremes, and how many published points lie in the misaligned band."""
-    own = {sense: _own(table, sense) for sense in table["sense"].unique(maintain_order=True)}
+    own = {sense: _rows_of_sense(table, sense) for sense in table["sense"].unique(maintain_order=True)}
     error = {sense: (rows["noise_free_m"] / rows["depth_m"] - 1.0).to_numpy() for sense, rows in own.items()}
-    inside = {sense: _inside(table, bands, sense) for sense in own}
+    inside = {sense: _inside_band(table, bands, sense) for sense in own}
     return text_table(
         own,
         {
@@ -301,7 +301,7 @@ def senses_shown(table: pl.DataFrame, bands: pl.DataFrame) -> tuple[Row, ...]:
             "rms, %": lambda sense: f"{100.0 * rms(error[sense]):.3f}",
             "smallest, %": lambda sense: f"{100.0 * error[sense].min():.3f}",
             "largest, %": lambda sense: f"{100.0 * error[sense].max():.3f}",
-            "rms to published, %": lambda sense: f"{100.0 * rms(_apart(own[sense])):.2f}",
+            "rms to published, %": lambda sense: f"{100.0 * rms(_published_differences(own[sense])):.2f}",
             "published in the band": lambda sense: f"{inside[sense].sum()} of {len(inside[sense])}",
         },
     )
@@ -338,18 +338,18 @@ def rms_finding(label: str, values: Array, *names: str) -> Finding:
     return Finding(label, 100.0 * rms(good), 100.0 * low, 100.0 * high, "%")
 
 
-def _own(table: pl.DataFrame, sense: str, method: str | None = None) -> pl.DataFrame:
+def _rows_of_sense(table: pl.DataFrame, sense: str, method: str | None = None) -> pl.DataFrame:
     """Rows of one sense and one method, the first if none is named."""
     return table.filter((pl.col("sense") == sense) & (pl.col("method") == (method or table["method"][0])))
 
 
-def _apart(rows: pl.DataFrame) -> Array:
+def _published_differences(rows: pl.DataFrame) -> Array:
     """Published minus noise-free estimate, relative."""
     return ((rows["published_m"] - rows["noise_free_m"]) / rows["depth_m"]).to_numpy()
 
 
-def _inside(table: pl.DataFrame, bands: pl.DataFrame, sense: str) -> Array:
-    own = _own(table, sense).join(bands, on=["sample_id", "sense"])
+def _inside_band(table: pl.DataFrame, bands: pl.DataFrame, sense: str) -> Array:
+    own = _rows_of_sense(table, sense).join(bands, on=["sample_id", "sense"])
     error = own["published_m"] - own["depth_m"]
     return ((error >= own["low_m"]) & (error <= own["high_m"])).to_numpy()
 

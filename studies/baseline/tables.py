@@ -185,7 +185,7 @@ def drawn_misalignment(rig: Rig, random: np.random.Generator) -> Misalignment:
     raise SceneError(f"none of {_TRIES} drawn misalignments of the rig can exist: take a rig with less distortion")
 
 
-def seen(rig: Rig, misalignment: Misalignment, points_m: Array, strokes_m: Array) -> tuple[Array, Array, Array]:
+def seen_pixels(rig: Rig, misalignment: Misalignment, points_m: Array, strokes_m: Array) -> tuple[Array, Array, Array]:
     """Pixels down and up, shape (n, 2), and true D, shape (n,), of world points (n, 3) with nominal strokes (n,)."""
     true = rig.perturbed(misalignment)
     down = image_of(true.at(0.0), points_m).uv_px
@@ -213,7 +213,7 @@ def drawn_errors(
     rig: Rig, points_m: Array, strokes_m: Array, count: int, random: np.random.Generator
 ) -> dict[str, Array]:
     """Errors of D, shape (count, n), metres, in every sense of phi, of an aligned reader of drawn rigs."""
-    pictures = [seen(rig, drawn_misalignment(rig, random), points_m, strokes_m) for _ in range(count)]
+    pictures = [seen_pixels(rig, drawn_misalignment(rig, random), points_m, strokes_m) for _ in range(count)]
     down, up, true = (np.stack(rows) for rows in zip(*pictures, strict=True))
     return {sense: estimates(sense, rig, strokes_m, down, up) - true for sense in SENSES}
 

@@ -132,7 +132,7 @@ def band(model: DepthModel, points: Array, grid: Experiments, random: np.random.
     return np.stack([low, np.nanmedian(middle, axis=0), high])
 
 
-def alike(model: DepthModel, point: Array) -> list[tuple[str, str, float]]:
+def alike_parameters(model: DepthModel, point: Array) -> list[tuple[str, str, float]]:
     """Pairs of parameters and the cosine between what they do to the 25 estimates, in units of their noise.
 
     +-1: the estimates cannot tell the two apart, however good they are.
@@ -308,7 +308,8 @@ def alike_table(settings: CauseSettings, posteriors: Posteriors) -> pl.DataFrame
         model = settings.model(name, published_experiments())
         median = np.median(posteriors["published", name].points, axis=0)
         rows += [
-            {"explanation": name, "first": a, "second": b, "cosine": cosine} for a, b, cosine in alike(model, median)
+            {"explanation": name, "first": a, "second": b, "cosine": cosine}
+            for a, b, cosine in alike_parameters(model, median)
         ]
     return pl.DataFrame(rows).sort(pl.col("cosine").abs(), descending=True)
 

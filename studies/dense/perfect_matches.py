@@ -43,7 +43,7 @@ Numbers = dict[tuple[str, float, str], float]
 
 
 @dataclass(frozen=True)
-class Asked:
+class PerfectMatchTask:
     """Numbers that are asked of each room.
 
     Parameters
@@ -76,7 +76,7 @@ def rigs() -> dict[str, Rig]:
     return {SPHERE: sphere, PARABOLOID: paraboloid, OFF_AXIS: hyperboloid.perturbed(_OFF), IN_FOCUS: hyperboloid}
 
 
-def fewer_pixels(rig: Rig, divisor: float) -> Rig:
+def coarser_rig(rig: Rig, divisor: float) -> Rig:
     """The rig with so many times fewer pixels along each side."""
     camera = rig.camera
     size = {name: round(getattr(camera, name) / divisor) for name in ("width_px", "height_px")}
@@ -90,20 +90,22 @@ def room_of(number: int) -> Room:
     return generate_room(drawn_properties(STREAM, number, height_m=_HEIGHT_M, gloss=0.0), STREAM, number)
 
 
-def of_room(asked: Asked, exact: Mapping[str, Rig], covariances: Mapping[str, Array], number: int) -> Numbers:
+def room_numbers(
+    asked: PerfectMatchTask, exact: Mapping[str, Rig], covariances: Mapping[str, Array], number: int
+) -> Numbers:
     """All numbers of one room, in % but for those in metres."""
     room, found = room_of(number), Numbers()
     for stroke_m in asked.strokes_m:
         for name, rig in exact.items():
-            values = of_rig(asked, fewer_pixels(rig, asked.divisor), room, stroke_m)
+            values = rig_numbers(asked, coarser_rig(rig, asked.divisor), room, stroke_m)
             found |= {(name, stroke_m, what): value for what, value in values.items()}
         for name, covariance in covariances.items():
             off = drawn_deviation(covariance, generator(STREAM, name, number))
-            found[f"rig {name}", stroke_m, THROUGH] = through_nominal(asked, exact[SPHERE], off, room, stroke_m)
+            found[f"rig {name}", stroke_m, THROUGH] = nominal_rig_error(asked, exact[SPHERE], off, room, stroke_m)
     return found
 
 
-def of_rig(asked: Asked, rig: Rig, room: Room, stroke_m: float) -> dict[str, float]:
+def rig_numbers(asked: PerfectMatchTask, rig: Rig, room: Room, stroke_m: float) -> dict[str, float]:
     """Numbers of an exactly known rig in one room at one stroke, in %."""
     seen = correspondence(room, rig.at(0.0), rig.at(stroke_m))
     uv, up, depth = _pixels_of(seen)
@@ -139,12 +141,12 @@ def bands(ends_m: Sequence[float]) -> dict[str, tuple[float, float]]:
     return dict(zip(names, pairwise((0.0, *ends_m, np.inf)), strict=True))
 
 
-def through_nominal(asked: Asked, nominal: Rig, off: Misalignment, room: Room, stroke_m: float) -> float:
+def nominal_rig_error(asked: PerfectMatchTask, nominal: Rig, off: Misalignment, room: Room, stroke_m: float) -> float:
     """Median error of D of perfect matches of a rig that deviates, seen through the nominal one, %.
 
     A match whose rays do not meet in front of the mirror counts as wrong by more than any other.
     """
-    true, rig = (fewer_pixels(each, asked.divisor) for each in (nominal.perturbed(off), nominal))
+    true, rig = (coarser_rig(each, asked.divisor) for each in (nominal.perturbed(off), nominal))
     uv, up, depth = _pixels_of(correspondence(room, true.at(0.0), true.at(off.stroke_m(stroke_m))))
     at = meeting(rig, stroke_m, uv, up)
     error = np.abs(keep(at.depth_m, at.status) / depth - 1.0)

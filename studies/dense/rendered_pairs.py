@@ -36,7 +36,7 @@ from phibench.render.optics.correspondence import Correspondence, correspondence
 from phibench.render.optics.faces import IntArray
 from phibench.scenes.frames import Array, BoolArray
 from phibench.scenes.rig import Rig
-from phibench.studies.dense.perfect_matches import fewer_pixels
+from phibench.studies.dense.perfect_matches import coarser_rig
 
 METHODS = ("dense_sweep", "dense_sgbm")
 PERFECT = "perfect matches, central model"
@@ -46,7 +46,7 @@ CELL_PX = 3  # odd: the middle of a cell is a pixel's centre
 
 
 @dataclass(frozen=True)
-class Near:
+class NearLimits:
     """Near space: pixels of the room below a D, and the largest error of D that is right."""
 
     near_m: float
@@ -84,11 +84,11 @@ class FreeFloor:
     origin_m: Array
     direction: Array
     centre_m: float
-    near: Near
+    near: NearLimits
     true_m: Array = field(default_factory=lambda: np.empty(0))
 
     @classmethod
-    def of(cls, truth: DenseTruth, near: Near) -> FreeFloor:
+    def of(cls, truth: DenseTruth, near: NearLimits) -> FreeFloor:
         """Floor of a pair's room."""
         view, lattice = truth.given_rig.at(0.0), np.zeros(truth.depth_m.shape, bool)
         lattice[::_STEP_PX, ::_STEP_PX] = True
@@ -163,12 +163,12 @@ class RenderedRoom:
     outcomes: Mapping[str, MethodOutcome]
 
 
-def rendered_room(pairs: DensePairs, strokes_m: Sequence[float], near: Near, number: int) -> RenderedRoom:
+def rendered_room(pairs: DensePairs, strokes_m: Sequence[float], near: NearLimits, number: int) -> RenderedRoom:
     """Bounds and answers of one pair."""
     pair, truth = pairs.pair(number), pairs.truth(number)
     sample = pairs.dataset[truth.sample_id]
     planes_e = sample.ambient("down").astype(float) * pair.card.exposure_s
-    coarse, bounds = fewer_pixels(truth.true_rig, CELL_PX), []
+    coarse, bounds = coarser_rig(truth.true_rig, CELL_PX), []
     for stroke_m in strokes_m:
         found = correspondence(sample.room, coarse.at(0.0), coarse.at(stroke_m))
         sigma = cell_bound(truth.true_rig, stroke_m, pair.card, planes_e, found)
@@ -196,7 +196,7 @@ def cell_bound(rig: Rig, stroke_m: float, card: SensorCard, planes_e: Array, fou
     return np.where(found.seen, sigma_of(told, found.depth_m), np.nan)
 
 
-def bound_at(stroke_m: float, found: Correspondence, sigma_m: Array, near: Near) -> BoundAtStroke:
+def bound_at(stroke_m: float, found: Correspondence, sigma_m: Array, near: NearLimits) -> BoundAtStroke:
     """Statistics of a map of sigma of D, which is NaN where the up image does not show the point."""
     relative = sigma_m[found.seen] / found.depth_m[found.seen]
     whole = np.concatenate([relative, np.full(int(found.of_room.sum()) - len(relative), np.inf)])
@@ -205,7 +205,7 @@ def bound_at(stroke_m: float, found: Correspondence, sigma_m: Array, near: Near)
     return BoundAtStroke(stroke_m, len(relative) / len(whole), median, p90, over_all, near.share(found, sigma_m))
 
 
-def outcome(depth_m: Array, truth: DenseTruth, near: Near, floor: FreeFloor) -> MethodOutcome:
+def outcome(depth_m: Array, truth: DenseTruth, near: NearLimits, floor: FreeFloor) -> MethodOutcome:
     """Numbers of an answer's D, NaN where there is none."""
     error = np.abs(depth_m / truth.depth_m - 1.0)[truth.scored]
     known = np.isfinite(error)

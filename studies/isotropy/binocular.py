@@ -23,7 +23,7 @@ from phibench.scenes.room import carriage
 from phibench.scenes.shapes import Mesh, Shape, Uniform
 from phibench.studies.framework import Finding
 from phibench.studies.isotropy.azimuth_errors import NORMAL_95, fitted_px, flat_pair, sideways
-from phibench.studies.isotropy.lines import moved
+from phibench.studies.isotropy.lines import moved_rig
 from phibench.studies.misaligned_rigs import spot_of
 
 _ROWS, _COLUMNS = 36, 72  # of the ball's mesh: chords lie up to 0.1 % of the radius inside
@@ -38,7 +38,7 @@ _PLACES_PX = (0.0, 0.5, 1.0, 1.5)  # per axis, over the two pixels of a Bayer ce
 _ACROSS_RAD = 0.5 * math.pi  # azimuth of the spots that show the laws: across the baseline
 
 
-def standing(view: View, name: str) -> tuple[Shape, ...]:
+def sensor_solids(view: View, name: str) -> tuple[Shape, ...]:
     """A sensor as others see it: ball, camera housing and mast."""
     parts = (replace(part, name=f"{name}_{part.name}") for part in carriage(view))
     return (_ball(view, f"{name}_ball"), *parts)
@@ -72,11 +72,11 @@ class Binocular:
     @property
     def views(self) -> tuple[View, View]:
         """Views of the first and the second sensor."""
-        return self.rig.at(0.0), moved(self.rig, self.apart_m).at(0.0)
+        return self.rig.at(0.0), moved_rig(self.rig, self.apart_m).at(0.0)
 
     def seen_beside(self, index: int) -> tuple[Shape, ...]:
         """Shapes of the other sensor, which stand in the images of one."""
-        return standing(self.views[1 - index], "second" if index == 0 else "first")
+        return sensor_solids(self.views[1 - index], "second" if index == 0 else "first")
 
     def hidden_deg(self, index: int, height_m: float) -> float:
         """Width of the azimuths, about the first sensor, whose rendered spots one sensor does not see, degrees.
@@ -154,7 +154,7 @@ class Laws:
     apart_m: Sequence[float] = (0.3, 0.425, 0.6, 0.85)
 
 
-def gain(both: Binocular, light: Array, sensor: Sensor, draws: int) -> Gain | None:
+def scatter_gain(both: Binocular, light: Array, sensor: Sensor, draws: int) -> Gain | None:
     """Scatter from drawn frames of a spot across the baseline, on an even background of this light.
 
     The frames are shared out to places in a cell of the mosaic, as the noise of one place is that of no other. None
@@ -190,7 +190,7 @@ def gain(both: Binocular, light: Array, sensor: Sensor, draws: int) -> Gain | No
     return Gain(D, b, scatter_m, scatter_px, degrees + 1, rays)
 
 
-def power(rows: Sequence[Gain], of: str, error: str = "m_per_px") -> tuple[float, float]:
+def error_power(rows: Sequence[Gain], of: str, error: str = "m_per_px") -> tuple[float, float]:
     """Power of `depth_m` or `apart_m` with which the error of D per pixel grows, and its standard error.
 
     A standard deviation of n draws is good to one part in sqrt(2 (n - 1)).
@@ -201,14 +201,16 @@ def power(rows: Sequence[Gain], of: str, error: str = "m_per_px") -> tuple[float
     return float(spread @ y / (spread @ spread)), sigma / float(np.sqrt(spread @ spread))
 
 
-def tried(both: Binocular, heights_m: Sequence[float], laws: Laws, light: Array, sensor: Sensor) -> Iterator[Finding]:
+def binocular_results(
+    both: Binocular, heights_m: Sequence[float], laws: Laws, light: Array, sensor: Sensor
+) -> Iterator[Finding]:
     """Render both sensors' spots, draw their frames, and state what they show."""
     shares = [(height, both.hidden_share(height)) for height in heights_m]
     varied = {
         "depth_m": [replace(both, depth_m=depth) for depth in laws.depths_m],
         "apart_m": [replace(both, apart_m=apart) for apart in laws.apart_m],
     }
-    tries = {of: [gain(pair, light, sensor, laws.draws) for pair in pairs] for of, pairs in varied.items()}
+    tries = {of: [scatter_gain(pair, light, sensor, laws.draws) for pair in pairs] for of, pairs in varied.items()}
     gains = {of: [row for row in rows if row is not None] for of, rows in tries.items()}
     return binocular_findings(shares, {of: rows for of, rows in gains.items() if len(rows) >= _LEAST_FITS})
 
@@ -218,8 +220,8 @@ def binocular_findings(shares: Sequence[tuple[float, float]], laws: Mapping[str,
     for height_m, share in shares:
         yield Finding(f"hidden from each other, by rendered spots, spot at {height_m:g} m", 100.0 * share, unit="%")
     for of, rows in laws.items():
-        value, sigma = power(rows, of)
+        value, sigma = error_power(rows, of)
         ends = (value, value - NORMAL_95 * sigma, value + NORMAL_95 * sigma)
         yield Finding.ranged(f"two sensors, error of D per pixel, by images: power of {_WORDS[of]}", ends)
-        by_rays = power(rows, of, "rays_m_per_px")[0]
+        by_rays = error_power(rows, of, "rays_m_per_px")[0]
         yield Finding(f"two sensors, error of D per pixel, by rays: power of {_WORDS[of]}", by_rays)

@@ -83,22 +83,22 @@ def epipolar_line(
         depths_m,
         uv,
         down_px,
-        float(np.max(beside(uv, centre, down_px))),
-        float(np.max(beside_best(uv))),
-        float(np.max(beside(centroids_px(up, X), centre, down_px))) if render else float("nan"),
+        float(np.max(line_distances(uv, centre, down_px))),
+        float(np.max(best_line_distances(uv))),
+        float(np.max(line_distances(centroids_px(up, X), centre, down_px))) if render else float("nan"),
         columns[1:],
         float(np.ptp(columns)),
     )
 
 
-def beside(points_px: Array, a_px: Array, b_px: Array) -> Array:
+def line_distances(points_px: Array, a_px: Array, b_px: Array) -> Array:
     """Distances, shape (n,), of points (n, 2) from the line through a and b."""
     along = (b_px - a_px) / np.linalg.norm(b_px - a_px)
     off = points_px - a_px
     return np.abs(off[:, 0] * along[1] - off[:, 1] * along[0])
 
 
-def beside_best(points_px: Array) -> Array:
+def best_line_distances(points_px: Array) -> Array:
     """Distances, shape (n,), of points (n, 2) from their best straight line (total least squares)."""
     off = points_px - points_px.mean(axis=0)
     # the direction of least scatter is the normal of the best line
@@ -113,7 +113,7 @@ def _columns(nominal: Rig, stroke_m: float, down_px: Array, uv: Array, grid: Pan
     return np.unwrap(columns, period=grid.width_px)
 
 
-def hidden_by(seeing: View, other: View, points_m: Array) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+def hidden_flags(seeing: View, other: View, points_m: Array) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
     """Flags of points (n, 3) whose ray to the seeing sensor's mirror the other sensor cuts, shape (n,)."""
     P = reflect(seeing, image_of(seeing, points_m).uv_px).origin_world_m
     along = points_m - P
@@ -132,8 +132,8 @@ def hidden_share(rig: Rig, apart_m: float, points_m: Array) -> tuple[float, floa
     The second of the pair stands `apart_m` along world x. The moving sensor is hidden by nothing but its own housing
     and mast, at each place.
     """
-    a, b = rig.at(0.0), moved(rig, apart_m).at(0.0)
-    pair = hidden_by(a, b, points_m) | hidden_by(b, a, points_m)
+    a, b = rig.at(0.0), moved_rig(rig, apart_m).at(0.0)
+    pair = hidden_flags(a, b, points_m) | hidden_flags(b, a, points_m)
     own = np.zeros(len(points_m), bool)
     for view in (a, b):
         P = reflect(view, image_of(view, points_m).uv_px).origin_world_m
@@ -141,7 +141,7 @@ def hidden_share(rig: Rig, apart_m: float, points_m: Array) -> tuple[float, floa
     return float(pair.mean()), float(own.mean())
 
 
-def moved(rig: Rig, by_m: float) -> Rig:
+def moved_rig(rig: Rig, by_m: float) -> Rig:
     """The same rig elsewhere along world x."""
     old = rig.T_world_camera
     shift = as_vector(old.t + np.array([by_m, 0.0, 0.0]))

@@ -57,7 +57,7 @@ from phibench.studies.isotropy.azimuth_errors import (
     scatter_findings,
     sideways,
 )
-from phibench.studies.isotropy.binocular import Binocular, Laws, tried
+from phibench.studies.isotropy.binocular import Binocular, Laws, binocular_results
 from phibench.studies.isotropy.lines import (
     STRAIGHT_PX,
     Line,
@@ -136,7 +136,7 @@ def run(settings: IsotropySettings, datasets: StudyDatasets) -> StudyResult:
         *baseline_findings(azimuths, curves[VERTICAL], curves[HORIZONTAL], scene.baseline_m),
         *misaligned_findings(wrong, words),
         *occlusion_findings(hidden, scene.baseline_m),
-        *tried(
+        *binocular_results(
             Binocular(scene.rig, scene.baseline_m, scene.depth_m, scene.height_m),
             settings.occlusion_heights_m,
             Laws(draws=settings.draws),

@@ -159,7 +159,7 @@ def _seen(
 ) -> dict[tuple[float, float], bool]:
     """Distances and heights that a pair measures, from all azimuths."""
     points = np.array([(d, 0.0, h) for d, h in places])
-    fine = visible_places.measured(rig, points, settings.stroke_m, settings.edge_px, settings.azimuths_rad)
+    fine = visible_places.measured_places(rig, points, settings.stroke_m, settings.edge_px, settings.azimuths_rad)
     return dict(zip(places, fine.tolist(), strict=True))
 
 
@@ -169,7 +169,7 @@ def place_map(settings: tables.MirrorSettings, rig: Rig) -> tables.PlaceMap:
     heights = np.arange(0.0, settings.map_height_m + 0.5 * settings.map_step_m, settings.map_step_m)
     D, Z = np.meshgrid(depths, heights)
     points = np.stack([D.ravel(), np.zeros(D.size), Z.ravel()], axis=-1)
-    fine = visible_places.measured(rig, points, settings.stroke_m, settings.edge_px, settings.azimuths_rad)
+    fine = visible_places.measured_places(rig, points, settings.stroke_m, settings.edge_px, settings.azimuths_rad)
     return tables.PlaceMap(depths, heights, fine.reshape(D.shape))
 
 

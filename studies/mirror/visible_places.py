@@ -15,7 +15,7 @@ _FLOOR_M, _FLOOR_STEP_M = 0.1, 0.02  # nearest place of the floor that is tried,
 _CHUNK = 500  # points whose distances from all sides of the outline are taken at once
 
 
-def measured(rig: Rig, points_m: Array, stroke_m: float, edge_px: float, azimuths_rad: Array) -> BoolArray:
+def measured_places(rig: Rig, points_m: Array, stroke_m: float, edge_px: float, azimuths_rad: Array) -> BoolArray:
     """Places that both images of a pair show, from every one of the azimuths, shape (n,).
 
     Parameters
@@ -28,12 +28,12 @@ def measured(rig: Rig, points_m: Array, stroke_m: float, edge_px: float, azimuth
         The places are turned about the mirror's axis; what the robot hides differs between them.
     """
     turned = [points_m @ _about_z(a).T for a in azimuths_rad]
-    fine = [shown(rig, points_m, offset, edge_px) for offset in (0.0, stroke_m)]
+    fine = [shown_places(rig, points_m, offset, edge_px) for offset in (0.0, stroke_m)]
     free = [unhidden(rig, points, offset) for points in turned for offset in (0.0, stroke_m)]
     return np.asarray(np.all([*fine, *free], axis=0))
 
 
-def shown(rig: Rig, points_m: Array, offset_m: float, edge_px: float) -> BoolArray:
+def shown_places(rig: Rig, points_m: Array, offset_m: float, edge_px: float) -> BoolArray:
     """Places whose image lies inside the mirror's and the camera's, shape (n,); the robot is not asked."""
     parts = np.array_split(points_m, max(len(points_m) // _CHUNK, 1))
     return np.concatenate([_shown(rig, points, offset_m, edge_px) for points in parts])
@@ -61,6 +61,6 @@ def floor_from_m(rig: Rig, stroke_m: float, edge_px: float, azimuth_rad: float, 
     """Least distance from which on every spot on the floor is measured up to the last, NaN where the last is not."""
     D = np.arange(_FLOOR_M, last_m + 0.5 * _FLOOR_STEP_M, _FLOOR_STEP_M)
     points = np.stack([D, np.zeros_like(D), np.zeros_like(D)], axis=-1)
-    missing = np.flatnonzero(~measured(rig, points, stroke_m, edge_px, np.array([azimuth_rad])))
+    missing = np.flatnonzero(~measured_places(rig, points, stroke_m, edge_px, np.array([azimuth_rad])))
     first = missing[-1] + 1 if missing.size else 0
     return float(D[first]) if first < len(D) else float("nan")

@@ -115,7 +115,7 @@ FACTORS: dict[str, Factor] = {
 """By name; the keys are those of the settings, whose levels include the base."""
 
 
-def applied(factor: str, preset: str, rig: Rig, level: float) -> tuple[Shot, Rig]:
+def shot_and_rig(factor: str, preset: str, rig: Rig, level: float) -> tuple[Shot, Rig]:
     """Shot and rig of a cell; the factor `BASE` changes nothing.
 
     Raises
@@ -160,7 +160,7 @@ class Cell:
 def cell_records(cell: Cell) -> pl.DataFrame:
     """Records of all methods of a cell: `scores.record_columns.COLUMNS` with method, factor and level."""
     rig, places = _places(cell)
-    shot = applied(cell.factor, cell.preset, rig, cell.level)[0]
+    shot = shot_and_rig(cell.factor, cell.preset, rig, cell.level)[0]
     truths, pairs = [], []
     for k, spot in enumerate(places):
         steady = bounds_of(shot, spot) if shot.sensor.speckle_m is None else None
@@ -170,7 +170,7 @@ def cell_records(cell: Cell) -> pl.DataFrame:
             bounds = steady or bounds_of(shot, spot, names)
             truths.append(truth_of(number, shot, spot, nominal, bounds, draw))
             pairs.append(drawn_pair(number, shot, spot, nominal, names, cell.box_px))
-    answers = [answered(pair, cell.methods) for pair in pairs]
+    answers = [method_answers(pair, cell.methods) for pair in pairs]
     tables = []
     for name in answers[0]:
         outcomes = [Outcome(i, *answer[name]) for i, answer in enumerate(answers)]
@@ -179,7 +179,7 @@ def cell_records(cell: Cell) -> pl.DataFrame:
     return pl.concat(tables)
 
 
-def answered(pair: Pair, methods: Sequence[str]) -> dict[str, tuple[Answer, float]]:
+def method_answers(pair: Pair, methods: Sequence[str]) -> dict[str, tuple[Answer, float]]:
     """Answers and seconds of the methods that take such a pair; laser-off frames go to those that cannot do without."""
     alone = without_off(pair)
     answers: dict[str, tuple[Answer, float]] = {}
@@ -208,16 +208,16 @@ def _places(cell: Cell) -> tuple[Rig, list[SpotPair]]:
     size = sample.rig.camera.height_px, sample.rig.camera.width_px
     uv = [(row.u_px, row.v_px) for row in (sample.truth_row(p) for p in POSITIONS)]
     region = cut_region(uv, size, _MARGIN_PX)
-    rig = applied(cell.factor, cell.preset, cut_rig(sample.rig, region), cell.level)[1]
+    rig = shot_and_rig(cell.factor, cell.preset, cut_rig(sample.rig, region), cell.level)[1]
     ambient = {p: sample.ambient(p)[(slice(None), *region.slices())].astype(float) for p in POSITIONS}
     stroke_m, spot = sample.row.stroke_m, sample.laser_spot
-    spots = [placed(spot, sample.row.depth_m, (*NAMES, cell.sample, k)) for k in range(cell.places)]
+    spots = [placed_spot(spot, sample.row.depth_m, (*NAMES, cell.sample, k)) for k in range(cell.places)]
     return rig, [
         SpotPair.of(rig, stroke_m, uv_px, dataset.room, ambient, f"{cell.sample}-{k}") for k, uv_px in enumerate(spots)
     ]
 
 
-def placed(spot: LaserSpot, depth_m: float, names: tuple[Name, ...]) -> LaserSpot:
+def placed_spot(spot: LaserSpot, depth_m: float, names: tuple[Name, ...]) -> LaserSpot:
     """The spot moved on its board by up to some pixels both ways."""
     along, across = spot.tangents()
     a, b = generator(*names, "place").uniform(-_REACH_PX, _REACH_PX, 2) * _RAD_PER_PX * depth_m

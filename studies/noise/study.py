@@ -38,7 +38,7 @@ from phibench.studies.framework import (
     line_style,
 )
 from phibench.studies.noise import tables
-from phibench.studies.noise.conditions import BASE, FACTORS, Cell, applied, cell_records
+from phibench.studies.noise.conditions import BASE, FACTORS, Cell, cell_records, shot_and_rig
 
 FEW_PLACES = 20  # the bootstrap resamples places: its intervals of few places are too narrow
 
@@ -127,7 +127,7 @@ def cells(settings: NoiseSettings, dataset: Dataset) -> list[Cell]:
     plan = [(s, p, f, x) for p in reversed(settings.presets) for s in settings.samples for f, x in _levels(settings, p)]
     for sample, preset, factor, level in plan:
         try:
-            applied(factor, preset, dataset[sample].rig, level)
+            shot_and_rig(factor, preset, dataset[sample].rig, level)
         except SensorError as error:
             raise DatasetError(f"levels of {factor}: {level:g} is not allowed: {error}") from error
     size = (settings.places, settings.draws, methods, settings.box_px)

@@ -15,7 +15,7 @@ import polars as pl
 
 from phibench.benchmark.scores.answer_errors import Rules
 from phibench.benchmark.scores.intervals import Estimate, Statistic, estimates
-from phibench.benchmark.scores.metrics import measure, prepared
+from phibench.benchmark.scores.metrics import measure, prepared_records
 from phibench.scenes.frames import Array
 from phibench.scenes.random_streams import generator
 from phibench.studies.framework import Finding, Row, ends_text, text_table
@@ -115,7 +115,7 @@ def scatter_and_bias_px(records: pl.DataFrame) -> tuple[float, float]:
 
 def _row(records: pl.DataFrame, rules: Rules, key: tuple[Any, ...]) -> dict[str, Any]:
     # one stream for all methods of a case: they are resampled alike
-    measured = measure(prepared(records), rules, *NAMES, *map(str, key[:-1]), names=METRICS)
+    measured = measure(prepared_records(records), rules, *NAMES, *map(str, key[:-1]), names=METRICS)
     scatter, bias = scatter_and_bias_px(records)
     row: dict[str, Any] = {"places": records["sample_id"].n_unique(), "images": len(records)}
     for name, metric in measured.items():

@@ -37,7 +37,7 @@ from phibench.estimator.methods.registry import method_for
 from phibench.robot.film.film_bundle import FilmDepth, film_depth
 from phibench.robot.film.film_estimates import EqualLight, bundle_depth, equal_light, seen_film
 from phibench.robot.film.film_frames import film_frames, lit_frames
-from phibench.robot.film.film_positions import FilmPositions, joined, processed_positions
+from phibench.robot.film.film_positions import FilmPositions, joined_positions, processed_positions
 from phibench.scenes.frames import Array
 from phibench.scenes.laser import Beam
 from phibench.scenes.random_streams import generator
@@ -300,7 +300,7 @@ def processed_stroke(
     way, offsets = processed_positions(frames, (ends.depth or start).point_world_m, moving)
     # bursts stand where the carriage was told to, and readings on the way have the encoder's noise
     sigma_m = np.concatenate([np.zeros(2), np.full(len(moving), frames.encoder_sigma_m)])
-    return _depth(bundle, joined(ends.positions, way), np.concatenate([ends.offsets_m, offsets]), sigma_m)
+    return _depth(bundle, joined_positions(ends.positions, way), np.concatenate([ends.offsets_m, offsets]), sigma_m)
 
 
 # What came out.

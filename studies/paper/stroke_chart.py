@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from phibench.benchmark.reports.figures import COLOURS, LINES, STYLE, encoded, styled
+from phibench.benchmark.reports.figures import COLOURS, LINES, STYLE, encoded_figure, styled_figure
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.shown_text import TextTable
 from phibench.datasets.store.files import write_bytes
@@ -181,9 +181,9 @@ def require_picture(path: Path) -> None:
 def write_stroke_picture(path: Path, best: BestStroke) -> Path:
     """Draw the error of D and its parts by the stroke, atomically; the same curve gives the same bytes."""
     require_picture(path)
-    with styled(STYLE, (7.0, 4.2), layout="constrained", dpi=110) as figure:
+    with styled_figure(STYLE, (7.0, 4.2), layout="constrained", dpi=110) as figure:
         _draw(figure.add_subplot(), best)
-        return write_bytes(path, encoded(figure, path.suffix.lower()[1:]))
+        return write_bytes(path, encoded_figure(figure, path.suffix.lower()[1:]))
 
 
 def _draw(ax: Axes, best: BestStroke) -> None:

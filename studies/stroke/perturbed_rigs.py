@@ -15,7 +15,7 @@ import numpy as np
 from phibench.benchmark.scores.answer_errors import Rules
 from phibench.benchmark.scores.intervals import Clusters, Estimate, estimates, rms_of
 from phibench.estimator.geometry.least_squares_depth import depth_general
-from phibench.estimator.geometry.rig_parameters import PARAMETERS, changed, stroke_of
+from phibench.estimator.geometry.rig_parameters import PARAMETERS, changed_rig, stroke_of
 from phibench.estimator.limits.best_stroke import ROOM_E_PER_S
 from phibench.estimator.limits.stroke_curve import covariance_root
 from phibench.estimator.methods.registry import METHODS
@@ -89,7 +89,7 @@ class RenderedOutcome:
         return self.rms_m.low <= self.check.predicted_m <= self.rms_m.high
 
 
-def measured(check: RenderedCheck) -> RenderedOutcome:
+def measured_outcome(check: RenderedCheck) -> RenderedOutcome:
     """Draw and evaluate all frames of a check."""
     nominal = Rig()
     answers = [_answer(check, nominal, k) for k in range(check.draws)]
@@ -107,7 +107,7 @@ def _answer(check: RenderedCheck, nominal: Rig, draw: int) -> tuple[float, Array
     names = (*_NAMES, check.tolerance, f"{check.depth_m:.6f}", f"{check.stroke_m:.6f}", draw)
     # named without the stroke: all strokes of a distance are compared on the same random rigs
     values = deviations(np.array(check.covariance), (*_NAMES, check.tolerance, f"{check.depth_m:.6f}", draw))
-    true, stroke_m = changed(nominal, values), float(stroke_of(np.array(check.stroke_m), values))
+    true, stroke_m = changed_rig(nominal, values), float(stroke_of(np.array(check.stroke_m), values))
     spot = _spot(check, nominal, 2.0 * math.pi * (draw * _TURN % 1.0))
     uv = [_pixel(true, stroke_m, spot, p) for p in POSITIONS]
     camera = nominal.camera

@@ -38,7 +38,7 @@ from phibench.studies.framework import (
     error_bars,
     line_style,
 )
-from phibench.studies.stroke.perturbed_rigs import RenderedCheck, RenderedOutcome, measured
+from phibench.studies.stroke.perturbed_rigs import RenderedCheck, RenderedOutcome, measured_outcome
 from phibench.studies.stroke.tables import (
     Found,
     best_findings,
@@ -98,7 +98,7 @@ def run(settings: StrokeSettings, datasets: StudyDatasets) -> StudyResult:
             d, rig, covariance_rig=rigs[name], strokes_m=settings.strokes_m, around=around, card=card, spot=spot
         )
     todo = planned(settings, rig, {k: rigs[k] for k in (AS_BUILT, EXACT)})
-    checks = datasets.map(measured, todo, "stroke, frames")
+    checks = datasets.map(measured_outcome, todo, "stroke, frames")
     names, top = tuple(rigs), settings.strokes_m[1]
     findings = [row for name in names for row in best_findings(best_by_case, name, tuple(longest))]
     findings += [row for d in longest for row in growth_findings(best_by_case, d, names, top)]

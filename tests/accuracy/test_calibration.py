@@ -17,7 +17,7 @@ from phibench.calibration.rig.bundle import KnownSpot, calibrate
 from phibench.calibration.rig.vertical_edges import vertical_of
 from phibench.datasets.common.parallel import parallel_map
 from phibench.estimator.geometry.least_squares_depth import depth_general
-from phibench.estimator.geometry.rig_parameters import PARAMETERS, changed, prior_sigmas, stroke_of
+from phibench.estimator.geometry.rig_parameters import PARAMETERS, changed_rig, prior_sigmas, stroke_of
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.render.optics.truth import spot_truth
 from phibench.scenes.laser import LaserSpot
@@ -91,7 +91,7 @@ DEPTHS = (1.0, 1.8, 2.6, 3.4, 4.2)
 def errors_of(k: int, names: Sequence[str]) -> np.ndarray:
     """Relative errors of D of rig k, nominal and after each calibration, shape (1 + names, depths); exact pixels."""
     rng = generator("test", "calibration", k)
-    true = changed(NOMINAL, rng.normal(0.0, prior_sigmas(DRAWN)))
+    true = changed_rig(NOMINAL, rng.normal(0.0, prior_sigmas(DRAWN)))
     rigs = [NOMINAL, *(DATA[name].calibrated(true, generator("test", "calibration", k, name)) for name in names)]
     points = [around(true, depth, rng.uniform(0.0, 2.0 * np.pi)) for depth in DEPTHS]
     uv = [np.array([pixel(true, point, h) for point in points]) for h in (0.0, STROKE)]
@@ -162,7 +162,7 @@ def calibrated_errors(known: str, rigs: int) -> tuple[np.ndarray, np.ndarray]:
     for k in range(rigs):
         rng = generator("test", "strokes", k)
         values = rng.normal(0.0, sigmas)
-        true = changed(NOMINAL, values)
+        true = changed_rig(NOMINAL, values)
         outline = PoseMeasurement(apparent(true).value + OUTLINE @ rng.standard_normal(3), OUTLINE**2)
         bundle = calibrate(NOMINAL, outline, drawn_spots(true, values, rng, known))
         for i, depth in enumerate((1.0, 1.8, 2.6, 3.4, 4.2)):
@@ -214,7 +214,7 @@ def pull_with_vertical(rigs: int) -> tuple[float, float]:
     error, sigma = np.zeros((rigs, 5)), np.zeros((rigs, 5))
     for k in range(rigs):
         rng = generator("test", "vertical", "depth", k)
-        true = changed(NOMINAL, rng.normal(0.0, sigmas))
+        true = changed_rig(NOMINAL, rng.normal(0.0, sigmas))
         seen = apparent(true).value
         sphere = replace(NOMINAL.T_camera_sphere, translation_m=tuple(seen))
         up = vertical_of(upright_edges(true), replace(NOMINAL, T_camera_sphere=sphere)).up[:2]

@@ -14,7 +14,7 @@ from phibench.calibration.rig.bundle import KnownSpot, apparent_outline, calibra
 from phibench.datasets.recipe.recipe_scene import build_rig
 from phibench.datasets.recipe.tables import RigTable
 from phibench.estimator.geometry.least_squares_depth import depth_general
-from phibench.estimator.geometry.rig_parameters import PARAMETERS, changed, prior_sigmas
+from phibench.estimator.geometry.rig_parameters import PARAMETERS, changed_rig, prior_sigmas
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.render.optics.reflection_point import mirror_points
 from phibench.scenes.frames import Array
@@ -104,7 +104,7 @@ DATA = {
 def errors_of(shape: str, k: int, names: tuple[str, ...]) -> tuple[Array, Array]:
     """Relative errors of D, nominal and after each calibration, and the calibrated ones over their sigma."""
     nominal, rng, sigmas = nominal_of(shape), generator("clos", shape, k), prior_sigmas(DRAWN)
-    true = changed(nominal, rng.normal(0.0, sigmas))
+    true = changed_rig(nominal, rng.normal(0.0, sigmas))
     points = [around(true, depth, rng.uniform(0.0, 2.0 * np.pi)) for depth in DEPTHS]
     uv = [np.array([pixel(true, point, h) for point in points]) for h in (0.0, STROKE)]
     seen, errors, pulls = seen_place(nominal, true), [depth_exact(nominal, STROKE, *uv).depth_m / DEPTHS - 1.0], []
@@ -160,7 +160,7 @@ def test_accuracy_of_a_tilts_sign() -> None:
     """
     nominal, sigmas = nominal_of("hyperboloid"), prior_sigmas(DRAWN | {"tilt_x_rad": 0.0, "tilt_y_rad": 0.0})
     sigmas[[PARAMETERS.index(name) for name in ("decentre_x_m", "decentre_y_m")]] = 1e-4  # the line of sight is known
-    true = changed(nominal, np.where(np.array(PARAMETERS) == "mirror_tilt_y_rad", math.radians(1.0), 0.0))
+    true = changed_rig(nominal, np.where(np.array(PARAMETERS) == "mirror_tilt_y_rad", math.radians(1.0), 0.0))
     sigma = np.array([1e-2, 1e-2, 1e-2, 2e-3, 2e-3])  # 10 mm: the vertex tells nothing of the tilt
     bundle = calibrate(nominal, PoseMeasurement(seen_place(nominal, true), np.diag(sigma**2)), sigmas=sigmas)
     about_x, about_y = (math.degrees(bundle.sigmas[f"mirror_tilt_{axis}_rad"]) for axis in "xy")
@@ -181,7 +181,7 @@ def test_accuracy_of_moments_given_an_ellipse() -> None:
     eigenvectors are not, and gave other draws on other processors.
     """
     nominal, rng, sigmas = nominal_of("hyperboloid"), generator("moments"), prior_sigmas(DRAWN)
-    true = changed(nominal, rng.normal(0.0, sigmas))
+    true = changed_rig(nominal, rng.normal(0.0, sigmas))
     sigma, mixed = np.array([2e-4, 2e-4, 5e-4, 0.01, 0.01]), np.eye(5)
     mixed[0, 3] = mixed[3, 0] = 0.8
     C = mixed * np.outer(sigma, sigma)
@@ -196,7 +196,7 @@ def test_accuracy_of_moments_given_an_ellipse() -> None:
     draws[:, free] = rng.multivariate_normal(
         without.values[free], without.covariance[np.ix_(free, free)], 3000, method="cholesky"
     )
-    off = np.array([apparent_outline(nominal, changed(nominal, draw)) for draw in draws]) - place
+    off = np.array([apparent_outline(nominal, changed_rig(nominal, draw)) for draw in draws]) - place
     B = np.linalg.solve(C[:3, :3], C[:3, 3:]).T
     left = off[:, 3:] - off[:, :3] @ B.T
     weight = np.exp(-0.5 * np.sum(left * np.linalg.solve(C[3:, 3:] - B @ C[:3, 3:], left.T).T, axis=1))

@@ -8,7 +8,7 @@ import numpy as np
 
 from phibench.estimator.geometry.joint_posterior import single_posterior
 from phibench.estimator.geometry.status import Status
-from phibench.estimator.methods.likelihood_maps import claimed_px2, likelihood_map, of_pixels
+from phibench.estimator.methods.likelihood_maps import claimed_px2, likelihood_map, pixels_likelihood
 from phibench.estimator.spots.fit_raw import fit_law, spot_data
 from phibench.estimator.spots.gaussian_spot import SpotBlur, SpotModel, SpotPixels
 from phibench.estimator.spots.raw_pixels import GaussLaw, PixelNoise, bayer_filters, spot_regions
@@ -56,7 +56,7 @@ def faint_spots(snr: float, sigma_px: float, room_e: float, count: int) -> Faint
         if fit.status[0] != Status.OK:
             continue
         uv, C = fit.uv_px[0], fit.covariance_px2[0]
-        one = of_pixels(spot_data(regions, law, blur, model), uv)
+        one = pixels_likelihood(spot_data(regions, law, blur, model), uv)
         claim, places = claimed_px2(uv, C, lambda one=one: one), likelihood_map(one)
         found = None if places is None else single_posterior(places)
         apart.append(np.hypot(*(uv - truth)))

@@ -30,7 +30,7 @@ from phibench.studies.baseline.tables import (
     experiments_of,
     fit_power_law,
     published_curve,
-    seen,
+    seen_pixels,
 )
 from phibench.studies.framework import Finding, read_settings
 from phibench.studies.run import run_study
@@ -79,7 +79,7 @@ def test_cases_without_a_value_are_left_out() -> None:
 def test_estimates_are_those_of_the_score(sense: str) -> None:
     """Many strokes at once against one at a time, where phi is taken at the raised carriage."""
     rig = Rig()
-    down, up, true = seen(rig, Misalignment(), POINTS_M, STROKE_M)
+    down, up, true = seen_pixels(rig, Misalignment(), POINTS_M, STROKE_M)
     ours = estimates(sense, rig, STROKE_M, down, up)
     name = sense if sense == "exact" else f"paper_{sense}"
     theirs = [float(ESTIMATORS[name](rig, float(h), *uv).depth_m) for h, *uv in zip(STROKE_M, down, up, strict=True)]
@@ -90,7 +90,7 @@ def test_estimates_are_those_of_the_score(sense: str) -> None:
 
 
 def test_true_depth_counts_from_the_true_sphere() -> None:
-    _, _, true = seen(Rig(), Misalignment(decentre_x_m=0.01), POINTS_M, STROKE_M)
+    _, _, true = seen_pixels(Rig(), Misalignment(decentre_x_m=0.01), POINTS_M, STROKE_M)
     assert true == pytest.approx(np.hypot(POINTS_M[:, 0] - 0.01, POINTS_M[:, 1]), rel=1e-12)
 
 

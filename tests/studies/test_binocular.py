@@ -12,7 +12,14 @@ import pytest
 from phibench.render.sensor.settings import sensor
 from phibench.scenes.room import default_rig
 from phibench.studies.isotropy.azimuth_errors import circle
-from phibench.studies.isotropy.binocular import Binocular, Gain, binocular_findings, gain, power, standing
+from phibench.studies.isotropy.binocular import (
+    Binocular,
+    Gain,
+    binocular_findings,
+    error_power,
+    scatter_gain,
+    sensor_solids,
+)
 from phibench.studies.isotropy.lines import hidden_share
 
 BOTH = Binocular(default_rig(), 0.425, 2.5, 0.5)
@@ -21,7 +28,7 @@ LIGHT = np.array([3e4, 3e4, 2e4])
 
 def test_the_ball_that_others_see_is_a_closed_sphere() -> None:
     """Volume by Gauss's theorem: outside positive, and 4/3 pi R^3 to the 0.4 % that chords of 5 degrees cut off."""
-    ball, *parts = standing(BOTH.views[1], "second")
+    ball, *parts = sensor_solids(BOTH.views[1], "second")
     assert [part.name for part in parts] == ["second_camera_housing", "second_robot_mast"]
     a, b, c = (ball.vertices_m[ball.triangles[:, k]] - BOTH.views[1].sphere_centre_m for k in range(3))
     volume = float(np.einsum("ni,ni->", a, np.cross(b, c))) / 6.0
@@ -44,7 +51,7 @@ def test_rendered_spots_are_hidden_where_rays_say() -> None:
 
 def test_powers_are_those_of_a_straight_line_in_the_logarithms() -> None:
     rows = [Gain(D, 0.4, 1e-3 * D**2.5, 1e-3, 51, D**2) for D in (1.0, 2.0, 4.0)]
-    found, sigma = power(rows, "depth_m")
+    found, sigma = error_power(rows, "depth_m")
     assert found == pytest.approx(2.5)
     # two ends of a factor of 4, each good to 10 %: 0.1 sqrt(2) / log(4)
     assert sigma == pytest.approx(0.1 * math.sqrt(2.0) / math.log(4.0), rel=1e-9)
@@ -62,12 +69,12 @@ def test_the_error_per_pixel_is_that_of_the_rays() -> None:
     """
     card = sensor("bayer-raw")
     pairs = [replace(BOTH, depth_m=1.5), replace(BOTH, depth_m=3.0), replace(BOTH, depth_m=3.0, apart_m=0.85)]
-    found = [gain(one, LIGHT, card, 64) for one in pairs]
+    found = [scatter_gain(one, LIGHT, card, 64) for one in pairs]
     for one in found:
         assert one is not None
         assert one.m_per_px == pytest.approx(one.rays_m_per_px, rel=0.35)
     rows = [one for one in found if one is not None]
-    assert power(rows[:2], "depth_m", "rays_m_per_px")[0] == pytest.approx(2.0, abs=0.25)
-    assert power(rows[1:], "apart_m", "rays_m_per_px")[0] == pytest.approx(-1.0, abs=0.15)
-    assert gain(replace(BOTH, height_m=3.0, depth_m=0.3), LIGHT, card, 5) is None  # not in the images
-    assert gain(replace(BOTH, depth_m=40.0), LIGHT, card, 5) is None  # too faint
+    assert error_power(rows[:2], "depth_m", "rays_m_per_px")[0] == pytest.approx(2.0, abs=0.25)
+    assert error_power(rows[1:], "apart_m", "rays_m_per_px")[0] == pytest.approx(-1.0, abs=0.15)
+    assert scatter_gain(replace(BOTH, height_m=3.0, depth_m=0.3), LIGHT, card, 5) is None  # not in the images
+    assert scatter_gain(replace(BOTH, depth_m=40.0), LIGHT, card, 5) is None  # too faint

@@ -30,7 +30,7 @@ from phibench.studies.cause.study import (
     residual_findings,
     scale_findings,
 )
-from phibench.studies.cause.tables import DECIDED, FLOOR, alike, coverage, fit_of, left_out_score
+from phibench.studies.cause.tables import DECIDED, FLOOR, alike_parameters, coverage, fit_of, left_out_score
 from phibench.studies.framework import Finding, read_settings
 from phibench.studies.run import run_study
 
@@ -211,7 +211,7 @@ def test_left_out_score_is_the_density_of_the_table(settings: CauseSettings) -> 
 def test_principal_point_and_tilt_are_alike(settings: CauseSettings) -> None:
     """A turned camera moves the image as a shifted principal point does, but for (r/f)^2 = 6 %: cosine near -1."""
     model = settings.model("ray", DATA)
-    pairs = {(a, b): c for a, b, c in alike(model, model.point(np.full(len(model.names), 0.5)))}
+    pairs = {(a, b): c for a, b, c in alike_parameters(model, model.point(np.full(len(model.names), 0.5)))}
     assert pairs["tilt_y_rad", "cx_px"] < -0.98
     assert pairs["focal_relative", "radius_m"] > 0.98
     assert abs(pairs["tilt_y_rad", "focal_relative"]) < 0.95

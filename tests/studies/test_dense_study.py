@@ -25,12 +25,12 @@ from phibench.studies.dense.perfect_matches import (
     SIGMA,
     SPHERE,
     TWICE,
-    Asked,
+    PerfectMatchTask,
     bands,
-    fewer_pixels,
-    of_rig,
+    coarser_rig,
+    nominal_rig_error,
+    rig_numbers,
     rigs,
-    through_nominal,
 )
 from phibench.studies.dense.rendered_pairs import (
     ANSWERS,
@@ -38,16 +38,17 @@ from phibench.studies.dense.rendered_pairs import (
     BoundAtStroke,
     FreeFloor,
     MethodOutcome,
-    Near,
+    NearLimits,
     RenderedRoom,
     bound_at,
     cell_bound,
     outcome,
 )
-from phibench.studies.dense.study import STUDY, parts_of
+from phibench.studies.dense.study import STUDY
+from phibench.studies.dense.tables import parts_of
 from phibench.studies.framework import read_settings
 
-ASKED = Asked((0.425,), 4.0, (1.0, 2.0, 4.0), 0.2, 3.0, 0.05)
+ASKED = PerfectMatchTask((0.425,), 4.0, (1.0, 2.0, 4.0), 0.2, 3.0, 0.05)
 ROOM = lab(())
 
 
@@ -58,25 +59,27 @@ def exact() -> dict[str, Rig]:
 
 def test_the_central_model_costs_what_the_score_says(exact: dict[str, Rig]) -> None:
     """In the lab the score's own oracles give 0.470 % (`test_what_the_central_model_costs`), printed to 3 digits."""
-    found = of_rig(ASKED, fewer_pixels(exact[SPHERE], 4.0), ROOM, 0.425)
+    found = rig_numbers(ASKED, coarser_rig(exact[SPHERE], 4.0), ROOM, 0.425)
     assert found[CENTRAL] == pytest.approx(0.470, rel=5e-3)
     assert found[TWICE] > 95.0
 
 
 def test_a_mirror_with_one_viewpoint_costs_nothing_and_scales_with_the_stroke(exact: dict[str, Rig]) -> None:
     """Where rays meet in the focus, D is proportional to h: a stroke that is 1 % longer than told makes D 1 / 1.01."""
-    found = of_rig(ASKED, fewer_pixels(exact[IN_FOCUS], 4.0), ROOM, 0.425)
+    found = rig_numbers(ASKED, coarser_rig(exact[IN_FOCUS], 4.0), ROOM, 0.425)
     assert found[CENTRAL] < 1e-9
     assert found[NEAR] > 0.0
-    error = through_nominal(ASKED, exact[IN_FOCUS], Misalignment(stroke_relative=0.01), ROOM, 0.425)
+    error = nominal_rig_error(ASKED, exact[IN_FOCUS], Misalignment(stroke_relative=0.01), ROOM, 0.425)
     assert error == pytest.approx(100.0 * (1.0 - 1.0 / 1.01), rel=1e-6)
-    assert through_nominal(ASKED, exact[SPHERE], Misalignment(), ROOM, 0.425) < 1e-7
+    assert nominal_rig_error(ASKED, exact[SPHERE], Misalignment(), ROOM, 0.425) < 1e-7
 
 
 def test_sigma_grows_with_the_error_of_a_match_and_not_with_the_pixels(exact: dict[str, Rig]) -> None:
     """Sigma is that of the full camera whatever the divisor: grids of other pixels agree to some per cent."""
-    one, coarse = (of_rig(replace(ASKED, divisor=d), fewer_pixels(exact[SPHERE], d), ROOM, 0.425) for d in (4.0, 8.0))
-    twice = of_rig(replace(ASKED, matching_px=0.4), fewer_pixels(exact[SPHERE], 4.0), ROOM, 0.425)
+    one, coarse = (
+        rig_numbers(replace(ASKED, divisor=d), coarser_rig(exact[SPHERE], d), ROOM, 0.425) for d in (4.0, 8.0)
+    )
+    twice = rig_numbers(replace(ASKED, matching_px=0.4), coarser_rig(exact[SPHERE], 4.0), ROOM, 0.425)
     assert twice[SIGMA] == pytest.approx(2.0 * one[SIGMA], rel=1e-9)
     assert coarse[SIGMA] == pytest.approx(one[SIGMA], rel=0.03)
 
@@ -93,7 +96,7 @@ def test_cells_have_the_bound_of_their_middle_pixels() -> None:
     camera has a quarter of its pixels, and by jumps at edges of D.
     """
     rig = smaller(Rig(), 4.0)
-    fine, coarse = (correspondence(ROOM, r.at(0.0), r.at(0.425)) for r in (rig, fewer_pixels(rig, CELL_PX)))
+    fine, coarse = (correspondence(ROOM, r.at(0.0), r.at(0.425)) for r in (rig, coarser_rig(rig, CELL_PX)))
     middle = slice(CELL_PX // 2, None, CELL_PX)
     height, width = (min(a, b) for a, b in zip(fine.seen[middle, middle].shape, coarse.seen.shape, strict=True))
     here, there = fine.uv_px[middle, middle][:height, :width], coarse.uv_px[:height, :width]
@@ -113,7 +116,7 @@ def test_cells_have_the_bound_of_their_middle_pixels() -> None:
 def test_shares_of_the_near_space_and_of_the_floor() -> None:
     """The truth is right everywhere; an answer of nothing nowhere; 4 cm more than the truth, but not 6, is right."""
     truth = truth_of(smaller(Rig(), 4.0))
-    near = Near(3.0, 0.05)
+    near = NearLimits(3.0, 0.05)
     floor = FreeFloor.of(truth, near)
     full = outcome(truth.depth_m, truth, near, floor)
     assert full == MethodOutcome(1.0, 0.0, 1.0, 1.0)
@@ -129,10 +132,10 @@ def test_hidden_pixels_count_as_unknown() -> None:
     """Pixels that the up image does not show have no sigma; they are no part of the near space that is right."""
     found = truth_of(smaller(Rig(), 8.0)).found
     sigma = np.where(found.seen, 0.01 * found.depth_m, np.nan)
-    told = bound_at(0.425, found, sigma, Near(3.0, 0.05))
+    told = bound_at(0.425, found, sigma, NearLimits(3.0, 0.05))
     assert told.twice == found.seen.sum() / found.of_room.sum()
     assert (told.median, told.over_all) == (pytest.approx(0.01), pytest.approx(0.01))
-    none = bound_at(0.425, found, np.where(found.seen, np.inf, np.nan), Near(3.0, 0.05))
+    none = bound_at(0.425, found, np.where(found.seen, np.inf, np.nan), NearLimits(3.0, 0.05))
     assert (none.median, none.near) == (np.inf, 0.0)
 
 

@@ -35,13 +35,13 @@ from phibench.studies.isotropy.azimuth_errors import (
     sideways,
 )
 from phibench.studies.isotropy.lines import (
-    beside,
-    beside_best,
+    best_line_distances,
     epipolar_line,
     half_width_rad,
-    hidden_by,
+    hidden_flags,
     hidden_share,
-    moved,
+    line_distances,
+    moved_rig,
     occlusion_findings,
 )
 from phibench.studies.isotropy.room_edges import SeenEdge
@@ -57,7 +57,7 @@ LIGHT = np.array([3e4, 3e4, 2e4])
 def test_hidden_azimuths_by_rays_are_those_of_the_closed_form(depth_m: float, height_m: float) -> None:
     """The first sensor is hidden from within +- the half width; the count of a circle is good to one step."""
     count = 20000
-    found = hidden_by(RIG.at(0.0), moved(RIG, 0.425).at(0.0), circle(depth_m, height_m, count)).mean()
+    found = hidden_flags(RIG.at(0.0), moved_rig(RIG, 0.425).at(0.0), circle(depth_m, height_m, count)).mean()
     expected = half_width_rad(RIG, 0.425, depth_m, height_m) / math.pi
     assert found == pytest.approx(expected, abs=2.5 / count)
     if height_m == 0.5:
@@ -111,13 +111,13 @@ def test_lines_are_radial_only_for_the_aligned_rig() -> None:
 
 def test_distances_from_lines_by_hand() -> None:
     points = np.array([[0.0, 0.0], [1.0, 1.5], [2.0, 2.0]])
-    assert beside(points, np.zeros(2), np.array([3.0, 3.0])) == pytest.approx([0.0, 0.5 / math.sqrt(2.0), 0.0])
+    assert line_distances(points, np.zeros(2), np.array([3.0, 3.0])) == pytest.approx([0.0, 0.5 / math.sqrt(2.0), 0.0])
     rng = generator("test", "isotropy", "line")
     noisy = np.stack([np.arange(9.0), 2.0 * np.arange(9.0)], axis=-1) + rng.normal(0.0, 0.1, (9, 2))
-    best = beside_best(noisy)
+    best = best_line_distances(noisy)
     for turn in (-0.01, 0.01):  # no neighbouring line has a smaller sum of squares
         centre, slope = noisy.mean(axis=0), math.atan(2.0) + turn
-        other = beside(noisy, centre, centre + [math.cos(slope), math.sin(slope)])
+        other = line_distances(noisy, centre, centre + [math.cos(slope), math.sin(slope)])
         assert np.sum(best**2) < np.sum(other**2) + 0.02
 
 

@@ -35,7 +35,7 @@ from phibench.studies.mirror.misalignment_costs import DIRECTIONS, UNCALIBRATED,
 from phibench.studies.mirror.place_bounds import BlurBounds, place_bound
 from phibench.studies.mirror.study import STUDY
 from phibench.studies.mirror.tables import MirrorSettings, PlaceMap, pick_table
-from phibench.studies.mirror.visible_places import floor_from_m, measured
+from phibench.studies.mirror.visible_places import floor_from_m, measured_places
 
 SHAPES = ("sphere", "ellipsoid", "paraboloid", "hyperboloid", "cone")
 STROKE_M = 0.425
@@ -178,7 +178,7 @@ def test_places_outside_of_the_field_are_not_measured() -> None:
     rig, step = _rig("cone"), 0.05
     heights = np.arange(0.0, 2.5, step)
     points = np.stack([np.full_like(heights, 4.0), np.zeros_like(heights), heights], axis=-1)
-    seen = heights[measured(rig, points, STROKE_M, 4.0, np.array([0.0]))]
+    seen = heights[measured_places(rig, points, STROKE_M, 4.0, np.array([0.0]))]
     assert seen.min() == pytest.approx(0.45 + 0.22 + STROKE_M, abs=step)
     # down, its rim sees up to 102 degrees less four pixels
     top = 0.45 + 0.22 + 4.0 * math.tan(math.radians(meridian(rig).field_deg(4.0)[1] - 90.0))

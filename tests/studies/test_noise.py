@@ -26,7 +26,7 @@ from phibench.scenes.random_streams import generator
 from phibench.scenes.rig import POSITIONS, Rig
 from phibench.studies.framework import Finding, StudyDatasets, read_settings
 from phibench.studies.image_cutout import Shot, SpotPair, bounds_of, cut_region, cut_rig, drawn_pair
-from phibench.studies.noise.conditions import BASE, FACTORS, OFF, applied
+from phibench.studies.noise.conditions import BASE, FACTORS, OFF, shot_and_rig
 from phibench.studies.noise.study import STUDY
 from phibench.studies.noise.tables import (
     Elasticity,
@@ -64,7 +64,7 @@ def test_every_factor_changes_its_own_number_only() -> None:
     rig, base = Rig(), sensor("mjpeg", jpeg_quality=85)
     for name, factor in FACTORS.items():
         level = {"jpeg_quality": 40.0, "adc_bits": 12.0, "speckle_contrast": 0.5}.get(name, 2.0 * factor.base)
-        shot, changed = applied(name, "mjpeg", rig, level)
+        shot, changed = shot_and_rig(name, "mjpeg", rig, level)
         numbers = shot.sensor.model_dump()
         different = {k for k, v in base.model_dump().items() if numbers[k] != v}
         assert different == {
@@ -76,12 +76,12 @@ def test_every_factor_changes_its_own_number_only() -> None:
         }.get(name, set())
         assert (shot.laser_level != 1.0) == (name == "power_mw")
         assert (changed != rig) == (name in ("blur_sigma_px", "focus_distance_m"))
-    assert applied(BASE, "mjpeg", rig, OFF) == (Shot(base), rig)
+    assert shot_and_rig(BASE, "mjpeg", rig, OFF) == (Shot(base), rig)
 
 
 def test_converters_share_their_range() -> None:
     for bits in (6, 8, 12):
-        other, base = applied("adc_bits", "bayer-raw", Rig(), float(bits))[0].sensor, sensor("bayer-raw")
+        other, base = shot_and_rig("adc_bits", "bayer-raw", Rig(), float(bits))[0].sensor, sensor("bayer-raw")
         assert other.adc_bits == bits
         # black and the largest code stand for the same electrons, but for the code that 2^bits - 1 leaves
         assert other.black_level_dn / other.dn_per_e == pytest.approx(base.black_level_dn / base.dn_per_e)
@@ -90,9 +90,9 @@ def test_converters_share_their_range() -> None:
 
 
 def test_speckle_contrast_is_that_of_the_flux() -> None:
-    shot = applied("speckle_contrast", "bayer-raw", Rig(), 0.5)[0]
+    shot = shot_and_rig("speckle_contrast", "bayer-raw", Rig(), 0.5)[0]
     assert shot.sensor.speckle_m == pytest.approx(4.0)
-    assert applied("speckle_contrast", "bayer-raw", Rig(), OFF)[0].sensor.speckle_m is None
+    assert shot_and_rig("speckle_contrast", "bayer-raw", Rig(), OFF)[0].sensor.speckle_m is None
 
 
 # -- the cut sensor -----------------------------------------------------------------------------------------------
@@ -144,7 +144,7 @@ def test_draws_are_named_and_boxes_hold_their_spots(tiny_dataset: Path) -> None:
 
 def test_speckle_moves_the_bound_of_a_draw(tiny_dataset: Path) -> None:
     _, pair, _ = _pair(tiny_dataset)
-    shot = applied("speckle_contrast", "bayer-raw", pair.rig, 1.0)[0]
+    shot = shot_and_rig("speckle_contrast", "bayer-raw", pair.rig, 1.0)[0]
     electrons = [bounds_of(shot, pair, ("test", k))["down"].electrons for k in range(200)]
     mean = bounds_of(shot, pair)["down"].electrons
     # a contrast of 1: the standard error of the mean of 200 is 7 %, of the contrast about 10 %; 4 sigma

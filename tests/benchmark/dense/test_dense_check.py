@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from phibench.benchmark.dense.dense_check import check_of_dense_outcomes, with_exchanged
-from phibench.benchmark.dense.dense_easy import EasyDensePairs, EasyTruth, points_of
+from phibench.benchmark.dense.easy_dense_pairs import EasyDensePairs, EasyTruth, points_of
 from phibench.benchmark.isolation.method_check import MethodCheck
 from phibench.estimator.dense.dense_interface import DenseAnswer
 from phibench.estimator.geometry.reflection import image_of

@@ -15,14 +15,14 @@ from helpers.bench_cases import RIG, Cases, cases, records
 from phibench.benchmark.pair_sets.wanted_pairs import CalibratedPairs, samples_of_calibration
 from phibench.benchmark.reports import bench as benching
 from phibench.benchmark.scores.answer_errors import Rules
-from phibench.benchmark.scores.metrics import measure, prepared
+from phibench.benchmark.scores.metrics import measure, prepared_records
 from phibench.benchmark.sealed.score_check import check_score
 from phibench.calibration.rig.bundle import Bundle
 from phibench.calibration.rig.calibration_file import Calibration, CalibrationError, read_calibration, write_calibration
 from phibench.cli.main import main
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.read import Dataset, open_finished
-from phibench.estimator.geometry.rig_parameters import PARAMETERS, RENAMED, changed, prior_sigmas
+from phibench.estimator.geometry.rig_parameters import PARAMETERS, RENAMED, changed_rig, prior_sigmas
 from phibench.estimator.interface import Answer, Outcome, Spot
 from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.random_streams import generator
@@ -35,11 +35,11 @@ PIXEL2 = 0.02**2 * np.eye(2)
 
 
 def calibration(values: np.ndarray, nominal: Rig = RIG, **made_from: object) -> Calibration:
-    return Calibration(changed(nominal, values), nominal, PARAMETERS, values, COVARIANCE, dict(made_from), "0" * 64)
+    return Calibration(changed_rig(nominal, values), nominal, PARAMETERS, values, COVARIANCE, dict(made_from), "0" * 64)
 
 
 def written(path: Path, values: np.ndarray, nominal: Rig, **made_from: object) -> Path:
-    bundle = Bundle(changed(nominal, values), values, COVARIANCE, 0.0, 0)
+    bundle = Bundle(changed_rig(nominal, values), values, COVARIANCE, 0.0, 0)
     return write_calibration(path, bundle, nominal, dict(made_from))
 
 
@@ -103,7 +103,7 @@ def test_pairs_carry_rig_stroke_and_covariance() -> None:
     seen = CalibratedPairs(base, calibration(values, dataset="x"))
     for number in range(3):
         pair, truth, before = seen.pair(number), seen.truth(number), base.truth(number)
-        assert pair.rig == truth.nominal_rig == changed(RIG, values)
+        assert pair.rig == truth.nominal_rig == changed_rig(RIG, values)
         assert truth.true_rig == before.true_rig
         assert pair.stroke_m == truth.nominal_stroke_m == pytest.approx(1.01 * before.stroke_m + 2e-3)
         assert np.array_equal(pair.calibration_covariance, COVARIANCE)
@@ -114,7 +114,7 @@ def test_pairs_carry_rig_stroke_and_covariance() -> None:
 def test_coverage_is_that_of_the_pulls() -> None:
     base = cases(40)
     rng = generator("tests", "coverage")
-    table = prepared(records(base, noisy_answers(base, rng), Rules()))
+    table = prepared_records(records(base, noisy_answers(base, rng), Rules()))
     pulls = table.filter(image="down")["depth_pull"].to_numpy()
     found = measure(table, Rules(), "tests", names=("coverage_depth",))["coverage_depth"]
     assert found.n == 40

@@ -39,12 +39,12 @@ from phibench.benchmark.scores.beyond_images import (
     TIMES_FINDING,
     _tried,
     at_least,
-    clipped,
+    clipped_covariances,
     excesses,
     most_found,
     searched_px2,
 )
-from phibench.benchmark.scores.metrics import measure, prepared
+from phibench.benchmark.scores.metrics import measure, prepared_records
 from phibench.datasets.read import open_finished
 from phibench.estimator.interface import Answer, Spot
 from phibench.estimator.pair_set import CachedPairs, PairTruth
@@ -78,7 +78,7 @@ def faint_pairs() -> Cases:
 
 def table(oracle: Oracle, of: Cases | None = None) -> pl.DataFrame:
     of = of or pairs()
-    return prepared(records(of, outcomes(of, oracle), RULES))
+    return prepared_records(records(of, outcomes(of, oracle), RULES))
 
 
 def marked(oracle: Oracle, of: Cases | None = None) -> dict[str, str]:
@@ -217,7 +217,7 @@ def test_clipped_covariances_and_the_number_of_tests() -> None:
     """A long covariance keeps its short axis and its directions; chances count as many tests as there are."""
     turn = np.array([[0.8, -0.6], [0.6, 0.8]])
     given = turn @ np.diag([9.0, 0.04]) @ turn.T
-    cut = clipped(np.stack([given, np.full((2, 2), np.nan)]))
+    cut = clipped_covariances(np.stack([given, np.full((2, 2), np.nan)]))
     assert cut[0] == pytest.approx(turn @ np.diag([0.5, 0.04]) @ turn.T, rel=1e-12)
     assert np.isnan(cut[1]).all()
     tried = list(_tried(table(HONEST)))

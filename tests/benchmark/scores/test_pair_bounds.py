@@ -29,7 +29,7 @@ from scipy.linalg import block_diag
 from phibench.benchmark.isolation.method_references import resolve
 from phibench.benchmark.scores.answer_errors import Rules
 from phibench.benchmark.scores.beyond_images import MODEL_MARGIN, RAW_MARGIN, excesses
-from phibench.benchmark.scores.metrics import METRICS, PAIR_TWINS, applies, measure, prepared
+from phibench.benchmark.scores.metrics import METRICS, PAIR_TWINS, applies, measure, prepared_records
 from phibench.benchmark.scores.score import score_outcomes
 from phibench.benchmark.scores.score_document import Flag, MethodCard
 from phibench.benchmark.scores.score_tables import leaderboard, scores_csv, scores_json
@@ -53,7 +53,7 @@ def raw_cases(samples: int = 200, draws: int = 1) -> Cases:
 
 def table(oracle, pairs=None):
     pairs = pairs or raw_cases()
-    return prepared(records(pairs, outcomes(pairs, oracle), RULES))
+    return prepared_records(records(pairs, outcomes(pairs, oracle), RULES))
 
 
 def flagged(oracle, pairs=None):

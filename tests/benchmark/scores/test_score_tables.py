@@ -27,7 +27,7 @@ from phibench.benchmark.scores.score_tables import (
     nothing_answered,
     number,
     print_scores,
-    refused,
+    refusal_text,
     score_table,
 )
 from phibench.estimator.interface import Answer, Outcome, Spot
@@ -207,8 +207,8 @@ def test_a_method_that_takes_none_of_the_pairs_is_not_ranked_and_not_blamed(scor
 
     pairs = cases(20)
     other = score_outcomes(MethodCard.of("chain_fit", kind="built-in"), pairs, outcomes(pairs, refuses), RULES)
-    assert refused(other.records) == why
-    assert [refused(one.records) for one in scored] == ["", "", ""]
+    assert refusal_text(other.records) == why
+    assert [refusal_text(one.records) for one in scored] == ["", "", ""]
     assert nothing_answered([other])
     assert not nothing_answered([*scored, other])  # it is told, and the others are scored
     print_scores([*scored, other], "terminal", "phi", wide=False)

@@ -12,7 +12,7 @@ from helpers.bench_cases import Cases, cases, change, outcomes, records, sampler
 
 from phibench.benchmark.pair_sets.dataset_pairs import BOX_PX, tracks_of
 from phibench.benchmark.scores.answer_errors import MATCH_PX, Rules
-from phibench.benchmark.scores.metrics import measure, prepared
+from phibench.benchmark.scores.metrics import measure, prepared_records
 from phibench.benchmark.scores.record_columns import LEAST_RATIO, THRESHOLDS, perfect_log
 from phibench.estimator.interface import Answer, Outcome, Spot
 from phibench.estimator.pair_set import PairTruth
@@ -22,7 +22,7 @@ NAMES = ("localise", "perfect_localise", "perfect_localise_pair", "find", "false
 
 
 def table(pairs: Cases, oracle) -> pl.DataFrame:
-    return prepared(records(pairs, outcomes(pairs, oracle), RULES))
+    return prepared_records(records(pairs, outcomes(pairs, oracle), RULES))
 
 
 def values(frame: pl.DataFrame, *names: str) -> dict[str, float]:
@@ -90,7 +90,7 @@ def test_find_counts_found_over_visible_and_false() -> None:
     truths = tuple(replace(t, number=n) for n, t in enumerate((first, first, empty, empty)))
     errors = ((0.5, 2.9), (3.1, None), (0.0, None), (None, None))
     asked = [Outcome(n, spots(t, *e), 0.1) for n, (t, e) in enumerate(zip(truths, errors, strict=True))]
-    found = values(prepared(records(Cases(truths), asked, RULES)), "find", "false_per_empty")
+    found = values(prepared_records(records(Cases(truths), asked, RULES)), "find", "false_per_empty")
     assert found["find"] == pytest.approx(2 / (4 + 2))  # 2 found of 4 visible; one false there, one in an empty image
     assert found["false_per_empty"] == pytest.approx(1 / 4)
 

@@ -11,7 +11,7 @@ import pytest
 import scipy
 from helpers.ball_photographs import BallPhotograph, ball_photograph
 
-from phibench.calibration.outline.ball_circle import BallCircle, circles, find_circle, refined
+from phibench.calibration.outline.ball_circle import BallCircle, find_circle, possible_circles, refined_circle
 from phibench.calibration.outline.edge_ring import TURNS, EdgeRing, log_colours
 from phibench.calibration.outline.outline import find_outline
 from phibench.calibration.outline.outline_result import require_near
@@ -68,12 +68,12 @@ def test_the_same_photograph_at_twice_the_size_has_the_same_outline() -> None:
     to that floor.
     """
     photo = photograph(3)
-    small, double = next(circles(photo.light)), np.kron(photo.light, np.ones((2, 2, 1), np.float32))
+    small, double = next(possible_circles(photo.light)), np.kron(photo.light, np.ones((2, 2, 1), np.float32))
     expected = 2.0 * np.array(small.circle_px) + [0.5, 0.5, 0.0]
-    again = next(circles(double))
+    again = next(possible_circles(double))
     np.testing.assert_allclose(again.circle_px, expected, atol=1e-6)
     np.testing.assert_allclose(again.sigma_px, 2.0 * small.sigma_px, rtol=1e-6)
-    large = refined(double, again)
+    large = refined_circle(double, again)
     np.testing.assert_allclose(large.circle_px, expected, atol=0.8)
     assert (large.sigma_px < again.sigma_px).all()
 
@@ -82,7 +82,7 @@ def test_the_same_photograph_at_twice_the_size_has_the_same_outline() -> None:
 def test_a_long_photograph_is_measured_in_finer_squares() -> None:
     """At 1280 x 960 the outline is within 1 px of the true one, nearer than the search at half the size has it."""
     photo = ball_photograph(np.random.default_rng([7, 3]), size=(960, 1280))
-    coarse, fine = next(circles(photo.light)), find_circle(photo.light)
+    coarse, fine = next(possible_circles(photo.light)), find_circle(photo.light)
     assert photo.distance_px(fine.points_px) < min(1.0, photo.distance_px(coarse.points_px))
     assert photo.distance_px(fine.points_px) < 3.0 * fine.sigma_px.max()
 
@@ -98,7 +98,7 @@ def test_radii_narrow_the_search() -> None:
 def test_the_contrast_of_a_curve_beside_the_outline_is_low() -> None:
     """A circle 6 px wider lies in the room's patterns, whose edges are no more frequent on it than beside it."""
     photo = photograph(3)
-    best = next(circles(photo.light, (0.95 * photo.radius_px, 1.05 * photo.radius_px)))
+    best = next(possible_circles(photo.light, (0.95 * photo.radius_px, 1.05 * photo.radius_px)))
     u, v, radius = best.circle_px
     there, beside = (EdgeRing(log_colours(photo.light), (u, v, radius + off)) for off in (0.0, 6.0))
     curve = np.array([0.0, 0.0, 0.0, *best.ellipse_px])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import ndimage
 
-from phibench.calibration.outline.ball_circle import on_limb
+from phibench.calibration.outline.ball_circle import limb_beside_circle
 from phibench.calibration.outline.edge_ring import TURNS, EdgeRing, LimbRing, log_colours
 
 ROWS, COLUMNS, FINE = 300, 320, 4
@@ -55,7 +55,7 @@ def test_a_stronger_edge_inside_is_not_the_limb() -> None:
     by_edges = EdgeRing(log_colours(light), CIRCLE)
     wrong = np.array([-6.0, 0.0, 0.0, 0.0, 0.0])
     assert by_edges.contrast(wrong) > by_edges.contrast(np.zeros(5))
-    found = on_limb(light, (CIRCLE[0], CIRCLE[1], CIRCLE[2] - 6.0), PICTURE_BLUR_PX)
+    found = limb_beside_circle(light, (CIRCLE[0], CIRCLE[1], CIRCLE[2] - 6.0), PICTURE_BLUR_PX)
     assert found
     # the step reaches into the windows of 5 px; by edges the radius is 6 px too small
     np.testing.assert_allclose(found.circle_px, CIRCLE, atol=0.3)
@@ -63,7 +63,7 @@ def test_a_stronger_edge_inside_is_not_the_limb() -> None:
 
 def test_a_start_many_pixels_off_is_enough() -> None:
     u, v, radius = CIRCLE
-    found = on_limb(ball(), (u + 6.0, v - 5.0, radius + 7.0), PICTURE_BLUR_PX)
+    found = limb_beside_circle(ball(), (u + 6.0, v - 5.0, radius + 7.0), PICTURE_BLUR_PX)
     assert found
     np.testing.assert_allclose(found.circle_px, CIRCLE, atol=0.05)
     assert found.edges > 0.95
@@ -72,4 +72,4 @@ def test_a_start_many_pixels_off_is_enough() -> None:
 def test_light_without_a_reflection_has_no_limb() -> None:
     """A smooth wall has none anywhere; a grey disc's edge is a weak one, about which nothing turns."""
     rows, columns = np.mgrid[:ROWS, :COLUMNS]
-    assert on_limb(1.0 + 1e-3 * rows + 2e-3 * columns, CIRCLE, PICTURE_BLUR_PX) is None
+    assert limb_beside_circle(1.0 + 1e-3 * rows + 2e-3 * columns, CIRCLE, PICTURE_BLUR_PX) is None

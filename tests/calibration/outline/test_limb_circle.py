@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from phibench.calibration.outline.ball_circle import BallCircle, beside_limb, find_circle
+from phibench.calibration.outline.ball_circle import BallCircle, edge_or_limb_circle, find_circle
 from phibench.calibration.outline.limb_circle import LimbCircle, limb_circle
 from phibench.estimator.spots.image_planes import ImageError
 from phibench.scenes.random_streams import generator
@@ -79,7 +79,7 @@ def test_a_ball_that_is_dark_on_one_side_claims_less(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr("phibench.calibration.outline.ball_circle.limb_circle", lambda *_: replace(limb, gain=0.5))
     edges = BallCircle((300.0, 296.0, 226.0), (0.0, 0.0), 0.25 * np.eye(3), 20.0, 3.0, np.zeros(360))
     # 0.3 % of the radius is what the model errs
-    assert beside_limb(np.zeros((600, 600)), edges).sigma_px[1] > 0.003 * 226.0 * np.sqrt(20.0)
+    assert edge_or_limb_circle(np.zeros((600, 600)), edges).sigma_px[1] > 0.003 * 226.0 * np.sqrt(20.0)
 
 
 def test_a_clear_edge_stays_where_it_is() -> None:
@@ -103,6 +103,6 @@ def test_where_neither_is_clearly_better_the_middle_is_the_answer(
     limb = LimbCircle((300.0, 300.0, 240.0), own, gain)
     monkeypatch.setattr("phibench.calibration.outline.ball_circle.limb_circle", lambda *_: limb)
     edges = BallCircle((300.0, 300.0, 230.0), (0.0, 0.0), own, contrast, 3.0, np.zeros(360))
-    found = beside_limb(np.zeros((600, 600)), edges)
+    found = edge_or_limb_circle(np.zeros((600, 600)), edges)
     assert found.circle_px == pytest.approx((300.0, 300.0, radius_px))
     assert least_px < found.sigma_px.min() <= found.sigma_px.max() < least_px + 0.2

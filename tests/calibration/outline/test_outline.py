@@ -10,7 +10,7 @@ import scipy
 from helpers.limb_frames import drawn_rig, limb_light
 
 from phibench.calibration.outline.first_circle import circles_by_size, grey, sphere_from_circle, sphere_from_rays
-from phibench.calibration.outline.limb_image import Plane, Tap, binned, planes_of
+from phibench.calibration.outline.limb_image import Plane, Tap, binned_planes, planes_of
 from phibench.calibration.outline.limb_sectors import Sectors, _medians, scatter
 from phibench.calibration.outline.outline import _approach as approach
 from phibench.calibration.outline.outline import find_outline, fit_outline, outline_at
@@ -130,7 +130,7 @@ def test_a_long_picture_is_fitted_in_squares(case, frames, monkeypatch: pytest.M
     assert error @ np.linalg.solve(found.covariance_m2, error) < scipy.stats.chi2.isf(1e-4, 3)
     assert (found.sigma_m < 1.5 * whole.sigma_m).all()
     assert found.blur_px == pytest.approx(whole.blur_px, abs=0.4)
-    squares = binned(planes_of(frames["mjpeg"], card), 2)
+    squares = binned_planes(planes_of(frames["mjpeg"], card), 2)
     again = fit_outline(outline_at(squares, binned_rig(rig, 2), found.sphere_in_camera_m))
     assert found.shift_rms_px == pytest.approx(2.0 * again.shift_rms_px, rel=0.05)
     assert np.allclose((binned_rig(rig, 2).outline_px() + 0.5) * 2.0 - 0.5, rig.outline_px())
@@ -161,7 +161,7 @@ def test_squares_hold_the_mean_of_what_is_usable(block: int) -> None:
     rng = np.random.default_rng(3)
     values, usable = rng.random((7, 8)), rng.random((7, 8)) > 0.3
     plane = Plane(values, usable, (((Tap(0.7, 0, 1, 0), Tap(0.3, 1)),) * 4))
-    small = binned((plane,), block)[0]
+    small = binned_planes((plane,), block)[0]
     for v, u in np.ndindex(small.values.shape):
         square = slice(v * block, (v + 1) * block), slice(u * block, (u + 1) * block)
         assert small.usable[v, u] == usable[square].any()

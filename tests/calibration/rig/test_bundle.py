@@ -12,11 +12,11 @@ from helpers.calibration_cases import OUTLINE2, RIG, STROKE, apparent
 from helpers.oracles import true_pixel
 
 from phibench.calibration.outline.outline_result import Outline, PoseMeasurement, mean_outline
-from phibench.calibration.rig.bundle import Bundle, KnownSpot, _Problem, calibrate, seen_at
+from phibench.calibration.rig.bundle import Bundle, KnownSpot, _Problem, calibrate, mirror_pixels
 from phibench.calibration.rig.calibration_file import CalibrationError, read_calibration, write_calibration
 from phibench.cli import main as cli
 from phibench.datasets.common.errors import DatasetError
-from phibench.estimator.geometry.rig_parameters import PARAMETERS, changed, has_effect, prior_sigmas, stroke_of
+from phibench.estimator.geometry.rig_parameters import PARAMETERS, changed_rig, has_effect, prior_sigmas, stroke_of
 from phibench.scenes.rig import Rig
 
 PIXEL2 = 0.05**2 * np.eye(2)
@@ -39,11 +39,11 @@ def spots_of(true: Rig, values: np.ndarray, rng: np.random.Generator | None) -> 
 
 
 def test_seen_at_against_the_quartic() -> None:
-    true = changed(RIG, 0.5 * prior_sigmas())
+    true = changed_rig(RIG, 0.5 * prior_sigmas())
     points = np.array([[1.0, 1.0, 0.5], [-2.0, 0.5, 1.2]])
     start = np.array([true_pixel(RIG, 0.0, point) for point in points])
     expected = [true_pixel(true, 0.0, point) for point in points]
-    assert seen_at(true.at(0.0), points, start) == pytest.approx(np.array(expected), abs=1e-6)
+    assert mirror_pixels(true.at(0.0), points, start) == pytest.approx(np.array(expected), abs=1e-6)
 
 
 def test_exact_data_of_the_nominal_rig_change_nothing() -> None:
@@ -81,7 +81,7 @@ def test_covariance_by_simulation(rigs: int, wrong: float) -> None:
     pulls, misfits, degrees, own = [], [], 0, has_effect(RIG)
     for _ in range(rigs):
         values = rng.normal(0.0, sigmas)
-        true = changed(RIG, values)
+        true = changed_rig(RIG, values)
         bundle = calibrate(RIG, apparent(true, rng), spots_of(true, values, rng), sigmas=sigmas)
         off = (bundle.values - values)[own]
         pulls.append(off @ np.linalg.solve(bundle.covariance[np.ix_(own, own)], off))

@@ -19,7 +19,7 @@ from phibench.estimator.dense.panorama_matchers import (
     dense_sgbm_exact,
     dense_sift,
 )
-from phibench.estimator.dense.sweep import dense_stroke, dense_sweep, hidden
+from phibench.estimator.dense.sweep import dense_stroke, dense_sweep, hidden_points
 from phibench.estimator.dense.unrolled_pair import luma_codes, maps_of
 from phibench.estimator.geometry.epipolar_line import up_image
 from phibench.estimator.geometry.reflection import image_of
@@ -149,7 +149,7 @@ def test_a_point_behind_another_is_hidden() -> None:
     maps = maps_of(small_rig(), STROKE_M, WIDTH_PX)
     inverse = np.full((maps.grid.height_px, WIDTH_PX), 0.2)
     inverse[50:60, 100:120] = 1.0
-    mask = hidden(maps, inverse)
+    mask = hidden_points(maps, inverse)
     rows, columns = np.nonzero(mask)
     assert 100 <= columns.min()
     assert columns.max() < 120

@@ -9,7 +9,7 @@ from helpers.oracles import random_rig, random_spot, true_pixel
 from scipy import optimize
 
 from phibench.estimator.geometry.least_squares_depth import GeneralDepth, depth_general
-from phibench.estimator.geometry.rig_parameters import PARAMETERS, changed, prior_sigmas, stroke_of
+from phibench.estimator.geometry.rig_parameters import PARAMETERS, changed_rig, prior_sigmas, stroke_of
 from phibench.estimator.geometry.status import Status
 from phibench.estimator.geometry.triangulate import meeting, meeting_gradients
 from phibench.scenes.rig import Rig
@@ -84,7 +84,7 @@ def simulate(n: int) -> tuple[np.ndarray, GeneralDepth]:
     sigmas, noise = 0.05 * prior_sigmas(), 1e-2 * np.eye(2)
     downs, ups, truth = [], [], []
     for _ in range(n):
-        true = changed(RIG, values := rng.normal(0.0, sigmas))
+        true = changed_rig(RIG, values := rng.normal(0.0, sigmas))
         h = float(stroke_of(STROKE, values)) + rng.normal(0.0, 2e-4)
         downs.append(true_pixel(true, 0.0, SPOT) + rng.multivariate_normal([0, 0], noise))
         ups.append(true_pixel(true, h, SPOT) + rng.multivariate_normal([0, 0], noise))
@@ -115,7 +115,7 @@ def test_sigma_and_false_alarms_by_simulation() -> None:
 
 def test_a_broken_rig_is_noticed() -> None:
     """A mirror 5 mm beside its place: seen across, at right angles to the shift, the rays miss each other."""
-    broken = changed(RIG, np.where(np.array(PARAMETERS) == "decentre_x_m", 5e-3, 0.0))
+    broken = changed_rig(RIG, np.where(np.array(PARAMETERS) == "decentre_x_m", 5e-3, 0.0))
     spot = np.array([0.3, 2.0, 0.5])
     down, up = true_pixel(broken, 0.0, spot), true_pixel(broken, STROKE, spot)
     small = 1e-4 * np.eye(2)

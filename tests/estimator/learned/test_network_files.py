@@ -12,7 +12,7 @@ import pytest
 from phibench.estimator.learned import networks
 from phibench.estimator.learned.network_file import _fields, read_model
 from phibench.estimator.learned.network_graphs import CROP, DETECT
-from phibench.estimator.learned.networks import Network, NetworkError, covariances, sealed, shipped
+from phibench.estimator.learned.networks import Network, NetworkError, covariances, sealed_model, shipped_network
 from phibench.scenes.random_streams import generator
 
 FOLDER = Path(networks.__file__).parent
@@ -130,7 +130,7 @@ def nothing_runs(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_an_attack_is_refused_in_a_sentence_before_anything_runs(name: str, attack: str, tmp_path: Path) -> None:
     change, words = WITH_WORDS[attack]
     path = tmp_path / "mine.onnx"
-    path.write_bytes(sealed(change(BARE[name])))
+    path.write_bytes(sealed_model(change(BARE[name])))
     with pytest.raises(NetworkError) as caught:
         Network(path, name)
     said = str(caught.value)
@@ -145,7 +145,7 @@ def test_one_output_of_two_is_refused(tmp_path: Path) -> None:
         last = max(k for k, (n, _) in enumerate(graph) if n == OUTPUT)
         return [*graph[:last], *graph[last + 1 :]]
 
-    (tmp_path / "mine.onnx").write_bytes(sealed(in_graph(without_last)(BARE[CROP])))
+    (tmp_path / "mine.onnx").write_bytes(sealed_model(in_graph(without_last)(BARE[CROP])))
     with pytest.raises(NetworkError, match="has the outputs uv_px: uv_px, factor are needed"):
         Network(tmp_path / "mine.onnx", CROP)
 
@@ -154,7 +154,7 @@ def test_one_output_of_two_is_refused(tmp_path: Path) -> None:
 def test_the_pinned_hash_is_compared_before_anything_runs(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(networks, "SHIPPED", {CROP: "0" * 64})
     with pytest.raises(NetworkError, match="belongs to another release"):
-        shipped(CROP)
+        shipped_network(CROP)
 
 
 def test_shipped_files_are_written_as_they_are_read() -> None:
@@ -183,7 +183,7 @@ def test_random_damage_ends_in_a_sentence_or_in_other_weights(tmp_path: Path, mo
         data = bytearray(BARE[name])
         near = (0, heads[name] - 300, 0)[k % 3], (1500, len(data), len(data))[k % 3]
         data[int(rng.integers(*near))] ^= int(rng.integers(1, 256))
-        path.write_bytes(sealed(bytes(data)))
+        path.write_bytes(sealed_model(bytes(data)))
         said = refusal(path, name)
         assert said.isprintable()
         refused += bool(said)
@@ -194,7 +194,7 @@ def test_thresholds_and_factors_of_any_kind(tmp_path: Path, monkeypatch: pytest.
     monkeypatch.setattr(networks, "_session", lambda model, file: None)
     for text, words in (("{}", "no two thresholds"), ("[1", "no two"), ('{"srgb8": [1, NaN]}', "not finite")):
         path = tmp_path / "mine.onnx"
-        path.write_bytes(sealed(entry("thresholds", text)(BARE[DETECT])))
+        path.write_bytes(sealed_model(entry("thresholds", text)(BARE[DETECT])))
         with pytest.raises(NetworkError, match=words):
             Network(path, DETECT).thresholds("srgb8")
     extreme = covariances(np.array([[1e3, 0.0, -1e3], [-1e30, 1.0, 1e30]]), 1.0)

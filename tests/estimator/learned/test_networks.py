@@ -27,7 +27,14 @@ from phibench.estimator.learned.network_input import (
     filter_planes,
     frame_input,
 )
-from phibench.estimator.learned.networks import Network, NetworkError, covariances, heat_peaks, sealed, shipped
+from phibench.estimator.learned.networks import (
+    Network,
+    NetworkError,
+    covariances,
+    heat_peaks,
+    sealed_model,
+    shipped_network,
+)
 from phibench.estimator.methods.registry import METHODS, learned_crop, learned_detect
 from phibench.scenes.random_streams import generator
 from tools import crop_training, frame_training
@@ -194,7 +201,7 @@ def test_peaks_of_heat_are_the_largest_of_five_cells_inside_the_part() -> None:
 def test_shipped_networks_are_small_and_give_the_same_bytes(name: str) -> None:
     file = FOLDER / f"{name}.onnx"
     assert file.stat().st_size <= 1_000_000
-    assert shipped(name).metadata["version"] == networks.VERSIONS[name]
+    assert shipped_network(name).metadata["version"] == networks.VERSIONS[name]
     inputs = {"planes": generator("planes").normal(size=(3, 4, 32, 32)).astype(np.float32)}
     inputs["scalars"] = np.zeros((3, SCALARS), np.float32)
     if name != CROP:
@@ -212,10 +219,10 @@ def test_a_mirrored_window_has_the_mirrored_answer() -> None:
     light = 1500.0 * np.exp(-0.5 * ((u - 14.3) ** 2 + (v - 17.1) ** 2) / 1.3**2) * np.array(DEV)[v % 2 + u % 2]
     on, off = (card.black_level_dn + np.rint(card.dn_per_e * (300.0 + x)) for x in (light + noise[0], noise[1]))
     whole = crop_input(on, off, card, DEV)
-    found = shipped(CROP).position(whole)
+    found = shipped_network(CROP).position(whole)
     assert np.abs(found.uv_px - [14.3, 17.1]).max() < 0.5
     for turn in (lambda x: x[..., ::-1], lambda x: x[..., ::-1, :], lambda x: np.swapaxes(x, -1, -2)):
-        seen = shipped(CROP).position(replace(whole, planes=np.ascontiguousarray(turn(whole.planes))))
+        seen = shipped_network(CROP).position(replace(whole, planes=np.ascontiguousarray(turn(whole.planes))))
         marked = turn(np.stack([u, v]).astype(float))  # where each pixel of the turned window comes from
         slopes = np.array([[marked[i, 0, 1] - marked[i, 0, 0], marked[i, 1, 0] - marked[i, 0, 0]] for i in (0, 1)])
         np.testing.assert_allclose(slopes @ seen.uv_px + marked[:, 0, 0], found.uv_px, rtol=0, atol=1e-4)
@@ -254,7 +261,7 @@ def test_the_network_of_crops_is_what_its_description_says() -> None:
     less = np.maximum(convolved(x, w["less.w"], w["less.b"], 1), 0.0).reshape(5, -1)
     pooled = np.concatenate([(weight[:, None] * x).sum(axis=(2, 3)), less, scalars], axis=1)
     y = dense("d2", np.maximum(dense("d1", pooled), 0.0))
-    uv, factor = shipped(CROP).run(planes=planes, scalars=scalars)
+    uv, factor = shipped_network(CROP).run(planes=planes, scalars=scalars)
     np.testing.assert_allclose(uv, np.stack(middle, axis=1) + 0.1 * y[:, :2], rtol=0, atol=1e-3)
     np.testing.assert_allclose(factor, y[:, 2:], rtol=1e-3, atol=1e-3)
 
@@ -264,16 +271,16 @@ def test_the_network_of_crops_is_what_its_description_says() -> None:
 def test_files_that_will_not_do_are_refused_in_one_sentence(name: str, tmp_path: Path, monkeypatch: Any) -> None:
     model = (FOLDER / f"{name}.onnx").read_bytes()
     bare = model[:-76]  # without the entry of its hash
-    assert sealed(bare) == model
+    assert sealed_model(bare) == model
     version = networks.VERSIONS[name].encode()
     other = bare.replace(b"version\x12\x01" + version, b"version\x12\x010")
     assert other != bare
     cases = [
-        (sealed(other), f"is of version 0, this phibench needs version {version.decode()}"),
+        (sealed_model(other), f"is of version 0, this phibench needs version {version.decode()}"),
         (b"", "does not end as"),
         (model[:-1], "does not end as"),
-        (sealed(b"no network"), "is no ONNX model"),
-        (sealed(_renamed(bare, name)), f"not '{name}'"),
+        (sealed_model(b"no network"), "is no ONNX model"),
+        (sealed_model(_renamed(bare, name)), f"not '{name}'"),
     ]
     for place in generator("flipped bits").integers(0, len(model), 20):
         flipped = bytearray(model)
@@ -290,7 +297,7 @@ def test_files_that_will_not_do_are_refused_in_one_sentence(name: str, tmp_path:
         Network(tmp_path / "nothing.onnx", name)
     monkeypatch.setattr(networks, "SHIPPED", {CROP: "0" * 64, DETECT: "0" * 64})
     with pytest.raises(NetworkError, match="belongs to another release"):
-        shipped(name)
+        shipped_network(name)
 
 
 @pytest.mark.parametrize(

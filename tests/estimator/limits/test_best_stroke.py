@@ -17,7 +17,7 @@ from phibench.datasets.frames.sensor_card import sensor_card
 from phibench.estimator.geometry.least_squares_depth import depth_general
 from phibench.estimator.geometry.line_of_sight import blocked, first_blocker
 from phibench.estimator.geometry.reflection import image_of
-from phibench.estimator.geometry.rig_parameters import PARAMETERS, changed, prior_sigmas, stroke_of
+from phibench.estimator.geometry.rig_parameters import PARAMETERS, changed_rig, prior_sigmas, stroke_of
 from phibench.estimator.limits import best_stroke as best_stroke_module
 from phibench.estimator.limits.best_stroke import (
     LARGEST,
@@ -236,7 +236,7 @@ def test_a_rig_as_built_errs_beyond_first_order_as_drawn_rigs_do() -> None:
     down, up, true = [], [], []
     for _ in range(n):
         values = root @ random.standard_normal(P)
-        rig, real_h = changed(RIG, values), float(stroke_of(np.array(h), values))
+        rig, real_h = changed_rig(RIG, values), float(stroke_of(np.array(h), values))
         down.append(image_of(rig.at(0.0), points).uv_px)
         up.append(image_of(rig.at(real_h), points).uv_px)
         true.append(np.hypot(*(points[:, :2] - rig.at(0.0).sphere_centre_m[:2]).T))
@@ -273,7 +273,7 @@ def _errors_m(drawn: np.ndarray, strokes_m: np.ndarray, points_m: np.ndarray, C:
     """Errors of D of rigs that deviate, shape (k, n, m): views and strokes of their own, the nominal rig's answer."""
     down, up, true_m = [], [], []
     for values in drawn:
-        rig = changed(RIG, values)
+        rig = changed_rig(RIG, values)
         down.append(image_of(rig.at(0.0), points_m).uv_px[None])
         up.append([image_of(rig.at(float(stroke_of(h, values))), points_m).uv_px for h in strokes_m])
         true_m.append(np.hypot(*(points_m[:, :2] - rig.at(0.0).sphere_centre_m[:2]).T)[None])

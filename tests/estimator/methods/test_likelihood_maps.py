@@ -9,7 +9,7 @@ from helpers.chain_scenes import MIDDLE, ROOM, SQUARE, scene
 
 from phibench.datasets.frames.sensor_card import card_of
 from phibench.estimator.geometry.status import Status
-from phibench.estimator.methods.likelihood_maps import likelihood_map, of_pixels
+from phibench.estimator.methods.likelihood_maps import likelihood_map, pixels_likelihood
 from phibench.estimator.processed.fit_processed_images import code_data
 from phibench.estimator.spots.fit_raw import fit_law
 from phibench.estimator.spots.gaussian_spot import SpotBlur, SpotModel
@@ -45,7 +45,7 @@ def test_maps_beside_full_codes_against_a_search(sigma_px: float, flux_e: float,
         fit = fit_law(data.regions, data.law, blur, model, uv)
         if fit.status[0] != Status.OK:
             continue
-        likelihood = of_pixels(data, fit.uv_px[0])
+        likelihood = pixels_likelihood(data, fit.uv_px[0])
         places = likelihood_map(likelihood)
         assert places is not None
 

@@ -17,7 +17,7 @@ from phibench.datasets.frames.sensor_card import SensorCard, sensor_card
 from phibench.estimator.interface import Answer, Box, Pair, Spot
 from phibench.estimator.methods.pair_light import laser_light, mirror_mask
 from phibench.estimator.methods.registry import KNOWN, METHODS, BuiltIn, at_the_red_peak
-from phibench.estimator.methods.spot_search import SharedPair, around, clipped, each_spot, locate, red_peak
+from phibench.estimator.methods.spot_search import SharedPair, box_at, clipped_box, each_spot, red_peak, spot_boxes
 from phibench.estimator.spots.camera_codes import linear_to_srgb, srgb_to_linear
 from phibench.estimator.spots.image_planes import (
     KINDS,
@@ -256,7 +256,7 @@ def test_methods_leave_their_input_alone() -> None:
 def test_locate_finds_easy_spots_without_a_hint(laser_off: bool) -> None:
     for number in range(3):
         pair, truth = easy("bayer-raw", number, laser_off), EasyPairs().truth(number)
-        for box, true in zip(locate(pair), (truth.down, truth.up), strict=True):
+        for box, true in zip(spot_boxes(pair), (truth.down, truth.up), strict=True):
             assert box is not None
             assert abs(box.u0_px + box.width_px // 2 - true.uv_px[0]) < 2.0
             assert abs(box.v0_px + box.height_px // 2 - true.uv_px[1]) < 2.0
@@ -270,7 +270,7 @@ def test_locate_looks_inside_the_mirror_only_and_may_find_nothing() -> None:
     for u0, v0 in ((100, 100), (640, 300)):  # outside the outline, and inside
         down = np.full_like(pair.down, np.median(pair.down))
         down[v0 - 10 : v0 + 12, u0 - 10 : u0 + 12] = spot
-        found.append(locate(replace(pair, down=down, up=np.full_like(down, 300), box_down=None, box_up=None)))
+        found.append(spot_boxes(replace(pair, down=down, up=np.full_like(down, 300), box_down=None, box_up=None)))
     assert found[0] == (None, None)
     box, nothing = found[1]
     assert nothing is None
@@ -379,9 +379,9 @@ def test_kinds_of_cards() -> None:
 
 
 def test_windows_are_cut_at_the_border() -> None:
-    assert around((10.4, 20.6), (100, 200)) == Box(3, 14, 15, 15)
-    assert around((0.0, 99.0), (100, 200)) == Box(0, 92, 8, 8)
-    assert clipped(Box(500, 500, 9, 9), (100, 200)).width_px == 0
+    assert box_at((10.4, 20.6), (100, 200)) == Box(3, 14, 15, 15)
+    assert box_at((0.0, 99.0), (100, 200)) == Box(0, 92, 8, 8)
+    assert clipped_box(Box(500, 500, 9, 9), (100, 200)).width_px == 0
 
 
 # -- blur and background of the likelihood ----------------------------------------------------------------------------

@@ -23,21 +23,21 @@ from phibench.estimator.spots.camera_codes import (
     noisy_code,
     quantisation,
     quantised,
+    quantiser_steps,
     srgb_slope,
     srgb_to_linear,
-    steps,
 )
 from phibench.estimator.spots.fit_raw import fit_law
 from phibench.estimator.spots.gaussian_spot import SpotBlur, SpotModel, SpotPixels
-from phibench.estimator.spots.jpeg_recovery import recovered
+from phibench.estimator.spots.jpeg_recovery import recovered_coefficients
 from phibench.estimator.spots.pixel_statistics import code_law, code_table
 from phibench.estimator.spots.raw_pixels import (
     GaussLaw,
     PixelNoise,
-    around,
     background_of,
     bayer_filters,
     noise_before_rounding,
+    outside_spot,
     spot_regions,
 )
 from phibench.render.sensor import processing
@@ -150,9 +150,9 @@ def test_coefficients_behind_a_decoded_image(subsampling: str, background_e: flo
     light = scene(MIDDLE, 0.7, FLUX_E, background_e, s)
     before = Chain(s.replace(output="srgb8")).frame(light, NoiseStream(("recovery",)))
     after = Chain(s).frame(light, NoiseStream(("recovery",)))
-    found = recovered(after[None], 85, subsampling, (True,) * 4)
+    found = recovered_coefficients(after[None], 85, subsampling, (True,) * 4)
     z = np.concatenate([found.luma.ravel(), found.chroma.ravel()])
-    step = steps(before.shape[:2], subsampling, 85)
+    step = quantiser_steps(before.shape[:2], subsampling, 85)
     codes_before = np.moveaxis(before.astype(float), -1, 0)
     exact = coefficients(codes_before, subsampling)
     exact[: before.shape[0] * before.shape[1] : 64] -= 1024.0  # the level shift, on Y's mean
@@ -169,7 +169,9 @@ def test_a_dark_room_comes_out_again(subsampling: str) -> None:
     s = MJPEG.replace(jpeg_subsampling=subsampling)
     for k in range(3):
         light = scene(MIDDLE + [0.2 * k, 0.3], 0.7, 4.0 * FLUX_E, 0.0, s)
-        found = recovered(Chain(s).frame(light, NoiseStream(("dark", k)))[None], 85, subsampling, (True,) * 4)
+        found = recovered_coefficients(
+            Chain(s).frame(light, NoiseStream(("dark", k)))[None], 85, subsampling, (True,) * 4
+        )
         assert found.wrong.mean() < 0.002
 
 
@@ -242,7 +244,7 @@ def test_background_of_a_flat_room_is_quiet_and_of_an_edge_is_kept() -> None:
     edge = (slice(None), slice(8, 40), slice(38, 42))
     assert np.abs(base.mean_e[edge] - room[edge]).mean() < 3.0 * 40.0
     assert base.variance_e2[edge].mean() > 3.0 * base.variance_e2[flat].mean()
-    hidden = around(np.array([[20.0, 20.0]]), np.zeros((1, 2)), (48, 64))
+    hidden = outside_spot(np.array([[20.0, 20.0]]), np.zeros((1, 2)), (48, 64))
     assert hidden[0, 20, 20] == 0.0
     assert hidden[0, 20, 26] == 1.0
 

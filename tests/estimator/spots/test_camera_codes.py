@@ -32,7 +32,7 @@ from phibench.estimator.spots.camera_codes import (
 )
 from phibench.estimator.spots.gaussian_spot import SpotBlur
 from phibench.estimator.spots.image_planes import colour_planes, linear_planes, through_jpeg
-from phibench.estimator.spots.jpeg_recovery import recovered
+from phibench.estimator.spots.jpeg_recovery import recovered_coefficients
 from phibench.estimator.spots.raw_pixels import noise_before_rounding
 from phibench.render.sensor import processing
 from phibench.render.sensor.camera_chain import Chain
@@ -217,8 +217,8 @@ def test_jpeg_tables_of_a_card_are_those_of_the_file() -> None:
     np.testing.assert_array_equal(np.asarray(Image.open(io.BytesIO(data))), frame)
     before = Chain(s.replace(output="srgb8")).frame(light, NoiseStream(("tables",)))
     np.testing.assert_array_equal(through_jpeg(before, card_of(s)), frame)
-    assert recovered(frame[None], tables, "4:2:2", (True,) * 4).wrong.mean() < 0.01
-    assert recovered(frame[None], 76, "4:2:2", (True,) * 4).wrong.mean() > 0.02
+    assert recovered_coefficients(frame[None], tables, "4:2:2", (True,) * 4).wrong.mean() < 0.01
+    assert recovered_coefficients(frame[None], 76, "4:2:2", (True,) * 4).wrong.mean() > 0.02
 
 
 def test_a_png_of_two_planes_is_read_as_yuyv(tmp_path) -> None:

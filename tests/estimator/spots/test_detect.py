@@ -24,7 +24,7 @@ from phibench.estimator.interface import Box, Pair
 from phibench.estimator.limits.position_bound import spot_limit
 from phibench.estimator.methods.raw_likelihood import joint_fit
 from phibench.estimator.methods.registry import detected_spots
-from phibench.estimator.methods.spot_search import box_around, locate
+from phibench.estimator.methods.spot_search import box_around, spot_boxes
 from phibench.estimator.spots.candidates import Candidates, candidates_at, lattice
 from phibench.estimator.spots.detect import (
     PROCESSED,
@@ -304,14 +304,14 @@ def test_far_candidates_are_not_consistent_with_a_spot_beyond_the_range() -> Non
 def test_boxes_hold_the_spot_and_stay_in_the_image() -> None:
     scene = Scene(BAYER)
     pair = scene.pair()
-    for box, name in zip(locate(pair), ("down", "up"), strict=True):
+    for box, name in zip(spot_boxes(pair), ("down", "up"), strict=True):
         assert box is not None
         u, v = scene.uv(name)
         assert box.u0_px + 5 < u < box.u0_px + box.width_px - 6
         assert box.v0_px + 5 < v < box.v0_px + box.height_px - 6
     edge = box_around(replace(detect(pair).down, uv_px=(0.2, 179.0)), pair.down)  # type: ignore[type-var]
     assert edge == Box(0, 159, 21, 21)
-    assert locate(Scene(BAYER, (0.0, 0.0)).pair()) == (None, None)
+    assert spot_boxes(Scene(BAYER, (0.0, 0.0)).pair()) == (None, None)
 
 
 def test_hints_are_kept_and_restrict_the_search() -> None:
@@ -319,8 +319,8 @@ def test_hints_are_kept_and_restrict_the_search() -> None:
     pair = scene.pair()
     wrong = Box(100, 60, 16, 16)
     hinted = replace(pair, box_down=wrong, box_up=wrong)
-    assert locate(hinted, hints=True) == (wrong, wrong)
-    assert locate(hinted) == (None, None)
+    assert spot_boxes(hinted, hints=True) == (wrong, wrong)
+    assert spot_boxes(hinted) == (None, None)
     assert min(misses(detect(hinted), scene)) == np.inf
     assert max(misses(detect(pair), scene)) < 1.0
 

@@ -7,7 +7,7 @@ import pytest
 import scipy
 
 from phibench.datasets.frames.sensor_card import sensor_card
-from phibench.estimator.spots.camera_codes import room_variance, steps
+from phibench.estimator.spots.camera_codes import quantiser_steps, room_variance
 from phibench.estimator.spots.pixel_statistics import (
     COUNTS,
     _information_table,
@@ -65,7 +65,7 @@ def test_quantised_rooms_err_as_much_as_is_said(power: float) -> None:
 
     The claim is a model of the spectrum, not a law: within a factor of 1.5 over all of them.
     """
-    rng, step = np.random.default_rng(5), steps((8, 16), "4:4:4", 85)[:64]
+    rng, step = np.random.default_rng(5), quantiser_steps((8, 16), "4:4:4", 85)[:64]
     rooms = drawn_room(rng, power, 2000)
     quantised = np.round(rooms / step) * step
     claimed = room_variance(quantised.ravel(), np.tile(step, len(rooms))).reshape(rooms.shape)
@@ -76,7 +76,7 @@ def test_quantised_rooms_err_as_much_as_is_said(power: float) -> None:
 
 
 def test_a_flat_room_is_known_but_for_its_level() -> None:
-    step = steps((8, 16), "4:4:4", 85)[:64]
+    step = quantiser_steps((8, 16), "4:4:4", 85)[:64]
     flat = np.zeros(64)
     flat[0] = 40 * step[0]
     variance = room_variance(flat, step)

@@ -23,7 +23,7 @@ from phibench.render.sensor.camera_chain import Chain
 from phibench.render.sensor.electrons import NoiseStream
 from phibench.render.sensor.light import Light, Region
 from phibench.render.sensor.settings import Sensor, sensor
-from phibench.robot.film.film_bundle import expected_sigma_m, film_depth, most_agree
+from phibench.robot.film.film_bundle import consensus_frames, expected_sigma_m, film_depth
 from phibench.robot.film.film_estimates import bundle_depth, joint_positions, seen_film
 from phibench.robot.film.film_frames import FilmFrames
 from phibench.robot.film.film_positions import FilmPositions, fit_positions, processed_positions, stepped_positions
@@ -79,16 +79,16 @@ def test_bundle_errors_are_within_their_covariance(understated: bool) -> None:
 def test_frames_that_most_agree_with_are_found() -> None:
     """Ten of 24 fits astray by up to 12 px, at both ends of the stroke too; without any, all frames agree."""
     positions, readings = drawn(0)
-    assert most_agree(SCENE.rig, positions, readings).all()
+    assert consensus_frames(SCENE.rig, positions, readings).all()
     astray = generator("film depth", "astray").permutation(FRAMES)[:10]
     positions.uv_px[astray] += (
         generator("film depth", "by").choice([-1.0, 1.0], (10, 2)) * np.linspace(4, 12, 10)[:, None]
     )
-    agree = most_agree(SCENE.rig, positions, readings)
+    agree = consensus_frames(SCENE.rig, positions, readings)
     assert not agree[astray].any()
     assert agree.sum() == FRAMES - 10
     nobody = replace(positions, uv_px=np.full_like(positions.uv_px, np.nan))
-    assert not most_agree(SCENE.rig, nobody, readings).any()
+    assert not consensus_frames(SCENE.rig, nobody, readings).any()
 
 
 def test_fitted_places_follow_a_rig_that_is_off() -> None:
