@@ -29,7 +29,7 @@ from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
 from scipy.optimize import least_squares
 from scipy.special import ndtr
 
-from phibench.calibration.sensor_fit.edge_spread import Edge, edges_of, measure
+from phibench.calibration.sensor_fit.edge_spread import Edge, edges_of, measure_edge
 from phibench.calibration.sensor_fit.fit_sensor import LensFit, fit_sensor
 from phibench.calibration.sensor_fit.noise_levels import decoded_by
 from phibench.render.sensor.camera_chain import Chain
@@ -163,7 +163,7 @@ def edge_measures(frames: Sequence[Array], share: float) -> tuple[Values, tuple[
     for frame in frames:
         edges = list(edges_of(frame[..., 0]))
         if len(edges) >= 20:
-            rows.append((np.median([list(vars(measure(edge)).values()) for edge in edges], axis=0), edges))
+            rows.append((np.median([list(vars(measure_edge(edge)).values()) for edge in edges], axis=0), edges))
     rows.sort(key=lambda row: float(row[0][0]))
     rows = rows[: max(int(np.ceil(share * len(rows))), 2)]
     medians = np.array([row[0] for row in rows])

@@ -23,7 +23,7 @@ from phibench.datasets.read import Dataset, Sample, open_dataset
 from phibench.estimator.drawn_pairs import DrawnPairs
 from phibench.estimator.interface import Answer, Box, Pair
 from phibench.estimator.methods.registry import METHODS
-from phibench.estimator.methods.spot_search import SharedPair, detected
+from phibench.estimator.methods.spot_search import SharedPair, pair_detection
 from phibench.scenes.rig import POSITIONS
 
 BOX_PX = 40
@@ -80,7 +80,7 @@ def answers(dataset: Dataset, preset: str, share: float, draws: int, laser_off: 
 
 def of_pair(sample: Sample, name: str, form: str, pair: SharedPair) -> Iterator[Seen]:
     """Answers of the fits for one pair."""
-    found = detected(pair)
+    found = pair_detection(pair)
     for method in FITS["raw" if pair.card.output == "raw" else "processed"]:
         answer: Answer = METHODS[method](pair)
         for position in POSITIONS:

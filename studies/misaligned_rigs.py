@@ -5,8 +5,8 @@ error is (estimate - D) / D, with D from the true sphere. Its *change* is the er
 error of the estimator itself (a convention of phi) is no cost of the misalignment.
 
 Four parts follow each other: one rig at a time (`errors`, `slopes`); thousands of rigs as arrays (`errors_of_many`);
-rendered spots, whose centroids confirm the chief rays (`rendered`); and a simulated calibration (`CalibrationSetup`).
-The second part takes spheres only, and chief rays from the simulator's solution of Alhazen's problem. So it is also a
+rendered spots, whose centroids confirm the chief rays (`rendered_deviations`); and a simulated calibration
+(`CalibrationSetup`). The second part takes spheres only, and chief rays from the simulator's solution of Alhazen's problem. So it is also a
 check of the first, which takes the estimator's.
 """
 
@@ -221,7 +221,7 @@ def _seen_px(views: _Views, points_m: Array, nominal: Rig) -> Array:
 
 
 @dataclass(frozen=True)
-class Rendered:
+class RenderedDeviation:
     """One parameter at one value.
 
     Attributes
@@ -242,7 +242,7 @@ class Rendered:
     explained: Array
 
 
-def rendered(nominal: Rig, places: Places, parameters: Sequence[str] = ALL) -> Iterator[Rendered]:
+def rendered_deviations(nominal: Rig, places: Places, parameters: Sequence[str] = ALL) -> Iterator[RenderedDeviation]:
     """Parameters at the study's magnitude, one at a time."""
     aligned = _errors(nominal, Misalignment(), places)
     before = errors(nominal, Misalignment(), places)
@@ -253,7 +253,7 @@ def rendered(nominal: Rig, places: Places, parameters: Sequence[str] = ALL) -> I
         seen = _errors(nominal, m, places)
         moved = [np.abs(a - b).max() for a, b in zip(seen.beside_px, aligned.beside_px, strict=True)]
         predicted = errors(nominal, m, places) - before
-        yield Rendered(
+        yield RenderedDeviation(
             name, PARAMETERS[name].study, seen.errors - aligned.errors, predicted, max(map(float, moved)), per_px
         )
 

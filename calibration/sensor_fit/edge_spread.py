@@ -159,7 +159,7 @@ def _line(values: Array) -> tuple[float, float] | None:
 # -- measures --------------------------------------------------------------------------------------------------------
 
 
-def measure(edge: Edge) -> EdgeMeasure:
+def measure_edge(edge: Edge) -> EdgeMeasure:
     """Rise and overshoot of one edge."""
     return measure_profile(*edge.profile())
 
@@ -342,7 +342,7 @@ def fit_edges(edges: list[Edge], model: EdgeModel, sharpness: float | None = Non
     fits = fits[good]
     if len(fits) < 5:
         return "the edges found do not follow the model of a blurred step"
-    measures = np.array([tuple(vars(measure(edge)).values()) for edge in edges])
+    measures = np.array([tuple(vars(measure_edge(edge)).values()) for edge in edges])
     centre, error = _robust(fits)
     mean, spread = _robust(measures)
     return EdgeFit(

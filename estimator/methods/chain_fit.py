@@ -17,10 +17,10 @@ from phibench.estimator.methods.likelihood_maps import SpotLikelihood, claimed_p
 from phibench.estimator.methods.spot_search import (
     at_detection,
     box_around,
-    detected,
     measured_twice,
     once,
     pair_blur,
+    pair_detection,
     seen_depth_m,
     trusted_hints,
 )
@@ -70,7 +70,7 @@ def chain_fit(pair: Pair) -> Answer:
 
 
 def _fitted(pair: Pair) -> Answer:
-    detections = detected(pair)
+    detections = pair_detection(pair)
     hint_down, hint_up = trusted_hints(pair, detections)
 
     def measure(depth_m: float | None) -> Answer:

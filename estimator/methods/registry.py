@@ -21,7 +21,14 @@ from phibench.estimator.learned.network_input import ACCEPTED, frame_input
 from phibench.estimator.learned.networks import Network, heat_peaks, network, refined_position, shipped_network
 from phibench.estimator.methods.chain_fit import chain_fit
 from phibench.estimator.methods.raw_likelihood import joint_fit, raw_likelihood
-from phibench.estimator.methods.spot_search import SearchRegion, at_detection, detected, each_spot, red_peak, spot_of
+from phibench.estimator.methods.spot_search import (
+    SearchRegion,
+    at_detection,
+    each_spot,
+    pair_detection,
+    red_peak,
+    spot_of,
+)
 from phibench.estimator.spots.candidates import Candidates
 from phibench.estimator.spots.detect import Detection, Thresholds, choose, mirror_box, outline_mask
 from phibench.estimator.spots.image_planes import KINDS, PROCESSED, RAW, kind_of, linear_planes, redness
@@ -237,7 +244,7 @@ def _spot_in_window(near: SearchRegion, u: float, v: float) -> Spot:
 
 def detected_spots(pair: Pair) -> Answer:
     """Position of the matched filter's peak, refined by a parabola, in both images."""
-    detections = detected(pair)
+    detections = pair_detection(pair)
     return Answer(_detected_spot(detections.down), _detected_spot(detections.up))
 
 

@@ -106,7 +106,7 @@ def once(pair: Pair, stage: str, make: Callable[[Pair], T]) -> T:
     return pair.work.once(stage, lambda: make(pair)) if isinstance(pair, SharedPair) else make(pair)
 
 
-def detected(pair: Pair) -> PairDetection:
+def pair_detection(pair: Pair) -> PairDetection:
     """Spots that `detect` sees.
 
     Raises
@@ -128,7 +128,7 @@ def spot_boxes(pair: Pair, hints: bool = False) -> tuple[Box | None, Box | None]
     ValueError
         If an image does not fit the card's output.
     """
-    return _boxes(pair, detected(pair), hints)
+    return _boxes(pair, pair_detection(pair), hints)
 
 
 def _boxes(pair: Pair, found: PairDetection, hints: bool) -> tuple[Box | None, Box | None]:
@@ -322,14 +322,14 @@ class SearchRegion:
 
 def each_spot(find: Callable[[SearchRegion], Spot], hints: bool = False) -> Method:
     """Method that looks at each image by itself, where `spot_boxes` sees a spot, or else at its hint if `hints`."""
-    return lambda pair: _both(find, pair, detected(pair), hints, None)
+    return lambda pair: _both(find, pair, pair_detection(pair), hints, None)
 
 
 def each_spot_twice(find: Callable[[SearchRegion], Spot]) -> Method:
     """Method as of `each_spot`, then once more with the distance found, for methods that use the beam's size."""
 
     def method(pair: Pair) -> Answer:
-        detections = detected(pair)
+        detections = pair_detection(pair)
         return measured_twice(lambda depth_m: _both(find, pair, detections, False, depth_m), pair)
 
     return method
@@ -432,7 +432,7 @@ def at_detection(found: Detection | None, spot: Spot) -> Spot:
 
 def joint_or_separate(pair: Pair, separate: Answer, together: Answer) -> Answer:
     """The answer for both images together; the separate one where a spot of it left its detection."""
-    detections = detected(pair)
+    detections = pair_detection(pair)
     for position in POSITIONS:
         detection, spot = getattr(detections, position), getattr(together, position)
         if detection is not None and left_px(detection, spot) is not None:

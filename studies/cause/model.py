@@ -30,7 +30,7 @@ from phibench.studies.cause.paper_reading import (
     Reader,
     inverse_depth,
     radii_px,
-    read,
+    read_depths,
 )
 from phibench.studies.framework import Settings
 
@@ -162,7 +162,7 @@ class DepthModel:
         return np.stack([prior.of_share(shares[..., i]) for i, prior in enumerate(self._chosen)], axis=-1)
 
     def named(self, points: Array) -> dict[str, Array]:
-        """Parameters by name for `read`: scalars of a point (d,), columns (m, 1) of points (m, d)."""
+        """Parameters by name for `read_depths`: scalars of a point (d,), columns (m, 1) of points (m, d)."""
         return dict(zip(self.names, points if points.ndim == 1 else points.T[..., None], strict=True))
 
     def noise_px(self, named: Parameters) -> Array:
@@ -171,7 +171,7 @@ class DepthModel:
 
     def reading(self, points: Array) -> PaperReading:
         """Noise-free estimates, shape (..., n)."""
-        return read(self.named(points), self.experiments, self.explanation.reader, self.rig)
+        return read_depths(self.named(points), self.experiments, self.explanation.reader, self.rig)
 
     def log_likelihood(self, point: Array) -> float:
         """Log density of the published estimates, per metre each, at one point, shape (d,)."""

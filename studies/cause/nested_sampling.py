@@ -76,7 +76,7 @@ def require_sampler() -> None:
         raise DatasetError("the study needs the package dynesty: pip install 'phibench[study]'") from error
 
 
-def sample(model: DepthModel, live_points: int, stop: float, *names: Name) -> Posterior:
+def nested_sample(model: DepthModel, live_points: int, stop: float, *names: Name) -> Posterior:
     """Run nested sampling.
 
     Parameters
@@ -111,7 +111,7 @@ def sample(model: DepthModel, live_points: int, stop: float, *names: Name) -> Po
     )
 
 
-class Truth(Settings):
+class MadeUpWorld(Settings):
     """A known world to make data in."""
 
     explanation: str
@@ -123,7 +123,7 @@ class Validation(Settings):
 
     candidates: list[str] = Field(min_length=1, description="explanations that are tried on them")
     repeats: int = Field(ge=1, le=100)
-    truths: list[Truth]
+    truths: list[MadeUpWorld]
 
 
 class CauseSettings(Settings):
@@ -243,7 +243,7 @@ def all_runs(settings: CauseSettings) -> list[Run]:
             runs.append(Run(("without", table, n), model, few, stop))
     for number, truth in enumerate(settings.validation.truths):
         for repeat in range(settings.validation.repeats):
-            made = made_up(settings, truth, number, repeat)
+            made = made_up_model(settings, truth, number, repeat)
             for n in settings.validation.candidates:
                 model = settings.model(n, made.experiments)
                 runs.append(Run(("made-up", number, repeat, n), model, few, stop))
@@ -267,7 +267,7 @@ def _again(repeats: int) -> list[tuple[Name, ...]]:
     return [(), *((repeat,) for repeat in range(1, repeats))]
 
 
-def made_up(settings: CauseSettings, truth: Truth, number: int, repeat: int) -> DepthModel:
+def made_up_model(settings: CauseSettings, truth: MadeUpWorld, number: int, repeat: int) -> DepthModel:
     """The explanation of a truth with data that it has made."""
     data = published_experiments()
     model = settings.model(truth.explanation, data)
@@ -276,6 +276,6 @@ def made_up(settings: CauseSettings, truth: Truth, number: int, repeat: int) -> 
     return settings.model(truth.explanation, data.with_estimates(estimates))
 
 
-def sampled(run: Run) -> Posterior:
+def posterior_of_run(run: Run) -> Posterior:
     """Posterior of a run: it has its own random stream, so that no other run changes it."""
-    return sample(run.model, run.live_points, run.stop, *run.key)
+    return nested_sample(run.model, run.live_points, run.stop, *run.key)

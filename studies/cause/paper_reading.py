@@ -122,7 +122,7 @@ class PaperReading:
         return 1.0 / self.inverse_depth_per_m
 
 
-def read(parameters: Parameters, experiments: Experiments, reader: Reader, rig: Rig) -> PaperReading:
+def read_depths(parameters: Parameters, experiments: Experiments, reader: Reader, rig: Rig) -> PaperReading:
     """Noise-free estimates of experiments with true rigs, and their slopes by the radii in the images.
 
     Parameters

@@ -20,9 +20,9 @@ from phibench.studies.cause.nested_sampling import (
     CauseSettings,
     all_runs,
     pooled_runs,
+    posterior_of_run,
     require_consistent,
     require_sampler,
-    sampled,
 )
 from phibench.studies.cause.paper_reading import TABLES, published_experiments
 from phibench.studies.cause.tables import DECIDED, ENOUGH, FLOOR, SIGMAS, Posteriors, band, grid_of, verdict
@@ -60,7 +60,7 @@ def run(settings: CauseSettings, datasets: StudyDatasets) -> StudyResult:
     require_consistent(settings)
     require_sampler()
     runs = all_runs(settings)
-    sampled_runs = datasets.map(sampled, runs, "cause, samplings")
+    sampled_runs = datasets.map(posterior_of_run, runs, "cause, samplings")
     posteriors = pooled_runs(dict(zip((run.key for run in runs), sampled_runs, strict=True)), settings)
     frames = {
         "table": tables.explanation_table(settings, posteriors),

@@ -36,7 +36,7 @@ from phibench.studies.cause.paper_reading import (
     Experiments,
     Reader,
     published_experiments,
-    read,
+    read_depths,
     sphere_image_px,
 )
 
@@ -128,7 +128,7 @@ def band(model: DepthModel, points: Array, grid: Experiments, random: np.random.
     """Lower end of simulated estimates on a grid, median of noise-free ones, upper end; shape (3, n)."""
     tail = (1.0 - level) / 2.0
     low, high = np.nanquantile(simulate(model, points, random, grid), [tail, 1.0 - tail], axis=0)
-    middle = read(model.named(points), grid, model.explanation.reader, model.rig).depth_m
+    middle = read_depths(model.named(points), grid, model.explanation.reader, model.rig).depth_m
     return np.stack([low, np.nanmedian(middle, axis=0), high])
 
 
@@ -151,7 +151,9 @@ def alike_parameters(model: DepthModel, point: Array) -> list[tuple[str, str, fl
 def _effect(model: DepthModel, at: dict[str, Array], name: str, step: float, covariance: Array) -> Array:
     """Change of the inverse estimates by a parameter, in units of their noise, shape (n,)."""
     ends = [
-        read({**at, name: np.asarray(by)}, model.experiments, model.explanation.reader, model.rig).inverse_depth_per_m
+        read_depths(
+            {**at, name: np.asarray(by)}, model.experiments, model.explanation.reader, model.rig
+        ).inverse_depth_per_m
         for by in (-step, step)
     ]
     return np.asarray((ends[1] - ends[0]) / (2.0 * step) / np.sqrt(np.diagonal(covariance)))
@@ -387,7 +389,7 @@ def short_stroke_table(height_m: float = -0.21, z_c_m: float = 0.26) -> pl.DataF
     }
     equations: tuple[Literal[4, 5], ...] = (4, 5)
     for equation in equations:
-        depth = read(world, data, Reader(equation=equation), Rig()).depth_m
+        depth = read_depths(world, data, Reader(equation=equation), Rig()).depth_m
         columns[f"eq{equation}_error_m"] = depth - data.depth_m
     return pl.DataFrame(columns)
 

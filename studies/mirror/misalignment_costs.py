@@ -53,12 +53,12 @@ UNCALIBRATED = (
 """Kinds that differ from pair to pair, so that no calibration knows them."""
 
 
-def usual(kind: str) -> float:
+def usual_size(kind: str) -> float:
     """Usual size of a kind, in its unit: what is left after careful mounting."""
     return MISALIGNMENT[DIRECTIONS[kind][0]].study
 
 
-def unit(kind: str) -> str:
+def unit_of_kind(kind: str) -> str:
     """Unit of a kind: "m", "rad", "px" or "1"."""
     return MISALIGNMENT[DIRECTIONS[kind][0]].unit
 
@@ -112,14 +112,14 @@ def tolerance(rig: Rig, kind: str, points_m: Array, stroke_m: float, cost: float
     Whole errors are searched, not slopes: near a cone's tip a deviation turns the azimuth, which has no first order.
     The search begins where the error would be in proportion to that of the usual size, and bisects in the logarithm.
     """
-    largest = min(_LARGEST * usual(kind), MISALIGNMENT[DIRECTIONS[kind][0]].limit)
+    largest = min(_LARGEST * usual_size(kind), MISALIGNMENT[DIRECTIONS[kind][0]].limit)
 
     def too_large(size: float) -> bool:
         return bool(np.max(errors(rig, kind, size, points_m, stroke_m)) >= cost)
 
-    at_usual = float(np.max(errors(rig, kind, usual(kind), points_m, stroke_m)))
+    at_usual = float(np.max(errors(rig, kind, usual_size(kind), points_m, stroke_m)))
     share = np.clip(cost / max(at_usual, _NO_ERROR), 1.0 / _LARGEST, _LARGEST) if np.isfinite(at_usual) else 0.5
-    low = high = min(float(share) * usual(kind), largest)
+    low = high = min(float(share) * usual_size(kind), largest)
     while too_large(low):
         low, high = low / _WIDER, low
     while low == high or not too_large(high):
@@ -132,6 +132,6 @@ def tolerance(rig: Rig, kind: str, points_m: Array, stroke_m: float, cost: float
     return float(np.sqrt(low * high))
 
 
-def together(found: Mapping[str, float], kinds: Sequence[str]) -> float:
+def root_of_squares(found: Mapping[str, float], kinds: Sequence[str]) -> float:
     """Root of the sum of squares of errors of some kinds."""
     return float(np.sqrt(sum(found[kind] ** 2 for kind in kinds)))

@@ -42,7 +42,10 @@ def run(settings: tables.MirrorSettings, datasets: StudyDatasets) -> StudyResult
     first = next(iter(rigs.values()))
     presets: tuple[str, ...] = settings.presets
     by_preset = {p: _bounds_of_spots(settings, p, first) for p in datasets.each(presets, "mirror, bounds")}
-    compared = {name: compare(settings, rigs[name], by_preset) for name in datasets.each(list(rigs), "mirror, mirrors")}
+    compared = {
+        name: mirror_comparison(settings, rigs[name], by_preset)
+        for name in datasets.each(list(rigs), "mirror, mirrors")
+    }
     heights = list(dict.fromkeys((*settings.heights_m, settings.spot_height_m)))
     percent, spot = f"{100.0 * settings.cost:g} %", f"spots at {settings.spot_height_m:g} m"
     shown = {
@@ -104,9 +107,9 @@ def _bounds_of_spots(settings: tables.MirrorSettings, preset: str, rig: Rig) -> 
     return place_bounds.blur_bounds(card, (r, g, b), settings.blurs_px)
 
 
-def compare(
+def mirror_comparison(
     settings: tables.MirrorSettings, rig: Rig, by_preset: Mapping[str, place_bounds.BlurBounds]
-) -> tables.Compared:
+) -> tables.MirrorComparison:
     """All that the study says of one mirror."""
     rays = meridian(rig)
     places = place_map(settings, rig)
@@ -127,14 +130,14 @@ def compare(
     spots = np.array([(d, 0.0, at) for d in wrong])
     costs = (
         {
-            kind: misalignment_costs.errors(rig, kind, misalignment_costs.usual(kind), spots, h)
+            kind: misalignment_costs.errors(rig, kind, misalignment_costs.usual_size(kind), spots, h)
             for kind in misalignment_costs.DIRECTIONS
         }
         if wrong
         else {}
     )
     sides = (0.0, 0.5 * math.pi, math.pi)
-    return tables.Compared(
+    return tables.MirrorComparison(
         rays=rays,
         field_deg=rays.field_deg(settings.edge_px),
         rim_deg=rays.field_deg()[1],
@@ -176,7 +179,7 @@ def place_map(settings: tables.MirrorSettings, rig: Rig) -> tables.PlaceMap:
 # -- tables of numbers -------------------------------------------------------------------------------------------------
 
 
-def bound_frame(found: Mapping[str, tables.Compared]) -> pl.DataFrame:
+def bound_frame(found: Mapping[str, tables.MirrorComparison]) -> pl.DataFrame:
     """A row per mirror, sensor, height and distance."""
     rows: list[dict[str, Any]] = [
         {
@@ -196,12 +199,12 @@ def bound_frame(found: Mapping[str, tables.Compared]) -> pl.DataFrame:
 
 
 def _below_each_other(
-    found: Mapping[str, tables.Compared], columns: Callable[[tables.Compared], dict[str, Any]]
+    found: Mapping[str, tables.MirrorComparison], columns: Callable[[tables.MirrorComparison], dict[str, Any]]
 ) -> pl.DataFrame:
     return pl.concat([pl.DataFrame({"mirror": name, **columns(c)}) for name, c in found.items()])
 
 
-def ray_columns(compared: tables.Compared) -> dict[str, Any]:
+def ray_columns(compared: tables.MirrorComparison) -> dict[str, Any]:
     """A row per ray of the meridian."""
     rays = compared.rays
     return {
@@ -213,7 +216,7 @@ def ray_columns(compared: tables.Compared) -> dict[str, Any]:
     }
 
 
-def cost_frame(found: Mapping[str, tables.Compared]) -> pl.DataFrame:
+def cost_frame(found: Mapping[str, tables.MirrorComparison]) -> pl.DataFrame:
     """A row per mirror, distance and kind of deviation: error of D at the usual size, and tolerance."""
     rows = [
         {
@@ -221,7 +224,7 @@ def cost_frame(found: Mapping[str, tables.Compared]) -> pl.DataFrame:
             "depth_m": d,
             "deviation": kind,
             "parameters": ", ".join(misalignment_costs.DIRECTIONS[kind]),
-            "usual": misalignment_costs.usual(kind),
+            "usual": misalignment_costs.usual_size(kind),
             "error_relative": error,
             "tolerance": compared.tolerances[kind],
         }
@@ -232,7 +235,7 @@ def cost_frame(found: Mapping[str, tables.Compared]) -> pl.DataFrame:
     return pl.DataFrame(rows)
 
 
-def map_columns(compared: tables.Compared) -> dict[str, Any]:
+def map_columns(compared: tables.MirrorComparison) -> dict[str, Any]:
     """A row per place of the map."""
     places = compared.places
     return {
@@ -258,7 +261,7 @@ def _notes(settings: tables.MirrorSettings) -> tuple[str, ...]:
 _LEAST = 1e-2  # per cent: what costs less is not drawn
 
 
-def comparison_drawing(found: Mapping[str, tables.Compared], settings: tables.MirrorSettings) -> Drawing:
+def comparison_drawing(found: Mapping[str, tables.MirrorComparison], settings: tables.MirrorSettings) -> Drawing:
     """The four panels."""
     from matplotlib.lines import Line2D
 
@@ -287,7 +290,7 @@ def _style(i: int) -> dict[str, Any]:
     return {"color": COLOURS[i % len(COLOURS)], "linestyle": LINES[i % len(LINES)]}
 
 
-def _resolution(ax: Axes, found: Mapping[str, tables.Compared]) -> None:
+def _resolution(ax: Axes, found: Mapping[str, tables.MirrorComparison]) -> None:
     for i, c in enumerate(found.values()):
         inside = np.degrees(c.rays.theta_rad) <= c.field_deg[1]
         ax.plot(np.degrees(c.rays.theta_rad)[inside], np.radians(1.0) * c.rays.px_per_rad[inside], **_style(i))
@@ -297,7 +300,7 @@ def _resolution(ax: Axes, found: Mapping[str, tables.Compared]) -> None:
     ax.set_ylabel("resolution, px/deg")
 
 
-def _bounds(ax: Axes, found: Mapping[str, tables.Compared], settings: tables.MirrorSettings) -> None:
+def _bounds(ax: Axes, found: Mapping[str, tables.MirrorComparison], settings: tables.MirrorSettings) -> None:
     preset = settings.presets[0]
     for i, c in enumerate(found.values()):
         depths = sorted(d for p, h, d in c.bounds if (p, h) == (preset, settings.spot_height_m))
@@ -308,7 +311,7 @@ def _bounds(ax: Axes, found: Mapping[str, tables.Compared], settings: tables.Mir
     ax.set_ylabel(f"bound of D, %, {preset}, spots at {settings.spot_height_m:g} m")
 
 
-def _places(ax: Axes, found: Mapping[str, tables.Compared]) -> None:
+def _places(ax: Axes, found: Mapping[str, tables.MirrorComparison]) -> None:
     for i, c in enumerate(found.values()):
         padded = np.pad(c.places.measured.astype(float), 1)
         D, Z = (
@@ -319,7 +322,7 @@ def _places(ax: Axes, found: Mapping[str, tables.Compared]) -> None:
     ax.set_ylabel("height of the spot, m: measured inside")
 
 
-def _costs(ax: Axes, found: Mapping[str, tables.Compared], settings: tables.MirrorSettings) -> None:
+def _costs(ax: Axes, found: Mapping[str, tables.MirrorComparison], settings: tables.MirrorSettings) -> None:
     middle = settings.misaligned_m[len(settings.misaligned_m) // 2]
     kinds = list(misalignment_costs.DIRECTIONS)
     for i, c in enumerate(found.values()):

@@ -18,7 +18,13 @@ from phibench.scenes.rig import Rig
 from phibench.scenes.validation import SceneError
 from phibench.studies.framework import Finding, Heights, Metres, Presets, Row, Settings, number, text_table
 from phibench.studies.mirror.field import DiscShares, Meridian
-from phibench.studies.mirror.misalignment_costs import DIRECTIONS, UNCALIBRATED, together, unit, usual
+from phibench.studies.mirror.misalignment_costs import (
+    DIRECTIONS,
+    UNCALIBRATED,
+    root_of_squares,
+    unit_of_kind,
+    usual_size,
+)
 from phibench.studies.mirror.place_bounds import PlaceBound
 
 ALL_KINDS = tuple(DIRECTIONS)
@@ -130,7 +136,7 @@ class PlaceMap:
 
 
 @dataclass(frozen=True)
-class Compared:
+class MirrorComparison:
     """All that the study says of one mirror.
 
     Attributes
@@ -162,7 +168,7 @@ class Compared:
 # -- tables ------------------------------------------------------------------------------------------------------------
 
 
-def field_table(found: Mapping[str, Compared]) -> tuple[Row, ...]:
+def field_table(found: Mapping[str, MirrorComparison]) -> tuple[Row, ...]:
     """Field of view, use of the image down, theta up to which the robot is seen down and up, and viewpoints."""
     return text_table(
         found.items(),
@@ -181,7 +187,7 @@ def field_table(found: Mapping[str, Compared]) -> tuple[Row, ...]:
     )
 
 
-def resolution_table(found: Mapping[str, Compared], angles_deg: Sequence[float]) -> tuple[Row, ...]:
+def resolution_table(found: Mapping[str, MirrorComparison], angles_deg: Sequence[float]) -> tuple[Row, ...]:
     """Pixels per degree by theta."""
     heads = ("mirror", *(f"{angle:g} deg" for angle in angles_deg))
     return heads, *(
@@ -190,7 +196,7 @@ def resolution_table(found: Mapping[str, Compared], angles_deg: Sequence[float])
     )
 
 
-def reach_table(found: Mapping[str, Compared], settings: MirrorSettings) -> tuple[Row, ...]:
+def reach_table(found: Mapping[str, MirrorComparison], settings: MirrorSettings) -> tuple[Row, ...]:
     """Nearest spot on the floor before, beside and behind the robot; lowest and highest spot by distance."""
     heads = (
         "mirror",
@@ -212,7 +218,7 @@ def reach_table(found: Mapping[str, Compared], settings: MirrorSettings) -> tupl
 
 
 def bound_table(
-    found: Mapping[str, Compared], preset: str, heights_m: Sequence[float], depths_m: Sequence[float]
+    found: Mapping[str, MirrorComparison], preset: str, heights_m: Sequence[float], depths_m: Sequence[float]
 ) -> tuple[Row, ...]:
     """Bound of D in % by height of the spot and distance."""
     heads = ("mirror, height of the spot", *(f"{d:g} m" for d in depths_m))
@@ -223,18 +229,18 @@ def bound_table(
     )
 
 
-def cost_table(found: Mapping[str, Compared], settings: MirrorSettings) -> tuple[Row, ...]:
+def cost_table(found: Mapping[str, MirrorComparison], settings: MirrorSettings) -> tuple[Row, ...]:
     """Errors of D of all deviations together and of those that no calibration knows, by distance."""
     heads = ("mirror, deviations", *(f"{d:g} m" for d in settings.misaligned_m))
     groups = {"all": ALL_KINDS, "beyond calibration": UNCALIBRATED}
     return heads, *(
-        (f"{name}, {label}", *(_error(together(c.costs[d], kinds)) for d in settings.misaligned_m))
+        (f"{name}, {label}", *(_error(root_of_squares(c.costs[d], kinds)) for d in settings.misaligned_m))
         for label, kinds in groups.items()
         for name, c in found.items()
     )
 
 
-def single_table(found: Mapping[str, Compared], settings: MirrorSettings) -> tuple[Row, ...]:
+def single_table(found: Mapping[str, MirrorComparison], settings: MirrorSettings) -> tuple[Row, ...]:
     """Error of D by each kind of deviation alone, by mirror and distance."""
     heads = ("deviation, mirror", *(f"{d:g} m" for d in settings.misaligned_m))
     return heads, *(
@@ -244,11 +250,11 @@ def single_table(found: Mapping[str, Compared], settings: MirrorSettings) -> tup
     )
 
 
-def tolerance_table(found: Mapping[str, Compared]) -> tuple[Row, ...]:
+def tolerance_table(found: Mapping[str, MirrorComparison]) -> tuple[Row, ...]:
     """Value of every kind that costs so much of D, and the usual size."""
     heads = ("deviation", "usual", *found)
     return heads, *(
-        (kind, _sized(kind, usual(kind)), *(_sized(kind, c.tolerances[kind]) for c in found.values()))
+        (kind, _sized(kind, usual_size(kind)), *(_sized(kind, c.tolerances[kind]) for c in found.values()))
         for kind in ALL_KINDS
     )
 
@@ -256,7 +262,7 @@ def tolerance_table(found: Mapping[str, Compared]) -> tuple[Row, ...]:
 def _sized(kind: str, value: float) -> str:
     if not math.isfinite(value):
         return _NONE
-    name, scale = _SHOWN_UNITS[unit(kind)]
+    name, scale = _SHOWN_UNITS[unit_of_kind(kind)]
     return f"{_two_digits(scale * value)} {name}".strip()
 
 
@@ -298,7 +304,7 @@ class Criterion:
 
     label: str
     unit: str
-    value: Callable[[Compared], float]
+    value: Callable[[MirrorComparison], float]
     small: bool = True
 
 
@@ -332,25 +338,25 @@ def criteria(settings: MirrorSettings) -> tuple[Criterion, ...]:
     )
 
 
-def _bound(preset: str, height_m: float, depth_m: float) -> Callable[[Compared], float]:
+def _bound(preset: str, height_m: float, depth_m: float) -> Callable[[MirrorComparison], float]:
     return lambda c: 100.0 * c.bounds[preset, height_m, depth_m].relative
 
 
-def _resolution(angle_deg: float) -> Callable[[Compared], float]:
+def _resolution(angle_deg: float) -> Callable[[MirrorComparison], float]:
     return lambda c: math.radians(1.0) * c.rays.at(angle_deg, c.rays.px_per_rad)
 
 
-def _together(depth_m: float, kinds: Sequence[str]) -> Callable[[Compared], float]:
-    return lambda c: 100.0 * together(c.costs[depth_m], kinds)
+def _together(depth_m: float, kinds: Sequence[str]) -> Callable[[MirrorComparison], float]:
+    return lambda c: 100.0 * root_of_squares(c.costs[depth_m], kinds)
 
 
-def _largest_blur(compared: Compared, preset: str, height_m: float) -> float:
+def _largest_blur(compared: MirrorComparison, preset: str, height_m: float) -> float:
     blurs = [bound.radial_blur_px for (p, h, _), bound in compared.bounds.items() if (p, h) == (preset, height_m)]
     known = [value for value in blurs if math.isfinite(value)]
     return max(known) if known else math.nan
 
 
-def pick_table(found: Mapping[str, Compared], settings: MirrorSettings) -> tuple[Row, ...]:
+def pick_table(found: Mapping[str, MirrorComparison], settings: MirrorSettings) -> tuple[Row, ...]:
     """Criteria as rows, mirrors as columns, and the best and the worst of them."""
     rows: list[Row] = [("criterion", "unit", *found, "best", "worst")]
     for criterion in criteria(settings):
@@ -384,7 +390,7 @@ def _names(names: Sequence[str]) -> str:
 # -- findings ----------------------------------------------------------------------------------------------------------
 
 
-def criteria_findings(found: Mapping[str, Compared], settings: MirrorSettings) -> Iterator[Finding]:
+def criteria_findings(found: Mapping[str, MirrorComparison], settings: MirrorSettings) -> Iterator[Finding]:
     """Best and worst value of each criterion, of the mirrors that have one."""
     for criterion in criteria(settings):
         known = sorted((x, name) for name, c in found.items() if math.isfinite(x := criterion.value(c)))
@@ -394,7 +400,7 @@ def criteria_findings(found: Mapping[str, Compared], settings: MirrorSettings) -
                 yield Finding(f"{criterion.label}, {word}: {name}", value, unit=criterion.unit)
 
 
-def ratio_findings(found: Mapping[str, Compared], settings: MirrorSettings) -> Iterator[Finding]:
+def ratio_findings(found: Mapping[str, MirrorComparison], settings: MirrorSettings) -> Iterator[Finding]:
     """Bounds of the first mirror over those of the others, and its tolerance of being aside over theirs."""
     first, *others = found
     preset, z, far = settings.presets[0], settings.spot_height_m, settings.misaligned_m[-1]
@@ -409,7 +415,7 @@ def ratio_findings(found: Mapping[str, Compared], settings: MirrorSettings) -> I
             yield Finding(f"allowed mirror aside, {first} over {name}", ratio)
 
 
-def place_findings(found: Mapping[str, Compared], settings: MirrorSettings) -> Iterator[Finding]:
+def place_findings(found: Mapping[str, MirrorComparison], settings: MirrorSettings) -> Iterator[Finding]:
     """Nearest distance with a bound, and the pixels that are spent on what is above the horizon."""
     for name, c in found.items():
         seen = [
@@ -420,7 +426,7 @@ def place_findings(found: Mapping[str, Compared], settings: MirrorSettings) -> I
         yield Finding(f"pixels above the horizon: {name}", 100.0 * c.down.above_horizon, unit="%")
 
 
-def cost_findings(found: Mapping[str, Compared], settings: MirrorSettings) -> Iterator[Finding]:
+def cost_findings(found: Mapping[str, MirrorComparison], settings: MirrorSettings) -> Iterator[Finding]:
     """Allowed error, and errors that no calibration knows: least and largest of all mirrors."""
     yield Finding("error of D that a tolerance allows", 100.0 * settings.cost, unit="%")
     for d in settings.misaligned_m:

@@ -60,7 +60,7 @@ class Interactions:
         return self.indices[len(self.parameters) : -2]
 
 
-def moving(
+def moving_parameters(
     nominal: Rig, places: Places, estimators: tuple[str, ...], parameters: Sequence[str] = ALL
 ) -> tuple[str, ...]:
     """Parameters of a spherical mirror that change any estimate at all, at the study's magnitude.
@@ -104,7 +104,7 @@ def interactions(
     DatasetError
         If a drawn rig has no estimate.
     """
-    names = moving(nominal, places, (estimator,), parameters)
+    names = moving_parameters(nominal, places, (estimator,), parameters)
     aligned = errors(nominal, Misalignment(), places, (estimator,))[0]
 
     size = np.array([PARAMETERS[name].study for name in names])
@@ -121,7 +121,7 @@ def interactions(
             )
         return np.concatenate([change[:, 0], np.mean(change**2, axis=1)])
 
-    values = evaluated(model, len(names), n, rng)
+    values = evaluated_outputs(model, len(names), n, rng)
     labels = [(kind, power, float(D)) for kind, power in OUTPUTS for D in places.depths_m]
     powers = np.array([power for _, power, _ in labels])
     indices, low, high = with_intervals(values, powers, resamples, rng)
@@ -141,7 +141,7 @@ class Values:
         return Values(self.A[:, index], self.B[:, index], self.AB[..., index])
 
 
-def evaluated(model: Callable[[Array], Array], p: int, n: int, rng: np.random.Generator) -> Values:
+def evaluated_outputs(model: Callable[[Array], Array], p: int, n: int, rng: np.random.Generator) -> Values:
     """Outputs of a model of p numbers, uniform from 0 to 1, shape (m, p), to (s, m)."""
     points = scipy.stats.qmc.Sobol(2 * p, rng=rng).random(n)
     A, B = points[:, :p], points[:, p:]

@@ -48,9 +48,9 @@ from phibench.studies.misaligned_rigs import (
     Calibrate,
     CalibrationSetup,
     Places,
-    Rendered,
+    RenderedDeviation,
     pixels,
-    rendered,
+    rendered_deviations,
     true_depth_m,
 )
 from phibench.studies.misalignment import tables
@@ -150,7 +150,7 @@ def run(settings: MisalignmentSettings, datasets: StudyDatasets) -> StudyResult:
         table = tables.study_table(nominal, strokes, calibrate, names)
         steps.advance()
         some = settings.places(places.stroke_m, settings.azimuths_rad[1 :: settings.rendered_every])
-        seen = tuple(rendered(nominal, some, names))
+        seen = tuple(rendered_deviations(nominal, some, names))
         steps.advance()
         fine, coarse = settings.tolerance_search(), settings.tolerance_search(calibrated=True)
         tolerances = list(tables.tolerance_rows(nominal, places, fine, coarse, calibrate, names))
@@ -231,7 +231,7 @@ def _refocused(settings: MisalignmentSettings, nominal: Rig) -> tuple[Finding, .
 def _findings(
     settings: MisalignmentSettings,
     table: pl.DataFrame,
-    seen: tuple[Rendered, ...],
+    seen: tuple[RenderedDeviation, ...],
     tolerances: list[dict[str, object]],
     at_once: tuple[Interactions, ...],
     noise: Array,
@@ -267,7 +267,7 @@ def _drawings(
     )
 
 
-def _notes(settings: MisalignmentSettings, seen: tuple[Rendered, ...]) -> tuple[str, ...]:
+def _notes(settings: MisalignmentSettings, seen: tuple[RenderedDeviation, ...]) -> tuple[str, ...]:
     off, name = tables.worst_disagreement(seen)
     missed = [
         f"rendered and predicted change differ by {off:.1e} of D ({name}); {settings.agreement:.0e} was the target"
@@ -289,8 +289,8 @@ def tightest_table(rows: Sequence[dict[str, Any]], estimator: str, depth_m: floa
         [row for row in tables.tolerances_of(rows, estimator, depth_m) if row["value"] is not None],
         {
             "parameter": lambda row: row["parameter"],
-            f"tolerance for {100.0 * cost:g} % of D": lambda row: tables.shown(row["parameter"], row["value"]),
-            "expected deviation": lambda row: tables.usual(row["parameter"]),
+            f"tolerance for {100.0 * cost:g} % of D": lambda row: tables.value_text(row["parameter"], row["value"]),
+            "expected deviation": lambda row: tables.usual_text(row["parameter"]),
             "ratio": lambda row: f"{row['value_over_study']:.2g}",
         },
     )
@@ -298,11 +298,12 @@ def tightest_table(rows: Sequence[dict[str, Any]], estimator: str, depth_m: floa
 
 def ranking_rows(ranks: Sequence[tables.Rank], calibrated: Sequence[tables.Rank]) -> tuple[Row, ...]:
     """Table: what every parameter costs, % of D, rms over azimuths."""
-    after = {rank.parameter: map(tables.percent, rank.rms) for rank in calibrated}
+    after = {rank.parameter: map(tables.percent_text, rank.rms) for rank in calibrated}
     depths = [f"{D:g} m" for D in ranks[0].depths_m]
     heads = ("parameter", "size", *depths, *(f"calibrated, {D}" for D in depths))
     return heads, *(
-        (r.parameter, tables.usual(r.parameter), *map(tables.percent, r.rms), *after[r.parameter]) for r in ranks
+        (r.parameter, tables.usual_text(r.parameter), *map(tables.percent_text, r.rms), *after[r.parameter])
+        for r in ranks
     )
 
 
@@ -313,7 +314,7 @@ def tolerance_table(rows: Sequence[dict[str, Any]], statistic: str, estimators: 
     values = {p: [mine[p, *case] for case in cases] for p in dict.fromkeys(parameter for parameter, _, _ in mine)}
     heads = ("parameter", *(f"{name}, {D:g} m" for name, D in cases))
     reached = {p: row for p, row in values.items() if any(value is not None for value in row)}
-    return heads, *((p, *("-" if x is None else tables.shown(p, x) for x in row)) for p, row in reached.items())
+    return heads, *((p, *("-" if x is None else tables.value_text(p, x) for x in row)) for p, row in reached.items())
 
 
 # -- drawings: change of D by azimuth, cost of each parameter, interactions --------------------------------------------
@@ -334,13 +335,13 @@ def azimuth_drawing(
                 size = PARAMETERS[name].study
                 style = {**line_style(i), "marker": ""}
                 x, y = _curve(table, name, size, stroke_m, D, "whole_relative")
-                ax.plot(x, y, label=f"{name}, {tables.usual(name)}", **style)
+                ax.plot(x, y, label=f"{name}, {tables.usual_text(name)}", **style)
                 x, y = _curve(rendered, name, size, stroke_m, D, "rendered_relative")
                 ax.plot(x, y, "x", color=style["color"], markersize=7)
             ax.set(title=f"D = {D:g} m", xlabel="azimuth of the spot, degrees", ylabel="change of D, %")
             ax.set_xticks(range(0, 361, 90))
         figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
-        parts = ", ".join(f"{rank.parameter} {tables.percent(rank.worst[-1])} %" for rank in ranks[:_CURVES])
+        parts = ", ".join(f"{rank.parameter} {tables.percent_text(rank.worst[-1])} %" for rank in ranks[:_CURVES])
         alt = (
             "Change of the exact estimator's D against the spot's azimuth for the costliest misalignments, predicted "
             f"as lines and rendered as crosses, at D = {depths[0]:g} and {depths[1]:g} m; largest at {depths[1]:g} m: "
@@ -364,11 +365,11 @@ def ranking_drawing(by_estimator: Mapping[str, Sequence[tables.Rank]], depth_ind
             values = [cost[name] for name in names]
             ax.barh(places, values, height, label=estimator, color=line_style(i)["color"])
         ax.set_xscale("log")
-        ax.set_yticks(range(len(names)), [f"{name}, {tables.usual(name)}" for name in names])
+        ax.set_yticks(range(len(names)), [f"{name}, {tables.usual_text(name)}" for name in names])
         ax.invert_yaxis()
         ax.set(xlabel=f"change of D, % (rms over azimuths and signs), D = {D:g} m")
         ax.legend()
-        top = ", ".join(f"{one.parameter} {tables.percent(one.rms[depth_index])} %" for one in order[:3])
+        top = ", ".join(f"{one.parameter} {tables.percent_text(one.rms[depth_index])} %" for one in order[:3])
         alt = f"Cost of each misalignment at D = {D:g} m by estimator, logarithmic; exact with nominal numbers: {top}."
         return drawn("ranking", figure, alt)
 

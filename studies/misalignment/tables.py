@@ -27,7 +27,7 @@ from phibench.studies.misaligned_rigs import (
     NOMINAL,
     Calibrate,
     Places,
-    Rendered,
+    RenderedDeviation,
     calibrated_errors,
     errors,
     slopes,
@@ -206,7 +206,7 @@ def study_table(
     return pl.concat([*nominal_rows, *_changes(strokes[0], values, *errors_by(nominal, strokes[0], calibrate)[1])])
 
 
-def rendered_table(found: Sequence[Rendered], places: Places) -> pl.DataFrame:
+def rendered_table(found: Sequence[RenderedDeviation], places: Places) -> pl.DataFrame:
     """Rows of rendered spots: rendered and predicted change of D's relative error."""
     frames = []
     for estimate in found:
@@ -293,9 +293,8 @@ def cost_findings(ranks: Sequence[Rank]) -> Iterator[Finding]:
     """Costliest parameters of one estimator at the usual size, at the nearest and the farthest D."""
     for rank in ranks[:_LISTED]:
         for i in (0, -1):
-            label = (
-                f"change of D, {rank.estimator}: {rank.parameter} {usual(rank.parameter)}, D = {rank.depths_m[i]:g} m"
-            )
+            what = f"{rank.parameter} {usual_text(rank.parameter)}, D = {rank.depths_m[i]:g} m"
+            label = f"change of D, {rank.estimator}: {what}"
             yield Finding(label, 100.0 * rank.rms[i], unit="%")
 
 
@@ -306,7 +305,7 @@ def slope_findings(miss: tuple[str, float, float], target: float) -> Iterator[Fi
     yield Finding(label, 100.0 * off, unit="% of D").judged("<=", 100.0 * target)
 
 
-def rendered_findings(found: Sequence[Rendered], tolerance: float) -> Iterator[Finding]:
+def rendered_findings(found: Sequence[RenderedDeviation], tolerance: float) -> Iterator[Finding]:
     """Rendered against predicted changes of D, from centroids of noise-free layers."""
     off, name = worst_disagreement(found)
     worst = Finding(f"rendered against predicted change of D, largest difference ({name})", off, unit="of D")
@@ -316,7 +315,7 @@ def rendered_findings(found: Sequence[Rendered], tolerance: float) -> Iterator[F
     yield Finding("centroid against chief ray, largest drift by a misalignment", drift, unit="mpx")
 
 
-def worst_disagreement(found: Sequence[Rendered]) -> tuple[float, str]:
+def worst_disagreement(found: Sequence[RenderedDeviation]) -> tuple[float, str]:
     """Largest |rendered - predicted| change and its parameter; infinite where one of them is missing."""
     sizes = []
     for estimate in found:
@@ -386,17 +385,17 @@ def tolerances_of(rows: Sequence[dict[str, Any]], estimator: str, depth_m: float
     return sorted(mine, key=lambda r: math.inf if r["value_over_study"] is None else float(r["value_over_study"]))
 
 
-def shown(parameter: str, value: float) -> str:
+def value_text(parameter: str, value: float) -> str:
     """A value with a unit that people use."""
     scale, unit = _SCALES[PARAMETERS[parameter].unit]
     return f"{scale * value:.3g} {unit}".strip()
 
 
-def usual(parameter: str) -> str:
+def usual_text(parameter: str) -> str:
     """Its usual size with a unit that people use."""
-    return shown(parameter, PARAMETERS[parameter].study)
+    return value_text(parameter, PARAMETERS[parameter].study)
 
 
-def percent(relative: float) -> str:
+def percent_text(relative: float) -> str:
     """Two digits of a per cent; "lost" where there is no estimate."""
     return f"{100.0 * relative:.2g}" if math.isfinite(relative) else "lost"

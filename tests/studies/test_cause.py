@@ -18,8 +18,8 @@ from phibench.scenes.frames import Array
 from phibench.scenes.random_streams import generator
 from phibench.scenes.rig import Rig
 from phibench.studies.cause.model import COMMON, NOISE, DepthModel, Explanation, Prior, simulate, without_table
-from phibench.studies.cause.nested_sampling import CauseSettings, Posterior, all_runs, pooled, sample
-from phibench.studies.cause.paper_reading import Reader, published_experiments, read
+from phibench.studies.cause.nested_sampling import CauseSettings, Posterior, all_runs, nested_sample, pooled
+from phibench.studies.cause.paper_reading import Reader, published_experiments, read_depths
 from phibench.studies.cause.study import (
     STUDY,
     convention_findings,
@@ -122,12 +122,12 @@ def test_evidence_and_posterior_of_a_closed_form(settings: CauseSettings) -> Non
     """
     pytest.importorskip("dynesty")
     line = _Line(settings.explanations[0], settings.priors, DATA, Rig(), 0.0)
-    found = sample(line, 200, 0.05, "line")
+    found = nested_sample(line, 200, 0.05, "line")
     expected = scipy.stats.norm.logpdf([0.5, -1.0], 0.0, np.hypot(1.0, 0.3)).sum()
     assert found.log_evidence == pytest.approx(expected, abs=4.0 * max(found.log_evidence_error, 0.13))
     assert found.points.mean(axis=0) == pytest.approx(np.array([0.5, -1.0]) / 1.09, abs=0.1)
     assert found.points.std(axis=0) == pytest.approx([0.287, 0.287], rel=0.25)
-    small, again = (sample(line, 30, 1.0, "line") for _ in range(2))
+    small, again = (nested_sample(line, 30, 1.0, "line") for _ in range(2))
     assert np.array_equal(small.points, again.points)
 
 
@@ -164,7 +164,8 @@ def test_made_up_data_give_back_their_cause(settings: CauseSettings) -> None:
         point = np.array([[values.get(name, 0.0) for name in model.names]])
         data = DATA.with_estimates(simulate(model, point, generator("test", "cause", "made-up", truth))[0])
         found = {
-            name: sample(settings.model(name, data), 25, 4.0, "test", truth, name) for name in ("ray", "ray_misaligned")
+            name: nested_sample(settings.model(name, data), 25, 4.0, "test", truth, name)
+            for name in ("ray", "ray_misaligned")
         }
         gains[truth] = found["ray_misaligned"].log_evidence - found["ray"].log_evidence
         tilts[truth] = found["ray_misaligned"].points[:, model.names.index("tilt_y_rad")]
@@ -222,7 +223,7 @@ def _moved(azimuth_deg: float, **errors: float) -> Array:
     world = {"z_c_m": 0.28, "tilt_y_rad": 0.0136, **HEIGHTS, **errors}
     world |= {f"azimuth_{k}_rad": np.radians(azimuth_deg) for k in (1, 2, 3, 4)}
     given = {name: np.asarray(value) for name, value in world.items()}
-    return np.asarray(read(given, DATA, Reader(), Rig()).depth_m / DATA.depth_m)
+    return np.asarray(read_depths(given, DATA, Reader(), Rig()).depth_m / DATA.depth_m)
 
 
 @pytest.mark.parametrize(

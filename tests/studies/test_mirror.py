@@ -31,7 +31,7 @@ from phibench.scenes.rig import Rig
 from phibench.scenes.room import escalade360
 from phibench.studies.framework import StudyDatasets, StudyResult, read_settings
 from phibench.studies.mirror.field import disc_shares, meridian, outline_radius_px
-from phibench.studies.mirror.misalignment_costs import DIRECTIONS, UNCALIBRATED, errors, tolerance, usual
+from phibench.studies.mirror.misalignment_costs import DIRECTIONS, UNCALIBRATED, errors, tolerance, usual_size
 from phibench.studies.mirror.place_bounds import BlurBounds, place_bound
 from phibench.studies.mirror.study import STUDY
 from phibench.studies.mirror.tables import MirrorSettings, PlaceMap, pick_table
@@ -286,7 +286,7 @@ def test_small_errors_follow_the_analytic_derivatives(shape: str) -> None:
     for kind, names in DIRECTIONS.items():
         if kind == "turn between images":  # a yaw, which has no first order
             continue
-        size = 1e-3 * usual(kind)
+        size = 1e-3 * usual_size(kind)
         # second orders are 1e-3 of what they are at the usual size, where they are at most as large as the first
         wanted = size * max(abs(slope[name]) for name in names) / 2.5
         assert errors(rig, kind, size, point[None], STROKE_M)[0] == pytest.approx(wanted, rel=2e-3, abs=1e-11), kind

@@ -27,19 +27,19 @@ from phibench.studies.misaligned_rigs import (
     NOMINAL,
     CalibrationSetup,
     Places,
-    Rendered,
+    RenderedDeviation,
     calibrated_errors,
     errors,
     errors_of_many,
     nominal_sigmas,
     pixels,
-    rendered,
+    rendered_deviations,
     seen_px,
     slopes,
 )
 from phibench.studies.misalignment.sobol_indices import (
     Interactions,
-    evaluated,
+    evaluated_outputs,
     interaction_findings,
     with_intervals,
 )
@@ -206,7 +206,7 @@ def test_sobol_indices_of_a_sum_and_of_a_product() -> None:
         x, y = (unit - 0.5).T
         return np.stack([2.0 * x + y, x * y])
 
-    values = evaluated(model, 2, 1024, generator("test", "sobol"))
+    values = evaluated_outputs(model, 2, 1024, generator("test", "sobol"))
     found, low, high = with_intervals(values, np.array([2, 2]), 200, generator("test", "boot"))
     # Sobol points at n = 1024 err by about 1/n^(3/4) of a smooth function; Monte Carlo would by 1/sqrt(n) = 0.03
     assert found[0, :5] == pytest.approx([0.8, 0.2, 0.8, 0.2, 1.0], abs=0.03)
@@ -246,7 +246,7 @@ def test_calibration_needs_its_spots_in_the_image() -> None:
 def test_rendered_spots_move_as_predicted() -> None:
     """One place, all parameters: centroids and chief rays drift apart by a thousandth of a pixel at most."""
     places = Places(np.array([2.18]), np.radians([30.0]), 0.5, 0.425)
-    found = tuple(rendered(RIG, places))
+    found = tuple(rendered_deviations(RIG, places))
     assert [one.parameter for one in found] == [name for name in PARAMETERS if name not in OF_REVOLVED]
     for one in found:
         # 1 mpx in each of four coordinates of the blurred spot, times what a pixel is worth
@@ -294,7 +294,7 @@ def test_slopes_are_judged_by_their_misses() -> None:
 
 
 def test_rendered_agreement_is_judged_by_the_tolerance() -> None:
-    one = Rendered("k1", 0.03, np.full((5, 1, 1), 0.011), np.full((5, 1, 1), 0.01), 1e-4, np.ones((1, 1)))
+    one = RenderedDeviation("k1", 0.03, np.full((5, 1, 1), 0.011), np.full((5, 1, 1), 0.01), 1e-4, np.ones((1, 1)))
     assert next(rendered_findings([one], 1e-4)).verdict == "missed"
     assert next(rendered_findings([one], 1e-2)).verdict == "met"
     lost = replace(one, change=np.full((5, 1, 1), np.nan))

@@ -26,7 +26,7 @@ from phibench.studies.cause.paper_reading import (
     Reader,
     published_experiments,
     radii_px,
-    read,
+    read_depths,
 )
 from phibench.studies.cause.study import STUDY, short_stroke_findings
 from phibench.studies.cause.tables import short_stroke_table
@@ -67,7 +67,7 @@ def test_readings_are_those_of_misaligned_rigs(convention: str) -> None:
     checked = 0
     for draw in range(3):
         world = _world(generator("test", "cause", "world", draw))
-        ours = read(world, DATA, Reader(convention), Rig()).depth_m  # type: ignore[arg-type]
+        ours = read_depths(world, DATA, Reader(convention), Rig()).depth_m  # type: ignore[arg-type]
         for i in range(0, 25, 3):
             rig, down, up = _pixels(world, i)
             expected = ESTIMATORS[f"paper_{convention}"](rig, float(DATA.stroke_m[i]), down, up).depth_m
@@ -81,7 +81,7 @@ def test_centred_radii_and_the_outline() -> None:
     world.update(cx_px=np.asarray(0.0), cy_px=np.asarray(0.0), roll_rad=np.asarray(0.0), pitch_rad=np.asarray(0.0))
     radii = radii_px(world, DATA, Reader("ray", centred=True), Rig())
     aligned = {name: value for name, value in world.items() if name not in PARAMETERS}
-    angles = read(aligned, DATA, Reader("outline"), Rig()).depth_m
+    angles = read_depths(aligned, DATA, Reader("outline"), Rig()).depth_m
     for i in (0, 9, 20):
         rig, down, up = _pixels(world, i)
         true = rig.perturbed(Misalignment(**{name: float(world[name]) for name in PARAMETERS}))

@@ -8,7 +8,7 @@ import pytest
 from phibench.benchmark.isolation.easy_pairs import EasyPairs
 from phibench.estimator.interface import Answer, Pair, Spot
 from phibench.estimator.methods.registry import METHODS
-from phibench.estimator.methods.spot_search import SharedPair, at_detection, detected, left_px, red_peak
+from phibench.estimator.methods.spot_search import SharedPair, at_detection, left_px, pair_detection, red_peak
 from phibench.estimator.spots.detect import Detection
 from phibench.estimator.spots.fit_raw import fit_law
 from phibench.estimator.spots.gaussian_spot import SpotBlur, SpotModel
@@ -46,7 +46,7 @@ def test_a_lamps_noise_draws_no_fit_away(number: int) -> None:
     """0.5 px: three times the bound of 900 electrons behind a mosaic, 0.15 px."""
     pair, truth = beside_a_lamp(number)
     shared, drawn = SharedPair.of(pair), 0
-    found = detected(shared)
+    found = pair_detection(shared)
     for method in ("raw_maximum_likelihood", "joint_fit"):
         answer: Answer = METHODS[method](shared)
         for position, true in truth.items():
