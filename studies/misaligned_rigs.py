@@ -6,8 +6,8 @@ error of the estimator itself (a convention of phi) is no cost of the misalignme
 
 Four parts follow each other: one rig at a time (`errors`, `slopes`); thousands of rigs as arrays (`errors_of_many`);
 rendered spots, whose centroids confirm the chief rays (`rendered_deviations`); and a simulated calibration
-(`CalibrationSetup`). The second part takes spheres only, and chief rays from the simulator's solution of Alhazen's problem. So it is also a
-check of the first, which takes the estimator's.
+(`CalibrationSetup`). The second part takes spheres only, and chief rays from the simulator's solution of Alhazen's
+problem. So it is also a check of the first, which takes the estimator's.
 """
 
 from __future__ import annotations
