@@ -79,7 +79,7 @@ def test_a_method_that_fails_on_every_pair_ends_in_1(
     shown = " ".join(capsys.readouterr().out.split())
     assert f"note: {failed}: mine:failing {told}" in shown
     assert f"note: {silent}" not in shown
-    monkeypatch.setattr(figures, "encoded", lambda *_: b"")  # the words are the subject
+    monkeypatch.setattr(figures, "encoded_figure", lambda *_: b"")  # the words are the subject
     page = tmp_path / "page.html"
     assert main(["report", str(failed), str(silent), "--out", str(page)]) == 0
     assert f"mine:failing {told}" in page.read_text(encoding="utf-8")

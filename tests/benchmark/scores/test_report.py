@@ -294,7 +294,7 @@ def crowded(scores):
     )
     first = [scores[0], scores[0], scored("constant", constant), scored("silent", silent)]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(figures, "encoded", lambda *_: b"")
+        patch.setattr(figures, "encoded_figure", lambda *_: b"")
         return report_html([*first, scored("truth", truth_itself, hidden())], [section])
 
 
@@ -371,7 +371,7 @@ def test_scores_of_fewer_pairs_are_told_of(score_files, tmp_path, capsys, monkey
     assert "25 pairs are counted here, other numbers elsewhere: half (40); such scores do not compare." in text
     assert "40 pairs are counted here, other numbers elsewhere: few (25); such scores do not compare." in text
     assert len(re.findall(r"^## .*, (?:25|40) pairs$", text, re.M)) == 2
-    monkeypatch.setattr(figures, "encoded", lambda *_: b"")  # words are the subject
+    monkeypatch.setattr(figures, "encoded_figure", lambda *_: b"")  # words are the subject
     assert cli.main(["report", *files, "--out", str(tmp_path / "page.html")]) == 0
     page = (tmp_path / "page.html").read_text()
     assert page.count("pairs are counted here, other numbers elsewhere") == 2
@@ -391,7 +391,7 @@ def test_points_without_an_interval_are_open_and_explained(few_samples, monkeypa
     many = scored("ideal", sampler(), cases(200))
     assert not has_open_marks(many[0])
     with monkeypatch.context() as undrawn:
-        undrawn.setattr(figures, "encoded", lambda *_: b"")
+        undrawn.setattr(figures, "encoded_figure", lambda *_: b"")
         assert "Open marks" not in report_html([many])
     for document, is_open in ((few, True), (many[0], False)):
         drawn = base64.b64decode(error_panels({"ideal": document})[0].source.split(",")[1]).decode()

@@ -36,7 +36,7 @@ from phibench.estimator.spots.detect import detect
 def test_the_benchmark_runs_what_accepts_each_preset(
     bench_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(figures, "encoded", lambda *_: b"")  # thirty figures, which test_report.py draws
+    monkeypatch.setattr(figures, "encoded_figure", lambda *_: b"")  # thirty figures, which test_report.py draws
     names = ["red_centroid", "raw_maximum_likelihood"]
     done = bench(bench_dataset, tmp_path / "out", names, workers=1, pairs=2, console=quiet())
     raw = [f"bayer-raw-{name}{track}" for track in ("", "-localise") for name in names]

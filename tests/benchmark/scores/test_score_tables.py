@@ -215,7 +215,7 @@ def test_a_method_that_takes_none_of_the_pairs_is_not_ranked_and_not_blamed(scor
     out = " ".join(capsys.readouterr().out.split())
     assert f"chain_fit: not compared: it {why}" in out
     assert out.count("chain_fit") == 1
-    monkeypatch.setattr(figures, "encoded", lambda *_: b"")  # words are the subject
+    monkeypatch.setattr(figures, "encoded_figure", lambda *_: b"")  # words are the subject
     html = report_html([(one.document, one.records) for one in (*scored, other)])
     assert f"chain_fit is not compared: it {why}." in html
     assert html.count("chain_fit") == 1
