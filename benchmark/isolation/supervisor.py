@@ -1,7 +1,8 @@
-"""Supervisor of a method's process, run as a module with SOCKET MEMORY: starts the worker, ends all that it leaves.
+"""Supervisor of a method's process: starts the worker, and ends it with all that it has started.
 
-It starts the worker and does nothing but wait. When the worker ends, or the runner hangs up or dies, it kills all that
-the worker has started and removes the working folder. On Linux it is a child subreaper: a daemon in a session of its
+Run as ``python -m phibench.benchmark.isolation.supervisor SOCKET MEMORY``. It starts the worker and does nothing but
+wait. When the worker ends, or the runner hangs up or dies, it kills all that the worker has started and removes the
+working folder. On Linux it is a child subreaper: a daemon in a session of its
 own (setsid) becomes its child when its parent dies. The worker is killed if its supervisor dies (parent-death signal).
 It ends as the worker did: with the same exit code, or of the same signal.
 

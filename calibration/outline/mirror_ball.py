@@ -1,4 +1,4 @@
-"""Panorama of the surroundings from a photograph of a mirror ball: found, unwrapped, written, with a recipe's table.
+"""Panorama from a photograph of a mirror ball: the ball found and unwrapped; its file, and a recipe's table for it.
 
 The ball is a sphere of a stated radius before a pinhole camera. Its outline in the photograph gives its direction and,
 with the focal length, its distance; or the focal length, with the distance. A direction of the panorama stands for the

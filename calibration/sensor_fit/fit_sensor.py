@@ -1,4 +1,4 @@
-"""Fit of a sensor from a folder of its frames: noise, tone curve, edges, JPEG, lens by chessboards; what is not told.
+"""Fit of a sensor from a folder of its frames: noise, tone curve, edges, JPEG, and the lens by chessboards.
 
 Raw frames give photon transfer; processed frames give tone curve, noise and sharpening; both give blur from edges and
 the lens from chessboards. Every number comes with its sigma. Numbers of the preset that the frames leave open stand in

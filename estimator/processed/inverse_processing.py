@@ -1,4 +1,4 @@
-"""Electrons of the raw pixels behind processed images: the camera's processing undone, and its means of chroma too.
+"""Electrons of the raw pixels behind processed images: tone curve, sharpening, matrix and chroma means undone.
 
 `unprocessed_electrons` undoes each step but denoising and the loss of chroma. The rest is for a room behind an image
 whose chroma the camera has averaged (yuyv, and JPEG of 4:2:2 and 4:2:0):

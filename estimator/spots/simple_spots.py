@@ -1,4 +1,4 @@
-"""Simple extractors of a spot's position, to compare with, on stacks of regions; `find_spot`, centroid without noise.
+"""Simple extractors of a spot's position, to compare with; and `find_spot`, the centroid in noise-free frames.
 
 Regions are images of one spot, shape (n, h, w), or (n, h, w, 3) R, G, B, of which the luma is taken. Integer (u, v) are
 pixel centres; `origin_px`, shape (2,) or (n, 2), is the image pixel of a region's first column and row. The background

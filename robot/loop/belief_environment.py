@@ -1,4 +1,4 @@
-"""Environment `phibench/ApproachTargetBelief-v0` for `gymnasium`: the observation is a belief; a learner commands.
+"""Environment `phibench/ApproachTargetBelief-v0` for `gymnasium`: its observation is the belief over the target.
 
 The flat environment asks a learner for a stereo method as well: to measure D to 2 % from pixels of two strokes. Here
 the robot identifies its target and keeps a belief of it, as the policy `paper` does. What is left is to plan: when to
