@@ -1,4 +1,4 @@
-"""Statistics over samples with confidence intervals, by BCa bootstrap or Clopper-Pearson.
+"""Statistics over samples (mean, rms, ratio, quantile, rate) with 95 % intervals, by bootstrap or Clopper-Pearson.
 
 Images of one sample share its errors. All noise realisations and both images of a sample are therefore resampled
 together. A resample is a weight per sample, its number of occurrences. Statistics take weights, shape (b, n), so that

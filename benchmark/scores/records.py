@@ -1,4 +1,4 @@
-"""Table that every score is computed from, one row per image: answer, truth, errors, bound.
+"""Table that every score is computed from, one row per image: answer, truth, errors, bound; missed pairs counted.
 
 A pair has two rows, "down" and "up"; columns of the pair are in both. Null where there is nothing: no answer, no
 truth (a spot without an image), no claimed covariance, no bound, or a ray that does not reach. Never NaN.

@@ -1,4 +1,4 @@
-"""Circle of a rig's mirror, as the rig predicts it and as its image shows it; plain sphere fits to begin with.
+"""Grey picture of a rig's image, and circles of its mirror, predicted and seen; plain sphere fits to begin with.
 
 The plain fits are biased: the steepest place of the light is not the limb, because light falls inside it and not
 outside. They are the start of the fit of the light across the limb, and a comparison for it.
