@@ -91,6 +91,7 @@ def slug(heading: str) -> str:
     return re.sub(r"[^\w\- ]", "", plain).replace(" ", "-")
 
 
+@cache
 def anchors(page: Path) -> set[str]:
     text = FENCE.sub("", page.read_text(encoding="utf-8"))
     return {slug(h) for h in re.findall(r"^#+\s+(.*)$", text, re.M)} | set(
@@ -132,70 +133,52 @@ def selects(expression: str, source: str, name: str) -> bool:
     return bool(eval(python))  # True, False, and, or, not, brackets: nothing else is left
 
 
-@pytest.mark.parametrize("page", PRESENT)
-def test_sentences_are_short(page):
-    long = [(words(s), s) for block in blocks(read(page)) for s in sentences(block) if words(s) > MAX_WORDS]
-    assert not long, "\n".join(f"{n} words: {s}" for n, s in long)
+def long_sentences(text: str) -> list[str]:
+    """Sentences of too many words."""
+    return [s for block in blocks(text) for s in sentences(block) if words(s) > MAX_WORDS]
 
 
-@pytest.mark.parametrize("page", PRESENT)
-def test_lines_are_short(page):
-    lines = enumerate(read(page).split("\n"), 1)
-    long = [n for n, line in lines if len(line) > MAX_COLUMNS and not in_table(line) and " " in line.strip()]
-    assert not long, f"lines beyond {MAX_COLUMNS} columns: {long}"
+def long_lines(text: str) -> list[str]:
+    """Lines of too many columns; a single word may be long."""
+    return [s for s in text.split("\n") if len(s) > MAX_COLUMNS and not in_table(s) and " " in s.strip()]
 
 
-@pytest.mark.parametrize("page", PRESENT)
-def test_rows_of_tables_are_short(page):
-    lines = enumerate(read(page).split("\n"), 1)
-    long = [n for n, line in lines if in_table(line) and len(line) > MAX_TABLE_COLUMNS]
-    assert not long, f"rows beyond {MAX_TABLE_COLUMNS} columns: {long}"
+def long_rows(text: str) -> list[str]:
+    """Rows of tables of too many columns."""
+    return [line for line in text.split("\n") if in_table(line) and len(line) > MAX_TABLE_COLUMNS]
 
 
-@pytest.mark.parametrize("page", [*PRESENT, *sorted(HISTORY)])
-def test_links_are_alive(page):
-    text = CODE.sub("", FENCE.sub("", read(page)))
-    dead = []
-    for target in [target for _, target in LINK.findall(text)] + SOURCE.findall(text):
-        path, _, anchor = target.partition("#")
-        if re.match(r"\w+:", path):
-            continue
-        file = (ROOT / page).parent / path if path else ROOT / page
-        if not file.exists() or (anchor and file.suffix == ".md" and anchor not in anchors(file)):
-            dead.append(target)
-    assert not dead
+def missing_files(text: str) -> list[str]:
+    """Paths of the repository that are not there."""
+    named = {path for piece in code_pieces(text) for path in REPOSITORY_PATH.findall(piece)}
+    return [path for path in sorted(named) if "NAME" not in path and not list(ROOT.glob(path))]
 
 
-@pytest.mark.parametrize("page", PRESENT)
-def test_files_that_are_named_exist(page):
-    named = {path for piece in code_pieces(read(page)) for path in REPOSITORY_PATH.findall(piece)}
-    assert not [path for path in sorted(named) if "NAME" not in path and not list(ROOT.glob(path))]
-
-
-@pytest.mark.parametrize("page", PRESENT)
-def test_tests_that_are_named_exist(page):
+def missing_tests(text: str) -> list[str]:
+    """Calls of pytest that select no test."""
     missing = []
-    for piece in code_pieces(read(page)):
+    for piece in code_pieces(text):
         if not re.search(r"\bpytest\b", piece):
             continue
-        files = re.findall(r"\btests/\S+\.py", piece)
-        sources = [
-            (s, n) for s, n in collected_tests() if not files or n.split("::")[0] in {Path(f).name for f in files}
-        ]
+        files = {Path(file).name for file in re.findall(r"\btests/\S+\.py", piece)}
+        tests = [(source, name) for source, name in collected_tests() if not files or name.split("::")[0] in files]
         for quoted, bare in re.findall(r"""-k\s+(?:"([^"]+)"|(\S+))""", piece):
-            if not any(selects(quoted or bare, source, name) for source, name in sources):
+            if not any(selects(quoted or bare, source, name) for source, name in tests):
                 missing.append(piece)
-    assert not missing
+    return missing
 
 
-@pytest.mark.parametrize("page", PRESENT)
-def test_commands_that_are_named_exist(page):
-    unknown = []
-    for piece in code_pieces(read(page)):
-        match = re.match(r"(?:time )?(?:\S*/)?phibench\s+([a-z][\w-]*)(?:\s+([a-z][\w-]*))?", piece)
-        if match and not is_command(match[1], match[2]):
-            unknown.append(piece)
-    assert not unknown
+def unknown_commands(text: str) -> list[str]:
+    """Calls of `phibench` that the command line does not have."""
+    call = re.compile(r"(?:time )?(?:\S*/)?phibench\s+([a-z][\w-]*)(?:\s+([a-z][\w-]*))?")
+    return [piece for piece in code_pieces(text) if (m := call.match(piece)) and not is_command(m[1], m[2])]
+
+
+def unknown_targets(text: str) -> list[str]:
+    """Targets that the Makefile does not have."""
+    targets = set(re.findall(r"^([a-z][\w-]*):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.M))
+    named = {m[1] for piece in code_pieces(text) if (m := re.match(r"(?:time )?make ([a-z][\w-]*)", piece))}
+    return sorted(named - targets)
 
 
 def is_command(name: str, sub: str | None) -> bool:
@@ -206,11 +189,27 @@ def is_command(name: str, sub: str | None) -> bool:
     return not group or sub is None or sub in group
 
 
+CHECKS = (long_sentences, long_lines, long_rows, missing_files, missing_tests, unknown_commands, unknown_targets)
+
+
 @pytest.mark.parametrize("page", PRESENT)
-def test_make_targets_that_are_named_exist(page):
-    targets = set(re.findall(r"^([a-z][\w-]*):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.M))
-    named = {m[1] for piece in code_pieces(read(page)) if (m := re.match(r"(?:time )?make ([a-z][\w-]*)", piece))}
-    assert named <= targets
+def test_a_page_is_short_and_names_what_exists(page):
+    text = read(page)
+    assert {check.__name__: faults for check in CHECKS if (faults := check(text))} == {}
+
+
+def test_links_are_alive():
+    dead = []
+    for page in PAGES:
+        text = CODE.sub("", FENCE.sub("", read(page)))
+        for target in [target for _, target in LINK.findall(text)] + SOURCE.findall(text):
+            path, _, anchor = target.partition("#")
+            if re.match(r"\w+:", path):
+                continue
+            file = (ROOT / page).parent / path if path else ROOT / page
+            if not file.exists() or (anchor and file.suffix == ".md" and anchor not in anchors(file)):
+                dead.append((page, target))
+    assert not dead
 
 
 def test_the_citation_has_the_version_of_the_package():
@@ -298,6 +297,11 @@ def test_nothing_is_named_that_only_the_authors_have():
 
 
 def test_the_checks_see_faults():
+    row = "| " + "x" * MAX_TABLE_COLUMNS
+    faults = ("word " * 26 + ".", "a " + "b" * MAX_COLUMNS, row, "`docs/no.md`", "`pytest -k no_such_test`")
+    for check, fault in zip(CHECKS, (*faults, "`phibench paint`", "`make tea`"), strict=True):
+        assert len(check(fault)) == 1, check
+        assert not check("`pytest -k test_links_are_alive`, `make test`, `phibench demo`, `docs/model.md`"), check
     long = "One " + "word " * 24 + "more."
     assert [words(s) for s in sentences(long + " Short one. See eq. (4) of `a b c` in [a page](x.md).")] == [26, 2, 8]
     assert list(blocks("# A\n\none\ntwo\n* three\n  four\n\n| t |\n\n    code\n$$\nx\n$$\nend")) == [
