@@ -120,6 +120,7 @@ def test_a_damaged_file_is_read_or_refused(name: str, further: dict[str, Kind], 
     fuzz_a_file(further[name], tmp_path, FEW, always_read=name in ALWAYS_READ)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", OF_FOLDERS)
 def test_a_folder_with_a_damaged_file_is_taken_or_refused(
     name: str, of_folders: dict[str, Kind], tmp_path: Path

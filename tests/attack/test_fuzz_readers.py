@@ -119,6 +119,7 @@ def fuzz_a_file(kind: Kind, folder: Path, cases: int, always_read: bool = False)
     assert found["refused"] > cases // 10 or kind.name == "journal.txt" or always_read
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", KINDS)
 def test_a_damaged_file_is_read_or_refused(name: str, valid: dict[str, Kind], tmp_path: Path) -> None:
     fuzz_a_file(valid[name], tmp_path, FEW)

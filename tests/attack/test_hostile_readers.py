@@ -175,6 +175,7 @@ def test_a_gltf_of_entries_without_bytes(tmp_path: Path) -> None:
     assert "entries together" in refusal(lambda: read_mesh(tmp_path / "a.gltf"))
 
 
+@pytest.mark.slow
 def test_a_gltf_of_thousands_of_parts(tmp_path: Path) -> None:
     document = {
         "asset": {"version": "2.0"},
@@ -209,6 +210,7 @@ def test_a_column_twice(tmp_path: Path) -> None:
     assert "has the column 'stroke_m' twice" in refusal(lambda: read_pair_list(tmp_path))
 
 
+@pytest.mark.slow
 def test_a_list_of_a_hundred_thousand_names_one_twice(tmp_path: Path) -> None:
     rows = "".join(f"n{k},x.png,y.png,0.1\n" for k in range(99_998))
     (tmp_path / "pairs.csv").write_text(f"name,down,up,stroke_m\n{rows}n99997,x.png,y.png,0.1\n")
@@ -259,6 +261,7 @@ def test_pipes_in_an_export_are_faults(tmp_path: Path) -> None:
 LITTLE = 400 << 20
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="the address space is bounded on Linux")
 @pytest.mark.parametrize(
     "tokens",

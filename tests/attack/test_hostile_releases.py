@@ -139,6 +139,7 @@ def bomb(layers: int = 1) -> bytes:
     return data if layers == 1 else gzip.compress(data)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("answer", "words"),
     [

@@ -120,6 +120,7 @@ def test_help_names_every_command(command, capsys):
     assert command in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_help_and_score_load_no_renderer(python):
     code = """
 import sys

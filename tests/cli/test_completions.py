@@ -75,6 +75,7 @@ def test_values_are_completed(
     assert not {*none.split(), ".hidden.py"} & set(values)
 
 
+@pytest.mark.slow
 def test_bash_asks_for_values(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The script of bash calls the command, whose name is on the path."""
     assert cli.main(["completion", "bash"]) == 0
@@ -104,6 +105,7 @@ def test_completion_imports_nothing_slow(python: Python) -> None:
     assert child.stdout.splitlines()[-1] == "[]"
 
 
+@pytest.mark.slow
 def test_the_script_of_zsh_calls_what_it_defines(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """As a file of `fpath` it is the function `_phibench` itself; sourced, it names its function to `compdef`."""
     assert cli.main(["completion", "zsh"]) == 0

@@ -62,6 +62,7 @@ def test_one_of_each_kind_is_made_and_verifies(made: Path) -> None:
     assert (report.faults, report.notes) == ((), ())
 
 
+@pytest.mark.slow
 def test_the_plan_without_files_is_the_one_with_them(made: Path) -> None:
     """Names of surfaces, spots and visibility: the stand-ins have the surfaces of the files to the bit."""
     without = make_plan(parse_recipe(TEXT))
@@ -107,6 +108,7 @@ def test_a_killed_export_is_taken_up_again_with_the_same_bytes(made: Path, tmp_p
     assert read_checksums(out) == read_checksums(made)
 
 
+@pytest.mark.slow
 def test_more_samples_keep_the_files_and_add_those_of_their_rooms(made: Path, tmp_path: Path) -> None:
     """Two samples need the panorama alone; the third needs the mesh."""
     out = tmp_path / "out"
@@ -133,6 +135,7 @@ def test_a_damaged_file_is_made_again(copy: Path, made: Path) -> None:
     assert read_checksums(copy) == read_checksums(made)
 
 
+@pytest.mark.slow
 def test_another_seed_is_refused_and_leaves_the_folder_as_it_was(copy: Path) -> None:
     held = exported(copy)
     with patch("phibench.datasets.make.WorkerPool", InlineWorkerPool):

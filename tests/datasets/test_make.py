@@ -317,6 +317,7 @@ def test_a_single_long_step_is_announced() -> None:
     assert said(console).splitlines()[-1].startswith("panorama: 1/1 after ")
 
 
+@pytest.mark.slow
 def test_the_preview_says_what_the_data_set_will_be(smallest_dataset: Path, tmp_path: Path) -> None:
     rows, text = read_manifest(smallest_dataset), make.dry_run(SMALLEST, tmp_path / "out", workers=2)
     assert list(tmp_path.iterdir()) == []
@@ -376,6 +377,7 @@ def _changed(folder: Path, old: str, new: str) -> Path:
     return folder / "changed.toml"
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("inline")
 def test_without_mitsuba_frames_may_change_and_nothing_may_be_rendered(smallest_dataset: Path, tmp_path: Path) -> None:
     copy, blocked = Path(shutil.copytree(smallest_dataset, tmp_path / "copy")), tmp_path / "blocked"

@@ -73,6 +73,7 @@ def test_a_fresh_data_set_is_in_order(name: str, request: pytest.FixtureRequest)
     assert report.samples in (2, 3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("damage", [truncate, flip_a_bit, Path.unlink])
 @pytest.mark.parametrize(
     "name",

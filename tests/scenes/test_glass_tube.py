@@ -242,6 +242,7 @@ def test_what_the_glass_costs_an_estimator_that_neglects_it() -> None:
     assert rows[0][0] == pytest.approx(0.135, abs=2e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["aligned", "crooked"])
 def test_estimators_that_know_of_the_glass_are_exact(name: str) -> None:
     """D, point and image by the estimator's Snell's law, from pixels of the simulator's closed form; derivatives."""

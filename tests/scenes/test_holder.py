@@ -69,6 +69,7 @@ def uprights(view: View, scale: float) -> list[np.ndarray]:
     return [plate, (0.0, 0.0, high, high + 0.004, holder.plate_m), *((*at, low, high, r) for at in rods)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("misalignment", [ALIGNED, CROOKED], ids=["aligned", "crooked"])
 @pytest.mark.parametrize("kind", KINDS)
 def test_rods_are_round_ones_within_the_error_of_their_prisms(kind: str, misalignment: Misalignment) -> None:
@@ -126,6 +127,7 @@ def test_nothing_of_it_stands_between_lens_and_mirror(kind: str) -> None:
     assert np.all(hits.distance_m > length)
 
 
+@pytest.mark.slow
 def test_truth_of_pixels_and_of_spots_agree() -> None:
     """Pixels that see a rod instead of the wall, and spots on what those pixels would see without it."""
     with_, without = rig("rods").at(0.3), default_rig().at(0.3)
@@ -153,6 +155,7 @@ def test_truth_of_pixels_and_of_spots_agree() -> None:
         assert spot_truth(without, spot, room_geometry(room, without)).visible
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_rod_cuts_a_part_of_the_light_and_the_certificate_agrees(kind: str) -> None:
     """At the rod's edge a part of the lens sees the spot: by the mirror's two independent solutions alike."""
@@ -192,6 +195,7 @@ def held(shape: str, kind: str, *, aligned: bool) -> Rig:
     return dataclasses.replace(rig, holder=fitted(kind, rig.mirror.profile.rim_radius_m, rig.mirror.profile.depth_m))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", PROFILES)
 @pytest.mark.parametrize("kind", [*KINDS, "tube"])
 def test_nothing_of_it_stands_between_lens_and_a_mirror_of_revolution(kind: str, shape: str) -> None:

@@ -43,6 +43,7 @@ def random_view(rng: np.random.Generator, size_m: float = 1e-3) -> View:
 # -- the surface ---------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", HARMONICS)
 def test_harmonics_are_scipys_scaled_to_a_peak_of_one(name: str) -> None:
     """A multiple of SciPy's harmonic (sign by the table of `scenes/form.py`); its peak is 1 within the lattice's pitch.
@@ -309,6 +310,7 @@ def test_a_vanishing_form_is_the_sphere() -> None:
     assert plain.rig.outline_px(30) == pytest.approx(tiny.rig.outline_px(30), abs=1e-8)
 
 
+@pytest.mark.slow
 def test_the_truth_layer_is_that_of_the_form() -> None:
     """Pixel by pixel the world point that the estimator's own ray through the pixel reaches; the sphere's is not."""
     from phibench.scenes.shapes import cuboid

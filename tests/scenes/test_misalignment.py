@@ -66,6 +66,7 @@ def test_every_parameter_has_a_range(name: str) -> None:
     assert 0.0 < PARAMETERS[name].study < limit
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PARAMETERS)
 def test_each_parameter_changes_the_rig_or_the_stroke(name: str) -> None:
     """One at a time: something changes, and what is changed is not shared with another parameter by mistake."""
@@ -334,6 +335,7 @@ def test_drawn_motions_keep_clear_of_boards_and_the_ceiling() -> None:
 # -- data sets -----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_data_set_says_what_is_true_and_what_is_nominal(misaligned_dataset: Path) -> None:
     report = verify(misaligned_dataset)
     assert report.ok, report.faults

@@ -94,6 +94,7 @@ def test_true_depth_counts_from_the_true_sphere() -> None:
     assert true == pytest.approx(np.hypot(POINTS_M[:, 0] - 0.01, POINTS_M[:, 1]), rel=1e-12)
 
 
+@pytest.mark.slow
 def test_drawn_rigs_spread_and_impossible_ones_are_drawn_again() -> None:
     """Deviation of 200 draws of one parameter is good to 5 %: four times that. Errors of phi_ray grow with D."""
     random = _random("drawn")

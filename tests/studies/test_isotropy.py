@@ -130,6 +130,7 @@ def _noise(rng: np.random.Generator, sigmas: np.ndarray, bounds: np.ndarray, dra
     ]
 
 
+@pytest.mark.slow
 def test_isotropy_is_denied_as_rarely_as_stated() -> None:
     """300 sets of equal scatter, false alarms 5 %: 15 +- 3.8 expected, 4 sigma allowed; Brown-Forsythe errs low."""
     rng = generator("test", "isotropy", "alarms")

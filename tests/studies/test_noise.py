@@ -142,6 +142,7 @@ def test_draws_are_named_and_boxes_hold_their_spots(tiny_dataset: Path) -> None:
             assert box.v0_px + 4 <= truth.v_px <= box.v0_px + box.height_px - 4
 
 
+@pytest.mark.slow
 def test_speckle_moves_the_bound_of_a_draw(tiny_dataset: Path) -> None:
     _, pair, _ = _pair(tiny_dataset)
     shot = shot_and_rig("speckle_contrast", "bayer-raw", pair.rig, 1.0)[0]
@@ -362,6 +363,7 @@ def test_tiny_study(tmp_path: Path, tiny_dataset: Path, monkeypatch: pytest.Monk
     assert [d.name for d in result.drawings][-1] == "ranking-seen-near-h0.500"
 
 
+@pytest.mark.slow
 def test_a_base_case_must_be_seen_and_levels_allowed(tmp_path: Path, tiny_dataset: Path) -> None:
     with pytest.raises(DatasetError, match="not visible in both images"):
         _run(tmp_path, tiny_dataset, TINY.replace("seen-near-h0.500", "half-hidden-h1.400"))

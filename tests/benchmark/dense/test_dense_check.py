@@ -136,6 +136,7 @@ DEPTHS: dict[str, tuple[Callable[[EasyTruth], np.ndarray], str]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fault", DEPTHS)
 def test_a_planted_fault_of_d_is_named(fault: str, truths: list[EasyTruth]) -> None:
     make, words = DEPTHS[fault]
@@ -148,6 +149,7 @@ def test_a_planted_fault_of_d_is_named(fault: str, truths: list[EasyTruth]) -> N
     assert re.search(words, found), found
 
 
+@pytest.mark.slow
 def test_images_that_a_right_method_exchanges_are_named(truths: list[EasyTruth]) -> None:
     """It is right where both are exchanged once more; a method that is wrong there, too, keeps its own faults."""
     (truth,) = truths
@@ -174,6 +176,7 @@ TARGETS: dict[str, tuple[Callable[[EasyTruth], np.ndarray], str]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fault", TARGETS)
 def test_a_planted_fault_of_places_is_named(fault: str, truths: list[EasyTruth]) -> None:
     make, words = TARGETS[fault]
@@ -183,6 +186,7 @@ def test_a_planted_fault_of_places_is_named(fault: str, truths: list[EasyTruth])
     assert words in found
 
 
+@pytest.mark.slow
 def test_right_answers_pass(truths: list[EasyTruth]) -> None:
     """Exact and coarse ones, as D and as places, with a sigma that is right."""
     rng = np.random.default_rng(2)
@@ -199,6 +203,7 @@ def test_right_answers_pass(truths: list[EasyTruth]) -> None:
     assert "67 % of the pixels answered" in judged(truths, coarse).notes
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("sigma", "words"),
     [

@@ -80,6 +80,7 @@ def test_causes_are_in_words(data: dict[str, Any], page: DensePage) -> None:
     assert np.array_equal(groups == 0, page.picture.truth.scored)
 
 
+@pytest.mark.slow
 def test_the_page_is_one_file_that_fetches_nothing(page: DensePage, tmp_path: Path) -> None:
     text = page.write(tmp_path / "page.html").read_text(encoding="utf-8")
     assert text == page.html()

@@ -52,6 +52,7 @@ def test_free_space_is_that_of_a_round_wall() -> None:
     assert free.shape == (180,)
 
 
+@pytest.mark.slow
 def test_the_same_answer_gives_the_same_picture(picture: DensePicture) -> None:
     panoramas, above = picture.panoramas_png(), picture.from_above_png()
     assert Image.open(io.BytesIO(panoramas)).size == (800, 1040)

@@ -210,6 +210,7 @@ CENTRAL = {
 """Median cost of the central model in the lab, % of D, at strokes of 0.10, 0.425 and 1.40 m: docs/dense.md."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", CENTRAL)
 def test_what_the_central_model_costs(shape: str) -> None:
     """Of perfect matches through the exact rig, a quarter of the pixels along each side."""

@@ -87,6 +87,7 @@ def test_the_oracle_scores_nothing(tiny_dataset: Path) -> None:
     assert {part.by for part in found.document.strata} >= {"depth", "elevation", "texture", "edge", "stroke"}
 
 
+@pytest.mark.slow
 def test_a_process_of_its_own_answers_as_the_function_does(
     tiny_dataset: Path, methods: Path, scored: DenseScored, tmp_path: Path
 ) -> None:
@@ -109,6 +110,7 @@ def test_a_method_that_wants_colours_is_told_so_on_raw_images(tiny_dataset: Path
     assert "images of 'bayer-raw' are raw, (H, W) without colours" in found.records["message"][0]
 
 
+@pytest.mark.slow
 def test_built_in_methods_run_in_processes_of_their_own(tiny_dataset: Path) -> None:
     pairs = dense_pairs(open_dataset(tiny_dataset), "mjpeg", pairs=1)
     assert not resolve("dense_sgbm", DENSE).shares
@@ -313,6 +315,7 @@ def test_names_of_no_method_are_answered_with_the_seats_own_words(tmp_path: Path
         resolve(f"{tmp_path / 'absent.py'}:depth", DENSE)
 
 
+@pytest.mark.slow
 def test_the_picture_of_a_sample(tiny_dataset: Path, methods: Path, tmp_path: Path, capsys: Any) -> None:
     """Both PNGs of a method of a file; a wrong sample, method or answer is a sentence, and nothing is written."""
     command = ["dense", "picture", str(tiny_dataset), "--out", str(tmp_path / "out"), "--method"]

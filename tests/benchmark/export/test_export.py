@@ -81,6 +81,7 @@ def test_others_read_the_same_numbers_and_images(done: Path, tiny_dataset: Path,
             assert (numbers["down.u0_px"], numbers["down.exposure_s"]) == (frame.region.u0_px, frame.sensor.exposure_s)
 
 
+@pytest.mark.slow
 def test_croissant_is_valid_and_gives_the_rows(done: Path) -> None:
     import mlcroissant
 
@@ -108,6 +109,7 @@ def test_same_bytes_again_and_with_other_workers(done: Path, tiny_dataset: Path,
     assert snapshot(tmp_path / "other") == snapshot(done)
 
 
+@pytest.mark.slow
 def test_what_is_lost_or_changed_alone_is_made_again(done: Path, tiny_dataset: Path, tmp_path: Path) -> None:
     """A flipped bit is found; the next run mends it and keeps the other shards."""
     folder = tmp_path / "copy"

@@ -36,6 +36,7 @@ def test_the_example_finds_the_spots_of_a_rendered_room(smoke_dataset: Path, pre
     assert found == visible
 
 
+@pytest.mark.slow
 def test_the_example_answers_without_laser_off_frames_and_without_a_spot(easy: Pair) -> None:
     without = replace(easy, down_off=None, up_off=None)
     # with one frame there is the room's slope below the spot: a tenth of a pixel between the two

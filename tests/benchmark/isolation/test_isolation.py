@@ -337,6 +337,7 @@ def shared():
 IN_SHARED_MEMORY = ("processes", "lock", "shared memory")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fresh", [False, True])
 def test_honest_methods_go_on_working(tmp_path: Path, fresh: bool) -> None:
     """All of it; where --fresh has no shared memory to give, what needs it is refused, and the rest goes on."""
@@ -381,6 +382,7 @@ def counted():
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("fresh", "count"), [(True, 1), (False, 3)])
 def test_fresh_is_a_process_and_a_folder_for_each_pair(tmp_path: Path, fresh: bool, count: int) -> None:
     """What is kept in memory, in the folder, in shared memory and in temporary folders is lost."""
@@ -397,6 +399,7 @@ def test_fresh_is_a_process_and_a_folder_for_each_pair(tmp_path: Path, fresh: bo
     assert lists[-1][0] == count
 
 
+@pytest.mark.slow
 @needs_landlock
 def test_the_truth_of_a_data_set_is_not_read_while_it_is_scored(smallest_dataset: Path, tmp_path: Path) -> None:
     """What was measured before: rms 0.001 px, efficiency 374, and no word of it."""

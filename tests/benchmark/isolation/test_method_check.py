@@ -307,6 +307,7 @@ def brightest(channel: int | None) -> Method:
     return method
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("preset", ["bayer-raw", "srgb8", "mjpeg"])
 def test_blue_taken_for_red_is_told_and_a_grey_picture_is_not(preset: str) -> None:
     of = WHOLE_SETS[preset]
@@ -329,6 +330,7 @@ def in_boxes(otherwise: Spot | None) -> Method:
     return method
 
 
+@pytest.mark.slow
 def test_a_method_that_needs_boxes_is_told() -> None:
     of = EasyPairs(count=8, whole=3)
     pairs = [of.pair(number) for number in range(len(of))]
@@ -343,6 +345,7 @@ def test_a_method_that_needs_boxes_is_told() -> None:
     assert "6 of 6 spots are missing where a pair has no boxes: 'no box'" in silent
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("preset", WHOLE_SETS)
 @pytest.mark.parametrize("name", ["detect", "brightest_pixel", "red_centroid", "laplacian_blob"])
 def test_sound_methods_pass_without_boxes_and_beside_a_blue_light(preset: str, name: str) -> None:
@@ -360,6 +363,7 @@ def test_the_check_has_pairs_without_boxes(tmp_path: Path) -> None:
 # -- through the method's process and the command line ----------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("body", "words"),
     [
@@ -379,6 +383,7 @@ def test_failures_name_the_users_own_line(tmp_path: Path, body: str, words: str)
     assert check.notes == ("0 of 2 pairs answered",)
 
 
+@pytest.mark.slow
 def test_check_gives_up_on_a_method_that_never_answers(tmp_path: Path) -> None:
     reference = method_file(tmp_path, "while True: pass")
     check = check_method(reference, limits=RunLimits(seconds=0.5))
@@ -400,6 +405,7 @@ def test_the_written_example_passes(tmp_path: Path, monkeypatch, capsys, preset:
     assert "mine.py:extract" in (tmp_path / "mine.py").read_text()
 
 
+@pytest.mark.slow
 def test_check_exits_with_1_and_says_what_is_wrong(tmp_path: Path, capsys) -> None:
     reference = method_file(tmp_path, "return 5", header=HEADER)
     assert cli.main(["method", "check", reference]) == 1

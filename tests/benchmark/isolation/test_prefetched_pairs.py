@@ -48,6 +48,7 @@ def assert_same(made: PairSet, plain: PairSet, number: int) -> None:
     assert_same_truth(made.truth(number), plain.truth(number))
 
 
+@pytest.mark.slow
 def test_pairs_and_truths_are_those_of_the_set_in_any_order() -> None:
     plain = EasyPairs("bayer-raw", count=5)
     with PrefetchedPairs(plain, 2) as made:
@@ -104,6 +105,7 @@ class Faulty(EasyPairs):
         return super().pair(number)
 
 
+@pytest.mark.slow
 def test_what_a_process_raises_is_raised_here_and_the_others_go_on(monkeypatch: pytest.MonkeyPatch) -> None:
     here = Path(__file__)
     for folder in (here.parent, here.parents[2]):  # the processes import this file, and its helpers

@@ -283,6 +283,7 @@ except OSError as error:
 """
 
 
+@pytest.mark.slow
 @needs_landlock
 @pytest.mark.parametrize(
     ("body", "words", "reached"),

@@ -129,6 +129,7 @@ NO_MEMORY = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("deed", NO_MEMORY.values(), ids=NO_MEMORY)
 def test_every_want_of_memory_is_memory_and_names_the_limit(tmp_path: Path, deed: str) -> None:
     reference = method_file(tmp_path, f"{deed}\nreturn {GOOD}")

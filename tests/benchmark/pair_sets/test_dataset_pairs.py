@@ -66,6 +66,7 @@ def every(pairs: DatasetPairs) -> list[tuple[Pair, PairTruth]]:
     return [(pairs.pair(i), pairs.truth(i)) for i in range(len(pairs))]
 
 
+@pytest.mark.slow
 def test_pairs_are_the_frames_of_their_takes(dataset: Dataset, pairs: DatasetPairs) -> None:
     assert len(pairs) == 9
     for pair_draw in pairs.pair_draws:
@@ -133,6 +134,7 @@ def test_images_have_the_shapes_of_their_preset_and_cannot_be_written(dataset: D
             image[0, 0] = 0
 
 
+@pytest.mark.slow
 def test_boxes_for_every_pair_are_those_of_a_recipe_that_has_them(dataset: Dataset) -> None:
     """64 pixels a side, the spot 4 px from their edges or more, from the recipe's own streams."""
     boxed = dataset_pairs(dataset, boxes_px=64)
@@ -159,6 +161,7 @@ def test_boxes_for_every_pair_are_those_of_a_recipe_that_has_them(dataset: Datas
             dataset_pairs(dataset, **given)
 
 
+@pytest.mark.slow
 def test_a_pair_knows_nothing_of_the_scene(pairs: DatasetPairs) -> None:
     """All that a pair has besides images: number, rig, stroke, card, boxes; none of them a number of the truth."""
     names = {field.name for field in fields(Pair)}
@@ -172,6 +175,7 @@ def test_a_pair_knows_nothing_of_the_scene(pairs: DatasetPairs) -> None:
         assert truth.sample_id not in text
 
 
+@pytest.mark.slow
 def test_the_truth_is_the_manifests(dataset: Dataset, pairs: DatasetPairs) -> None:
     for pair_draw, (pair, truth) in zip(pairs.pair_draws, every(pairs), strict=True):
         row = dataset[pair_draw.sample_id].row
@@ -202,6 +206,7 @@ def test_the_truth_is_the_manifests(dataset: Dataset, pairs: DatasetPairs) -> No
         assert float(light.depth_m) == pytest.approx(truth.depth_m, rel=1e-3)  # coma of the optics: see the page model
 
 
+@pytest.mark.slow
 def test_bounds_are_of_the_image_and_of_the_raw_pixels_behind_it(pairs: DatasetPairs) -> None:
     """Processing takes information away: no processed bound is below the raw one, but for what its model leaves out.
 
@@ -225,6 +230,7 @@ def test_bounds_are_of_the_image_and_of_the_raw_pixels_behind_it(pairs: DatasetP
     assert all(np.array_equal(one, other) for one, *others in by_sample.values() for other in others)
 
 
+@pytest.mark.slow
 def test_without_other_lights_and_levels_the_bound_is_that_of_the_sample(dataset: Dataset) -> None:
     """At a long exposure the room alone fills pixels without filters: there they carry nothing."""
     checked = {"full": 0, "mono-raw": 0, "bayer-raw": 0}
@@ -326,6 +332,7 @@ def test_a_hidden_spot_has_no_bounds(dataset: Dataset) -> None:
     assert truth.down.raw_bound_px2 is not None
 
 
+@pytest.mark.slow
 def test_order_and_subsets(dataset: Dataset, pairs: DatasetPairs) -> None:
     first = dataset_pairs(dataset, pairs=2)
     assert len(first) == 2
@@ -369,6 +376,7 @@ def test_the_document_says_where_it_comes_from(pairs: DatasetPairs) -> None:
     assert document["presets"] == ["bayer-raw", "mjpeg", "srgb8"]
 
 
+@pytest.mark.slow
 def test_tracks_show_boxes_of_their_own_or_whole_frames(bench_dataset: Path, tmp_path: Path) -> None:
     """The spot lies in the middle half of the box, in layers and in frames alike; other tracks have no box."""
     dataset = scored_dataset(bench_dataset)

@@ -59,6 +59,7 @@ def test_pairs_and_truths_are_those_of_the_layers(frames: FramesSet, tiny_datase
         assert frames.number_of(truth.sample_id, truth.draw) == number
 
 
+@pytest.mark.slow
 def test_a_score_has_the_same_records(frames: FramesSet, tiny_dataset: Path, tmp_path: Path) -> None:
     """All records but the seconds; both scores are of the same pairs for `compare`."""
     here = score(frames.folder, "red_centroid", draws=2, out=tmp_path / "a.json")

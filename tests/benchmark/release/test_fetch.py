@@ -47,6 +47,7 @@ def test_fetched_from_a_folder(made: Made, tmp_path: Path, smallest_dataset: Pat
     assert read_seal(tmp_path / "hidden").pairs == 2
 
 
+@pytest.mark.slow
 def test_the_starter_part_is_fetched_and_scored(
     made: Made, tmp_path: Path, smallest_dataset: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

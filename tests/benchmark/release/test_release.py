@@ -45,6 +45,7 @@ def test_frozen_recipes_are_unchanged() -> None:
         assert part.title == f"phibench-v4-{part.name}"
 
 
+@pytest.mark.slow
 def test_frozen_samples_are_unchanged() -> None:
     """What the code draws from the frozen recipe of the open set; 1e-6 m is more than libraries of sines differ by."""
     plan = make_plan(parse_recipe(with_numbers(recipe_text("bench-dev"), "bench-dev", 4, None)))

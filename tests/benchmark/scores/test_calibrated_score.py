@@ -212,6 +212,7 @@ def test_score_prints_the_general_row(misaligned: Dataset, tmp_path: Path, capsy
     assert seen["sigma_m"] > 0.0
 
 
+@pytest.mark.slow
 def test_methods_are_scored_with_a_calibration(
     misaligned: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

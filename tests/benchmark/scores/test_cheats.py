@@ -151,6 +151,7 @@ ORACLES: dict[str, tuple[Oracle, set[str]]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ORACLES)
 def test_whoever_has_the_truth_in_part_is_marked(name: str) -> None:
     oracle, quantities = ORACLES[name]
@@ -164,6 +165,7 @@ def test_the_part_that_shows_it_is_told() -> None:
     assert marked(in_one_image)["positions"].endswith("down images")
 
 
+@pytest.mark.slow
 def test_honest_methods_are_not_marked() -> None:
     """At the bound of each image, of the pair, worse, silent on some, and blind: chance of any 5e-3 at most."""
     for oracle in (sampler(5), at_the_pairs_bound(5), sampler(6, spread=2.0), silent, constant):
@@ -269,6 +271,7 @@ def test_a_truth_is_made_when_its_pair_is_answered_and_before_the_next_one() -> 
     assert second.late_seconds > 0.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("workers", [1, 2, 3])
 def test_no_truth_is_made_while_its_pair_is_looked_at(workers: int, tmp_path: Path) -> None:
     """In a run: the method says when it answers, and the set when a truth is begun."""
@@ -342,6 +345,7 @@ GAINLESS: dict[str, Oracle] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", GAINLESS)
 def test_a_cheat_that_knows_nothing_gains_no_rank(name: str) -> None:
     """No rank is below the honest one; constants and box centres are no better than silence."""

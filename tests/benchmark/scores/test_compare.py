@@ -67,6 +67,7 @@ def test_pairing_sees_what_two_intervals_do_not():
     assert other_noise.high - other_noise.low > 10 * (item.difference.high - item.difference.low)
 
 
+@pytest.mark.slow
 def test_equal_methods_are_seldom_told_apart_and_unequal_ones_always():
     """Two samplers with the same law, 20 times 16 metrics: any metric at all is called different in at most 5 %.
 
@@ -168,6 +169,7 @@ def write(folder, name, pairs, oracle, answers=None, rules=RULES):
     return folder / f"{name}.json"
 
 
+@pytest.mark.slow
 def test_scores_on_disk_are_compared_over_the_pairs_of_both(tmp_path):
     pairs = cases(40)
     whole = write(tmp_path, "whole", pairs, shifted(0.1))

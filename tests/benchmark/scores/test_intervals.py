@@ -148,6 +148,7 @@ STATISTICS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", STATISTICS)
 def test_bca_intervals_cover(name):
     """40 samples of 4 records that share half their variance, 400 trials.
@@ -159,6 +160,7 @@ def test_bca_intervals_cover(name):
     assert 0.95 - 0.02 - 3 * 0.011 < coverage(over_samples(statistic), truth, 7) < 0.95 + 3 * 0.011
 
 
+@pytest.mark.slow
 def test_intervals_over_records_would_not_cover():
     """What the test above is for: resampling images instead of samples covers the mean in some 78 % only.
 

@@ -302,6 +302,7 @@ def test_the_ideal_samplers_phi_and_depth_are_at_their_bounds(ideal):
     assert abs(value(m, "pull_depth") - 1.0) < 3 / np.sqrt(2 * 4000)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("claim", "expected"), [(1.2**2, 1 / 1.2), (1 / 1.2**2, 1.2)])
 def test_a_wrong_covariance_shows_in_the_pull(claim, expected):
     table, m = score(cases(200, FEW), sampler(claim=claim))

@@ -102,6 +102,7 @@ def planned(name: str, samples: int | None, rooms: int | None) -> tuple[Plan, se
     return plan, {room_of(source).digest for source in list(plan.rooms.values())[-3:]}
 
 
+@pytest.mark.slow
 def test_the_cheat_gains_where_the_room_is_the_same() -> None:
     """Boards in one room, as before version 3: the same cheat, and other samples of the same recipe."""
     recipe = load_recipe("random")
@@ -124,6 +125,7 @@ def test_the_cheat_gains_where_the_room_is_the_same() -> None:
     assert chance <= FALSE_ALARM
 
 
+@pytest.mark.slow
 def test_no_room_of_one_set_is_in_the_other_and_the_cheat_gains_nothing() -> None:
     """Three rooms of each, one a kind; all 240 by their sources."""
     sources = [set(draw_rooms(load_recipe(name)).values()) for name in ("bench-dev", "bench-test")]

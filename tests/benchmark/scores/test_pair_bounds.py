@@ -104,6 +104,7 @@ def test_records_have_both_bounds():
     assert checked == 40
 
 
+@pytest.mark.slow
 def test_a_pair_method_at_its_bound_is_above_1_against_single_images_and_at_1_against_the_pair():
     """200 pairs, whose squares have 3 degrees of freedom and bounds that spread by 1.7: 0.5 sqrt(2 x 1.7 / 400), 0.05.
 
@@ -131,6 +132,7 @@ def test_a_missing_bound_or_spot_gives_no_pair_bound():
 # -- what the images cannot tell ---------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_squares_over_what_is_possible_have_the_law_of_chi2():
     """Both samplers at the smallest possible covariance, 1 / RAW_MARGIN of the bound: means 3, 1, 1.
 
@@ -150,6 +152,7 @@ def test_squares_over_what_is_possible_have_the_law_of_chi2():
             assert squares.mean() > 1.0 - 4.0 * np.sqrt(2.0 / 500)
 
 
+@pytest.mark.slow
 def test_methods_at_the_bounds_are_not_flagged():
     """10 runs each of samplers at the bound and at the smallest possible covariance: chance of any 10 x 1e-3."""
     pairs = raw_cases(40)
@@ -174,6 +177,7 @@ def test_whoever_reads_the_truth_is_flagged_with_five_pairs():
     assert found["D"].ratio > 1e6
 
 
+@pytest.mark.slow
 def test_whoever_knows_the_boards_is_flagged():
     """The attack of issue 13: no noise is left out, only the plane of each board is known. D falls out exactly."""
     found = flagged(knows_boards())
@@ -199,6 +203,7 @@ def test_errors_without_noise_are_flagged():
     assert "D" in flagged(shifted(0.5))
 
 
+@pytest.mark.slow
 def test_the_flag_is_in_document_and_tables():
     pairs = raw_cases(30)
     scored = [

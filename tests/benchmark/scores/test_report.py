@@ -189,6 +189,7 @@ def test_causes_that_occur_are_counted(html):
     assert "Every image has a right position." not in html
 
 
+@pytest.mark.slow
 def test_causes_are_defined(html):
     assert all(text in Page(html).text for text in CAUSES.values())
 
@@ -234,6 +235,7 @@ def told(kind="", pair_set=(), **word):
     return division_and_rig(document.model_copy(update={"method": card, "pair_set": dict(pair_set)}))
 
 
+@pytest.mark.slow
 def test_division_and_rig_are_the_authors_word_and_what_the_pairs_gave():
     assert told() == ("open", "nominal")
     assert told(division="closed", self_calibrates=True) == ("closed", "self-calibrated")
@@ -270,6 +272,7 @@ def test_pictures_are_pictures(html):
             assert np.ptp(np.asarray(Image.open(io.BytesIO(raw)).convert("L"))) > 100
 
 
+@pytest.mark.slow
 def test_the_same_scores_give_the_same_page(html, scores):
     assert report_html(scores) == html
 
@@ -361,6 +364,7 @@ def test_results_are_one_page_in_each_form(score_files, tmp_path, capsys):
     assert again.read_bytes() == page.read_bytes()
 
 
+@pytest.mark.slow
 def test_scores_of_fewer_pairs_are_told_of(score_files, tmp_path, capsys, monkeypatch):
     """One method was scored on 25 of the 40 pairs."""
     few = tmp_path / "few.json"
@@ -383,6 +387,7 @@ def test_scores_of_fewer_pairs_are_told_of(score_files, tmp_path, capsys, monkey
     assert "counts" not in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_points_without_an_interval_are_open_and_explained(few_samples, monkeypatch):
     """Each stratum of three pairs has fewer than five samples; with two hundred, those of distance have more."""
     few, page = few_samples
@@ -420,6 +425,7 @@ def test_results_of_nothing_or_of_one_method_twice_are_refused(score_files, tmp_
         read_parts([])
 
 
+@pytest.mark.slow
 def test_results_leave_out_who_takes_none_of_the_pairs(tmp_path):
     """`chain_fit` is what others are compared with by default: on raw pixels the best method stands in."""
     why = "takes srgb8, yuyv, mjpeg, not bayer-raw"

@@ -33,6 +33,7 @@ from phibench.estimator.methods.spot_search import SharedPair
 from phibench.estimator.spots.detect import detect
 
 
+@pytest.mark.slow
 def test_the_benchmark_runs_what_accepts_each_preset(
     bench_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -60,6 +61,7 @@ def test_the_benchmark_runs_what_accepts_each_preset(
     assert one.worst == other.worst
 
 
+@pytest.mark.slow
 def test_registered_methods_run_beside_built_in_ones(
     bench_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -94,6 +96,7 @@ def test_a_benchmark_that_cannot_be_is_refused(
         bench(bench_dataset, folder, names, console=quiet())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("preset", ["bayer-raw", "mjpeg"])
 def test_shared_work_is_done_once_and_changes_no_answer(
     bench_dataset: Path, preset: str, monkeypatch: pytest.MonkeyPatch
@@ -113,6 +116,7 @@ def test_shared_work_is_done_once_and_changes_no_answer(
     assert replace(shared, stroke_m=0.1).work.stages == {}
 
 
+@pytest.mark.slow
 def test_a_method_of_others_neither_profits_from_shared_work_nor_changes_it(
     bench_dataset: Path, tmp_path: Path
 ) -> None:
@@ -144,6 +148,7 @@ def test_a_method_of_others_neither_profits_from_shared_work_nor_changes_it(
         MethodProcess(resolve("detect"), RunLimits(), others=[resolve(foreign)])
 
 
+@pytest.mark.slow
 def test_a_shared_process_that_ends_is_started_anew(bench_dataset: Path) -> None:
     pair = dataset_pairs(open_finished(bench_dataset), "bayer-raw").pair(0)
     process = MethodProcess(resolve("red_centroid"), RunLimits(), others=[resolve("detect")])
@@ -158,6 +163,7 @@ def test_a_shared_process_that_ends_is_started_anew(bench_dataset: Path) -> None
     )
 
 
+@pytest.mark.slow
 def test_a_data_set_that_becomes_unreadable_in_the_middle_keeps_the_records_so_far(
     bench_dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -80,6 +80,7 @@ def test_six_ways_give_the_same_bytes(folder: Path, tmp_path: Path, preset: str)
     assert compared == 4 * len(dataset) > 4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("preset", ["bayer-raw", "mjpeg"])
 @pytest.mark.parametrize("folder", ["with [frames]", "without"], indirect=True)
 def test_crops_have_the_camera_of_the_pairs(folder: Path, preset: str) -> None:

@@ -87,6 +87,7 @@ def test_a_score_and_its_records_are_read_back(mine, tmp_path):
     assert sorted(file.name for file in path.parent.iterdir()) == ["mine.json", "mine.parquet"]
 
 
+@pytest.mark.slow
 def test_the_same_run_gives_the_same_bytes(mine):
     again = scored(limits={"seconds": 30.0})
     assert again.document.model_dump_json() == mine.document.model_dump_json()
@@ -141,6 +142,7 @@ def test_a_stratum_holds_its_own_errors():
     assert rms == {"60": pytest.approx(0.5), "75": 0.0, "85": 0.0}
 
 
+@pytest.mark.slow
 def test_ranks_go_by_phi_with_missed_spots_and_by_depth_where_asked():
     """The one that answers only easy pairs has the smaller rms, and the lower rank."""
     good, half, pairs = sampler(spread=0.5), shifted(0.2), cases(80)
@@ -157,6 +159,7 @@ def test_ranks_go_by_phi_with_missed_spots_and_by_depth_where_asked():
     assert "ranked by D" in leaderboard([easy, every], "depth").title
 
 
+@pytest.mark.slow
 def test_worst_images_of_parts_are_those_of_all_at_once():
     """Pictures are made of what is among the worst so far: the end is the same in whatever order errors come."""
     pairs = cases(70)  # five parts
@@ -264,6 +267,7 @@ def test_small_numbers_do_not_read_as_zero():
 # -- commands ------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_several_methods_are_scored_as_each_alone():
     """Pairs are drawn once for all and in parts of 16; what a method gets does not depend on that.
 
@@ -329,6 +333,7 @@ def test_score_with_methods_compare_and_report(bench_dataset, half, tmp_path, ca
     assert (tmp_path / "page.html").read_text().startswith("<!DOCTYPE html>")
 
 
+@pytest.mark.slow
 def test_several_frames_of_a_position_are_scored_against_their_own_bound(bench_dataset, tmp_path):
     """Bounds fall with the frames, and a score of other frames or another sensor is no score of the same pairs."""
     sensor = SensorFile("bayer-raw", {"read_noise_e": 3.0})

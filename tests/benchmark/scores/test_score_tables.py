@@ -65,6 +65,7 @@ def test_tables_fit_eighty_columns_and_wide_ones_have_all(scored, capsys, monkey
     assert "pull" in wide
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sentence", ["not isolated: this kernel has no Landlock", "isolated: read ...", ""])
 def test_a_score_without_isolation_says_so(scored, capsys, sentence):
     one = with_isolation(scored[0], sentence)
@@ -103,6 +104,7 @@ def test_a_method_that_fails_on_every_pair_is_told_in_a_sentence(scored, capsys,
     assert "most frequent causes" in shown
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("messages", "words"),
     [
@@ -198,6 +200,7 @@ def test_an_interval_from_nothing_begins_at_nothing():
     assert shown == ["[0, 100]", "[0.001, 100]"]
 
 
+@pytest.mark.slow
 def test_a_method_that_takes_none_of_the_pairs_is_not_ranked_and_not_blamed(scored, capsys, monkeypatch):
     """It answers every pair with its refusal: neither last in the table nor a failure in the report's headline."""
     why = "takes srgb8, yuyv, mjpeg, not bayer-raw"

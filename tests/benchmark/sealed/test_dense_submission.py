@@ -75,6 +75,7 @@ def answers(public: Path, method: str, tmp_path_factory: pytest.TempPathFactory)
     return {name: folder / name for name in NAMES}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_a_submission_scores_as_the_method_does(
     name: str, answers: dict[str, Path], public: Path, true_set: Path, method: str

@@ -110,6 +110,7 @@ def test_a_forgery_is_told_by_its_column(honest: Honest, bench_dataset: Path, tm
     assert any(text.startswith(sentence) for text in told), told
 
 
+@pytest.mark.slow
 def test_the_truth_as_answers_does_not_hide_what_is_possible(
     honest: Honest, bench_dataset: Path, tmp_path: Path
 ) -> None:
@@ -134,6 +135,7 @@ def other(values: pl.Series) -> pl.Series:
                                    for i, x in enumerate(values)], kind)  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("once")
 def test_every_column_that_is_no_answer_is_compared(honest: Honest, bench_dataset: Path, tmp_path: Path) -> None:
     table = read_records(honest.path, read_score(honest.path))
@@ -160,6 +162,7 @@ def test_answers_come_back_out_of_the_records(honest: Honest) -> None:
     assert honest.again.records.equals(table)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("once")
 def test_parts_of_the_document_that_no_record_holds(honest: Honest, bench_dataset: Path, tmp_path: Path) -> None:
     document = read_score(honest.path)
@@ -214,6 +217,7 @@ def test_what_a_score_says_of_its_method_has_a_form(honest: Honest, tmp_path: Pa
     assert "method.files: the system did not tell every file that was opened" in checked.unchecked
 
 
+@pytest.mark.slow
 def test_the_code_is_that_of_the_program(honest: Honest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("phibench.benchmark.sealed.rebuilt_score.program_version", lambda: "phibench 0.2.0")
     document = read_score(honest.path).model_copy(update={"program": "phibench 0.2.0"})

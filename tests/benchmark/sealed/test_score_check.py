@@ -52,6 +52,7 @@ def honest(bench_dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
     return path
 
 
+@pytest.mark.slow
 def test_an_honest_score_has_no_fault(honest: Path, bench_dataset: Path, capsys: pytest.CaptureFixture[str]) -> None:
     checked = check_score(honest, bench_dataset)
     assert checked.faults == ()
@@ -66,6 +67,7 @@ def test_an_honest_score_has_no_fault(honest: Path, bench_dataset: Path, capsys:
     assert len([text for text in document["unchecked"] if not text.startswith("code_sha256")]) == 4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("track", ["localise", "find"])
 def test_a_score_of_a_track_is_built_again_as_that_track(bench_dataset: Path, tmp_path: Path, track: Track) -> None:
     """Boxes are the track's: called another one, the records' hints and the pair set are told."""
@@ -114,6 +116,7 @@ SENTENCES = (
 )
 
 
+@pytest.mark.slow
 def test_a_built_in_method_is_closed_and_takes_the_rig_as_it_is(honest: Path, tmp_path: Path) -> None:
     """Of a method of one's own the word stands; of a built-in one phibench knows."""
     document = read_score(honest)
@@ -162,6 +165,7 @@ RECORDS: dict[str, tuple[Change, str]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", list(RECORDS))
 def test_a_fault_of_the_records_is_told(honest: Path, bench_dataset: Path, tmp_path: Path, name: str) -> None:
     change, sentence = RECORDS[name]
@@ -191,6 +195,7 @@ def test_another_version_is_one_sentence(honest: Path, tmp_path: Path, capsys: p
         check_score(path)
 
 
+@pytest.mark.slow
 def test_a_method_that_runs_here_is_not_taken(bench_dataset: Path, tmp_path: Path) -> None:
     out = tmp_path / "here.json"
     score(bench_dataset, lambda pair: Answer(*2 * (Spot.missing("-"),)), "bayer-raw", out=out, console=quiet())

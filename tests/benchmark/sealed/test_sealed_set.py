@@ -160,6 +160,7 @@ def test_a_sealed_set_has_no_truth(sealed: Sealed) -> None:
         SealedPairs(sealed.public).pair(3)
 
 
+@pytest.mark.slow
 def test_truth_survives_its_file_to_the_bit(secret_dataset: Path) -> None:
     pairs = dataset_pairs(hidden(open_dataset(secret_dataset), "up"))
     for i in range(len(pairs)):
@@ -332,6 +333,7 @@ def test_an_interrupted_seal_leaves_nothing(
 # Command line
 
 
+@pytest.mark.slow
 def test_the_commands_say_what_they_did(
     sealed: Sealed, method: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -92,6 +92,7 @@ def test_a_folder_gives_a_csv_and_one_bad_pair_ends_no_run(folder: Path, sample:
     assert "contradicts the tape" in short["status"]
 
 
+@pytest.mark.slow
 def test_an_imported_set_is_scored_by_its_tape(
     imported: Path, folder: Path, sample: Sample, tmp_path: Path, capsys
 ) -> None:
@@ -171,6 +172,7 @@ def test_the_rig_is_calibrated_from_pictures(
     assert pairs.pair(0).rig.camera.blur_sigma_px == blur_px
 
 
+@pytest.mark.slow
 def test_vertical_edges_of_pictures_tell_the_tilt(
     imported: Path, sample: Sample, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
 ) -> None:

@@ -106,6 +106,7 @@ def test_outlines_of_one_rig_claim_what_one_does() -> None:
     assert np.allclose(outlines_as_one(outlines).covariance, C, rtol=1e-12, atol=0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("unaligned")
 def test_sigma_falls_with_the_frames(case: Case) -> None:
     setting = read_setting(case.folder / "rig.toml")
@@ -125,6 +126,7 @@ def test_sigma_falls_with_the_frames(case: Case) -> None:
     assert pull < 4.0
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("unaligned")
 def test_jpeg_frames_are_fitted_together(case: Case, capsys) -> None:
     several = [word for name in NAMES for word in (f"--{name.replace('_', '-')}", *map(str, case.jpg[name]))]
@@ -136,6 +138,7 @@ def test_jpeg_frames_are_fitted_together(case: Case, capsys) -> None:
     assert "3 of each position" in text
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("unaligned")
 def test_swapped_positions_are_told(case: Case, capsys) -> None:
     swapped = {"down": case.raw["up"], "up": case.raw["down"]}
@@ -143,6 +146,7 @@ def test_swapped_positions_are_told(case: Case, capsys) -> None:
     assert "swapped" in refused(capsys, case.arguments(swapped))
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("unaligned")
 def test_laser_on_and_off_exchanged_is_told(case: Case, capsys) -> None:
     dark = {"down": case.raw["down_off"], "up": case.raw["up_off"]}
@@ -150,6 +154,7 @@ def test_laser_on_and_off_exchanged_is_told(case: Case, capsys) -> None:
     assert "laser on and off are exchanged" in refused(capsys, case.arguments(dark))
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("unaligned")
 def test_all_four_pictures_exchanged_are_told(case: Case, capsys) -> None:
     crossed = {"down": case.raw["up_off"], "up": case.raw["down_off"]}
@@ -165,6 +170,7 @@ def test_laser_on_and_off_exchanged_at_one_position_is_told(case: Case, capsys) 
     assert "down" not in said.partition("exchanged at")[2]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("unaligned")
 def test_red_and_blue_exchanged_are_told(case: Case, tmp_path: Path, capsys) -> None:
     """Frames that OpenCV counts as B, G, R, stored as if they were R, G, B: D was 6 sigma off, with the wrong doubt."""
@@ -177,6 +183,7 @@ def test_red_and_blue_exchanged_are_told(case: Case, tmp_path: Path, capsys) -> 
     assert "red and blue are exchanged" in refused(capsys, case.arguments(swapped))
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("unaligned")
 @pytest.mark.parametrize("kind", ["raw", "jpg"])
 def test_a_camera_that_moved_between_on_and_off_is_told(case: Case, tmp_path: Path, kind: str, capsys) -> None:
@@ -197,6 +204,7 @@ def test_a_camera_that_moved_between_on_and_off_is_told(case: Case, tmp_path: Pa
     assert found[1] in ("2.9", "3.0", "3.1")
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("unaligned")
 @pytest.mark.parametrize(("degrees", "far_px"), [(2.0, 0), (0.0, 40)])
 def test_a_camera_that_turned_or_moved_far_is_told(
@@ -217,6 +225,7 @@ def test_a_camera_that_turned_or_moved_far_is_told(
     assert float(found[1]) == pytest.approx(far_px, abs=0.3) if far_px else float(found[1]) > 1.0  # 2 deg of 30 px
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("unaligned")
 def test_light_that_changed_between_on_and_off_is_told(case: Case, tmp_path: Path, capsys) -> None:
     relit = {}
@@ -230,6 +239,7 @@ def test_light_that_changed_between_on_and_off_is_told(case: Case, tmp_path: Pat
     assert "the light changed between laser on and off" in said
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("unaligned")
 def test_laser_off_pictures_of_the_other_position_are_told(case: Case, capsys) -> None:
     mixed = {**case.raw, "down_off": case.raw["up_off"], "up_off": case.raw["down_off"]}
@@ -258,6 +268,7 @@ def test_a_list_between_semicolons_and_a_folder_without_out_are_told(case: Case,
         assert name in refused(capsys, ["measure", str(tmp_path), *rig, *out])
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("unaligned")
 def test_a_stroke_in_centimetres_is_told(case: Case, capsys) -> None:
     text = refused(capsys, case.arguments(case.raw, 0.01 * case.sample.row.stroke_m))
@@ -266,6 +277,7 @@ def test_a_stroke_in_centimetres_is_told(case: Case, capsys) -> None:
     assert low < case.sample.row.stroke_m < high
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("unaligned")
 def test_a_laser_that_is_off_is_told(case: Case, capsys) -> None:
     dark = {"down": case.raw["down_off"][1:], "up": case.raw["up_off"][1:]}
@@ -396,6 +408,7 @@ def test_a_mirror_elsewhere_in_the_second_picture_is_told() -> None:
     assert "1.0 % larger" in apart_note([first, _outline(0.0, 0.0, 0.2574)])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("given", "said"),
     [

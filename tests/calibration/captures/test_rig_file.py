@@ -119,6 +119,7 @@ def test_numbers_of_the_recipes_are_usual() -> None:
     assert not any(unusual_numbers(raw) for raw in rigs)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("keys", "words"),
     [

@@ -43,6 +43,7 @@ def drawn(folder: Path, sample: Sample, preset: str, draws: int) -> list[SpotPic
     return [image for pair in ready for image in spot_pictures(pair, *places).values()]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("preset", ["bayer-raw", "srgb8", "mjpeg"])
 def test_spots_say_their_blur_and_colour(tiny_dataset: Path, sample: Sample, preset: str) -> None:
     images = drawn(tiny_dataset, sample, preset, 2)

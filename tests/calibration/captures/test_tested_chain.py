@@ -105,6 +105,7 @@ def test_a_decoded_jpeg_tells_its_quality(case: Case, quality: int, sampling: st
     assert jpeg_behind(decoded[3:, 5:]) is None  # its blocks begin elsewhere
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("unaligned")
 @pytest.mark.parametrize("preset", ["srgb8", "bayer-raw"])
 @pytest.mark.parametrize("phase", TURNS)
@@ -120,6 +121,7 @@ def test_a_camera_that_is_read_out_turned_is_measured(
     assert not found.doubts
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("unaligned")
 def test_a_png_of_a_jpeg_is_measured_as_the_jpeg(case: Case, tmp_path: Path) -> None:
     pixels = {name: case.pixels("mjpeg", name) for name in NAMES}
@@ -129,6 +131,7 @@ def test_a_png_of_a_jpeg_is_measured_as_the_jpeg(case: Case, tmp_path: Path) -> 
     assert max(case.spot_pulls(found, (0, 0))) < 4.4
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("unaligned")
 def test_a_smoothed_picture_is_doubtful_and_a_drawn_one_is_not(case: Case, tmp_path: Path) -> None:
     drawn = case.measured({name: case.pixels("srgb8", name) for name in NAMES}, tmp_path)

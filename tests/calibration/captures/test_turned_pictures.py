@@ -56,6 +56,7 @@ OF_SQUARES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["rgb", "raw"])
 @pytest.mark.parametrize("words", TURNS)
 def test_a_turned_picture_is_named(words: str, kind: Kind) -> None:

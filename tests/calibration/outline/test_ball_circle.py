@@ -53,6 +53,7 @@ def test_accuracy_of_outlines_among_patterns(found) -> None:
         assert circle.edges > 0.7
 
 
+@pytest.mark.slow
 def test_rooms_without_a_ball_are_refused() -> None:
     for number in range(2):
         photo = ball_photograph(np.random.default_rng([8, number]), ball=False)
@@ -87,6 +88,7 @@ def test_a_long_photograph_is_measured_in_finer_squares() -> None:
     assert photo.distance_px(fine.points_px) < 3.0 * fine.sigma_px.max()
 
 
+@pytest.mark.slow
 def test_radii_narrow_the_search() -> None:
     photo = photograph(3)
     r = photo.radius_px
@@ -118,12 +120,14 @@ def test_edges_of_a_disc_have_their_place() -> None:
     assert np.abs(place[:, 0]).max() < 0.2
 
 
+@pytest.mark.slow
 def test_a_grey_picture_is_enough() -> None:
     photo = photograph(1)
     circle = find_circle(photo.light.mean(axis=-1))
     assert photo.distance_px(circle.points_px) < 1.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("light", [np.zeros((40, 60)), np.ones((40, 60, 3)), np.ones((1, 1))])
 def test_empty_pictures_are_refused(light) -> None:
     with pytest.raises(ImageError, match="no outline of a ball"):
@@ -147,6 +151,7 @@ def rig_and_light() -> tuple[Rig, np.ndarray]:
     return rig, np.moveaxis(photo.light, -1, 0).astype(float)
 
 
+@pytest.mark.slow
 def test_where_the_light_is_not_steels_the_edge_is_the_outline(rig_and_light) -> None:
     """Mahalanobis distance of three numbers, false alarm rate 1e-4; a centre 5 sigma off is refused."""
     rig, light = rig_and_light

@@ -57,6 +57,7 @@ def test_a_limb_without_contrast_is_found_or_refused(pool: tuple[float, float, f
     assert (np.abs(np.subtract(found.circle_px, true)) < 3.0 * found.sigma_px).all()
 
 
+@pytest.mark.slow
 def test_the_fall_of_the_light_tells_the_limb() -> None:
     """From 3 px inside, as edges are: back to 0.7 px, 0.3 % of the radius, which is what the model of the fall errs."""
     true = (300.3, 295.6, 230.0)
@@ -69,6 +70,7 @@ def test_the_fall_of_the_light_tells_the_limb() -> None:
     assert limb_circle(light, (10.0, 10.0, 227.0), (0.0, 0.0)) is None  # most of it is outside
 
 
+@pytest.mark.slow
 def test_a_ball_that_is_dark_on_one_side_claims_less(monkeypatch: pytest.MonkeyPatch) -> None:
     """Light on a third of the turn: centre and radius are told only together; one such ball was 10 sigma off."""
     light = np.maximum(ball((300.3, 295.6, 230.0), (0.0, -1.2, 0.45), 1.0, 4) - 0.02, 0.0)
@@ -82,6 +84,7 @@ def test_a_ball_that_is_dark_on_one_side_claims_less(monkeypatch: pytest.MonkeyP
     assert edge_or_limb_circle(np.zeros((600, 600)), edges).sigma_px[1] > 0.003 * 226.0 * np.sqrt(20.0)
 
 
+@pytest.mark.slow
 def test_a_clear_edge_stays_where_it_is() -> None:
     """A ball half as bright as the wall: the answer is that of the edges, which err by 0.4 px and the jackknife."""
     true = (300.3, 295.6, 230.0)

@@ -61,6 +61,7 @@ def directions(rows: int) -> np.ndarray:
     return np.stack(d, axis=-1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("elevation_deg", [0.0, 90.0, -30.0])
 def test_surroundings_come_back(elevation_deg):
     """Pixels are 2 / r = 11 mrad apart in the ball's middle, and 1 / cos i as much towards its rim.
@@ -86,6 +87,7 @@ def test_surroundings_come_back(elevation_deg):
     assert np.abs(found.light - expected)[~found.seen].max() < 0.2  # the nearest direction: half a radian at most
 
 
+@pytest.mark.slow
 def test_distance_of_the_surroundings_matters():
     """A point 0.8 m off is seen from a place up to 50 mm beside the centre: 60 mrad."""
     light = photograph()
@@ -95,6 +97,7 @@ def test_distance_of_the_surroundings_matters():
     assert error > 5e-3
 
 
+@pytest.mark.slow
 def test_distance_gives_the_focal_length():
     light = photograph(centre=np.array([0.0, 0.0, 0.30]))
     ball = find_ball(light, BallPhoto(RADIUS, distance_m=0.30))
@@ -123,6 +126,7 @@ def test_a_panorama_coarser_than_the_photograph_is_averaged():
     assert coarse < 0.5 * fine
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("background", [0.0, 0.3, 0.9])
 def test_the_outline_is_found_before_any_background(background):
     """Light may rise or fall at the outline, or both along it."""
@@ -170,6 +174,7 @@ def test_command_writes_a_panorama_that_makes_a_room(photo, tmp_path, capsys, na
     assert room.lit
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "word"),
     [
@@ -201,6 +206,7 @@ def test_mistakes_end_in_one_sentence(photo, tmp_path, capsys, monkeypatch, chan
     assert not list(tmp_path.glob("room*"))
 
 
+@pytest.mark.slow
 def test_a_picture_without_a_ball_is_refused(tmp_path):
     rng = np.random.default_rng(1)
     for light in (rng.random((200, 300, 3)), np.full((200, 300, 3), 0.5), np.zeros((200, 300, 3))):

@@ -92,6 +92,7 @@ def test_plain_fits_are_biased(case) -> None:
         assert found[2] - s[2] > 1e-4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("preset", ["bayer-raw", "srgb8", "mjpeg"])
 def test_frames_within_their_covariance(case, frames, preset: str) -> None:
     """Mahalanobis distance of 3 numbers, false alarm rate 1e-4; a centre 0.2 mm off is refused."""
@@ -109,6 +110,7 @@ def test_frames_within_their_covariance(case, frames, preset: str) -> None:
     assert found.contrast == pytest.approx(1.0, abs=0.1)
 
 
+@pytest.mark.slow
 def test_a_long_picture_is_fitted_in_squares(case, frames, monkeypatch: pytest.MonkeyPatch) -> None:
     """In squares of 2 px errors keep within their covariance, false alarm rate 1e-4, and lengths are in pixels.
 
@@ -136,6 +138,7 @@ def test_a_long_picture_is_fitted_in_squares(case, frames, monkeypatch: pytest.M
     assert np.allclose((binned_rig(rig, 2).outline_px() + 0.5) * 2.0 - 0.5, rig.outline_px())
 
 
+@pytest.mark.slow
 def test_a_hopeless_fit_ends_soon(monkeypatch: pytest.MonkeyPatch) -> None:
     """A dark disc on a bright wall is an outline, but no light of polished steel: 30 steps would not come to rest."""
     rig = Rig()
@@ -187,6 +190,7 @@ def test_light_of_codes_is_light_of_numbers(frames) -> None:
     assert by_codes.taps == by_numbers.taps
 
 
+@pytest.mark.slow
 def test_radius_and_distance_scale_together(case) -> None:
     rig, light = case
     planes, s = planes_of(light), rig.sphere_in_camera_m
@@ -197,6 +201,7 @@ def test_radius_and_distance_scale_together(case) -> None:
     assert b.sphere_in_camera_m == pytest.approx(1.01 * a.sphere_in_camera_m, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_an_image_without_a_mirror_is_refused() -> None:
     rng = np.random.default_rng(12)
     blocks = np.kron(rng.uniform(0.5, 2.0, (9, 16)), np.ones((80, 80)))

@@ -51,12 +51,14 @@ def test_the_move_brings_the_mirror_above_the_lens(light) -> None:
     assert found.sigma_m == found.sigma_outline_m
 
 
+@pytest.mark.slow
 def test_doubts_about_the_camera_are_in_sigma(light) -> None:
     """0.1 deg and 5 px at 0.26 m: 0.45 mm and 0.91 mm."""
     found = alignment(light, Rig())
     assert found.sigma_m == pytest.approx(np.hypot(0.2605 * np.radians(0.1), 0.2605 * 5.0 / 1430.0), rel=1e-3)
 
 
+@pytest.mark.slow
 def test_a_tilted_camera_moves_along_the_worlds_axes(light) -> None:
     """Turned by 90 degrees about the vertical, the image's right is the world's y."""
     turned = replace(Rig(), T_world_camera=Pose("world", "camera", (0, 0, 0.45), ((0, -1, 0), (1, 0, 0), (0, 0, 1))))
@@ -133,6 +135,7 @@ def rig_file(tmp_path):
     return file
 
 
+@pytest.mark.slow
 def test_a_rig_file_says_a_mirror_of_another_shape(rig_file, tmp_path, capsys) -> None:
     """A hyperboloid aside by 1.70 mm, within 0.03 mm; half a degree of its own tilt is in sigma."""
     rig = read_rig_file(rig_file).rig
@@ -210,6 +213,7 @@ def fitted(monkeypatch: pytest.MonkeyPatch) -> list[tuple[np.ndarray, BallCircle
     return done
 
 
+@pytest.mark.slow
 def test_a_photograph_of_an_unknown_camera_gives_the_circle(fitted, tmp_path, capsys) -> None:
     """Neither focal length nor distance: the circle in pixels. With the focal length the outline tells the distance."""
     photo = ball_photograph(np.random.default_rng([7, 3]))
@@ -229,6 +233,7 @@ def test_a_photograph_of_an_unknown_camera_gives_the_circle(fitted, tmp_path, ca
     assert distance_of(circle, photo.focal_px, 0.06) == pytest.approx(0.06 * np.linalg.norm(photo.centre), rel=0.01)
 
 
+@pytest.mark.slow
 def test_grey_turned_and_deep_photographs_are_read_like_their_twin(fitted, tmp_path, capsys) -> None:
     """A grey JPEG, one that EXIF turns, and TIFF: `align` and the panorama's reader find the circle of the PNG.
 
@@ -266,6 +271,7 @@ def test_pictures_without_a_ball_end_in_one_sentence(tmp_path, capsys, size) -> 
     assert "no outline of a ball was found" in said
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("numbers", "words"),
     [

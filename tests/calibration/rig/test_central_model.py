@@ -42,6 +42,7 @@ def test_against_opencvs_omnidir() -> None:
     assert model.ray(uv) == pytest.approx(ray, abs=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("profile", "off_m", "rms_px", "error"),
     [

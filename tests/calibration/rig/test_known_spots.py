@@ -172,6 +172,7 @@ def test_the_command_refuses_in_one_sentence(tiny: Dataset, tmp_path: Path, caps
     assert not (tmp_path / "c.json").exists()
 
 
+@pytest.mark.slow
 def test_upright_edges_give_the_tilt(smoke: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The nominal rig is the true one: all stays within 5 sigmas. Measured is the tilt with the principal point.
 

@@ -81,6 +81,7 @@ def test_the_worst_comes_first(bundle: Bundle) -> None:
     assert [reason.split()[0] for reason in found.reasons] == ["chi2", "only"]
 
 
+@pytest.mark.slow
 def test_shifts_say_where_the_limb_is(light: np.ndarray) -> None:
     """A model 30 um too far right, 0.165 px: the limb lies further in on the right and further out on the left."""
     found = find_outline(light, RIG)

@@ -60,6 +60,7 @@ def test_a_sloping_line_is_left_out() -> None:
     assert np.abs(found.up[:2] - rig.T_world_camera.R.T[:2, 2]).max() < 2e-3
 
 
+@pytest.mark.slow
 def test_sigma_of_points_with_noise() -> None:
     """Pull over 60 draws; it scatters by 1 / sqrt(120) = 9 %, with few edges by twice that: false alarm 1e-3."""
     rig = tilted(0.4, -0.3)

@@ -19,6 +19,7 @@ TWELVE_BITS = BentCamera(0.1, 30.0, 29.4)
 EIGHT_BITS = BentCamera(0.02, 15.0, 6.0, bits=8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("camera", "bend", "power"),
     [(TWELVE_BITS, 0.02, 3.0), (TWELVE_BITS, 0.05, 1.0), (EIGHT_BITS, 0.02, 2.0), (EIGHT_BITS, 0.05, 3.0)],
@@ -68,6 +69,7 @@ def test_pulls_of_bent_cameras(tmp_path: Path) -> None:
         assert largest < 5.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2, 3])
 @pytest.mark.parametrize("camera", [TWELVE_BITS, EIGHT_BITS], ids=["12 bits", "8 bits"])
 def test_a_straight_response_has_no_finding(tmp_path: Path, camera: BentCamera, seed: int) -> None:
@@ -78,6 +80,7 @@ def test_a_straight_response_has_no_finding(tmp_path: Path, camera: BentCamera, 
     assert found.tables.sigma["gain_dn_per_e"] < 0.04 * camera.gain
 
 
+@pytest.mark.slow
 def test_a_bend_that_noise_does_not_show_is_in_sigma() -> None:
     """40 responses that lose or win up to 0.3 % by powers 1 to 3, noise of 0.3 % of each variance, in 12 blocks.
 
@@ -140,6 +143,7 @@ def test_a_dark_level_that_jitters_is_frame_noise(tmp_path: Path, black: float, 
     assert not found.tables.findings
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("black", "is_cut"), [(-0.4, True), (0.0, True), (0.4, True), (2.0, False), (6.0, False)])
 def test_dark_frames_that_are_cut_are_said_to_be(tmp_path: Path, black: float, is_cut: bool) -> None:
     """Noise of 0.5 DN: 42, 16, 4 and 0.0 % of the values lie below -0.5 DN."""
@@ -149,6 +153,7 @@ def test_dark_frames_that_are_cut_are_said_to_be(tmp_path: Path, black: float, i
     assert ("read_noise_e" in tables.not_determined) == is_cut
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("shares", "bend"), [(SHARES, 0.0), ((0.2, 0.6), 0.0), (SHARES, 0.05)])
 def test_cut_dark_frames_do_not_spoil_the_gain(tmp_path: Path, shares: tuple[float, ...], bend: float) -> None:
     """Their variance is too small: taken for the line's first point it made K 25 % too large, 7 sigma.
@@ -168,6 +173,7 @@ def test_cut_dark_frames_do_not_spoil_the_gain(tmp_path: Path, shares: tuple[flo
         assert sigma["gain_dn_per_e"] < 0.002
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("black", [3.0, 3.3, 3.45])
 def test_a_black_level_between_two_codes_has_their_distance_for_sigma(tmp_path: Path, black: float) -> None:
     """Noise of 0.06 DN: all values are one code, or two whose shares tell no width. Sigma was 0, and 0.018."""

@@ -55,6 +55,7 @@ def test_its_numbers_are_those_of_the_camera(descriptor: Path) -> None:
     assert 0.2 < tables.measured["linearity_error"].value < 1.0  # the stack's wrong light would make it 10 %
 
 
+@pytest.mark.slow
 def test_more_electrons_than_photons_are_said(descriptor: Path) -> None:
     """Means of four frames, given as single ones, have four times the electrons: photons are stated so here."""
     text = descriptor.read_text("latin-1").replace(",", ".")

@@ -176,6 +176,7 @@ def averaged(places: str | tuple[str, ...]) -> Change:
     return change
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("places", ["dark", "flat"])
 def test_means_beside_single_frames_are_refused(tmp_path: Path, places: str) -> None:
     """Means of four among flat frames made the gain 80 % too small, at 235 sigma."""
@@ -208,6 +209,7 @@ def test_noise_below_a_code_bends_no_line(tmp_path: Path) -> None:
     assert pull(found, "gain_dn_per_e", NARROW.gain) < 4.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("power", [0.9, 1.05])
 def test_a_power_of_the_codes_is_among_the_responses(tmp_path: Path, power: float) -> None:
     """Gamma, black included. Polynomials alone were 7 % off at 8 sigma."""

@@ -28,6 +28,7 @@ def test_the_command_writes_file_and_page(tmp_path: Path, capsys: pytest.Capture
     assert read_sensor_file(tmp_path / "a.toml").sensor().mosaic == "mono"
 
 
+@pytest.mark.slow
 def test_a_markdown_page_has_its_picture_beside_it(tmp_path: Path) -> None:
     folder = write_processed_capture(tmp_path / "c", sensor("yuyv"), 0, frames=2, side=64)
     page, out = tmp_path / "page.md", tmp_path / "s.toml"

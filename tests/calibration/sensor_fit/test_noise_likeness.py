@@ -56,6 +56,7 @@ def evened(place: str, k: int, frame: Frame) -> Frame:
     return rounded(seen * CAMERA.gain / light + CAMERA.black) if place != "dark" else frame
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "kind", "said"),
     [

@@ -42,6 +42,7 @@ def all_pulls(tmp_path: Path, numbers: range) -> list[float]:
     return result
 
 
+@pytest.mark.slow
 def test_every_number_lies_within_its_sigma(tmp_path: Path) -> None:
     """Four sensors, 26 pulls or so: of Student's t with 63 degrees of freedom beyond 5 once in 1e4 runs.
 

@@ -84,6 +84,7 @@ def test_edges_give_blur_and_sharpening(tmp_path: Path, sigma_px: float, sharpne
     assert found.measure.rise_px == pytest.approx(2.2 if sharpness > 0.0 else 3.15, abs=0.1)
 
 
+@pytest.mark.slow
 def test_a_measured_table_stands_for_an_unknown_tone_curve(tmp_path: Path) -> None:
     points = tuple((float(x), float(x**0.6)) for x in np.linspace(0.0, 1.0, 33))
     s = sensor("srgb8", transfer_function="table", transfer_points=points, exposure_s=0.01)
@@ -123,6 +124,7 @@ def test_the_jpeg_header_comes_back(tmp_path: Path, s: Sensor) -> None:
     assert "MJPEG" in found.file.tables.not_determined["read_noise_e"]
 
 
+@pytest.mark.slow
 def test_the_lens_comes_back_from_chessboards(tmp_path: Path) -> None:
     """Eleven views: each number within five of its sigmas; and a wrong one is not."""
     write_frames(tmp_path / "chessboard", board_views((320.0, 322.0, 163.0, 118.0), 0.08, 11))

@@ -77,6 +77,7 @@ def test_a_set_that_was_cut_off_is_finished_without_its_seed(copy: Path, smalles
     assert contents(copy) == contents(smallest_dataset)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("inline")
 def test_another_name_is_refused_without_a_journal_too(copy: Path, tmp_path: Path) -> None:
     (copy / schema.JOURNAL).unlink()

@@ -81,6 +81,7 @@ def test_fewer_samples_and_shards_take_theirs(drawn: Plan, folder: Path) -> None
     assert part.pairs == drawn.pairs[5:]
 
 
+@pytest.mark.slow
 def test_of_more_samples_the_others_are_drawn(drawn: Plan, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     recipe, numbers, once = recipe_of(12), list[int](), sampling._Makers._once
     monkeypatch.setattr(sampling._Makers, "_once", lambda self, few, k: numbers.extend(few) or once(self, few, k))
@@ -165,6 +166,7 @@ def test_a_restart_is_faster(tmp_path: Path) -> None:
     assert again_s < first_s / 3.0
 
 
+@pytest.mark.slow
 def test_make_keeps_them_and_its_bytes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     recipe, out = tmp_path / "drawn.toml", tmp_path / "out"
     spot = '[random.spot]\ntarget = { choice = ["near"] }\nacross_m = { uniform = [-0.02, 0.02] }\n'

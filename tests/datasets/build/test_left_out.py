@@ -138,6 +138,7 @@ def test_it_is_whole_but_for_the_refused_samples(whole: Path, finished: Path) ->
     assert "left_out" not in json.loads((whole / schema.INFO).read_text())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("tasks_done", "newest_first"), [(1, False), (6, True), (11, False), (17, True)])
 def test_kills_and_the_order_of_tasks_change_no_byte(
     recipe: Path,
@@ -245,6 +246,7 @@ def test_without_one_sample_there_is_no_data_set(recipe: Path, tmp_path: Path) -
     assert not (tmp_path / "out" / schema.CHECKSUMS).exists()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("refusals")
 @pytest.mark.parametrize(
     "lost",

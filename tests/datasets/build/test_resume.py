@@ -104,6 +104,7 @@ def allowed(copy: Path, lost: str, *changes: tuple[str, str]) -> list[str]:
     return again(copy, *changes, replace=bool(lost))
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("inline")
 def test_only_what_changes_one_after_the_other_change_is_made_again(copy: Path) -> None:
     made = []
@@ -149,6 +150,7 @@ def test_names_and_times_of_files_prove_nothing(copy: Path) -> None:
     assert spot.read_bytes() == data
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("inline")
 @pytest.mark.parametrize("line", range(1, 9))
 def test_a_damaged_line_of_the_journal_costs_its_task_only(copy: Path, smallest_dataset: Path, line: int) -> None:

@@ -98,6 +98,7 @@ def colours(room: Room, directions: np.ndarray) -> tuple[np.ndarray, ...]:
     return hits.distance_m, faces.normal[hits.patch], values, emits | faces.is_radiance[hits.patch]
 
 
+@pytest.mark.slow
 def test_a_mesh_has_faces_colours_and_lamps_of_the_room(tmp_path: Path) -> None:
     """float32 corners in a room of 16 m round by 1e-6 m. sRGB of 8 bits is off by half a code: at most
     0.5 / 255 x 2.28 (the curve's slope at 1) = 0.0045, and 0.002 more by averaging to 5 mm; screens likewise.

@@ -163,6 +163,7 @@ sys.exit(cli.main(["try-workers"]))
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self").is_dir(), reason="needs /proc")
 @pytest.mark.parametrize(
     ("stop", "status", "sentence"),
@@ -292,6 +293,7 @@ def test_a_wait_for_a_scheduler_that_starts_late(tmp_path: Path) -> None:
                 assert waiting.result(timeout=100) is None
 
 
+@pytest.mark.slow
 def test_a_client_that_failed_is_gone_before_the_next_begins(monkeypatch: pytest.MonkeyPatch) -> None:
     """Deleted while the next one starts, it would wait for dask's lock of loops, which that one has, for ever."""
     import distributed  # here: workers import this file

@@ -147,6 +147,7 @@ def boxes(bench_dataset: Path, count: int = 1500) -> tuple[np.ndarray, Dataset, 
     return np.array([u_px - (box.u0_px - 0.5) for box in found]), dataset, found
 
 
+@pytest.mark.slow
 def test_a_spot_is_anywhere_in_its_box(bench_dataset: Path) -> None:
     places, dataset, found = boxes(bench_dataset)
     row = dataset.rows[0].down.centre
@@ -187,6 +188,7 @@ def test_without_a_place_of_the_spot_the_box_is_anywhere(bench_dataset: Path) ->
     assert len(starts) == 600
 
 
+@pytest.mark.slow
 def test_hints_come_as_often_as_the_recipe_says(bench_dataset: Path) -> None:
     hinted = sum(pair_draw.boxes is not None for pair_draw in pair_draws(many(bench_dataset, 1000), "bayer-raw"))
     # binomial, n = 1000, p = 0.5: sigma 16; 4 sigma, false alarms 6e-5

@@ -179,6 +179,7 @@ def test_a_killed_run_goes_on_and_gives_the_same_bytes(film_windows: Path, tmp_p
         assert theirs[name] == data, name
 
 
+@pytest.mark.slow
 def test_damage_is_found_and_mended(film_windows: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(film_task, "frame_spots", SPOTS)
     out = tmp_path / "films"

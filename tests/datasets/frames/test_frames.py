@@ -160,6 +160,7 @@ assert "mitsuba" not in sys.modules
 """
 
 
+@pytest.mark.slow
 def test_another_process_draws_the_same_bits(tiny_dataset: Path, python: Callable[..., CompletedProcess[str]]) -> None:
     runs = [python(CHILD, str(tiny_dataset), step, PYTHONHASHSEED=seed) for step, seed in (("1", "1"), ("-1", "2"))]
     lines = [sorted(run.stdout.splitlines()) for run in runs]
@@ -245,6 +246,7 @@ def test_the_seed_of_the_data_set_counts(dataset: Dataset, sample: Sample) -> No
     assert _dependent(residuals) == [False, True, False]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("preset", ["mono-raw", "bayer-raw"])
 def test_the_mean_of_many_draws_is_the_expectation(sample: Sample, preset: str) -> None:
     """400 draws of both regions: chi-square of the mean, and of the sum of squares, two-sided 1e-6 each.

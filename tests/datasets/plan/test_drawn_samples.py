@@ -59,6 +59,7 @@ def copy(made: Path, tmp_path: Path) -> Path:
 # More samples.
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("inline")
 def test_more_samples_keep_every_byte_and_render_only_the_new_ones(made: Path, copy: Path, tmp_path: Path) -> None:
     (copy / schema.LOG).write_text("")
@@ -244,6 +245,7 @@ def test_estimators_use_each_samples_rig(made: Path) -> None:
     assert max(abs(s.relative_error) for s in wrong[1:] if s.status == "ok") > 1e-3
 
 
+@pytest.mark.slow
 def test_the_exact_depth_comes_out_of_80_drawn_rigs() -> None:
     from phibench.estimator.geometry.triangulate import depth_exact
 

@@ -41,6 +41,7 @@ def test_the_tables_here_are_the_published_ones() -> None:
     assert rows == [(table, depth_m, h) for table, pairs in PAPER.items() for depth_m, h in pairs]
 
 
+@pytest.mark.slow
 def test_every_spot_of_the_paper_is_seen_and_certified_at_both_ends_of_its_strokes() -> None:
     plan = make_plan(load_recipe("paper"))
     ends = {pair.target: pair for pair in sorted(plan.pairs, key=lambda pair: pair.stroke_m)}

@@ -36,6 +36,7 @@ def the_room(drawn: Plan) -> Room:
     return room_of(source)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sequence", ["sobol", "independent"])
 @pytest.mark.parametrize("spot", [{"across_m": {"uniform": [-0.1, 0.1]}}, RAY], ids=["board", "ray"])
 def test_the_first_samples_do_not_depend_on_how_many_there_are(sequence: str, spot: dict[str, Any]) -> None:
@@ -162,6 +163,7 @@ def test_choices_are_equally_probable() -> None:
     assert scipy.stats.chisquare(moved).pvalue < 1e-5
 
 
+@pytest.mark.slow
 def test_the_plans_values_are_those_of_the_recipe() -> None:
     """End to end, through rig, spot and stroke, at a level of 1e-5 each."""
     rig = {"fx_px": {"uniform": [1400, 1550]}, "cx_px": {"normal": [639.5, 15], "clip": [594.5, 684.5]}}
@@ -218,6 +220,7 @@ def test_spots_on_boards_lie_wholly_on_them() -> None:
     assert np.abs(local[:, 1:]).max(axis=0) == pytest.approx(room_left, rel=0.05)
 
 
+@pytest.mark.slow
 def test_spots_of_rays_lie_on_the_first_thing_that_the_ray_meets() -> None:
     drawn, checked = plan(samples=300, spot=RAY), Counter[str]()
     walls = {"wall_east": (0, X_HIGH), "wall_west": (0, X_LOW), "wall_north": (1, Y_HIGH), "wall_south": (1, Y_LOW)}
@@ -255,6 +258,7 @@ def test_spots_of_rays_lie_on_the_first_thing_that_the_ray_meets() -> None:
     assert Counter(pair.tries for pair in drawn.pairs)[1] < 300  # some would have lain over an edge
 
 
+@pytest.mark.slow
 def test_an_impossible_recipe_is_refused_with_the_reason() -> None:
     with pytest.raises(RecipeError, match=r"sample 0 has no possible .* inside the sphere; .*narrow") as caught:
         plan(rig={"z_c_m": 0.05})
@@ -268,6 +272,7 @@ def test_an_impossible_recipe_is_refused_with_the_reason() -> None:
         make_plan(check_recipe({**drawing(stroke_m=0.3, rig={"radius_m": 0.17, "z_c_m": 0.26}), "targets": boards}))
 
 
+@pytest.mark.slow
 def test_the_shipped_recipe_shows_every_spot() -> None:
     recipe = load_recipe("random")
     assert warnings(recipe) == []

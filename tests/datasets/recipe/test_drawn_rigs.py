@@ -70,6 +70,7 @@ def test_a_shard_keeps_only_its_rigs() -> None:
     assert {pose.rig for pose in first.poses} == {"r000000"}
 
 
+@pytest.mark.slow
 def test_what_is_drawn_is_what_the_estimator_takes_as_prior() -> None:
     """400 rigs: every parameter's sum of squares over the prior's variance is chi-square, false alarm rate 1e-3 in all.
 

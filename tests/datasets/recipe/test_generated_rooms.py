@@ -32,6 +32,7 @@ def properties_of(count: int, seed: int = 0, **properties: Any) -> list[dict[str
     return [to_json(source)["properties"] for source in sources]
 
 
+@pytest.mark.slow
 def test_properties_follow_their_distributions() -> None:
     """600 draws: the mean of a uniform number lies within 5 of its standard errors (false alarm 6e-7)."""
     drawn = properties_of(600, height_m={"uniform": [2.5, 3.0]}, lamp_kind="tubes", windows={"choice": [1, 2]})
@@ -50,6 +51,7 @@ def test_one_property_changes_no_other_and_more_rooms_change_none() -> None:
     assert plain != properties_of(5, seed=1)
 
 
+@pytest.mark.slow
 def test_samples_are_dealt_to_rooms_in_turn_and_more_of_them_keep_the_first() -> None:
     few, many = make_plan(check_recipe(raw(samples=2))), make_plan(check_recipe(raw(samples=4)))
     assert [pair.room for pair in many.pairs] == ["room000000", "room000001"] * 2

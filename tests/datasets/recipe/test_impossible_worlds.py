@@ -91,6 +91,7 @@ def test_gloss_that_is_no_mirror_is_allowed() -> None:
     assert placed[0] == "wall_0"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", range(2))
 def test_no_spot_lies_on_lamp_pane_ball_or_camera(number: int) -> None:
     """600 rays in generated rooms, with lamps and panes in reach of some: what they carry is matt and not the robot's.

@@ -27,6 +27,7 @@ def without_light(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(scene_check, "_ambient", lambda _: {})
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("without_light")
 def test_outline_and_spot_of_a_sound_sample(sample: Sample) -> None:
     checked = check_view(sample, "down")

@@ -54,6 +54,7 @@ def by_a_stranger(path: Path, **settings: int) -> tuple[list[int], np.ndarray]:
     return shape, np.array(mean)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("position", ["down", "up"])
 def test_an_unmodified_mitsuba_opens_it(sample: Sample, exported: Path, position: str) -> None:
     """Mean light of a window in the mirror: a room baked this coarsely, 0.5 m, agrees to some percents."""

@@ -202,6 +202,7 @@ def test_a_new_run_waits_for_the_workers_of_a_killed_one(tmp_path: Path, monkeyp
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_one_of_many_that_come_together_gets_the_lock(tmp_path: Path) -> None:
     """The holder removes the file when it leaves: a lock on the removed file must not count."""
     inside, most = [], []

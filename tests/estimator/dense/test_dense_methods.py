@@ -75,6 +75,7 @@ def test_maps_of_a_moving_carriage_have_each_row_at_its_own_height() -> None:
     assert np.abs(exact - still).max() > 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tilted", [False, True])
 def test_the_sweep_finds_the_room(tilted: bool) -> None:
     """The small rig's pixel is 23 mrad: at 2.5 m, and a stroke of 0.4 m, one of disparity is 0.14 of D.

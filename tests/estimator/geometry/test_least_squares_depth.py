@@ -93,6 +93,7 @@ def simulate(n: int) -> tuple[np.ndarray, GeneralDepth]:
     return (result.depth_m - truth) / result.sigma_m, result
 
 
+@pytest.mark.slow
 def test_sigma_and_false_alarms_by_simulation() -> None:
     """1000 rigs: the pull's variance within the chi-square interval of false alarm rate 1e-5, which is +-20 %.
 

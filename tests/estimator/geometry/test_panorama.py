@@ -78,6 +78,7 @@ def test_model_and_truth_layer_agree(tiny_dataset: Path, position: str) -> None:
     assert np.max(np.abs(by_model - shifted)[both]) > 1e-3  # the tolerance would notice a hundredth of a pixel
 
 
+@pytest.mark.slow
 def test_truth_of_a_misaligned_rig_differs_from_the_nominal_model(misaligned_dataset: Path) -> None:
     sample = open_dataset(misaligned_dataset).samples[0]
     by_model, by_truth = (places(sample, "down", GRID, by) for by in ("model", "truth"))

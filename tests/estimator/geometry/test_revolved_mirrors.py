@@ -152,6 +152,7 @@ def test_accuracy_exact_depth_through_a_glass_tube(shape: str) -> None:
     assert found.depth_m == pytest.approx(expected, rel=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
     [

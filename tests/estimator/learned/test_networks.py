@@ -329,6 +329,7 @@ def test_without_onnxruntime_and_pytorch_it_says_what_to_install(monkeypatch: An
 # -- detection in whole frames ---------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @needs_runtime
 @pytest.mark.parametrize("preset", ["bayer-raw", "srgb8", "mjpeg"])
 def test_a_bright_spot_is_found_in_the_whole_mirror_and_an_absent_one_is_not(preset: str) -> None:

@@ -176,6 +176,7 @@ def _curve(depth_m: float, strokes: np.ndarray, rig: Rig = RIG, **options: objec
     return curve.sigma_m
 
 
+@pytest.mark.slow
 def test_predicted_error_is_that_of_drawn_positions() -> None:
     # n draws give a standard deviation to 1 / sqrt(2 n): 1.6 %; 4 sigma over 3 strokes is wrong once in 5000
     random, n, strokes = generator("test", "drawn positions"), 2000, np.array([0.2, 0.8, 1.6])
@@ -227,6 +228,7 @@ def test_minimum_is_that_of_a_brute_force_search_with_a_rig_as_built() -> None:
     assert sigma[-1] > 1.2 * best.sigma_m  # the error of a rig as built grows again
 
 
+@pytest.mark.slow
 def test_a_rig_as_built_errs_beyond_first_order_as_drawn_rigs_do() -> None:
     """At D = 1.4 m, h = 0.4 m the first order of a tilt is nearly 0; what is left is its square."""
     random, n, D, h = generator("test", "drawn rigs"), 125, 1.4, 0.4
@@ -322,6 +324,7 @@ def test_what_cannot_be_seen_has_no_stroke() -> None:
     assert cut.limits == (IMAGE_EDGE,)
 
 
+@pytest.mark.slow
 def test_strokes_whose_error_is_unknown_have_a_cause() -> None:
     """At 0.2 m and 1 mW a spot has more electrons than the bound's table; a free stroke has a finite error."""
     preset_spot = spot_bound(RIG, sensor_card("mjpeg"))
@@ -388,6 +391,7 @@ def test_bad_numbers_end_in_a_sentence(call: object, words: tuple[str, ...]) -> 
     assert all(word in str(caught.value) for word in words)
 
 
+@pytest.mark.slow
 def test_default_spot_is_that_of_the_preset_and_the_default_rig_is_put_together_by_hand(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -119,6 +119,7 @@ def test_exact_information_is_a_little_above_the_approximate_one() -> None:
     np.testing.assert_allclose(exact_information(np.array([5.0, 50.0]), 0.0), [0.2, 0.02])  # counts alone: 1 / mu
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("r", [0.5, 4.0])
 def test_the_spline_through_exact_values(r: float) -> None:
     mean = np.geomspace(0.2, 2000.0, 150)

@@ -53,6 +53,7 @@ def test_both_spots_are_found(preset: str, off: bool) -> None:
         assert (sd < 0.06).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("preset", ["srgb8", "yuyv", "mjpeg"])
 def test_full_pixels_are_part_of_the_model(preset: str) -> None:
     """30 times the light, up to four full pixels: within 5 of its own standard deviations, and those below 0.03 px.
@@ -67,6 +68,7 @@ def test_full_pixels_are_part_of_the_model(preset: str) -> None:
         assert (sd < 0.03).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("preset", ["srgb8", "yuyv", "mjpeg"])
 def test_a_striped_room_behind_the_spot_is_taken_from_the_off_frame(preset: str) -> None:
     """Stripes of 5 px and 300 e-: with the off frame within 0.15 px."""

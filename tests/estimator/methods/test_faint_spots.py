@@ -87,6 +87,7 @@ def test_accuracy_of_what_a_fit_of_faint_spots_claims(faint: dict[str, np.ndarra
     assert squares.max() < 25.0
 
 
+@pytest.mark.slow
 def test_claims_of_faint_spots_all_over_the_mosaic() -> None:
     """70 spots of 7 sigma: the rms of 140 numbers is 1 +- 0.06 of right claims; 1.24 is 4 sigma, false alarms 3e-5."""
     found = faint_spots(snr=7.0, sigma_px=0.8, room_e=20.0, count=70)

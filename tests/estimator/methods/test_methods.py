@@ -104,6 +104,7 @@ def test_accuracy_of_the_built_in_methods(preset: str, name: str) -> None:
         assert np.median(np.linalg.norm(error + 0.5, axis=1)) > WORST_PX[preset][name]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("laser_off", [True, False])
 @pytest.mark.parametrize("preset", ["bayer-raw", "mono-raw", "srgb8"])
 def test_laser_light_in_the_mirror_is_brightest_at_the_spot(preset: str, laser_off: bool) -> None:
@@ -252,6 +253,7 @@ def test_methods_leave_their_input_alone() -> None:
 # -- locate -----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("laser_off", [True, False])
 def test_locate_finds_easy_spots_without_a_hint(laser_off: bool) -> None:
     for number in range(3):

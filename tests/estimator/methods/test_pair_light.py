@@ -68,6 +68,7 @@ def test_a_lamp_and_its_margin_are_masked_and_a_wall_is_not(raw: Pair, level: fl
         assert mask.sum() < (40 + 2 * 24) ** 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("preset", ["mono-raw", "bayer-raw", "srgb8"])
 def test_in_a_dark_room_nothing_is_a_lamp_and_the_spot_is_found(preset: str) -> None:
     """A room without light, noise alone: three times its median is no light either."""

@@ -81,6 +81,7 @@ def test_posterior_against_drawn_outputs() -> None:
     assert (np.abs(np.sqrt(np.diag(wrong)) / sigma - 1.0) > 0.1).all()
 
 
+@pytest.mark.slow
 def test_coarse_steps_give_honest_errors() -> None:
     """Quality 60, 20 000 electrons over 500 of a room: 40 fits, of which the quasi-score erred by 3 times its claim.
 

@@ -142,6 +142,7 @@ def places(count: int) -> list[tuple[float, float, float]]:
 # -- rates -----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("off", [True, False], ids=["off frame", "one frame"])
 @pytest.mark.parametrize("s", [BAYER, MONO, SRGB, MJPEG], ids=lambda s: s.name)
 def test_spots_above_the_threshold_are_found(s: Sensor, off: bool) -> None:
@@ -162,6 +163,7 @@ def test_spots_above_the_threshold_are_found(s: Sensor, off: bool) -> None:
     assert checked == 12
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("off", [True, False], ids=["off frame", "one frame"])
 @pytest.mark.parametrize("s", [BAYER, MONO, SRGB, MJPEG], ids=lambda s: s.name)
 def test_without_a_spot_nothing_is_found(s: Sensor, off: bool) -> None:
@@ -193,6 +195,7 @@ def test_significance_of_noise_is_normal_or_less() -> None:
     assert values.max() < RAW.each
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("s", [BAYER, SRGB], ids=lambda s: s.name)
 def test_the_start_is_good_to_a_fraction_of_a_pixel(s: Sensor) -> None:
     """The parabola's vertex at 20 sigma and more; a spot between red pixels is interpolated away, hence the size."""

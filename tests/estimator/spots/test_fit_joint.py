@@ -109,6 +109,7 @@ def test_combine_returns_exact_pixels_and_their_depth() -> None:
     assert best.chi2.max() < 1e-10
 
 
+@pytest.mark.slow
 def test_combine_against_draws() -> None:
     """Depth's scatter is its sigma, chi^2 has one degree of freedom, and the midpoint is no better.
 

@@ -78,6 +78,7 @@ def test_fit_of_noise_free_spots(depth_m: float, without_mpx: float) -> None:
     assert max(without) > without_mpx
 
 
+@pytest.mark.slow
 def test_near_spots_are_as_far_off_as_claimed() -> None:
     """Maximum likelihood on raw pixels at D = 1 m: errors over the claimed deviations, squared, are 1 on average.
 

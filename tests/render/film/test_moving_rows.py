@@ -64,6 +64,7 @@ def brute_force(
     return image
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["carriage", "target", "driving"])
 def test_moving_rows_are_those_of_brute_force(name: str) -> None:
     scene, frame = CASES[name], 8
@@ -88,6 +89,7 @@ def test_moving_rows_are_those_of_brute_force(name: str) -> None:
     assert np.abs(still - wanted).max() > 1e-2 * peak
 
 
+@pytest.mark.slow
 def test_a_waypoint_within_an_exposure_parts_it() -> None:
     """The spot turns back: its speed jumps in the midst of the exposure, at another part of each row's."""
     path = SpotPath((Waypoint(0.0, -0.1, 0.0), Waypoint(0.268, 0.1, 0.1), Waypoint(0.5, -0.1, 0.2)))

@@ -71,6 +71,7 @@ def test_a_furnace_is_as_bright_as_its_walls() -> None:
         assert image == pytest.approx(expected, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_faces_send_out_albedo_times_light() -> None:
     """Each hit by its texture's own formula, and light that is linear in space, which bilinear texels give exactly."""
     room, rng = lit(LAB, 9.0, linear=True), generator("test", "faces")

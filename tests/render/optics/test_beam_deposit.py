@@ -108,6 +108,7 @@ def test_step_of_albedo_through_the_middle_moves_the_centroid() -> None:
     assert certify(VIEW, spot, geometry, still, layer).passed
 
 
+@pytest.mark.slow
 def test_place_of_a_torn_spot_on_the_wall_and_in_the_image() -> None:
     """Where the light of two halves of albedo a and b lies: sigma sqrt(2 / pi) (b - a) / (a + b) from the axis.
 
@@ -188,6 +189,7 @@ def first_triangle(shapes: tuple[Shape, ...], origins: np.ndarray, directions: n
     return distance, face, table
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("shapes", "aim"), [((BOX,), (*CORNER_M[:2], 0.6)), ((PRISM,), (2.0, 0.3114, 0.7))], ids=["edge", "prism"]
 )

@@ -53,6 +53,7 @@ def rays(seed: int, count: int) -> tuple[np.ndarray, np.ndarray]:
     return rng.uniform([-4, -4, 0.2], [4, 4, 2.8], (count, 3)), d / np.linalg.norm(d, axis=1, keepdims=True)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 def test_random_rooms_against_a_loop_over_all_triangles(seed: int) -> None:
     """Distances to 1e-12 of rounding over 10 m (at 1e-4 rad from the plane it grows to 1e-9); same shape and face."""
@@ -65,6 +66,7 @@ def test_random_rooms_against_a_loop_over_all_triangles(seed: int) -> None:
     assert {0, 1, 2} == {shapes[k].name[0] == "b" or 2 * (shapes[k].name[0] == "m") for k in object_id if k >= 14}
 
 
+@pytest.mark.slow
 def test_bundles_of_rays_against_a_loop_over_all_triangles() -> None:
     """Bundles as wide as a few pixels of the mirror and up to 20 degrees; each has to try few faces alone, or all.
 

@@ -109,6 +109,7 @@ def check_pixels(light: LightMap, settings: BakeSettings, side_px: int) -> None:
     assert mean_square(0.98 * ours) > limit
 
 
+@pytest.mark.slow
 def test_ambient_pixels_by_z_test_which_rejects_two_per_cent(coarse_light: LightMap) -> None:
     check_pixels(coarse_light, COARSE, 15)
 

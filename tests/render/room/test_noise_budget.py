@@ -47,6 +47,7 @@ def _blurred_noise(rng: np.random.Generator, draws: int, h: int, w: int) -> np.n
     return np.asarray(noise / noise.std())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("source", ["sensor", "render"])
 def test_predicted_errors_against_monte_carlo(source: str) -> None:
     """4000 draws of one Newton step from the truth: the standard deviation's own error is 1.1 %; 6 sigma, 7 %."""

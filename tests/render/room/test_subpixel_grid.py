@@ -171,6 +171,7 @@ def test_stored_variance_is_what_repeated_rendering_scatters_by(repeated: tuple[
     assert checked == 5
 
 
+@pytest.mark.slow
 def test_stored_variance_beside_the_mirror_is_the_scatter_and_a_tenth(light: LightMap) -> None:
     """Pixels beside the mirror are sampled whole, and stated as if each of their n x n cells had its own noise.
 
@@ -256,6 +257,7 @@ def test_cells_at_lamps_need_few_samples(film: CellSampler, outline: tuple[np.nd
     assert noise(6, cover) < noise(32, None) < noise(6, None)
 
 
+@pytest.mark.slow
 def test_a_lamp_that_something_hides_is_left_to_chance(monkeypatch: pytest.MonkeyPatch) -> None:
     """A board under half of a lamp: no pixel is negative, and the noise is what is stated.
 
@@ -354,6 +356,7 @@ def test_cells_sampled_in_parts_get_the_same_bits(
             assert np.array_equal(getattr(one, field.name), getattr(other, field.name)), field.name
 
 
+@pytest.mark.slow
 def test_pixels_that_look_full_by_chance_are_refined(
     light: LightMap, film: CellSampler, outline: tuple[np.ndarray, np.ndarray]
 ) -> None:
@@ -430,6 +433,7 @@ def test_refinement_moves_no_edge_and_no_lamp(light: LightMap, outline: tuple[np
         assert np.abs(off).max() < 5e-4
 
 
+@pytest.mark.slow
 def test_phi_noise_of_a_spot_is_what_repeated_rendering_moves_it_by(light: LightMap) -> None:
     """A spot laid over tile edges: the weighted estimate from 48 renderings scatters as `noise_budget` says.
 
@@ -471,6 +475,7 @@ def test_a_window_has_the_pixels_of_the_whole_image(light: LightMap) -> None:
     np.testing.assert_allclose(part.electrons_per_s, whole.electrons_per_s[:, 20:36, 30:54], rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_rough_mirror_blurs_the_room_as_path_tracing_does(light: LightMap) -> None:
     """Edge of the robot's body in a mirror of alpha 0.02 (about 4 px): column means within 2 % of the contrast.
 

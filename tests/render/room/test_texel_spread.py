@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from phibench.render.optics.faces import TexelGrid, face_table
 from phibench.render.room.lamp_light import direct_light, whole_lamp
@@ -49,6 +50,7 @@ def seen_of_lamp(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return light
 
 
+@pytest.mark.slow
 def test_a_shadow_edge_within_a_texel_leaves_the_mean_of_its_light() -> None:
     """The middle alone is off by 20 % of the light and more.
 

@@ -82,6 +82,7 @@ def brute_force(velocity: tuple[float, float], exposure_s: float, centre: tuple[
     return image
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("velocity", [(150.0, 0.0), (0.0, -200.0), (-120.0, 90.0)])
 @pytest.mark.parametrize("exposure_s", [1e-4, 1 / 60])
 def test_a_moving_spot_is_what_brute_force_gives(velocity: tuple[float, float], exposure_s: float) -> None:
@@ -145,6 +146,7 @@ def test_a_spot_at_rest_is_the_layer_itself() -> None:
     assert np.abs(slow - spot.electrons_per_s).max() < 1e-9 * slow.max()
 
 
+@pytest.mark.slow
 def test_a_moving_rig_against_layers_rendered_on_the_way() -> None:
     """Rig at 0.2 m/s: rows put together from layers of the carriage's true positions."""
     rig = default_rig()

@@ -50,6 +50,7 @@ def test_exact_positions_give_the_exact_point() -> None:
     assert found.chi2 < 1e-9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("understated", [False, True])
 def test_bundle_errors_are_within_their_covariance(understated: bool) -> None:
     """60 films: mean of squared pulls, and of chi2, within the bands of 1e-5; noise twice as large is noticed."""
@@ -239,6 +240,7 @@ def test_frames_of_no_one_place_are_a_sentence() -> None:
         bundle_depth(seen_film(frames_of(images, told()[0] + swings)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("by_px", [(1, 1), (2, 0), (0, 2)])
 def test_a_frame_that_shows_the_spot_elsewhere_is_left_out(by_px: tuple[int, int]) -> None:
     """One frame of twelve, its image moved: no position in it, and D as without it."""
@@ -281,6 +283,7 @@ def test_a_faint_spot_is_found_beside_a_bright_part_of_the_room() -> None:
     assert found.sum() >= 18
 
 
+@pytest.mark.slow
 def test_drawn_films_have_the_claimed_errors() -> None:
     """Six cameras with 2 % PRNU: chi2 and squared pulls of the point, each within its band of 1e-5."""
     box, chi2, pulls, dof = lights()[1], 0.0, 0.0, 0
@@ -301,6 +304,7 @@ def test_drawn_films_have_the_claimed_errors() -> None:
         assert low < value < high
 
 
+@pytest.mark.slow
 def test_pattern_of_a_camera_is_the_claimed_covariance() -> None:
     """One place, 40 cameras of 6 frames on and off: what is common errs by the pattern. 80 squares; band of 1e-5."""
     strong = STRONG.model_copy(update={"prnu": 0.05, "read_noise_e": 1.0})

@@ -132,6 +132,7 @@ def room_of(folder: Path) -> RenderedRoom:
     return RenderedRoom(film.plan, films._set, np.array([0.0]), film.views[:1])
 
 
+@pytest.mark.slow
 def test_targets_are_found_among_lights_in_whole_frames(film_images: Path) -> None:
     """Film of an eighth of the size: two targets, a reflection and another laser, through the whole chain."""
     film = staged(room_of(film_images), ("found", 0), 25.0, 2, 16, ("reflection", "other laser"), targets=2)
@@ -147,6 +148,7 @@ def test_targets_are_found_among_lights_in_whole_frames(film_images: Path) -> No
         assert apart[number] < 1.0
 
 
+@pytest.mark.slow
 def test_a_target_that_is_hidden_is_lost_and_found_again(film_images: Path) -> None:
     film = staged(room_of(film_images), ("hidden", 0), 25.0, 0, 44)
     card = card_of(sensor("bayer-raw", exposure_s=1 / 60, readout_s=0.03))

@@ -156,6 +156,7 @@ def approached(number: int, bias: RigBias | None) -> list[float]:
     return [*found, belief.nees(run.place())]
 
 
+@pytest.mark.slow
 def test_a_belief_that_knows_how_well_its_rig_is_known_is_consistent() -> None:
     """NEES in the band of the runs; without the covariance the same rigs give hundreds of times as much."""
     bias, n = RigBias(RIG, rig_covariance(SIZE)), 6
@@ -242,6 +243,7 @@ def test_frames_at_once_say_what_explicit_steps_say(moving: float) -> None:
     assert np.max(np.abs(belief.mean[:5] - mean) / sigma) < (0.25 if moving else 0.1)
 
 
+@pytest.mark.slow
 def test_noise_of_many_frames_does_not_move_the_rig() -> None:
     """A rig as built and 40 frames: q of the explicit solution to 0.15 standard deviations, those to 5 %.
 

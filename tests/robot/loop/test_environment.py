@@ -180,6 +180,7 @@ def test_a_strange_action_is_one_sentence(action: dict[str, float], words: str) 
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.slow
 def test_the_name_with_its_module_is_enough(python) -> None:
     code = "import gymnasium; print(gymnasium.make('phibench.robot.loop.environment:phibench/ApproachTarget-v0'))"
     child = python(code)
@@ -236,6 +237,7 @@ def test_steps_per_second_of_the_exact_model(capsys) -> None:
     assert best >= 2000
 
 
+@pytest.mark.slow
 def test_named_settings_are_environments_of_gymnasium() -> None:
     """What the page says of each; `hard` draws a rig of its own for every episode."""
     for place in ("ApproachTarget", "ApproachTargetFlat"):

@@ -34,6 +34,7 @@ from phibench.scenes.validation import SceneError
 from phibench.studies.loop.study import misaligned, summary
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("policy", ["paper", "greedy", "oracle"])
 def test_policies_reach_their_targets(policy: str) -> None:
     episodes = run_episodes(Setup(), policy, 3, "policies")
@@ -244,6 +245,7 @@ def test_rigs_whose_covariance_is_stated(capsys, policy: str) -> None:
     assert 0.9 < found.pull[0] < 1.1
 
 
+@pytest.mark.slow
 def test_the_command_line_draws_rigs_from_what_is_known_of_them(tmp_path, capsys) -> None:
     setup = Setup(rig_covariance=rig_covariance(1.0), own_rigs=True)
     simulator, drawn = Simulator(setup), []

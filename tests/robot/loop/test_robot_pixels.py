@@ -40,6 +40,7 @@ def pixels(arena: Arena, **options) -> Setup:
     return Setup(arenas=(arena,), **{"fidelity": "windows"} | options)
 
 
+@pytest.mark.slow
 def test_spots_in_windows_lie_where_the_exact_model_has_them(arena) -> None:
     """Errors over what the fit states have a mean square of 1: 240 numbers, standard error 9 %.
 
@@ -117,6 +118,7 @@ def test_pixels_need_baked_rooms_and_codes(arena, tmp_path) -> None:
         baked_arenas(tmp_path)
 
 
+@pytest.mark.slow
 def test_frames_are_whole_images_and_the_target_is_read_in_them(arena) -> None:
     simulator = Simulator(pixels(arena, fidelity="frames", task=Task(lights=1)))
     simulator.start("test pixels", 2)

@@ -139,11 +139,13 @@ def faults_of(properties: RoomProperties, room: Room) -> list[str]:
     return found
 
 
+@pytest.mark.slow
 def test_rooms_are_valid(rooms):
     """Nothing overlaps, hides a lamp, stands in the robot's way or leaves the room."""
     assert {k: found for k, pair in enumerate(rooms) if (found := faults_of(*pair))} == {}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fixed", [SMALLEST, FULLEST], ids=["smallest", "fullest"])
 @pytest.mark.parametrize("kind", PROPERTIES["lamp_kind"].choices)
 def test_rooms_at_the_ends_of_the_ranges_are_valid(fixed, kind):
@@ -162,6 +164,7 @@ def test_500_rooms_are_valid_and_differ():
     assert len(digests) == 500
 
 
+@pytest.mark.slow
 def test_each_fault_is_found(rooms):
     """The checks above see a fault of each kind."""
     properties, room = rooms[0]
@@ -228,6 +231,7 @@ def split(room: Room) -> tuple[dict[str, object], dict[str, object]]:
     return lamps, others
 
 
+@pytest.mark.slow
 def test_other_lamps_leave_furniture_and_textures():
     for number in range(3):
         lamps, others = split(drawn(number, lamp_kind="tubes", illuminance_lx=200.0)[1])
@@ -298,6 +302,7 @@ def test_flux_per_floor_area_is_the_stated_illuminance():
     assert lumens / floor == pytest.approx(321.0, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_sun_shines_in_through_a_window():
     seen = 0
     for number in range(4):

@@ -15,6 +15,7 @@ from phibench.estimator.limits.processed_bound import spot_sigma
 from phibench.studies.paper.experiment_bounds import spot_bounds
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("preset", ["bayer-raw", "mjpeg"])
 def test_more_light_of_the_laser_gives_a_better_bound(tiny_dataset: Path, preset: str) -> None:
     """Between sqrt(k), where the spot's own photons are the noise, and k, where the room's are; PRNU lies below both.

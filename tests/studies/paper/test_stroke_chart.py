@@ -101,6 +101,7 @@ def test_what_to_give_instead_is_said_once() -> None:
         require_measured(replace(found(), stroke_m=math.nan, limits=(NO_BOUND, "occluded by camera_housing")))
 
 
+@pytest.mark.slow
 def test_the_picture_is_the_same_for_the_same_curve(tmp_path: Path) -> None:
     barred = tuple(CEILING if h > 0.9 else FREE for h in STROKES)
     for name in ("a.png", "b.png", "a.svg", "b.svg"):
