@@ -108,17 +108,20 @@ def code_pieces(text: str) -> Iterator[str]:
     yield from (line.strip() for line in rest.split("\n") if line.startswith("    ") and not in_table(line))
 
 
-TEST = re.compile(r"^(?:async )?def (test_\w+)\(", re.M)  # none stands in a class
+# None stands in a class. A decorator is one line, or ends with a bracket of its own.
+TEST = re.compile(r"^((?:@.*\n(?:[ \])].*\n)*)*)(?:async )?def (test_\w+)\(", re.M)
+SLOW = re.compile(r"^@pytest\.mark\.(?:slow|study)$", re.M)
+ALL_SLOW = re.compile(r"^pytestmark = pytest\.mark\.(?:slow|study)$", re.M)
 
 
 @cache
-def collected_tests() -> tuple[tuple[str, str], ...]:
-    """All tests: (file's source, "file name::function")."""
+def collected_tests() -> tuple[tuple[str, str, bool], ...]:
+    """All tests: (file's source, "file name::function", whether it runs without an option)."""
     return tuple(
-        (source, f"{file.name}::{name}")
+        (source, f"{file.name}::{name}", not SLOW.search(marks) and not ALL_SLOW.search(source))
         for file in sorted((ROOT / "tests").rglob("test_*.py"))
         for source in (file.read_text(encoding="utf-8"),)
-        for name in TEST.findall(source)
+        for marks, name in TEST.findall(source)
     )
 
 
@@ -155,16 +158,23 @@ def missing_files(text: str) -> list[str]:
 
 
 def missing_tests(text: str) -> list[str]:
-    """Calls of pytest that select no test."""
+    """Calls of pytest that select no test, or slow ones alone without an option for them."""
     missing = []
     for piece in code_pieces(text):
         if not re.search(r"\bpytest\b", piece):
             continue
         files = {Path(file).name for file in re.findall(r"\btests/\S+\.py", piece)}
-        tests = [(source, name) for source, name in collected_tests() if not files or name.split("::")[0] in files]
+        slow = "--s" in piece or "::" in piece
+        tests = [
+            (source, name)
+            for source, name, quick in collected_tests()
+            if (quick or slow) and (not files or name.split("::")[0] in files)
+        ]
         for quoted, bare in re.findall(r"""-k\s+(?:"([^"]+)"|(\S+))""", piece):
             if not any(selects(quoted or bare, source, name) for source, name in tests):
                 missing.append(piece)
+        if not tests:
+            missing.append(piece)
     return missing
 
 
