@@ -12,7 +12,7 @@ import hashlib
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
 
 import numpy as np
 
@@ -241,6 +241,13 @@ def board(target: TargetBoard) -> Cuboid:
 
 def lab(targets: Sequence[TargetBoard] = ()) -> Room:
     """Room of 10 x 9 x 3 m: tiled floor, striped and plain walls, six lamps, a door, furniture, boards."""
+    surfaces, furniture = _empty_lab()
+    return Room("lab", surfaces, (*furniture, *(board(target) for target in targets)))
+
+
+@cache
+def _empty_lab() -> tuple[tuple[Rectangle, ...], tuple[Cuboid, ...]]:
+    """Surfaces and furniture: a recipe is checked with its boards in this room one by one."""
     furniture = (
         cuboid("table", (3.6, -1.9, 0.72), (1.6, 0.8, 0.05), (0.45, 0.33, 0.20)),
         cuboid("table_base", (3.6, -1.9, 0.35), (1.2, 0.5, 0.69), (0.30, 0.30, 0.32)),
@@ -250,7 +257,7 @@ def lab(targets: Sequence[TargetBoard] = ()) -> Room:
         cuboid("crate_blue", (4.6, 3.2, 0.45), (0.80, 0.80, 0.90), (0.10, 0.18, 0.50)),
         cuboid("column", (-3.4, -4.3, 1.5), (0.40, 0.40, 2.98), (0.62, 0.60, 0.56)),
     )
-    return Room("lab", (*_shell(), *_lamps()), (*furniture, *(board(target) for target in targets)))
+    return (*_shell(), *_lamps()), furniture
 
 
 def dark(targets: Sequence[TargetBoard] = ()) -> Room:
