@@ -9,7 +9,7 @@ from functools import cache
 from pathlib import Path
 
 import pytest
-from helpers.districts import DISTRICTS
+from helpers.districts import DISTRICTS, tree
 from helpers.docstring_entries import annotations, entries
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -27,11 +27,6 @@ FILE_ENDS = {"py", "toml", "json", "jsonl", "md", "html", "js", "exr", "npz", "p
 
 def sources() -> list[Path]:
     return sorted(file for folder in DISTRICTS for file in (ROOT / folder).rglob("*.py"))
-
-
-@cache
-def tree(file: Path) -> ast.Module:
-    return ast.parse(file.read_text(encoding="utf-8"))
 
 
 def named(file: Path) -> Iterator[str]:

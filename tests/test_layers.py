@@ -11,12 +11,11 @@ import tomllib
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from fnmatch import fnmatch
-from functools import cache
 from pathlib import Path
 
 import grimp
 import pytest
-from helpers.districts import DISTRICTS
+from helpers.districts import DISTRICTS, tree
 
 Python = Callable[..., subprocess.CompletedProcess[str]]
 
@@ -86,12 +85,6 @@ RENDERS = (
 
 def sources(root: Path) -> list[Path]:
     return sorted(file for folder in (*DISTRICTS, PACKAGE) for file in (root / folder).rglob("*.py"))
-
-
-@cache
-def tree(file: Path) -> ast.Module:
-    """Syntax of a file, which several tests look through."""
-    return ast.parse(file.read_text(encoding="utf-8"))
 
 
 def module_name(root: Path, file: Path) -> str:

@@ -6,6 +6,7 @@ import ast
 from collections.abc import Iterator
 from pathlib import Path
 
+from helpers.districts import tree
 from helpers.docstring_entries import Documented, annotations, entries
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -13,21 +14,23 @@ ROOT = Path(__file__).resolve().parent.parent
 
 def reference() -> list[Path]:
     """Modules of the site's reference, of the hooks' source: its imports are not all here."""
-    tree = ast.parse((ROOT / "docs" / "site_hooks.py").read_text(encoding="utf-8"))
-    named = (node for node in tree.body if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "REFERENCE")
+    hooks = ast.parse((ROOT / "docs" / "site_hooks.py").read_text(encoding="utf-8"))
+    named = (
+        node for node in hooks.body if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "REFERENCE"
+    )
     modules = [module for group in ast.literal_eval(next(named).value).values() for module in group]
     return [ROOT / f"{module.removeprefix('phibench.').replace('.', '/')}.py" for module in modules]
 
 
-def public(tree: ast.AST) -> Iterator[Documented]:
-    for node in ast.iter_child_nodes(tree):
+def public(parent: ast.AST) -> Iterator[Documented]:
+    for node in ast.iter_child_nodes(parent):
         if isinstance(node, Documented) and not node.name.startswith("_"):
             yield node
             yield from public(node)
 
 
 def faults(file: Path) -> Iterator[str]:
-    for node in public(ast.parse(file.read_text(encoding="utf-8"))):
+    for node in public(tree(file)):
         types = annotations(node)
         for section, head, said in entries(ast.get_docstring(node) or ""):
             where = f"{file.relative_to(ROOT)}: {node.name}: {head}"

@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from helpers.districts import DISTRICTS
+from helpers.districts import DISTRICTS, tree
 from helpers.hostile_policies import DEEDS, HEADER, REACHES, deeds
 from helpers.listeners import accepting
 from helpers.processes import processes_under
@@ -150,7 +150,7 @@ def test_pickles_are_opened_of_our_own_processes_alone() -> None:
     """`Connection.recv` of multiprocessing and `pickle.load(s)`; no NumPy file with objects, no marshal, no shelve."""
     found = set()
     for file in sorted(path for folder in SOURCES for path in (ROOT / folder).rglob("*.py")):
-        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        for node in ast.walk(tree(file)):
             if isinstance(node, ast.Import | ast.ImportFrom):
                 names = {alias.name for alias in node.names} | {getattr(node, "module", None)}
                 assert not names & {"marshal", "shelve", "dill", "cloudpickle", "joblib"}, file

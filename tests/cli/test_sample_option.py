@@ -68,7 +68,10 @@ def files(folder: Path) -> dict[str, bytes]:
     return {name: data for name, data in found.items() if not name.endswith((".json", ".jsonl", ".parquet"))}
 
 
-@pytest.mark.parametrize("command", COMMANDS)
+SLOW = ("calibrate", "dense picture")  # two thirds of the time; that they take a number is asked of all commands below
+
+
+@pytest.mark.parametrize("command", [pytest.param(c, marks=pytest.mark.slow) if c in SLOW else c for c in COMMANDS])
 def test_a_number_does_what_the_id_does(
     tiny_dataset: Path, tmp_path: Path, command: str, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import polars as pl
-from helpers.districts import DISTRICTS
+from helpers.districts import DISTRICTS, tree
 from helpers.strange_releases import TITLE, tiny_release
 from helpers.valid_files import ROOT, TEXT, Kind, compact, digest, png
 from PIL import Image
@@ -56,7 +56,7 @@ def readers(root: Path) -> Iterator[str]:
     """Functions that make an `InputFile` or call a decoder themselves, as "folder/module.py function"."""
     for folder in FOLDERS:
         for path in sorted((root / folder).rglob("*.py")):
-            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            for node in ast.walk(tree(path)):
                 if isinstance(node, ast.FunctionDef) and any(map(_reads, ast.walk(node))):
                     yield f"{path.relative_to(root).as_posix()} {node.name}"
 

@@ -407,6 +407,7 @@ def test_a_moved_view_is_the_view_of_a_rig_that_was_built_there(misaligned_datas
 # -- the page ------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_page_has_the_tables_of_the_code() -> None:
     """docs/misalignment.md against `python docs/draw_misalignment.py`."""
     folder = Path(__file__).resolve().parents[2] / "docs"

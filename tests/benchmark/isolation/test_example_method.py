@@ -17,7 +17,8 @@ from phibench.estimator.interface import Answer, Pair
 
 
 @pytest.mark.parametrize(
-    "preset", ["mono-raw", "bayer-raw", "mjpeg", *(pytest.param(p, marks=pytest.mark.slow) for p in ("srgb8", "yuyv"))]
+    "preset",
+    ["mjpeg", *(pytest.param(name, marks=pytest.mark.slow) for name in ("mono-raw", "bayer-raw", "srgb8", "yuyv"))],
 )
 def test_the_example_finds_the_spots_of_a_rendered_room(smoke_dataset: Path, preset: str) -> None:
     """The recipe `smoke` has the room of `paper`, its lamps and two of its distances: at 1.975 m and at 3.18 m.

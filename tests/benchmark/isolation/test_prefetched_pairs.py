@@ -70,6 +70,7 @@ def test_pairs_of_a_data_set_are_the_same_bytes(bench_dataset: Path) -> None:
         assert min(made.seconds.values()) > 0.0
 
 
+@pytest.mark.slow
 def test_a_score_does_not_depend_on_who_makes_the_pairs(bench_dataset: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     began: list[int] = []
     start = PrefetchedPairs.__init__

@@ -36,7 +36,11 @@ def folder(request: pytest.FixtureRequest, bench_dataset: Path, tiny_dataset: Pa
 
 @pytest.mark.parametrize(
     ("folder", "preset"),
-    [("with [frames]", "bayer-raw"), ("with [frames]", "mjpeg"), ("without", "srgb8")],
+    [
+        pytest.param("with [frames]", "bayer-raw", marks=pytest.mark.slow),
+        ("with [frames]", "mjpeg"),
+        ("without", "srgb8"),
+    ],
     indirect=["folder"],
 )
 def test_six_ways_give_the_same_bytes(folder: Path, tmp_path: Path, preset: str) -> None:

@@ -91,7 +91,7 @@ def lit(request: pytest.FixtureRequest) -> tuple[Room, LightMap]:
     return place, bake(RIG.at(0.0), place, SETTINGS)
 
 
-QUICK = ("floor", "post")
+QUICK = ("floor",)
 
 
 @pytest.mark.parametrize(
