@@ -17,7 +17,7 @@ from rich.console import Console
 
 from phibench.datasets.build.dataset_build import (
     Build,
-    claimed,
+    claimed_folder,
     copy_room_files,
     finish,
     missing_room_files,
@@ -37,19 +37,19 @@ from phibench.datasets.build.earlier_runs import (
     kept_samples,
     left_out_line,
     left_out_text,
-    lost_work,
-    possible,
+    lost_work_text,
+    possible_tasks,
     refused_samples,
     settled_samples,
 )
 from phibench.datasets.build.forecast import Forecast, forecast, slowdown
 from phibench.datasets.build.journal import Journal
-from phibench.datasets.build.parts import unfinished
-from phibench.datasets.build.room_export import damaged_exports, export_lines, export_rooms, held, own_files
+from phibench.datasets.build.parts import unfinished_tasks
+from phibench.datasets.build.room_export import damaged_exports, export_lines, export_rooms, held_files, own_files
 from phibench.datasets.build.workers import Environment, NoRendererError, WorkerPool
 from phibench.datasets.common.errors import DatasetError, IncompleteError
 from phibench.datasets.common.progress import progress_console
-from phibench.datasets.plan.draws import Causes, unexported
+from phibench.datasets.plan.draws import Causes, unexported_rooms
 from phibench.datasets.plan.pair_forecasts import pair_forecasts, pair_table, rim_lines
 from phibench.datasets.plan.plan import Plan, make_plan
 from phibench.datasets.recipe.checks import warnings
@@ -168,7 +168,7 @@ def dry_run(recipe: str | Path, out: str | Path, workers: int | None = None, **o
     """
     out, count, wanted = Path(out), _count(workers), MakeOptions(**options)
     leave_out = wanted.leave_out_refused
-    plan, _, note = _planned(recipe, out, wanted, lambda _, files: held(files, out))
+    plan, _, note = _planned(recipe, out, wanted, lambda _, files: held_files(files, out))
     refuse_other(out, None if wanted.replace else plan.recipe.dataset.name)
     pairs, journal = list(pair_forecasts(plan)), Journal(out)
     tasks, todo, told = plan_tasks(plan, {}), [], [note] if note else []
@@ -187,7 +187,7 @@ def dry_run(recipe: str | Path, out: str | Path, workers: int | None = None, **o
     told += rim_lines(plan, pairs) + [f"warning: {warning}" for warning in warnings(plan.recipe)]
     verb = "left out" if leave_out else "refused"
     told += [f"will be {verb}: {name}: {reason}" for name, reason in {**plan.left_out, **plan.refused}.items()]
-    told += export_lines(unexported(plan.recipe, plan.files))
+    told += export_lines(unexported_rooms(plan.recipe, plan.files))
     return "\n".join([*pair_table(pairs), seen, *told, f"{cost}, {len(tasks)} tasks in all; nothing was rendered"])
 
 
@@ -201,7 +201,7 @@ def cost(recipe: str | Path, out: str | Path, samples: int | None = None) -> For
     """
     out = Path(out)
     wanted = MakeOptions(samples=samples, replace=True)
-    plan, _, _ = _planned(recipe, out, wanted, lambda _, files: held(files, out))
+    plan, _, _ = _planned(recipe, out, wanted, lambda _, files: held_files(files, out))
     return forecast(plan, plan_tasks(plan, {}).values())
 
 
@@ -259,13 +259,13 @@ def _export(
 
     Samples are drawn from what the files hold, so that this comes before the plan.
     """
-    with claimed(out, None if replace else recipe.dataset.name):
+    with claimed_folder(out, None if replace else recipe.dataset.name):
         remove_files(out, damaged_exports(out))
         own = own_files(recipe, files)
         made += [schema.room_file(name) for name in missing_room_files(own, out)]
         copy_room_files(own, out)
         held = RoomFiles(out / schema.ROOM_FILES, own.digests)
-        if todo := unexported(recipe, held):
+        if todo := unexported_rooms(recipe, held):
             with WorkerPool(out, _count(workers), scheduler) as pool:
                 pool.environment()  # tells where nothing can be rendered, and connects to a scheduler
                 export_rooms(todo, recipe.ambient, pool, console, made)
@@ -287,7 +287,7 @@ def make_from_plan(
     Of what is `wanted`, `replace` and `leave_out_refused` count. `draws` are kept for the next start.
     """
     with (
-        claimed(out, None if wanted.replace else plan.recipe.dataset.name),
+        claimed_folder(out, None if wanted.replace else plan.recipe.dataset.name),
         WorkerPool(out, _count(workers), scheduler) as pool,
         Journal(out) as journal,
     ):
@@ -344,15 +344,15 @@ def _make(
 def _lost(build: Build, leave_out: bool) -> str | None:
     """Sentence on what a run would lose: finished work, or the end of a data set that leaves samples out."""
     keys = {name: task.key for name, task in build.tasks.items()}
-    if lost := lost_work(build.out, keys, build.journal, dataset_info(build.plan, build.environment)):
+    if lost := lost_work_text(build.out, keys, build.journal, dataset_info(build.plan, build.environment)):
         return f"{lost}; {OR_REPLACE}"
     return None if leave_out else finished_without(build.out, build.journal)
 
 
 def _todo(build: Build, leave_out: bool) -> list[str]:
     """Names of the tasks that are to be done: all that are not whole, without those that cannot be done."""
-    todo = unfinished(build.tasks, build.journal, build.out)
-    return possible(todo, build.tasks, build.journal) if leave_out else todo
+    todo = unfinished_tasks(build.tasks, build.journal, build.out)
+    return possible_tasks(todo, build.tasks, build.journal) if leave_out else todo
 
 
 def _environment(pool: WorkerPool, journal: Journal) -> tuple[Environment, NoRendererError | None]:

@@ -15,8 +15,8 @@ from typing import Any
 
 from rich.console import Console
 
-from phibench.datasets.build.dataset_build import claimed, copy_room_files, finish, held_head, task_names
-from phibench.datasets.build.earlier_runs import lost_work
+from phibench.datasets.build.dataset_build import claimed_folder, copy_room_files, finish, held_head, task_names
+from phibench.datasets.build.earlier_runs import lost_work_text
 from phibench.datasets.build.journal import Entry, FolderHead, Journal, Refusal, is_intact
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.progress import Steps, progress_console
@@ -57,8 +57,8 @@ def merge(out: str | Path, shards: Sequence[str | Path], console: Console | None
     names = task_names(plan)
     if missing := [name for name in names if name not in entries]:
         raise DatasetError(f"the shards lack {len(missing)} tasks, such as {missing[0]}; finish or add their shards")
-    with claimed(out, info.name), Journal(out) as journal:
-        if lost := lost_work(out, {name: entries[name][0].key for name in names}, journal, info):
+    with claimed_folder(out, info.name), Journal(out) as journal:
+        if lost := lost_work_text(out, {name: entries[name][0].key for name in names}, journal, info):
             raise DatasetError(f"{lost}; give another folder")
         (out / CHECKSUMS).unlink(missing_ok=True)
         journal.begin(head, [])  # says what the folder is, should this be interrupted

@@ -24,7 +24,7 @@ from phibench.datasets.read import Dataset, Sample
 from phibench.datasets.store.files import write_text
 from phibench.render.optics.faces import IntArray
 from phibench.render.optics.ray_tracer import trace_pixels
-from phibench.render.optics.reflection_point import mirror_points, onward
+from phibench.render.optics.reflection_point import mirror_points, onward_ways
 from phibench.render.sensor.processing import eight_bit
 from phibench.render.sensor.srgb import srgb_encoded
 from phibench.scenes.frames import Array
@@ -164,7 +164,7 @@ def epipolar_line(sample: Sample, position: str) -> dict[str, Any] | None:
     points = mirror_points(view, spot, view.camera_centre_m[None])
     if not np.isfinite(points.points_m).all():
         return None  # the mirror does not show it
-    start, end = (leg[0] for leg in onward(view, points, spot).legs[-1])
+    start, end = (leg[0] for leg in onward_ways(view, points, spot).legs[-1])
     reach = float(np.linalg.norm(end - start))
     along = np.sort(np.append(np.geomspace(_NEAREST_M, _FARTHEST_M, _LINE_POINTS), reach))
     direction = (end - start) / reach
@@ -281,7 +281,7 @@ def _rig_lines(sample: Sample, position: str) -> dict[str, Any]:
     if np.isfinite(row.reflection_point_world_m).all():
         spot = np.array([sample.row.spot_world_m])
         points = mirror_points(view, spot, view.camera_centre_m[None])
-        way = [view.camera_centre_m, *(leg[0][0] for leg in onward(view, points, spot).legs), spot[0]]
+        way = [view.camera_centre_m, *(leg[0][0] for leg in onward_ways(view, points, spot).legs), spot[0]]
     return {
         "position": position,
         "lens": _rounded(view.camera_centre_m, 4),

@@ -19,12 +19,12 @@ from phibench.datasets.store import schema
 from phibench.datasets.store.pictures import (
     TEXT,
     Picture,
-    captioned,
+    captioned_picture,
     crop,
     display_exposure_s,
     enlarged,
-    halved,
-    marked,
+    halved_planes,
+    marked_picture,
     save_png,
     to_srgb,
 )
@@ -215,9 +215,9 @@ def _height(parts: list[Picture]) -> int:
 def _pictures(sample: Sample, position: str) -> tuple[Picture, Picture]:
     detector, spot = sample.rig.camera.detector, sample.truth_row(position)
     frame = sample.expected_image(position)
-    exposure = display_exposure_s(halved(sample.ambient(position)), detector)
-    overview = marked(to_srgb(halved(halved(frame)), detector, exposure), spot.centre, 4)
+    exposure = display_exposure_s(halved_planes(sample.ambient(position)), detector)
+    overview = marked_picture(to_srgb(halved_planes(halved_planes(frame)), detector, exposure), spot.centre, 4)
     window = crop(frame, spot.centre)
     peak = float(window[1].max(initial=1.0))
     close = enlarged(to_srgb(window, detector, min(exposure, 1.0 / peak)), spot.centre, _ZOOM)
-    return overview, close if spot.visible else captioned(close, f"{position}: not visible\n{spot.cause}")
+    return overview, close if spot.visible else captioned_picture(close, f"{position}: not visible\n{spot.cause}")

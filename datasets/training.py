@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from phibench.datasets.common.errors import DatasetError, whole_number
 from phibench.datasets.common.shown_text import ShortForm
-from phibench.datasets.frames.frame_request import FrameOptions, FrameRequest, in_one_sentence, sample_request
+from phibench.datasets.frames.frame_request import FrameOptions, FrameRequest, request_faults, sample_request
 from phibench.datasets.frames.frame_source import FrameSource
 from phibench.datasets.frames.sensor_card import SensorCard, card_of
 from phibench.datasets.read import Dataset, Sample, open_finished
@@ -343,7 +343,7 @@ class SpotCrops:
         light = side.moved(first + place, s.patch_px, request.lamp_level, request.laser_level * level)
         chain = replace(camera, camera_seed=int(draw.integers(s.cameras)))
         region = Region(*(int(x) for x in (*first, *(first + s.side_px))))
-        with in_one_sentence():
+        with request_faults():
             image = chain.frame(light, NoiseStream((*names, "noise")), region)
             off = chain.frame(light.laser_off(), NoiseStream((*names, "off")), region) if self.laser_off else None
         named = side.sample_id, side.position, request.preset

@@ -31,14 +31,14 @@ from phibench.datasets.read import Dataset, Sample, open_dataset
 from phibench.datasets.recipe.load import parse_recipe
 from phibench.datasets.store import schema
 from phibench.datasets.store.checksums import (
-    damaged,
+    damaged_files,
     differing_files,
     held_room_files,
-    misplaced,
+    misplaced_files,
     read_checksums,
-    strays,
+    stray_files,
 )
-from phibench.datasets.store.json_forms import alike, same_number, to_json
+from phibench.datasets.store.json_forms import same_document, same_number, to_json
 from phibench.datasets.store.layers import SPOT_STACKS, read_ambient_pair, read_exr, read_spot, read_truth
 from phibench.datasets.store.metadata import differences, parse_info
 from phibench.datasets.store.schema import LightRow, ManifestRow, PoseInfo, RoomInfo, SpotRow
@@ -166,13 +166,13 @@ def file_faults(folder: Path) -> tuple[list[str], int, tuple[str, ...]]:
     Every bit of every file counts, but of the diaries and pictures that `schema.NOT_DATA` names: `run.json`,
     `log.jsonl`, `contact_sheet.png`. Without SHA256SUMS the journal's hashes stand in.
     """
-    faults, journal = misplaced(folder), Journal(folder)
+    faults, journal = misplaced_files(folder), Journal(folder)
     held = {name: digest for entry in journal.entries.values() for name, digest in entry.files.items()}
     if journal.head is not None:
         texts = {schema.INFO: journal.head.info, schema.RECIPE: journal.head.recipe}
         held |= {name: hashlib.sha256(text.encode()).hexdigest() for name, text in texts.items()}
     try:
-        faults += damaged(folder)
+        faults += damaged_files(folder)
         listed = read_checksums(folder)
     except DatasetError as error:
         faults += [str(error), *differing_files(folder, held), *_journal_faults(folder, journal)]
@@ -188,7 +188,7 @@ def file_faults(folder: Path) -> tuple[list[str], int, tuple[str, ...]]:
         unknown = (name for name in listed if schema.is_task_file(name) and name not in held)
         faults += [f"{schema.JOURNAL} is damaged: it has no entry for {name}" for name in unknown]
     faults += filter(None, [sensitivity_fault(folder)])
-    return faults, len(listed), tuple(f"{name} is not part of the data set" for name in strays(folder))
+    return faults, len(listed), tuple(f"{name} is not part of the data set" for name in stray_files(folder))
 
 
 def _journal_faults(folder: Path, journal: Journal) -> Iterator[str]:
@@ -449,7 +449,7 @@ def _row_faults(plan: Plan, pair: PairPlan, row: ManifestRow) -> Iterator[str]:
         "spot_diameter_m": spot.diameter_m,
     }
     for name, value in expected.items():
-        if not alike(getattr(row, name), value):
+        if not same_document(getattr(row, name), value):
             yield f"{row.sample_id}: {name} is {getattr(row, name)}, the recipe gives {value}"
 
 
@@ -458,7 +458,7 @@ def _rig_faults(plan: Plan, dataset: Dataset) -> Iterator[str]:
     if set(held) != set(plan.rigs):
         yield f"{schema.RIGS}: the rigs are not those of the recipe"
     for name in (name for name in plan.rigs if name in held):
-        if not alike(_with_form(held[name]), json.loads(json.dumps(to_json(plan.rigs[name])))):
+        if not same_document(_with_form(held[name]), json.loads(json.dumps(to_json(plan.rigs[name])))):
             yield f"{schema.RIGS}: {name} is not the rig that the recipe gives"
 
 
@@ -467,7 +467,7 @@ def _room_faults(plan: Plan, dataset: Dataset) -> Iterator[str]:
         yield f"{schema.ROOMS}: the rooms are not those of the recipe"
     for info in dataset.rooms.infos.values():
         if info.source and info.room in plan.rooms:
-            if not alike(info.source, to_json(plan.rooms[info.room])):
+            if not same_document(info.source, to_json(plan.rooms[info.room])):
                 yield f"{schema.ROOMS}: {info.room} is not the room that the recipe gives"
             yield from _guarded(_room_line_faults(plan, dataset, info))
 

@@ -12,7 +12,7 @@ from phibench.datasets.build.bake_task import light_map
 from phibench.datasets.store.pictures import display_exposure_s, to_srgb
 from phibench.render.room.ambient_layer import render_ambient
 from phibench.render.room.light_map import BakeSettings
-from phibench.scenes.holder import fitted
+from phibench.scenes.holder import fitted_holder
 from phibench.scenes.room import default_rig, lab
 
 _COARSE = BakeSettings(texel_m=0.25, lamp_rays=8, bounces=3, bounce_rays=16, final_rays=32)
@@ -28,7 +28,7 @@ def main() -> None:
     camera = replace(old, width_px=_WIDTH, height_px=_HEIGHT, **half, **middle)
     light = light_map(rig.at(0.0), room, _COARSE)
     parts = []
-    for holder in (None, *(fitted(kind, rig.sphere.radius_m) for kind in ("rods", "post", "tube"))):
+    for holder in (None, *(fitted_holder(kind, rig.sphere.radius_m) for kind in ("rods", "post", "tube"))):
         view = replace(rig, camera=camera, holder=holder).at(0.3)
         planes = render_ambient(view, room, light, _COARSE, 2, 0).electrons_per_s
         left = (_WIDTH - _SQUARE) // 2

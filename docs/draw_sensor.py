@@ -26,7 +26,7 @@ from phibench.render.sensor import processing
 from phibench.render.sensor.camera_chain import Chain
 from phibench.render.sensor.electrons import (
     NoiseStream,
-    collected,
+    collected_charge,
     expected_electrons,
     frame_stream,
     mean_charge,
@@ -55,7 +55,7 @@ def steps(source: FrameSource) -> list[tuple[str, Picture]]:
     pattern = chain.pattern(tiles)
     photo = chain.photo_electrons(light, tiles)
     mean = mean_charge(photo, s, pattern)
-    charge = collected(mean, s, stream, tiles)
+    charge = collected_charge(mean, s, stream, tiles)
     box = chain.raw_region(region, size)
     raw = chain.raw(light, stream, box)
     linear = linear_rgb(linear_signal(raw, s, np.float32), s)

@@ -44,7 +44,7 @@ from phibench.estimator.dense.unrolled_pair import WIDTH_PX
 from phibench.render.optics.correspondence import Correspondence
 from phibench.render.sensor.camera_chain import Chain, auto_exposed
 from phibench.render.sensor.electrons import NoiseStream
-from phibench.render.sensor.processing import decoded
+from phibench.render.sensor.processing import jpeg_image
 from phibench.scenes.frames import Array
 
 PARTS = (0.25, 0.5, 0.75)
@@ -180,7 +180,7 @@ def with_stills(films: DenseFilms, pair: DensePair) -> DensePair:
     images = []
     for frame in stroke.between:
         light = film_light(scene, at_once.room(frame), film.spots[frame]).laser_off()
-        images.append(decoded(camera.jpeg_bytes(light, NoiseStream((*film.plan.names, "still", frame, draw)))))
+        images.append(jpeg_image(camera.jpeg_bytes(light, NoiseStream((*film.plan.names, "still", frame, draw)))))
     heights = scene.offset_m(scene.times.frame_s[list(stroke.between)])
     return with_between(pair, images, tuple(map(float, heights)))
 

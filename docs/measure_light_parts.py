@@ -31,7 +31,7 @@ from phibench.render.optics.faces import FaceTable, IntArray, TexelGrid, face_ta
 from phibench.render.optics.room_tracer import room_geometry
 from phibench.render.optics.truth import truth_layer
 from phibench.render.room.ambient_layer import view_surfaces
-from phibench.render.room.bounced_light import gathered
+from phibench.render.room.bounced_light import gathered_light
 from phibench.render.room.camera_plugin import MM_PER_M
 from phibench.render.room.lamp_light import direct_light
 from phibench.render.room.light_map import (
@@ -41,7 +41,7 @@ from phibench.render.room.light_map import (
     _spread_texels,
     bake,
     fixed_shapes,
-    smoothed,
+    smoothed_mean,
 )
 from phibench.render.room.surfaces import Surfaces, aligned
 from phibench.render.room.texel_points import Texels, nearest_free
@@ -108,7 +108,7 @@ def exact(mi: ModuleType, room: Room, surfaces: Surfaces, points: Shown) -> tupl
     surfaces.set_light(texels.grid, np.zeros((texels.grid.count, 3)))
     lamps = direct_light(mi, surfaces, texels, None, _LAMP_RAYS, 77)
     surfaces.set_light(TexelGrid.of(table, FINE.texel_m), bake(RIG.at(0.0), room, FINE).irradiance_w_m2)
-    others = [gathered(mi, surfaces, texels, np.full(len(start), _RAYS), 5000 + k) for k in (0, 7)]
+    others = [gathered_light(mi, surfaces, texels, np.full(len(start), _RAYS), 5000 + k) for k in (0, 7)]
     return 0.5 * (lamps[0] + lamps[1]), 0.5 * (others[0] + others[1])
 
 
@@ -131,7 +131,7 @@ def lamps_alone(mi: ModuleType, surfaces: Surfaces, grid: TexelGrid, settings: B
     direct = direct_light(mi, surfaces, texels, None, settings.lamp_rays, _SEED)
     free = nearest_free(covered, grid)
     halves = (half[free] for half in direct)
-    return np.maximum(smoothed(grid, *halves, _KEPT_OF_LAMPS)[0], 0.0)
+    return np.maximum(smoothed_mean(grid, *halves, _KEPT_OF_LAMPS)[0], 0.0)
 
 
 def main() -> None:

@@ -194,7 +194,7 @@ def _symmetric(monomial: str, coefficient: float) -> Array:
     return result
 
 
-def added(old: Form | None, new: Form) -> Form:
+def form_sum(old: Form | None, new: Form) -> Form:
     """Sum of two forms in the same frame."""
     return new if old is None else Form(*(a + b for a, b in zip(old.coefficients_m, new.coefficients_m, strict=True)))
 

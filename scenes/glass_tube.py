@@ -176,7 +176,7 @@ class GlassTube:
             seen = np.where(lost[:, None], np.nan, seen)
             way, length = seen - places_m, np.linalg.norm(seen - places_m, axis=1)
             by_direction = (np.cross(self.axis, places_m - self.origin_m), np.broadcast_to(self.axis, seen.shape))
-            gradients = (across(vector, way / length[:, None], length) for vector in by_direction)
+            gradients = (parts_across(vector, way / length[:, None], length) for vector in by_direction)
             return seen, self.stretch(seen, places_m, *gradients)
 
     def stretch(self, seen_m: Array, places_m: Array, moment_slope: Array, cosine_slope: Array) -> Array:
@@ -206,7 +206,7 @@ class GlassTube:
         return np.arcsin(b / self.inner_m) - np.arcsin(b / self.outer_m), 1.0 / near - 1.0 / far, far - near
 
 
-def across(vectors: Array, directions: Array, length: Array) -> Array:
+def parts_across(vectors: Array, directions: Array, length: Array) -> Array:
     """Parts of vectors across unit directions, over the distance: (I - d d^T) v / l."""
     along = np.einsum("ni,ni->n", vectors, directions)
     return (vectors - along[:, None] * directions) / length[:, None]

@@ -167,7 +167,7 @@ class Holder:
             )
 
 
-def fitted(kind: HolderKind, wide_m: float, depth_m: float | None = None, **given: float) -> Holder:
+def fitted_holder(kind: HolderKind, wide_m: float, depth_m: float | None = None, **given: float) -> Holder:
     """Holder with the sizes that are given, and others that suit a ball of radius `wide_m`, or a rim of this radius.
 
     The gap between mirror and rods, or tube, is a quarter of the radius. The plates reach two radii of a rod beyond
@@ -190,7 +190,7 @@ def fitted(kind: HolderKind, wide_m: float, depth_m: float | None = None, **give
 OF_TUBES = ("wall_m", "glass_index")
 """Fields that mean something for a tube alone; documents of other holders leave them out."""
 LENGTHS = tuple(field.name for field in fields(Holder) if field.name.endswith("_m"))
-"""Names of the sizes that `fitted` may choose."""
+"""Names of the sizes that `fitted_holder` may choose."""
 
 
 def prism_radius_m(radius_m: float) -> float:

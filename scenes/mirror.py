@@ -9,7 +9,7 @@ from typing import ClassVar, Protocol, Self
 import numpy as np
 
 from phibench.scenes.camera import Camera
-from phibench.scenes.form_error import Form, Level, added, curvatures, deviation, directions, level, limb_points
+from phibench.scenes.form_error import Form, Level, curvatures, deviation, directions, form_sum, level, limb_points
 from phibench.scenes.frames import Array, Pose
 from phibench.scenes.holder import Extent
 from phibench.scenes.metals import MetalName, MetalSurface, ReflectanceTable, known_metal
@@ -190,7 +190,7 @@ class SphereMirror(MetalSurface):
     def deviated(self, radius_m: float, rim_radius_m: float, roughness_alpha: float, form: Form) -> Self:
         """Sphere with these added; it has no rim."""
         alpha = self.roughness_alpha + roughness_alpha
-        return replace(self, radius_m=self.radius_m + radius_m, roughness_alpha=alpha, form=added(self.form, form))
+        return replace(self, radius_m=self.radius_m + radius_m, roughness_alpha=alpha, form=form_sum(self.form, form))
 
 
 def _check_convex(radius_m: float, form: Form) -> None:

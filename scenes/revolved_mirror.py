@@ -13,7 +13,7 @@ from typing import ClassVar, Self
 import numpy as np
 
 from phibench.scenes.camera import Camera
-from phibench.scenes.form_error import Form, Level, added
+from phibench.scenes.form_error import Form, Level, form_sum
 from phibench.scenes.frames import Array, Pose
 from phibench.scenes.holder import Extent
 from phibench.scenes.metals import MetalName, MetalSurface, ReflectanceTable, known_metal
@@ -164,7 +164,7 @@ class RevolvedMirror(MetalSurface):
             profile = replace(profile, rim_radius_m=profile.rim_radius_m + rim_radius_m)
         if radius_m and self.shape != "cone":
             profile = replace(profile, vertex_radius_m=profile.vertex_radius_m + radius_m)
-        alpha, form = self.roughness_alpha + roughness_alpha, added(self.form, form)
+        alpha, form = self.roughness_alpha + roughness_alpha, form_sum(self.form, form)
         return replace(self, profile=profile, roughness_alpha=alpha, form=form, form_radius_m=disc_m)
 
 

@@ -204,10 +204,10 @@ def _fault(schema: Schema, details: ErrorDetails) -> Fault:
     node = schema_node(schema, location)
     hint = f" ({node['description']})" if "description" in node else ""
     if kind == "missing":
-        return Fault(path, f"missing; add {allowed(node)}{hint}")
+        return Fault(path, f"missing; add {allowed_text(node)}{hint}")
     if isinstance(given, dict) and node.get("type") == "array" and not _plain(node):
         return Fault(path, f"a single table; write [[{path}]] with two brackets, once for each entry{hint}")
-    return Fault(path, f"{_shown(given)} is not allowed; give {allowed(node)}{hint}")
+    return Fault(path, f"{_shown(given)} is not allowed; give {allowed_text(node)}{hint}")
 
 
 def schema_node(schema: Schema, location: Location) -> Schema:
@@ -230,7 +230,7 @@ def _resolve(schema: Schema, node: Schema) -> Schema:
     return node
 
 
-def allowed(node: Schema) -> str:
+def allowed_text(node: Schema) -> str:
     """Say in words what a JSON schema node allows."""
     if KINDS_OF_NUMBERS <= set(node.get("properties", {})):
         return "a number or a distribution such as { uniform = [low, high] }"
@@ -245,7 +245,7 @@ def allowed(node: Schema) -> str:
         words.append(f"of at most {node['maxLength']} letters, digits and signs like {_signs(node['pattern'])}")
     if "minItems" in node:
         count = "of" if node["minItems"] == node.get("maxItems") else "of at least"
-        words.append(f"{count} {node['minItems']} ({allowed(_entry(node))})" if _plain(node) else "with entries")
+        words.append(f"{count} {node['minItems']} ({allowed_text(_entry(node))})" if _plain(node) else "with entries")
     elif "maxItems" in node:
         words.append(f"of at most {node['maxItems']} entries")
     return " ".join(words)

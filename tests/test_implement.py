@@ -19,7 +19,7 @@ import pytest
 from phibench.estimator.geometry.paper_depth import depth_paper
 from phibench.estimator.geometry.phi import phi_incidence, phi_normal, phi_ray
 from phibench.estimator.geometry.reflection import reflect
-from phibench.render.sensor.electrons import digitised, mosaic
+from phibench.render.sensor.electrons import digitised_signal, mosaic
 from phibench.render.sensor.light import row_times_s
 from phibench.render.sensor.processing import tone_encoded, yuyv
 from phibench.render.sensor.settings import sensor
@@ -248,7 +248,7 @@ CHECKS: dict[str, tuple[BY, BY]] = {
     "mosaic": (lambda: [1.0, 2.0, 2.0, 3.0], library_mosaic),
     "converter": (
         lambda: [float(round(64.0 + 959.0 / 12000.0 * 1000.0))],
-        lambda: [float(digitised(np.array(1000.0), sensor("bayer-raw")))],
+        lambda: [float(digitised_signal(np.array(1000.0), sensor("bayer-raw")))],
     ),
     "rec709": (
         lambda: [255.0 * (1.09929682680944 * 0.2**0.45 - 0.09929682680944)],

@@ -468,7 +468,7 @@ def one_or_more(text: str) -> int:
     return int(text)
 
 
-def told(made: Callable[[], Path]) -> int:
+def exit_code_of(made: Callable[[], Path]) -> int:
     """Make a file and print its name, or what is wrong; exit code."""
     try:
         print(made())
@@ -492,8 +492,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = parser.parse_args(arguments)
     settings = TrainingSettings(given.seed, tuple(given.preset or REQUESTS), given.crops, given.passes)
     if given.rescale is None:
-        return told(lambda: train(given.folder, given.out, settings))
-    return told(lambda: rescaled(given.folder, given.rescale, given.out, settings))
+        return exit_code_of(lambda: train(given.folder, given.out, settings))
+    return exit_code_of(lambda: rescaled(given.folder, given.rescale, given.out, settings))
 
 
 if __name__ == "__main__":

@@ -52,11 +52,11 @@ from tools.crop_training import (
     Answers,
     Parameters,
     TrainingSettings,
+    exit_code_of,
     first_layer,
     one_or_more,
     rooms_of,
     scale_of,
-    told,
     torch_on_one_thread,
 )
 
@@ -370,8 +370,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = parser.parse_args(arguments)
     settings = FrameSettings(given.seed, given.spots, passes=given.passes)
     if given.rescale is None:
-        return told(lambda: train(given.folder, given.out, settings))
-    return told(lambda: rescaled(given.folder, given.rescale, given.out, settings))
+        return exit_code_of(lambda: train(given.folder, given.out, settings))
+    return exit_code_of(lambda: rescaled(given.folder, given.rescale, given.out, settings))
 
 
 if __name__ == "__main__":

@@ -55,7 +55,7 @@ from phibench.datasets.recipe.tables import (
 )
 from phibench.scenes.rig import Rig
 from phibench.scenes.room import RIGS
-from phibench.scenes.validation import allowed, schema_node
+from phibench.scenes.validation import allowed_text, schema_node
 from phibench.scenes.worlds.room_properties import PROPERTIES
 
 TABLES: dict[str, type[BaseModel]] = {
@@ -327,7 +327,7 @@ strongest light that goes out with the laser.
 _NAMES = "NameChoice"
 _LONGEST_ROW = 160  # characters; what a longer one allows stands below the table
 _ABSENT: dict[type[BaseModel], str] = {RigTable: "as preset", HolderTable: "follows R", FramesTable: "as preset"}
-# What `allowed` says in a sentence of a fault stands in a table's cell in fewer words.
+# What `allowed_text` says in a sentence of a fault stands in a table's cell in fewer words.
 _IN_CELLS = (
     (r"\ba number (?=from|above)", ""),
     (r"\b(an integer|a whole number) ", "whole, "),
@@ -419,8 +419,8 @@ def _allowed(key: str, model: type[BaseModel]) -> str:
         return f"{_values(schema['properties'][key]) or 'a number'} (or drawn)"
     if node.get("title") in (_NAMES, TargetChoice.__name__):
         names = schema_node(schema, (key, "choice", 0))
-        return f"{allowed(names) if 'enum' in names else 'a name'} (or drawn)"
-    return allowed(node)
+        return f"{allowed_text(names) if 'enum' in names else 'a name'} (or drawn)"
+    return allowed_text(node)
 
 
 def _values(node: object) -> str:

@@ -18,7 +18,7 @@ from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import InputFile
 from phibench.datasets.exposures.draw_frames import require_outside
 from phibench.datasets.frames.frame_files import suffix, write_frame
-from phibench.datasets.store.checksums import filling, signed, write_documents
+from phibench.datasets.store.checksums import filling, with_checksums, write_documents
 from phibench.datasets.store.files import sha256
 from phibench.datasets.store.layers import write_exr
 from phibench.datasets.store.schema import TruthFolder
@@ -118,7 +118,7 @@ def read_dense_index(out: Path) -> dict[str, dict[str, Any]]:
 
 def _write_index(out: Path, lines: list[dict[str, Any]]) -> None:
     hashes = {file: hashed for line in lines for file, hashed in line["files"].items()}
-    write_documents(out, signed({INDEX: _text(lines)}, hashes))
+    write_documents(out, with_checksums({INDEX: _text(lines)}, hashes))
 
 
 def _is_of(pairs: DensePairs, out: Path, line: dict[str, Any]) -> bool:

@@ -47,7 +47,7 @@ from phibench.datasets.store.checksums import (
     differing_files,
     filling,
     read_checksums,
-    signed,
+    with_checksums,
     write_documents,
 )
 from phibench.datasets.store.croissant import LICENSE_TEXT
@@ -329,7 +329,7 @@ def _finish(dataset: Dataset, request: ExportRequest, out: Path, shards: Sequenc
         lines = [line for result in results for line in result.scored]
         taken = scored_pairs(dataset, request)
         documents |= frames_set_documents(taken, request.frames.preset, request.draws, lines)
-    write_documents(out, signed(documents, hashes))
+    write_documents(out, with_checksums(documents, hashes))
 
 
 def _used_lines(dataset: Dataset, name: str, data: bytes) -> bytes:

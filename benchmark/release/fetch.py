@@ -27,9 +27,9 @@ from phibench.datasets.build.forecast import megabytes
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import FILE_NAME, SETTINGS_BYTES, InputFile
 from phibench.datasets.common.progress import Steps, progress_console
-from phibench.datasets.film.film_store import verify as film_faults
+from phibench.datasets.film.film_store import verify_films as film_faults
 from phibench.datasets.store import schema
-from phibench.datasets.store.checksums import damaged, differing_files, read_checksums, writing_to
+from phibench.datasets.store.checksums import damaged_files, differing_files, read_checksums, writing_to
 from phibench.datasets.store.files import sha256, write_text
 from phibench.datasets.store.folder_lock import only_run
 from phibench.datasets.store.temporary_folders import (
@@ -346,7 +346,7 @@ def _check(stage: Path, title: str, part: ReleasedPart, place: Source, is_fresh:
             told = f"{folder} holds {printable_line(strange[0], 80)}, which is not listed in {schema.CHECKSUMS}"
             raise DatasetError(f"{told}; move it away if it is yours, or else ask who made the release")
         other = film_faults if part.kind == "films" else lambda folder: differing_files(folder, listed)
-        faults = damaged(folder) if part.kind == "pairs" else other(folder)
+        faults = damaged_files(folder) if part.kind == "pairs" else other(folder)
     if faults:
         remove_tree(folder)
         _write_state(stage, {"title": title, "sums_sha256": part.sums_sha256, "unpacked": []})

@@ -54,7 +54,7 @@ from phibench.datasets.make import cost, make
 from phibench.datasets.read import open_finished
 from phibench.datasets.recipe.load import parse_recipe, recipe_files, with_numbers
 from phibench.datasets.store import schema
-from phibench.datasets.store.checksums import differing_files, filling, read_checksums, signed, write_documents
+from phibench.datasets.store.checksums import differing_files, filling, read_checksums, with_checksums, write_documents
 from phibench.datasets.store.croissant import LICENSE_TEXT, LICENSE_URL, croissant_text, file_object
 from phibench.datasets.store.files import sha256, write_text
 from phibench.datasets.store.metadata import read_info
@@ -416,7 +416,7 @@ def _finish(out: Path, manifest: Manifest) -> None:
         "LICENSE": LICENSE_TEXT.encode(),
         README: _card(title, manifest).encode(),
     }
-    write_documents(out, signed(documents, hashes))
+    write_documents(out, with_checksums(documents, hashes))
 
 
 def _card(title: str, manifest: Manifest) -> str:

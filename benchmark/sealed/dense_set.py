@@ -33,7 +33,7 @@ from phibench.datasets.common.input_files import SETTINGS_BYTES, FileName, Input
 from phibench.datasets.exposures.pair_draws import PairDraw
 from phibench.datasets.frames.frame_files import png_bytes
 from phibench.datasets.read import Dataset
-from phibench.datasets.store.checksums import filling, signed, write_documents
+from phibench.datasets.store.checksums import filling, with_checksums, write_documents
 from phibench.datasets.store.files import sha256, write_bytes, write_secret
 from phibench.datasets.store.json_forms import from_json, to_json
 from phibench.datasets.store.layers import read_exr, write_exr
@@ -285,7 +285,7 @@ def write_dense_set(pairs: DensePairs, out: Path) -> Path:
             hashes |= {path.relative_to(out).as_posix(): sha256(path) for path in files}
         info = DenseSetInfo(task_version=DENSE_TASK_VERSION, pairs=len(pairs), source=pairs.document())
         text = json.dumps(info.model_dump(mode="json"), indent=1) + "\n"
-        write_documents(out, signed({PAIRS: "".join(rows).encode(), DENSE_SET: text.encode()}, hashes))
+        write_documents(out, with_checksums({PAIRS: "".join(rows).encode(), DENSE_SET: text.encode()}, hashes))
     return out
 
 
@@ -352,7 +352,7 @@ def seal_dense_set(folder: Path, out: Path) -> Path:
         )
         write_secret(folder / DENSE_TRUTH, text)  # first: no seal without its truth
         told = json.dumps(seal.model_dump(mode="json"), indent=1) + "\n"
-        write_documents(out, signed({PAIRS: lines, DENSE_SEAL: told.encode()}, hashes))
+        write_documents(out, with_checksums({PAIRS: lines, DENSE_SEAL: told.encode()}, hashes))
     return out
 
 

@@ -37,7 +37,7 @@ from phibench.benchmark.sealed.submission import check_complete, without_folders
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import SETTINGS_BYTES, FileName, InputFile, Name, Text
 from phibench.datasets.common.progress import Steps, progress_console
-from phibench.datasets.store.checksums import filling, read_checksums, signed, write_documents
+from phibench.datasets.store.checksums import filling, read_checksums, with_checksums, write_documents
 from phibench.datasets.store.files import sha256
 from phibench.datasets.store.layers import read_exr, write_exr
 from phibench.datasets.store.pair_files import MOST_PAIRS, PAIRS, PairFiles, PublicPair
@@ -191,7 +191,7 @@ def submit_dense(
         )
         text = json.dumps(document.model_dump(mode="json"), indent=1, allow_nan=False) + "\n"
         hashes = {line.file: sha256(out / line.file) for line in lines if line.file is not None}
-        write_documents(out, signed({SUBMISSION: text.encode()}, hashes))
+        write_documents(out, with_checksums({SUBMISSION: text.encode()}, hashes))
     silent = Counter(f"{line.failure}: {line.message}" for line in lines if line.failure)
     answered = sum(line.file is not None for line in lines)
     return DenseSubmitted(out, len(lines), answered, "".join(text for text, _ in silent.most_common(1)))

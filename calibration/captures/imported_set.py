@@ -31,7 +31,7 @@ from phibench.calibration.captures.rig_file import require_camera_size
 from phibench.calibration.captures.tested_chain import ChainTest, chain_test
 from phibench.datasets.common.camera_pictures import read_camera_picture
 from phibench.datasets.common.errors import DatasetError
-from phibench.datasets.common.input_files import SETTINGS_BYTES, FileName, InputFile, Name, below
+from phibench.datasets.common.input_files import SETTINGS_BYTES, FileName, InputFile, Name, path_below
 from phibench.datasets.frames.frame_files import png_bytes
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.datasets.store.checksums import checksums_text, read_checksums, writing_to
@@ -111,7 +111,7 @@ def import_pairs(folder: Path, out: Path, rig: Path | None = None, sensor: Path 
     setting = read_setting(rig or folder / RIG_FILE, None, sensor or _there(folder / SENSOR_FILE))
     listed = read_pair_list(folder)
     for name in {name for row in listed for names in row.files.values() for name in names}:
-        below(folder, name)  # what a link leads to elsewhere would be given away with the set
+        path_below(folder, name)  # what a link leads to elsewhere would be given away with the set
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise DatasetError(f"{out} exists and is not an empty folder; give a new one, --out")
     with writing_to(out), folder_for_work(out.parent), OwnedFolder("import", out.parent) as work:

@@ -19,7 +19,7 @@ from phibench.calibration.rig.bundle import Bundle
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import MIB, InputFile
 from phibench.datasets.store.files import write_text
-from phibench.datasets.store.json_forms import alike, from_json, to_json
+from phibench.datasets.store.json_forms import from_json, same_document, to_json
 from phibench.estimator.geometry.rig_parameters import PARAMETERS, RENAMED, changed_rig
 from phibench.scenes.frames import IDENTITY, Array
 from phibench.scenes.mirror import OF_REVOLVED
@@ -179,7 +179,7 @@ def _require_sound(path: Path, nominal: Rig, rig: Rig, values: Array, covariance
         )
     try:
         # another machine rounds the last bits otherwise, another Python or program may print fewer digits
-        same = alike(_document(changed_rig(nominal, values)), _document(rig), relative=1e-9)
+        same = same_document(_document(changed_rig(nominal, values)), _document(rig), relative=1e-9)
     except SceneError as error:
         raise CalibrationError(f"{path} corrects the rig to one that cannot be: {error}; make it again") from error
     if not same:

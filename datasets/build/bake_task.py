@@ -63,7 +63,7 @@ _ENTRY_MB = 1000  # as much as the cache holds by default
 _GLARE = 1e3
 
 
-def cache_folder() -> Path:
+def light_map_cache() -> Path:
     """Folder of the user's light maps."""
     return cache_root() / "lightmaps"
 
@@ -135,7 +135,7 @@ def _recipe(view: View, room: Room, settings: BakeSettings) -> bytes:
 
 
 def _path(recipe: bytes, folder: Path | None) -> Path:
-    return (folder or cache_folder()) / f"{hashlib.sha256(recipe).hexdigest()}{_SUFFIX}"
+    return (folder or light_map_cache()) / f"{hashlib.sha256(recipe).hexdigest()}{_SUFFIX}"
 
 
 def _read(path: Path, recipe: bytes) -> LightMap | None:
@@ -174,7 +174,7 @@ class CacheEntry:
 def cache_entries(folder: Path | None = None) -> list[CacheEntry]:
     """Light maps of the cache, those last used first."""
     entries = []
-    for path in (folder or cache_folder()).glob(f"*{_SUFFIX}"):
+    for path in (folder or light_map_cache()).glob(f"*{_SUFFIX}"):
         with contextlib.suppress(OSError):  # gone meanwhile
             status = path.stat()
             entries.append(CacheEntry(path, status.st_size, status.st_mtime))
@@ -184,7 +184,7 @@ def cache_entries(folder: Path | None = None) -> list[CacheEntry]:
 def cache_limit_mb(folder: Path | None = None) -> float:
     """Limit of the cache, 1e6 bytes."""
     with contextlib.suppress(OSError, ValueError):  # no file, or a damaged one: the default holds
-        text = InputFile((folder or cache_folder()) / _LIMIT, "set it anew", limit_bytes=100).text()
+        text = InputFile((folder or light_map_cache()) / _LIMIT, "set it anew", limit_bytes=100).text()
         if math.isfinite(limit := float(text)) and limit >= 0.0:
             return limit
     return LIMIT_MB
@@ -200,7 +200,7 @@ def limit_cache(limit_mb: float, folder: Path | None = None) -> int:
     """
     if not (math.isfinite(limit_mb) and limit_mb >= 0.0):
         raise DatasetError(f"limit of the cache = {limit_mb} MB: must be 0 or more")
-    with _for_user(folder or cache_folder()) as where:
+    with _for_user(folder or light_map_cache()) as where:
         write_text(where / _LIMIT, f"{limit_mb!r}\n")
         return _shrink(where)
 
@@ -213,7 +213,7 @@ def clear_cache(folder: Path | None = None) -> int:
     DatasetError
         If the cache cannot be written.
     """
-    where = folder or cache_folder()
+    where = folder or light_map_cache()
     if not where.is_dir():
         return 0
     with _for_user(where):

@@ -22,7 +22,7 @@ from rich.console import Console
 from phibench.datasets.build.bake_task import bake_room, bake_settings
 from phibench.datasets.build.forecast import Pace, TaskProgress, forecast, megabytes, slowdown
 from phibench.datasets.build.journal import Entry, FolderHead, Journal
-from phibench.datasets.build.parts import bring, note
+from phibench.datasets.build.parts import log_outcome, run_tasks
 from phibench.datasets.build.sample_task import finish_sample
 from phibench.datasets.build.spot_task import make_spot
 from phibench.datasets.build.tasks import BuildTask, Done, Failed, task_key
@@ -35,7 +35,7 @@ from phibench.datasets.plan.plan import PairPlan, Plan, PosePlan
 from phibench.datasets.rooms.room_files import RoomFiles, checked_data
 from phibench.datasets.rooms.room_sources import EXPORTED, ONLY_ROOM
 from phibench.datasets.store import schema
-from phibench.datasets.store.checksums import differing, filling, signed, write_documents
+from phibench.datasets.store.checksums import differing_documents, filling, with_checksums, write_documents
 from phibench.datasets.store.croissant import dataset_croissant
 from phibench.datasets.store.files import sha256, write_bytes
 from phibench.datasets.store.json_forms import to_json
@@ -162,7 +162,7 @@ def _digest(document: Any) -> str:
 _OWN = ".phibench-"  # locks, and temporary files that a killed run left
 
 
-def claimed(out: Path, name: str | None) -> contextlib.AbstractContextManager[None]:
+def claimed_folder(out: Path, name: str | None) -> contextlib.AbstractContextManager[None]:
     """Hold a folder to be filled; one of another data set than `name` (None for any), or of others, is refused."""
     return filling(out, lambda: refuse_other(out, name), (schema.DRAWS,))
 
@@ -259,7 +259,7 @@ class Build:
     ----------
     plan : what the folder is to hold
     recipe : text
-    out, journal : folder, held by `claimed`
+    out, journal : folder, held by `claimed_folder`
     environment : what tasks run on
     """
 
@@ -317,11 +317,11 @@ def _run(tasks: list[BuildTask], pace: Pace, journal: Journal, pool: WorkerPool,
     progress = TaskProgress(tasks, pace)
 
     def settle(task: BuildTask, outcome: Done | Failed) -> None:
-        note(journal.folder, task, outcome)
+        log_outcome(journal.folder, task, outcome)
         progress.settle(task)
 
     steps = Steps(console, "tasks", len(tasks), progress.left_s, progress.running_text)
-    return bring(tasks, journal, progress.watch(pool.executor(len(tasks))), steps, settle)
+    return run_tasks(tasks, journal, progress.watch(pool.executor(len(tasks))), steps, settle)
 
 
 def _info_text(info: DatasetInfo, journal: Journal, out: Path) -> str:
@@ -341,7 +341,7 @@ def _report(failures: dict[str, Failed], count: int) -> str:
     first = (
         f"{len(failures)} of {count} tasks failed; what is finished is kept, run the same command again for the rest:"
     )
-    return listed(first, lines)
+    return listed_text(first, lines)
 
 
 # The small files, when all tasks are done.
@@ -358,7 +358,7 @@ def finish(plan: Plan, head: FolderHead, journal: Journal, tasks: Collection[str
         journal.begin(head, tasks)
     copy_room_files(plan.files, out)
     wanted = assemble(plan, head, journal.entries)
-    changed = differing(out, wanted)
+    changed = differing_documents(out, wanted)
     stale = stale_files(out, [file for entry in journal.entries.values() for file in entry.files])
     remove_files(out, stale)
     write_documents(out, wanted, changed)
@@ -379,7 +379,9 @@ def assemble(plan: Plan, head: FolderHead, entries: Mapping[str, Entry]) -> dict
     types = {name: str(dtype) for name, dtype in to_table(rows).schema.items()}
     listed = hashes | {name: hashlib.sha256(data).hexdigest() for name, data in small.items()}
     small[schema.CROISSANT] = dataset_croissant(parse_info(head.info), types, listed).encode()
-    return signed(small, hashes | {schema.room_file(name): digest for name, digest in plan.files.digests.items()})
+    return with_checksums(
+        small, hashes | {schema.room_file(name): digest for name, digest in plan.files.digests.items()}
+    )
 
 
 def _room_line(room_id: str, entries: Mapping[str, Entry]) -> str:
@@ -417,7 +419,7 @@ def visibility_line(rows: Sequence[ManifestRow]) -> str:
 _TOLD = 20  # samples or failures that are told in full
 
 
-def listed(first: str, lines: Sequence[str]) -> str:
+def listed_text(first: str, lines: Sequence[str]) -> str:
     """A sentence, and some lines below it; of many the first ones."""
     more = [f"  and {len(lines) - _TOLD} more, see {schema.LOG}"] if len(lines) > _TOLD else []
     return "\n".join([first, *(f"  {line}" for line in lines[:_TOLD]), *more])

@@ -20,7 +20,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from phibench.datasets.build.dataset_build import held_head, listed, plan_tasks, sample_task_name
+from phibench.datasets.build.dataset_build import held_head, listed_text, plan_tasks, sample_task_name
 from phibench.datasets.build.journal import Entry, FolderHead, Journal, is_intact
 from phibench.datasets.build.parts import intact
 from phibench.datasets.build.tasks import BuildTask
@@ -46,7 +46,7 @@ class LostWorkError(DatasetError):
     """Finished work would be lost; nothing has been changed."""
 
 
-def lost_work(out: Path, keys: Mapping[str, str], journal: Journal, wanted: DatasetInfo) -> str | None:
+def lost_work_text(out: Path, keys: Mapping[str, str], journal: Journal, wanted: DatasetInfo) -> str | None:
     """Finished work that a run would delete or make again, as the beginning of a sentence; None if there is none.
 
     Parameters
@@ -197,7 +197,7 @@ def settled_samples(plan: Plan, tasks: Mapping[str, BuildTask], journal: Journal
     return {name: cause for name, cause in refused_samples(plan, tasks, journal).items() if name in held}
 
 
-def possible(names: Sequence[str], tasks: Mapping[str, BuildTask], journal: Journal) -> list[str]:
+def possible_tasks(names: Sequence[str], tasks: Mapping[str, BuildTask], journal: Journal) -> list[str]:
     """Names of those tasks that are not refused, nor is what they need."""
     return [name for name in names if _culprit(name, tasks, journal) is None] if journal.refusals else list(names)
 
@@ -221,7 +221,7 @@ def incomplete_text(plan: Plan, refused: Mapping[str, str]) -> str:
     lines = [f"{name} is refused: {refused[name]}; {remedy}" for name in order]
     first = f"{len(refused)} of {count} samples are refused, all others are kept; the data set is not finished"
     finish = f" (`phibench dataset make ... {OPTION}` finishes it without them)" if len(refused) < count else ""
-    return listed(f"{first}{finish}:", lines)
+    return listed_text(f"{first}{finish}:", lines)
 
 
 def left_out_line(left_out: Mapping[str, str], others: int) -> str:
@@ -235,4 +235,4 @@ def left_out_line(left_out: Mapping[str, str], others: int) -> str:
 def left_out_text(left_out: Mapping[str, str], others: int) -> str:
     """The same with a line for each sample and its cause."""
     first = f"{left_out_line(left_out, others)}; {schema.INFO} lists them:"
-    return listed(first, [f"{name}: {cause}" for name, cause in left_out.items()])
+    return listed_text(first, [f"{name}: {cause}" for name, cause in left_out.items()])

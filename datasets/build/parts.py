@@ -1,8 +1,8 @@
 """Tasks of a folder, run in workers or here in order of their needs (`bring_all`); what the journal proves is kept.
 
 `journal.txt` proves which parts are whole: a line for each, with its key (a hash of all that it depends on) and the
-SHA-256 of its files. `bring` makes the parts that are not. So a run that was killed goes on, more is added, and damage
-is mended by the same call.
+SHA-256 of its files. `run_tasks` makes the parts that are not. So a run that was killed goes on, more is added, and
+damage is mended by the same call.
 """
 
 from __future__ import annotations
@@ -39,14 +39,14 @@ def intact(entries: Sequence[Entry], out: Path) -> list[bool]:
         return list(pool.map(lambda entry: is_intact(entry, out), entries))
 
 
-def unfinished(tasks: Mapping[str, BuildTask], journal: Journal, out: Path) -> list[str]:
+def unfinished_tasks(tasks: Mapping[str, BuildTask], journal: Journal, out: Path) -> list[str]:
     """Names of the tasks whose entry is missing, of another key, or belies the files."""
     held = [e for name, task in tasks.items() if (e := journal.entries.get(name)) is not None and e.key == task.key]
     good = {entry.task for entry, whole in zip(held, intact(held, out), strict=True) if whole}
     return [name for name in tasks if name not in good]
 
 
-def bring(
+def run_tasks(
     tasks: Sequence[BuildTask],
     journal: Journal,
     executor: Executor,
@@ -72,7 +72,7 @@ def bring(
     return failures
 
 
-def note(out: Path, task: BuildTask, outcome: Done | Failed) -> None:
+def log_outcome(out: Path, task: BuildTask, outcome: Done | Failed) -> None:
     """Add a line to a folder's diary: when a task ended, what it took, and who did it."""
     with (out / schema.LOG).open("a", encoding="utf-8") as log:
         log.write(json.dumps({"time": datetime.now(UTC).isoformat(), **log_entry(task, outcome)}) + "\n")
@@ -213,14 +213,14 @@ def bring_all(
         With the cause of the first part that failed; the others are made first.
     """
     with Journal(state or out) as journal:
-        todo = unfinished(tasks, journal, out)
+        todo = unfinished_tasks(tasks, journal, out)
         if todo:
             (out / sign).unlink(missing_ok=True)
             journal.begin(NO_HEAD, [name for name in tasks if name not in set(todo)])
             with executor(min(workers or os.cpu_count() or 1, len(todo)), out) as workforce:
-                settle = partial(note, out) if diary else lambda *_: None
+                settle = partial(log_outcome, out) if diary else lambda *_: None
                 steps = Steps(console, title, len(todo))
-                failures = bring([tasks[name] for name in todo], journal, workforce, steps, settle)
+                failures = run_tasks([tasks[name] for name in todo], journal, workforce, steps, settle)
             if failures:
                 raise DatasetError(next(iter(failures.values())).cause)
         journal.refusals.clear()

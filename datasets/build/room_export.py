@@ -185,7 +185,7 @@ def own_files(recipe: Recipe, files: RoomFiles) -> RoomFiles:
     )
 
 
-def held(files: RoomFiles, out: Path) -> RoomFiles:
+def held_files(files: RoomFiles, out: Path) -> RoomFiles:
     """Files of rooms as a folder holds them, where it has all that are known; else as they were."""
     there = (out / schema.ROOM_FILES / EXPORTED).is_dir() and not missing_room_files(files, out)
     return RoomFiles(out / schema.ROOM_FILES, files.digests) if there else files

@@ -64,7 +64,7 @@ NoFileName = Annotated[str | None, AfterValidator(_below)]
 """Name of a file relative to the folder of its document: no absolute path, and no part that begins with a dot."""
 
 
-def below(folder: Path, name: str) -> Path:
+def path_below(folder: Path, name: str) -> Path:
     """Path of a file below a folder that somebody else may have filled.
 
     Raises

@@ -100,11 +100,11 @@ class ShortForm:
         return type(self).__name__
 
     def _shown(self) -> Mapping[str, Any]:
-        """Values by their names, as `short` takes them."""
+        """Values by their names, as `short_text` takes them."""
         return {}
 
     def __repr__(self) -> str:
-        return "\n".join([self._title(), *_lines({name: short(value) for name, value in self._shown().items()})])
+        return "\n".join([self._title(), *_lines({name: short_text(value) for name, value in self._shown().items()})])
 
     def _repr_html_(self) -> str:
         return f"<pre>{html.escape(repr(self))}</pre>"
@@ -115,7 +115,7 @@ def _lines(shown: Mapping[str, str]) -> Iterator[str]:
     return (f"  {name:{width}}{value}".rstrip() for name, value in shown.items())
 
 
-def short(value: Any) -> str:
+def short_text(value: Any) -> str:
     """Few words for a value: numbers with six digits, arrays of more than four values by shape and range."""
     if value is None:
         return "-"
@@ -126,19 +126,19 @@ def short(value: Any) -> str:
     if isinstance(value, np.ndarray):
         return _array(value)
     if isinstance(value, tuple | list) and len(value) <= _FEW:
-        return f"({', '.join(map(short, value))})"
+        return f"({', '.join(map(short_text, value))})"
     return str(value)
 
 
 def _array(values: np.ndarray[Any, Any]) -> str:
     if values.ndim == 0:
-        return short(values.item())
+        return short_text(values.item())
     if values.size <= _FEW and values.ndim == 1:
-        return f"({', '.join(short(one) for one in values.tolist())})"
+        return f"({', '.join(short_text(one) for one in values.tolist())})"
     text = f"{' x '.join(map(str, values.shape))} {values.dtype}"
     if values.dtype.kind not in "iuf" or not np.isfinite(values).any():
         return text
-    return f"{text}, {short(np.nanmin(values).item())} to {short(np.nanmax(values).item())}"
+    return f"{text}, {short_text(np.nanmin(values).item())} to {short_text(np.nanmax(values).item())}"
 
 
 # -- tables ------------------------------------------------------------------------------------------------------------

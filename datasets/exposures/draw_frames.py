@@ -131,7 +131,7 @@ def draw_frames(
     return Drawn(target, made, kept, tuple(notes))
 
 
-def perform(job: SampleJob) -> tuple[list[FrameRow], int]:
+def perform_job(job: SampleJob) -> tuple[list[FrameRow], int]:
     """Do a job: rows of all its files, and how many were written."""
     sample = _opened(job.dataset, sha256(job.dataset / schema.CHECKSUMS))[job.sample_id]
     base, source = sample_key(sample, job.options, read_checksums(job.dataset)), None
@@ -163,7 +163,7 @@ def _draw(
     made, total, due = 0, 0, time.monotonic() + _SAVE_EVERY_S
     try:
         with Steps(console, "frames", len(jobs)) as steps:
-            for done, written in parallel_map(perform, jobs, count, in_order=False):
+            for done, written in parallel_map(perform_job, jobs, count, in_order=False):
                 rows |= {row.file: row for row in done}
                 made, total = made + written, total + len(done)
                 steps.advance()

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.read import Sample
 from phibench.render.sensor.camera_chain import Chain
-from phibench.render.sensor.electrons import sampled, stop_factor, vignetting
+from phibench.render.sensor.electrons import sampled_planes, stop_factor, vignetting
 from phibench.render.sensor.light import Light, Region, SpotImage
 from phibench.render.sensor.settings import Sensor
 from phibench.scenes.camera import Camera
@@ -80,7 +80,7 @@ def expected_of_light(light: Light, sensor: Sensor, camera: Camera | None = None
     factor = scale * vignetting(sensor.vignetting_exponent, camera, region)
     stacks = (spot.electrons_per_s, spot.du_electrons_per_s_px, spot.dv_electrons_per_s_px)
     phase = (region.v0_px, region.u0_px)
-    images = [factor * sampled(_placed(stack, spot, region), sensor, phase) for stack in stacks]
+    images = [factor * sampled_planes(_placed(stack, spot, region), sensor, phase) for stack in stacks]
     filters = _filters(region) if sensor.mosaic == "bayer" else np.zeros(region.shape, np.int64)
     dark = sensor.dark_e_per_s * sensor.exposure_s
     return ExpectedRegion(region.u0_px, region.v0_px, filters, background + dark, *images)

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phibench.datasets.common.errors import DatasetError, whole_number
-from phibench.datasets.frames.distractors import Distractor, distractors, present
+from phibench.datasets.frames.distractors import Distractor, distractors, present_tables
 from phibench.datasets.frames.frame_request import FrameOptions, FrameRequest, sample_stream
 from phibench.datasets.frames.frame_source import FrameSource, has_place
 from phibench.datasets.frames.sensor_card import presets_of
@@ -124,7 +124,7 @@ def pair_draws(
 def _of_sample(
     sample: Sample, frames: FramesTable, presets: tuple[str, ...], draws: int, sensor: SensorFile | None
 ) -> Iterator[PairDraw]:
-    lights = present(sample.stream_names, sample.dataset.recipe.distractors)
+    lights = present_tables(sample.stream_names, sample.dataset.recipe.distractors)
     requests = {preset: _request(sample, preset, sensor) for preset in presets}
     boxes = _boxes(sample, frames)
     for draw in range(draws):

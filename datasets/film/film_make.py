@@ -16,7 +16,7 @@ import polars
 from rich.console import Console
 
 from phibench.datasets.build.journal import Journal
-from phibench.datasets.build.parts import bring_all, unfinished
+from phibench.datasets.build.parts import bring_all, unfinished_tasks
 from phibench.datasets.build.tasks import BuildTask
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.progress import progress_console
@@ -34,7 +34,7 @@ from phibench.datasets.film.film_store import (
 from phibench.datasets.film.film_task import make_film
 from phibench.datasets.plan.plan import Plan
 from phibench.datasets.recipe.load import find_recipe, parse_recipe, recipe_files, recipe_text
-from phibench.datasets.store.checksums import filling, signed, write_documents
+from phibench.datasets.store.checksums import filling, with_checksums, write_documents
 from phibench.datasets.store.croissant import films_croissant
 from phibench.datasets.store.provenance import code_behind, code_sha256
 from phibench.datasets.store.schema import CROISSANT, TruthFolder
@@ -78,7 +78,7 @@ def make_films(
             INFO: document_text(info).encode(),
             CROISSANT: films_croissant(dataset.name, version("phibench"), len(names), kinds).encode(),
         }
-        write_documents(out, signed(documents, brought.hashes))
+        write_documents(out, with_checksums(documents, brought.hashes))
     made = tuple(film.film_id for film, name in zip(films, tasks, strict=True) if name in brought.made)
     return FilmsMade(out, made, tuple(name for name in names if name not in made))
 
@@ -93,7 +93,7 @@ def unfinished_films(plan: Plan, films: Sequence[FilmPlan], out: Path) -> list[F
     """
     _refuse_other(out, plan.recipe.dataset.name)
     tasks = film_tasks(plan, films)
-    todo = unfinished(tasks, Journal(out), out)
+    todo = unfinished_tasks(tasks, Journal(out), out)
     return [film for film, name in zip(films, tasks, strict=True) if name in todo]
 
 

@@ -23,7 +23,7 @@ from phibench.scenes.frames import Array, as_vector
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.motion.carriage import Carriage, Encoder, Vibration
 from phibench.scenes.motion.drive import Drive, DriveLeg, placement
-from phibench.scenes.motion.film_scene import FilmLight, FilmScene, SpotPath, Waypoint, frames_of
+from phibench.scenes.motion.film_scene import FilmLight, FilmScene, SpotPath, Waypoint, frame_count
 from phibench.scenes.motion.film_times import BlinkCode, FilmTimes
 from phibench.scenes.motion.vehicle import Vehicle
 from phibench.scenes.room import Room
@@ -115,7 +115,7 @@ def film_scene(plan: Plan, table: FilmTable, pair: PairPlan) -> FilmScene:
     height = rig.camera.height_px
     seed = plan.recipe.dataset.name, plan.recipe.dataset.seed, pair.sample_id
     drive = _drive(table, carriage, seed)
-    frames = frames_of(carriage, table.rate_hz, drive) if table.frames is None else table.frames
+    frames = frame_count(carriage, table.rate_hz, drive) if table.frames is None else table.frames
     times = FilmTimes(frames, table.rate_hz, table.exposure_s, table.readout_s, height)
     bands = tuple(
         Vibration.band(band.axis, band.low_hz, band.high_hz, band.rms_m, *seed, number)

@@ -43,7 +43,7 @@ from phibench.datasets.film.film_store import (
     read_table,
     read_view,
 )
-from phibench.datasets.frames.frame_request import in_one_sentence
+from phibench.datasets.frames.frame_request import request_faults
 from phibench.datasets.plan.plan import Plan
 from phibench.datasets.recipe.load import parse_recipe, recipe_files, recipe_text
 from phibench.datasets.rooms.room_sources import RoomSource
@@ -56,7 +56,7 @@ from phibench.render.optics.truth import truth_layer
 from phibench.render.sensor.camera_chain import Chain
 from phibench.render.sensor.electrons import NoiseStream
 from phibench.render.sensor.light import Light, OtherSpot, Region
-from phibench.render.sensor.processing import decoded
+from phibench.render.sensor.processing import jpeg_image
 from phibench.render.sensor.settings import Sensor, sensor
 from phibench.scenes.frames import Array
 from phibench.scenes.motion.film_scene import FilmScene
@@ -187,7 +187,7 @@ class Film:
         times = self.plan.scene.times
         if fixed := {"exposure_s", "readout_s"} & set(changes):
             raise DatasetError(f"{fixed.pop()} is that of the film, whose motion blur it is; change [film] instead")
-        with in_one_sentence():
+        with request_faults():
             return sensor(preset, exposure_s=times.exposure_s, readout_s=times.readout_s, **changes)
 
     def frame(
@@ -245,10 +245,10 @@ class Film:
         light = self.light(number) if laser else self.light(number).laser_off()
         chain, jpeg = Chain(chosen, camera_seed, self.plan.scene.rig.camera), None
         stream = NoiseStream((*self.plan.names, "film", "on" if laser else "off", number, draw))
-        with in_one_sentence():
+        with request_faults():
             if chosen.output == "mjpeg" and region == Region.whole(light.size):
                 jpeg = chain.jpeg_bytes(light, stream)
-                return FilmFrame(decoded(jpeg), jpeg, number, draw, chosen, region)
+                return FilmFrame(jpeg_image(jpeg), jpeg, number, draw, chosen, region)
             return FilmFrame(chain.frame(light, stream, region), jpeg, number, draw, chosen, region)
 
     def expected(self, number: int, preset: str = "bayer-raw", margin_px: int = 4, **changes: Any) -> ExpectedRegion:

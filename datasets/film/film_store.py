@@ -321,7 +321,7 @@ def data_files(out: Path, films: Sequence[str]) -> list[str]:
     return sorted(names)
 
 
-def verify(out: Path) -> list[str]:
+def verify_films(out: Path) -> list[str]:
     """Faults of a data set of films, one sentence each; none for a sound one.
 
     Raises

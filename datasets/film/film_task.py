@@ -111,11 +111,11 @@ def light_images(film: FilmPlan, room: Room, number: int) -> tuple[list[RowsImag
     images, centres = frame_spots(alone, room, times)
     colour = film.scene.lights[number].colour
     if colour is not None:
-        images = [coloured(image, colour) for image in images]
+        images = [coloured_image(image, colour) for image in images]
     return images, frame_truths(alone, room, times, images, centres)
 
 
-def coloured(image: RowsImage, colour: tuple[float, ...]) -> RowsImage:
+def coloured_image(image: RowsImage, colour: tuple[float, ...]) -> RowsImage:
     """Image whose planes are shares of the laser's red one."""
     share = np.array(colour)[:, None, None]
     stacks = (image.electrons_per_s, image.du_electrons_per_s_px, image.dv_electrons_per_s_px)

@@ -24,7 +24,7 @@ from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.parallel import parallel_map
 from phibench.datasets.film.film_read import Film, Films, open_films
 from phibench.datasets.store.files import require_file, write_atomic, write_bytes, write_text
-from phibench.render.sensor.processing import decoded
+from phibench.render.sensor.processing import jpeg_image
 from phibench.scenes.validation import printable_line
 
 Codec = Literal["mjpeg", "yuyv"]
@@ -337,7 +337,7 @@ def _stats(table: pl.DataFrame, videos: Sequence[Path]) -> dict[str, dict[str, A
     for video in videos:
         frames = list(read_frames(video))
         pixels += [
-            decoded(jpeg)[::4, ::4].reshape(-1, 3) / 255.0 for jpeg in frames[:: -(-len(frames) // _STATS_FRAMES)]
+            jpeg_image(jpeg)[::4, ::4].reshape(-1, 3) / 255.0 for jpeg in frames[:: -(-len(frames) // _STATS_FRAMES)]
         ]
     return {**made, _CAMERA: _moments(np.concatenate(pixels), (3, 1, 1))}
 

@@ -22,7 +22,7 @@ from phibench.datasets.build.tasks import BuildTask, Made, task_key
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import FileName, InputFile
 from phibench.datasets.common.progress import progress_console
-from phibench.datasets.frames.frame_request import in_one_sentence
+from phibench.datasets.frames.frame_request import request_faults
 from phibench.datasets.rooms.room_sources import GeneratedRoom
 from phibench.datasets.store.checksums import filling
 from phibench.datasets.store.files import write_bytes, write_text
@@ -227,7 +227,7 @@ class MovingCamera:
 
     def sensor(self, exposure_s: float) -> Sensor:
         """Sensor at an exposure."""
-        with in_one_sentence():
+        with request_faults():
             return sensor(self.preset, exposure_s=exposure_s)
 
     def light(
@@ -259,7 +259,7 @@ class MovingCamera:
     def frames(self, light: Light, exposure_s: float, regions: Sequence[Region], *stream: Name) -> list[NDArray[Any]]:
         """Pixels of regions, one draw, named by the stream: as `Chain.frame`."""
         chain = Chain(self.sensor(exposure_s), self.camera_seed, self.rig.camera)
-        with in_one_sentence():
+        with request_faults():
             return [chain.frame(light, NoiseStream(stream), region) for region in regions]
 
 

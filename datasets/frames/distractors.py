@@ -16,7 +16,7 @@ import numpy as np
 
 from phibench.datasets.recipe.distributions import DistributionTable, quantile
 from phibench.datasets.recipe.recipe_scene import spot_albedo
-from phibench.datasets.recipe.spot_placement import by_ray, on_board
+from phibench.datasets.recipe.spot_placement import by_ray, spot_on_board
 from phibench.datasets.recipe.tables import DistractorTable, Recipe
 from phibench.datasets.store.layers import SpotWindow
 from phibench.datasets.store.schema import ManifestRow, SpotRow
@@ -103,7 +103,7 @@ class Distractor:
         return OtherSpot(window, self.follows_laser)
 
 
-def present(names: Names, tables: tuple[DistractorTable, ...]) -> tuple[int, ...]:
+def present_tables(names: Names, tables: tuple[DistractorTable, ...]) -> tuple[int, ...]:
     """Numbers of the tables that a sample was drawn to have."""
     return tuple(i for i, table in enumerate(tables) if _unit(names, i, "present") < table.probability)
 
@@ -127,7 +127,7 @@ def _found(sample: _Sample) -> tuple[Distractor, ...]:
     tables = sample.dataset.recipe.distractors
     if not any(sample.truth_row(position).visible for position in POSITIONS):
         return ()  # who cannot see the spot is not distracted from it
-    numbers = present(sample.stream_names, tables)
+    numbers = present_tables(sample.stream_names, tables)
     if not numbers:
         return ()
     room = sample.dataset.rooms.geometry(sample.row.room)
@@ -230,7 +230,7 @@ def _board_place(
         (2.0 * _unit(names, number, key, attempt) - 1.0) * max(size_m / 2.0 - reach_m, 0.0)
         for key, size_m in zip(("across", "up"), BOARD_SIZE_M, strict=True)
     )
-    spot = on_board(recipe.laser, board, across_m, up_m)
+    spot = spot_on_board(recipe.laser, board, across_m, up_m)
     return spot.position_world_m, spot.normal_world
 
 

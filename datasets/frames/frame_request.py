@@ -87,7 +87,7 @@ class FrameRequest:
                 whole_number(f"region.{name}", value)
         elif self.region is not None:
             object.__setattr__(self, "region", whole_number("region", self.region, 1))
-        with in_one_sentence():
+        with request_faults():
             self.sensor()  # refused now rather than at the first draw
 
     def sensor(self) -> Sensor:
@@ -208,7 +208,7 @@ def _number(name: str, value: Any, low: float, high: float) -> float:
 
 
 @contextmanager
-def in_one_sentence() -> Iterator[None]:
+def request_faults() -> Iterator[None]:
     """Say what the sensor refuses as a fault of the request."""
     try:
         yield

@@ -18,13 +18,13 @@ from numpy.typing import NDArray
 from phibench.datasets.common.errors import DatasetError, whole_number
 from phibench.datasets.common.shown_text import ShortForm
 from phibench.datasets.frames.distractors import Distractor
-from phibench.datasets.frames.frame_request import FrameRequest, in_one_sentence
+from phibench.datasets.frames.frame_request import FrameRequest, request_faults
 from phibench.datasets.store.layers import SpotWindow
 from phibench.datasets.store.schema import ManifestRow, SpotRow
 from phibench.render.sensor.camera_chain import Chain, auto_exposed
 from phibench.render.sensor.electrons import frame_stream
 from phibench.render.sensor.light import Light, Region, moved_spot, spot_velocity_px_per_s
-from phibench.render.sensor.processing import decoded
+from phibench.render.sensor.processing import jpeg_image
 from phibench.render.sensor.settings import Sensor
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.rig import POSITIONS, Rig, View
@@ -214,7 +214,7 @@ class FrameSource:
         DatasetError
             If the request cannot be met or a layer cannot be read; in one sentence.
         """
-        with in_one_sentence():
+        with request_faults():
             sensor = _exposed(sample, request)
             sides = {position: _side(sample, position, request, sensor) for position in POSITIONS}
         return cls(request, sample.stream_names, sides)
@@ -244,10 +244,10 @@ class FrameSource:
         side, draw = self.sides[position], whole_number("draw", draw)
         stream = frame_stream(*self.names, position, laser, noise_draw(self.request.preset, draw, repeat))
         light, jpeg = side.light if laser else side.light.laser_off(), None
-        with in_one_sentence():
+        with request_faults():
             if side.chain.sensor.output == "mjpeg" and side.region == Region.whole(light.size):
                 jpeg = side.chain.jpeg_bytes(light, stream)  # encoded once: the image is what is in the file
-                image: NDArray[Any] = decoded(jpeg)
+                image: NDArray[Any] = jpeg_image(jpeg)
             else:
                 image = side.chain.frame(light, stream, side.region)
         return Frame(image, jpeg, position, laser, draw, side.chain.sensor, side.region)

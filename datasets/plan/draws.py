@@ -31,10 +31,10 @@ from phibench.datasets.plan.sampling import (
 from phibench.datasets.recipe.distributions import DistributionTable, quantile
 from phibench.datasets.recipe.recipe_scene import (
     build_target,
-    by_keys,
     ceiling_m,
     make_spot,
     room_source,
+    text_by_keys,
     true_stroke_m,
 )
 from phibench.datasets.recipe.room_tables import RoomPropertiesTable, RoomsTable
@@ -126,7 +126,7 @@ def used_rooms(recipe: Recipe, files: RoomFiles) -> dict[str, RoomSource]:
     return dict(list(rooms.items())[:count])
 
 
-def unexported(recipe: Recipe, files: RoomFiles) -> list[UnexportedRoom]:
+def unexported_rooms(recipe: Recipe, files: RoomFiles) -> list[UnexportedRoom]:
     """Rooms with samples whose file the data set has to make."""
     return [source for source in used_rooms(recipe, files).values() if isinstance(source, UnexportedRoom)]
 
@@ -298,7 +298,7 @@ def _made(
         rig = nominal.perturbed(misalignment)
         strokes_m = {true_stroke_m(misalignment, h) for experiment in recipe.experiments for h in experiment.strokes_m}
     except SceneError as error:
-        return by_keys(str(error))
+        return text_by_keys(str(error))
     faults = (rig_fault(rig, stroke_m, top_m, boards) for stroke_m in sorted(strokes_m))
     why = next((fault for fault in faults if fault), None)
     return why or DrawnRig(f"r{number:06d}", tries, tuple(drawn.items()), misalignment, rig)
@@ -342,7 +342,7 @@ Kept = Mapping[int, KeptSample | str]
 """Outcome by number of a sample; of one that stays impossible its reason."""
 
 
-def rebuilt(
+def rebuilt_samples(
     recipe: Recipe, table: RandomTable, rooms: Sequence[str], kept: Kept, wanted: range
 ) -> dict[int, RandomSample]:
     """Kept samples of the wanted numbers; `rooms` are the ids of all rooms. One that is no draw of this is left out."""

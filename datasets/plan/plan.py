@@ -12,7 +12,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from phibench.datasets.common.errors import DatasetError, RecipeError
-from phibench.datasets.plan.draws import Kept, draw_rigs, draw_rooms, rebuilt, room_files
+from phibench.datasets.plan.draws import Kept, draw_rigs, draw_rooms, rebuilt_samples, room_files
 from phibench.datasets.plan.sampling import RandomSample, draw_samples, have_own_rigs
 from phibench.datasets.recipe.recipe_scene import build_misalignment, build_rig, build_spot, true_stroke_m
 from phibench.datasets.recipe.tables import DrawnRigsTable, RandomTable, Recipe
@@ -280,7 +280,7 @@ def _random_plan(
     """Equal rigs share an id, and so their views; the first sample that has one names it, so that more change none."""
     held: dict[int, RandomSample | str] = {number: one for number, one in kept.items() if isinstance(one, str)}
     if kept:
-        held |= rebuilt(recipe, table, list(rooms), kept, range(table.samples) if wanted is None else wanted)
+        held |= rebuilt_samples(recipe, table, list(rooms), kept, range(table.samples) if wanted is None else wanted)
     samples, refused = draw_samples(recipe, table, rooms, files.folder, wanted, held)
     ids = {rig: RECIPE_RIG}
     for sample in samples:

@@ -29,8 +29,8 @@ from phibench.datasets.recipe.recipe_scene import (
     build_misalignment,
     build_rig,
     build_target,
-    by_keys,
     ceiling_m,
+    text_by_keys,
     true_stroke_m,
 )
 from phibench.datasets.recipe.spot_placement import Boards, Placed, place, shown_as
@@ -328,7 +328,7 @@ class _Makers:
         try:
             rigs = drawn_rigs(self._recipe, values)
         except SceneError as error:
-            return by_keys(str(error))
+            return text_by_keys(str(error))
         if fault := rig_fault(rigs.rig, rigs.stroke_m, self._ceiling_m, self._boards):
             return fault
         causes: tuple[str, ...] | str = ()

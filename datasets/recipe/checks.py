@@ -19,13 +19,13 @@ from phibench.datasets.recipe.recipe_scene import (
     build_spot,
     build_target,
     build_true_rig,
-    by_keys,
     ceiling_m,
     drawn_mirror_faults,
     fixed_conic_faults,
     idle_holder_keys,
     idle_mirror_keys,
     rig_fault_of,
+    text_by_keys,
     true_stroke_m,
 )
 from phibench.datasets.recipe.room_checks import low_rooms, room_faults, tables_of_rooms
@@ -327,7 +327,7 @@ def _rig(scene: _Scene) -> Iterator[Fault]:
         try:
             rig.mirror.band(recipe.laser.wavelength_nm)
         except SceneError as error:
-            yield rig_fault_of(SceneError(by_keys(str(error))))
+            yield rig_fault_of(SceneError(text_by_keys(str(error))))
     yield from _without_axis(recipe, rig)
     try:
         FilmGrid.of(rig.camera, recipe.ambient.cells_per_pixel)
@@ -374,7 +374,7 @@ def _true_rig(
         rig = nominal.perturbed(deviation)
         reached = [(path, stroke_m, true_stroke_m(deviation, stroke_m)) for path, stroke_m in strokes]
     except SceneError as error:
-        yield Fault("misalignment", by_keys(str(error)))
+        yield Fault("misalignment", text_by_keys(str(error)))
         return  # what follows needs the rig
     if not rig.in_image():
         yield Fault("misalignment", "the mirror is outside of the image; take smaller deviations")

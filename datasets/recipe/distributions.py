@@ -29,7 +29,7 @@ from pydantic import (
 from pydantic_core import CoreSchema, core_schema
 
 from phibench.scenes.frames import Array
-from phibench.scenes.validation import allowed, schema_node
+from phibench.scenes.validation import allowed_text, schema_node
 
 
 class Table(BaseModel):
@@ -161,7 +161,7 @@ class ValuesOf:
 
     @cached_property
     def _words(self) -> str:
-        return allowed(schema_node(self._adapter.json_schema(), ()))
+        return allowed_text(schema_node(self._adapter.json_schema(), ()))
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
         """Schema of the annotated type, and the check after it."""

@@ -23,7 +23,7 @@ from phibench.datasets.rooms.room_sources import NamedRoom, room_of
 from phibench.render.optics.faces import face_table
 from phibench.scenes.camera import Camera
 from phibench.scenes.frames import Array, Pose, Vector, as_matrix, as_vector, rotation_xyz
-from phibench.scenes.holder import LENGTHS, Holder, fitted
+from phibench.scenes.holder import LENGTHS, Holder, fitted_holder
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.metals import ReflectanceTable
 from phibench.scenes.misalignment import Misalignment
@@ -61,10 +61,10 @@ def build_rig(table: RigTable) -> Rig:
     try:
         return _rig(table)
     except SceneError as error:
-        raise SceneError(by_keys(str(error))) from error
+        raise SceneError(text_by_keys(str(error))) from error
 
 
-def by_keys(text: str) -> str:
+def text_by_keys(text: str) -> str:
     """Sentence of a `SceneError` of a rig with the recipe's keys instead of names of classes."""
     for owner, path in _OWNERS:
         text = re.sub(rf"\b{re.escape(owner)}(?=[a-z])", path, text)
@@ -228,7 +228,7 @@ def _holder(table: HolderTable, wide_m: float, depth_m: float | None) -> Holder 
     if table.kind == "none":
         return None
     given = {name: value for name in (*LENGTHS, "glass_index") if (value := getattr(table, name)) is not None}
-    return fitted(table.kind, wide_m, depth_m, azimuth_rad=float(np.radians(table.azimuth_deg)), **given)
+    return fitted_holder(table.kind, wide_m, depth_m, azimuth_rad=float(np.radians(table.azimuth_deg)), **given)
 
 
 def build_misalignment(table: MisalignmentTable) -> Misalignment:

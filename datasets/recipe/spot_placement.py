@@ -74,7 +74,7 @@ def free_margin_m(laser: LaserTable, target: TargetTable) -> tuple[float, float]
     return BOARD_SIZE_M[0] / 2.0 - reach, BOARD_SIZE_M[1] / 2.0 - reach
 
 
-def on_board(laser: LaserTable, target: TargetTable, across_m: float, up_m: float) -> LaserSpot:
+def spot_on_board(laser: LaserTable, target: TargetTable, across_m: float, up_m: float) -> LaserSpot:
     """Spot on a target's board, off its centre to the right as seen from the axis, and upwards."""
     centre = build_spot(laser, target)
     nx, ny, _ = centre.normal_world  # up x normal points to the right of who looks at the board
@@ -202,7 +202,7 @@ def place(laser: LaserTable, room: Room, targets: Mapping[str, TargetTable], val
     still = np.zeros(len(names))
     offsets = zip(values.get("spot.across_m", still), values.get("spot.up_m", still), strict=True)
     return [
-        (name, on_board(laser, targets[name], float(across), float(up)))
+        (name, spot_on_board(laser, targets[name], float(across), float(up)))
         for name, (across, up) in zip(names, offsets, strict=True)
     ]
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phibench.datasets.common.input_files import InputFile
-from phibench.datasets.rooms.mesh_parts import MOST_TRIANGLES, Companions, damaged
+from phibench.datasets.rooms.mesh_parts import MOST_TRIANGLES, Companions, damage_error
 from phibench.scenes.frames import Array
 from phibench.scenes.validation import printable_line
 
@@ -141,7 +141,7 @@ class GltfDocument:
         data = self._buffer(self.whole(view, "buffer"))
         start, length = self.whole(view, "byteOffset", 0), self.whole(view, "byteLength")
         if start + length > len(data):
-            raise damaged(self.file)
+            raise damage_error(self.file)
         return memoryview(data)[start : start + length], self.whole(
             view, "byteStride", 0, 252
         )  # 252: glTF's largest stride
@@ -153,26 +153,26 @@ class GltfDocument:
             data = self._binary if uri is None and number == 0 else self.of_uri(uri)
             length = self.whole(buffer, "byteLength")
             if length > len(data):
-                raise damaged(self.file)
+                raise damage_error(self.file)
             self._buffers[number] = data[:length]
         return self._buffers[number]
 
     def of_uri(self, uri: Any) -> bytes:
         """Bytes that a URI names: in itself, or a file."""
         if not isinstance(uri, str):
-            raise damaged(self.file)
+            raise damage_error(self.file)
         if not uri.startswith("data:"):
             return self.companions.named(uri, is_uri=True).read()
         head, comma, text = uri.partition(",")
         if not comma:
-            raise damaged(self.file)
+            raise damage_error(self.file)
         raw = urllib.parse.unquote_to_bytes(text)  # RFC 2397: bytes as %XX, or base64
         if not head.endswith(";base64"):
             return raw
         try:
             return base64.b64decode(raw, validate=True)
         except (binascii.Error, ValueError) as error:
-            raise damaged(self.file) from error
+            raise damage_error(self.file) from error
 
     def array(self, number: Any, width: int | tuple[int, ...]) -> Array:
         """Entries of an accessor, shape (count, width), as floats; normalised whole numbers span 0 or -1 to 1."""
@@ -206,7 +206,7 @@ class GltfDocument:
         size = np.dtype(kind).itemsize * shape[1]
         step = stride or size
         if shape[0] and (step < size or start + step * (shape[0] - 1) + size > len(data)):
-            raise damaged(self.file)
+            raise damage_error(self.file)
         if not shape[0]:
             return np.zeros(shape, kind)
         return np.ndarray(shape, kind, data, start, (step, np.dtype(kind).itemsize)).copy()
@@ -216,11 +216,11 @@ class GltfDocument:
         places, entries = self.table(sparse, "indices"), self.table(sparse, "values")
         kind = _KINDS.get(places.get("componentType", 0))
         if kind is None or kind[1] != "u":
-            raise damaged(self.file)
+            raise damage_error(self.file)
         index = self._strided(*self._sparse_view(places), 0, (count, 1), kind)[:, 0].astype(np.int64)
         new = self._strided(*self._sparse_view(entries), 0, (count, values.shape[1]), values.dtype.str)
         if count and (index.max() >= len(values) or (np.diff(index) <= 0).any()):
-            raise damaged(self.file)
+            raise damage_error(self.file)
         values = values.copy()
         values[index] = new
         return values

@@ -339,6 +339,6 @@ def named_parts(parts: Iterable[MeshPart]) -> tuple[MeshPart, ...]:
     return tuple(named)
 
 
-def damaged(file: InputFile) -> DatasetError:
+def damage_error(file: InputFile) -> DatasetError:
     """Fault of a file whose numbers contradict each other."""
     return file.fault(DAMAGED)

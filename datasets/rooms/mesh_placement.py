@@ -30,7 +30,7 @@ from phibench.datasets.rooms.mesh_parts import (
     check_count,
     check_part,
     check_parts,
-    damaged,
+    damage_error,
     named_parts,
 )
 from phibench.datasets.rooms.mesh_polygons import CuttingError
@@ -66,7 +66,7 @@ def read_mesh(path: Path, one_file: bool = False) -> tuple[MeshPart, ...]:
     except CuttingError as error:
         raise file.fault(f"has {error}: export triangles") from error
     except Exception as error:  # documents and arrays can contradict each other in any way
-        raise damaged(file) from error
+        raise damage_error(file) from error
     named = named_parts(part for part in parts if len(part.triangles))
     check_count(file, sum(len(part.triangles) for part in named))
     check_parts(file, len(named))

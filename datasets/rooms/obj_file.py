@@ -29,7 +29,7 @@ from phibench.datasets.rooms.mesh_parts import (
     Paint,
     check_count,
     check_parts,
-    damaged,
+    damage_error,
     leaves_picture,
     three_numbers,
 )
@@ -440,7 +440,7 @@ def _map(file: InputFile, name: str, key: str, rest: str) -> _Map:
             picture = replace(picture, clamped=words == ["on"])
         k += 1 + _OPTIONS[option]
     if k >= len(values):
-        raise damaged(file)
+        raise damage_error(file)
     return replace(picture, name=rest[words_found[k].start() :])
 
 

@@ -25,7 +25,7 @@ from phibench.datasets.rooms.mesh_parts import (
     MeshPart,
     Paint,
     check_count,
-    damaged,
+    damage_error,
 )
 from phibench.datasets.rooms.mesh_polygons import QUAD, Cutting, plain_quads, triangulated
 from phibench.render.sensor.srgb import srgb_decoded
@@ -133,7 +133,7 @@ def _header(file: InputFile, data: bytes) -> tuple[str, list[_Element], list[str
     # a comment may hold the word, and a header may end its lines as a body does not: by a carriage return alone
     ending = re.search(rb"[\r\n]end_header[ \t]*(\r\n|\n|\r)", data[:100_000])
     if not data.startswith(b"ply") or ending is None:
-        raise damaged(file)
+        raise damage_error(file)
     end, stop = ending.start() + 1, ending.end() - 1
     if ending[1] == b"\r\n" and b"\n" not in data[:end]:
         stop -= 1
@@ -162,7 +162,7 @@ def _header(file: InputFile, data: bytes) -> tuple[str, list[_Element], list[str
         else:
             raise file.fault(f"has a line in its header that is not PLY's: {printable_line(line, 60)}")
     if order is None:
-        raise damaged(file)
+        raise damage_error(file)
     if sum(element.count for element in elements) > 2 * _MOST_ENTRIES:
         raise file.fault(f"has more than {2 * _MOST_ENTRIES} entries: at most that many are read")
     if any(len({p.name for p in element.properties}) < len(element.properties) for element in elements):
@@ -221,7 +221,7 @@ class _AsciiBody:
     def _take(self, count: int) -> Array:
         values = self.numbers[self.at : self.at + count]
         if len(values) != count:
-            raise damaged(self.file)
+            raise damage_error(self.file)
         self.at += count
         return values
 
@@ -282,14 +282,14 @@ class _BinaryBody:
     def _read(self, kind: str, count: int, at: int) -> tuple[Any, int]:
         size = np.dtype(kind).itemsize * count
         if at + size > len(self.data):
-            raise damaged(self.file)
+            raise damage_error(self.file)
         return np.frombuffer(self.data, self.order + kind, count, at), at + size
 
 
 def _corners(file: InputFile, count: float) -> int:
     """Length of a list."""
     if not (0 <= count <= 3 * MOST_TRIANGLES and count == math.floor(count)):
-        raise damaged(file)
+        raise damage_error(file)
     return int(count)
 
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from phibench.datasets.common.errors import DatasetError
-from phibench.datasets.common.input_files import MIB, InputFile, below
+from phibench.datasets.common.input_files import MIB, InputFile, path_below
 from phibench.scenes.validation import SceneError
 
 LARGEST_BYTES = 64 * MIB  # a data set keeps a copy of every file
@@ -83,4 +83,4 @@ def checked_file(folder: Path | None, name: str, sha256: str) -> Path:
 def _data(folder: Path | None, name: str) -> bytes:
     if folder is None:
         raise RoomError(f"the file '{name}' of a room is needed, and nobody says in which folder it is; give a folder")
-    return InputFile(below(folder, name), _REMEDY, RoomError, LARGEST_BYTES).read()
+    return InputFile(path_below(folder, name), _REMEDY, RoomError, LARGEST_BYTES).read()

@@ -86,7 +86,7 @@ def held_room_files(folder: Path) -> RoomFiles:
     return RoomFiles(folder / schema.ROOM_FILES, known)
 
 
-def strays(folder: Path) -> list[str]:
+def stray_files(folder: Path) -> list[str]:
     """Relative names of files in a folder that are neither listed nor ours otherwise (notes, scores), sorted."""
     known = {*read_checksums(folder), *schema.NOT_DATA}
     names = (path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
@@ -124,7 +124,7 @@ _NAME = 66  # place of the name in a line
 _LINE = re.compile(r"[0-9a-f]{64}  " + FILE_NAME)
 
 
-def misplaced(folder: Path) -> list[str]:
+def misplaced_files(folder: Path) -> list[str]:
     """One sentence per FIFO, socket, device or circular link in a folder, and per folder in place of a file of ours."""
     faults = []
     for path in sorted(folder.rglob("*")):
@@ -137,7 +137,7 @@ def misplaced(folder: Path) -> list[str]:
     return faults
 
 
-def damaged(folder: Path) -> list[str]:
+def damaged_files(folder: Path) -> list[str]:
     """One sentence per file that is missing, cannot be read, was changed or is not listed although it belongs here.
 
     The list itself must have the bytes that `checksums_text` gives: sorted lines, each name once.
@@ -227,26 +227,26 @@ def writing_to(out: Path) -> Iterator[None]:
         raise DatasetError(f"{text}; then run the same command again") from error
 
 
-def signed(documents: Mapping[str, bytes], hashes: Mapping[str, str]) -> dict[str, bytes]:
+def with_checksums(documents: Mapping[str, bytes], hashes: Mapping[str, str]) -> dict[str, bytes]:
     """Documents by name, and after them SHA256SUMS of them and of files whose hashes are known."""
     own = {name: hashlib.sha256(data).hexdigest() for name, data in documents.items()}
     return {**documents, schema.CHECKSUMS: checksums_text({**hashes, **own}).encode()}
 
 
-def differing(out: Path, wanted: Mapping[str, bytes]) -> list[str]:
+def differing_documents(out: Path, wanted: Mapping[str, bytes]) -> list[str]:
     """Names of files that are missing or have other bytes."""
     return [name for name, data in wanted.items() if not (out / name).is_file() or (out / name).read_bytes() != data]
 
 
 def write_documents(out: Path, wanted: Mapping[str, bytes], names: Iterable[str] | None = None) -> None:
-    """Write those documents of `signed` that differ, or some, in their order; without SHA256SUMS no folder is whole.
+    """Write those documents of `with_checksums` that differ, or some, in order; without SHA256SUMS no folder is whole.
 
     Raises
     ------
     DatasetError
         If a file that SHA256SUMS names is not there: it is then not written, or removed.
     """
-    names = set(differing(out, wanted) if names is None else names)
+    names = set(differing_documents(out, wanted) if names is None else names)
     if names:
         (out / schema.CHECKSUMS).unlink(missing_ok=True)
         names.add(schema.CHECKSUMS)

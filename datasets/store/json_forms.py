@@ -105,10 +105,10 @@ def same_number(a: float, b: float, relative: float = 1e-11, absolute: float = 1
     return (math.isnan(a) and math.isnan(b)) or math.isclose(a, b, rel_tol=relative, abs_tol=absolute)
 
 
-def alike(a: Any, b: Any, relative: float = 1e-11) -> bool:
+def same_document(a: Any, b: Any, relative: float = 1e-11) -> bool:
     """Equality of nested documents, of their numbers to rounding."""
     if isinstance(a, dict) and isinstance(b, dict):
-        return a.keys() == b.keys() and all(alike(a[key], b[key], relative) for key in a)
+        return a.keys() == b.keys() and all(same_document(a[key], b[key], relative) for key in a)
     if isinstance(a, list | tuple) and isinstance(b, list | tuple):
-        return len(a) == len(b) and all(alike(x, y, relative) for x, y in zip(a, b, strict=True))
+        return len(a) == len(b) and all(same_document(x, y, relative) for x, y in zip(a, b, strict=True))
     return same_number(a, b, relative) if isinstance(a, float) and isinstance(b, float | int) else bool(a == b)

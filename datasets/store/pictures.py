@@ -52,7 +52,7 @@ def to_srgb(planes: NDArray[Any], detector: Detector, exposure: float) -> Pictur
     return picture
 
 
-def halved(planes: NDArray[Any]) -> NDArray[Any]:
+def halved_planes(planes: NDArray[Any]) -> NDArray[Any]:
     """Mean of 2 x 2 pixels, shape (3, H // 2, W // 2)."""
     height, width = planes.shape[1] // 2 * 2, planes.shape[2] // 2 * 2
     cropped = planes[:, :height, :width]
@@ -107,7 +107,7 @@ class SpotPlace(Protocol):
         """Downwards."""
 
 
-def marked(picture: Picture, spot: SpotPlace, scale: int) -> Picture:
+def marked_picture(picture: Picture, spot: SpotPlace, scale: int) -> Picture:
     """Frame at 1 / `scale` of its size, with a cross that leaves the spot itself free."""
     if not np.isfinite(spot.u_px):
         return picture
@@ -140,7 +140,7 @@ def enlarged(picture: Picture, spot: SpotPlace, zoom: int) -> Picture:
     return np.asarray(image)
 
 
-def captioned(picture: Picture, text: str) -> Picture:
+def captioned_picture(picture: Picture, text: str) -> Picture:
     """Picture with a text, white on black, in its upper left corner."""
     image = Image.fromarray(picture)
     draw = ImageDraw.Draw(image)
@@ -178,16 +178,16 @@ class PositionImages:
 
 def sample_picture(sides: Sequence[PositionImages], detector: Detector) -> Picture:
     """Both positions side by side, exposed for the first."""
-    exposure = display_exposure_s(halved(sides[0].ambient), detector)
+    exposure = display_exposure_s(halved_planes(sides[0].ambient), detector)
     return np.concatenate([_picture(s.frame, s.position, s.spot, detector, exposure) for s in sides], axis=1)
 
 
 def _picture(
     frame: NDArray[np.float64], position: str, spot: SpotTruth, detector: Detector, exposure: float
 ) -> Picture:
-    picture = marked(to_srgb(halved(frame), detector, exposure), spot, 2)
+    picture = marked_picture(to_srgb(halved_planes(frame), detector, exposure), spot, 2)
     if not spot.visible:
-        return captioned(picture, f"{position}: not visible, {spot.cause}")
+        return captioned_picture(picture, f"{position}: not visible, {spot.cause}")
     window = crop(frame, spot)
     peak = float(window[1].max(initial=1.0))
     zoom = min(max(min(picture.shape[:2]) // 3 // CROP_PX, 1), _LARGEST_ZOOM)

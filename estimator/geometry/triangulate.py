@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from phibench.datasets.common.shown_text import ShortForm, short
+from phibench.datasets.common.shown_text import ShortForm, short_text
 from phibench.estimator.geometry.mirror_geometry import geometry_of
 from phibench.estimator.geometry.paper_depth import PARALLEL_SINE, depth_approx
 from phibench.estimator.geometry.phi import CONVENTIONS
@@ -53,10 +53,10 @@ class PointEstimate(ShortForm, DepthEstimate):
     def _shown(self) -> dict[str, Any]:
         states, counts = np.unique(self.status, return_counts=True)
         return {
-            "depth D": f"{short(np.asarray(self.depth_m))} m",
-            "sigma of D": f"{short(np.asarray(self.sigma_m))} m",
-            "point": f"{short(np.asarray(self.point_world_m))} m",
-            "gap": f"{short(np.asarray(self.gap_m))} m",
+            "depth D": f"{short_text(np.asarray(self.depth_m))} m",
+            "sigma of D": f"{short_text(np.asarray(self.sigma_m))} m",
+            "point": f"{short_text(np.asarray(self.point_world_m))} m",
+            "gap": f"{short_text(np.asarray(self.gap_m))} m",
             "status": ", ".join(
                 f"{Status(one).name}{f' {n}' if self.status.size > 1 else ''}"
                 for one, n in zip(states.tolist(), counts.tolist(), strict=True)

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import gaussian_laplace
 
-from phibench.datasets.common.shown_text import ShortForm, short
+from phibench.datasets.common.shown_text import ShortForm, short_text
 from phibench.estimator.geometry.status import Status, StatusArray, flag, keep
 from phibench.scenes.frames import Array, BoolArray
 
@@ -212,7 +212,7 @@ class SpotPosition(ShortForm):
     def _shown(self) -> dict[str, Any]:
         u0, v0, u1, v1 = self.window
         return {
-            "position": f"{short(self.uv_px)} px",
+            "position": f"{short_text(self.uv_px)} px",
             "flux": self.flux,
             "window": f"{u1 - u0} x {v1 - v0} px from ({u0}, {v0})",
             "status": self.status.name,

@@ -47,7 +47,7 @@ def make(
 @film.command
 def verify(directory: FilmFolder) -> int:
     """Check every file of a data set of films; exit code 1 if there is a fault."""
-    from phibench.datasets.film.film_store import verify as verify_films
+    from phibench.datasets.film.film_store import verify_films as verify_films
 
     faults = verify_films(directory)
     for fault in faults:

@@ -82,23 +82,23 @@ def show() -> int:
     """List the light maps that are kept for all data sets, with their size and last use."""
     from datetime import datetime
 
-    from phibench.datasets.build.bake_task import cache_entries, cache_folder, cache_limit_mb
+    from phibench.datasets.build.bake_task import cache_entries, cache_limit_mb, light_map_cache
 
     entries = cache_entries()
     for entry in entries:
         used = datetime.fromtimestamp(entry.used_s).isoformat(" ", "minutes")
         print(f"{entry.path.stem[:12]}  {entry.size_bytes / 1e6:8.1f} MB  last used {used}")
     total = sum(entry.size_bytes for entry in entries) / 1e6
-    print(f"{cache_folder()}: {_maps(len(entries))}, {total:.1f} MB of at most {cache_limit_mb():g} MB")
+    print(f"{light_map_cache()}: {_maps(len(entries))}, {total:.1f} MB of at most {cache_limit_mb():g} MB")
     return 0
 
 
 @cache.command
 def clear() -> int:
     """Remove all light maps; a room is baked again when a data set needs it."""
-    from phibench.datasets.build.bake_task import cache_folder, clear_cache
+    from phibench.datasets.build.bake_task import clear_cache, light_map_cache
 
-    print(f"{cache_folder()}: {_maps(clear_cache())} removed")
+    print(f"{light_map_cache()}: {_maps(clear_cache())} removed")
     return 0
 
 
@@ -111,10 +111,10 @@ def limit(megabytes: float) -> int:
     megabytes
         Limit in 1e6 bytes; 0 keeps none.
     """
-    from phibench.datasets.build.bake_task import cache_folder, limit_cache
+    from phibench.datasets.build.bake_task import light_map_cache, limit_cache
 
     gone = limit_cache(megabytes)
-    print(f"{cache_folder()}: at most {megabytes:g} MB from now on, {_maps(gone)} removed")
+    print(f"{light_map_cache()}: at most {megabytes:g} MB from now on, {_maps(gone)} removed")
     return 0
 
 

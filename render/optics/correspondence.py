@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from phibench.render.optics.faces import IntArray
 from phibench.render.optics.ray_tracer import trace_pixels
-from phibench.render.optics.reflection_point import mirror_points, onward
-from phibench.render.optics.room_tracer import RoomGeometry, blocked_by, into_room, room_geometry
+from phibench.render.optics.reflection_point import mirror_points, onward_ways
+from phibench.render.optics.room_tracer import RoomGeometry, blocked_by, rays_into_room, room_geometry
 from phibench.render.optics.truth import depth_m, disc_window
 from phibench.scenes.frames import Array, BoolArray
 from phibench.scenes.rig import View
@@ -152,7 +152,7 @@ def _shown(view: View, room: RoomGeometry, pixel: IntArray) -> _Shown:
     v, u = np.divmod(pixel, view.rig.camera.width_px)
     rays = trace_pixels(view, np.stack([u, v]).T.astype(float))
     on = np.flatnonzero(np.isfinite(rays.cos_incidence))
-    way = into_room(view, room, rays.points_m[on], rays.directions[on])
+    way = rays_into_room(view, room, rays.points_m[on], rays.directions[on])
     hits = room.first_hit(way.starts_m, way.directions)
     seen = np.flatnonzero(hits.object_id >= 0)
     points = way.starts_m[seen] + hits.distance_m[seen, None] * way.directions[seen]
@@ -169,7 +169,7 @@ def _places(other: View, room: RoomGeometry, shown: _Shown) -> tuple[Array, NDAr
         return np.empty((0, 2)), np.empty(0, np.int16)
     eye = np.broadcast_to(other.camera_centre_m, points.shape)
     found = mirror_points(other, points, eye, _REST)
-    way = onward(other, found, points)
+    way = onward_ways(other, found, points)
     with np.errstate(invalid="ignore"):
         uv = other.rig.camera.project(other.T_world_camera.inverse().points(found.points_m))
         reflected = np.isfinite(uv).all(axis=1)

@@ -111,10 +111,10 @@ def _laser_albedo(texture: Texture, place: Array) -> Array:
 
 def face_table(shapes: Sequence[Shape]) -> FaceTable:
     """All faces of some shapes, in their order; the sides of a solid as in `shapes.faces`, those of a prism around."""
-    return joined([_table(shape) for shape in shapes], [1] * len(shapes))
+    return joined_tables([_table(shape) for shape in shapes], [1] * len(shapes))
 
 
-def joined(tables: Sequence[FaceTable], shapes: Sequence[int]) -> FaceTable:
+def joined_tables(tables: Sequence[FaceTable], shapes: Sequence[int]) -> FaceTable:
     """One table of several, one after the other; `shapes` are the numbers of shapes that they stand for."""
     if not tables:
         return _empty()

@@ -44,7 +44,7 @@ from numpy.typing import NDArray
 from phibench.render.optics.revolved_reflection import revolved_determinant, revolved_points, rising_root
 from phibench.scenes.form_error import Form, Level, deviation, level
 from phibench.scenes.frames import Array, BoolArray, cross
-from phibench.scenes.glass_tube import GlassTube, across
+from phibench.scenes.glass_tube import GlassTube, parts_across
 from phibench.scenes.mirror import Mirror, SphereMirror
 from phibench.scenes.revolved_mirror import RevolvedMirror
 from phibench.scenes.rig import View
@@ -101,7 +101,7 @@ def mirror_points(view: View, points_m: Array, eyes_m: Array, rest: float = 4e-1
 
 
 @dataclass(frozen=True)
-class Onward:
+class OnwardWays:
     """Ways from reflection points to world points.
 
     Attributes
@@ -119,12 +119,12 @@ class Onward:
     transmittance: Array | float
 
 
-def onward(view: View, found: MirrorPoints, points_m: Array) -> Onward:
+def onward_ways(view: View, found: MirrorPoints, points_m: Array) -> OnwardWays:
     """Ways from reflection points to the points (N, 3) that they were found for."""
     mirror, tube = found.points_m, view.tube
     directions = -_split(mirror - found.apparent_m)[1]
     if tube is None or found.bent is None:
-        return Onward(directions, ((mirror, points_m),), 1.0)
+        return OnwardWays(directions, ((mirror, points_m),), 1.0)
     crossing, bent = tube.leave(mirror, directions), found.bent[:, None]
     whole = points_m - mirror  # a straight way is cut anywhere
     inner, outer = (
@@ -132,7 +132,7 @@ def onward(view: View, found: MirrorPoints, points_m: Array) -> Onward:
         np.where(bent, crossing.outer_m, mirror + whole * (2.0 / 3.0)),
     )
     legs = ((mirror, inner), (inner, outer), (outer, points_m))
-    return Onward(
+    return OnwardWays(
         np.where(bent, crossing.directions, directions), legs, np.where(found.bent, crossing.transmittance, 1.0)
     )
 
@@ -256,11 +256,11 @@ def _stretch(view: View, tube: GlassTube, found: MirrorPoints, eyes_m: Array) ->
         def moved(vectors: Array) -> Array:
             """Transposed derivative of the reflection point by the place, times vectors."""
             flat = np.einsum("nkl,nli,ni->nk", inverse, tangents, vectors)
-            return across(np.einsum("nk,nki->ni", flat, tangents), ray, length)
+            return parts_across(np.einsum("nk,nki->ni", flat, tangents), ray, length)
 
         axis = np.broadcast_to(tube.axis, ray.shape)
-        by_moment = across(cross(tube.axis, found.points_m - tube.origin_m), ray, length)
-        by_cosine = across(axis, ray, length)
+        by_moment = parts_across(cross(tube.axis, found.points_m - tube.origin_m), ray, length)
+        by_cosine = parts_across(axis, ray, length)
         moment_slope = by_moment + moved(cross(ray, axis) - by_moment)
         cosine_slope = by_cosine - moved(by_cosine)
         return tube.stretch(found.apparent_m, found.points_m, moment_slope, cosine_slope)

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.polynomial.legendre import leggauss
 
 from phibench.render.optics.face_tree import FaceTree, Rays
-from phibench.render.optics.faces import FaceTable, IntArray, face_table, joined
+from phibench.render.optics.faces import FaceTable, IntArray, face_table, joined_tables
 from phibench.scenes.frames import Array
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.rig import View
@@ -80,7 +80,7 @@ class RoomGeometry:
     @cached_property
     def table(self) -> FaceTable:
         """Faces of all shapes."""
-        return joined([part.table for part in self._parts], [len(part.shapes) for part in self._parts])
+        return joined_tables([part.table for part in self._parts], [len(part.shapes) for part in self._parts])
 
     def first_hit(self, origins_m: Array, directions: Array, limit_m: Array | None = None) -> RoomHits:
         """First face along each ray; nothing at `limit_m`, shape (N,), or beyond it."""
@@ -175,7 +175,7 @@ def blocked_by(room: GeometryLike, starts_m: Array, ends_m: Array) -> IntArray:
 
 
 @dataclass(frozen=True)
-class IntoRoom:
+class RaysIntoRoom:
     """Rays from inside the holder on their way into the room.
 
     Attributes
@@ -190,14 +190,14 @@ class IntoRoom:
     path_m: Array | float
 
 
-def into_room(view: View, room: RoomGeometry, points_m: Array, directions: Array) -> IntoRoom:
+def rays_into_room(view: View, room: RoomGeometry, points_m: Array, directions: Array) -> RaysIntoRoom:
     """Rays that leave the mirror, unit directions, as they go on into the room: as they are unless a tube bends them.
 
     A ray that meets a plate or the camera before the glass stays as it is. One that meets a plate within the wall goes
     on from its inner face, the others from its outer one.
     """
     if view.tube is None:
-        return IntoRoom(points_m, directions, 0.0)
+        return RaysIntoRoom(points_m, directions, 0.0)
     crossing = view.tube.leave(points_m, directions)
     crosses = np.flatnonzero(crossing.crosses)
     inner, outer = crossing.inner_m[crosses], crossing.outer_m[crosses]
@@ -209,7 +209,7 @@ def into_room(view: View, room: RoomGeometry, points_m: Array, directions: Array
     starts[crosses] = np.where(passes, outer, inner)
     onward[crosses] = np.where(passes, crossing.directions[crosses], (outer - inner) / within[:, None])
     path[crosses] = before + np.where(passes[:, 0], within, 0.0)
-    return IntoRoom(starts, onward, path)
+    return RaysIntoRoom(starts, onward, path)
 
 
 # Parts: shapes with their faces and tree.
@@ -316,7 +316,7 @@ def footprint(spot: LaserSpot, disc: Array) -> Array:
     return np.array(spot.position_world_m) + offset
 
 
-def is_plain(spot: LaserSpot, room: RoomGeometry, light: Deposit) -> bool:
+def is_plain_spot(spot: LaserSpot, room: RoomGeometry, light: Deposit) -> bool:
     """True for a flat spot, and where places of a beam all lie on one face and in one colour of it."""
     if spot.beam_direction_world is None:
         return True

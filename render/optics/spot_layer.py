@@ -18,7 +18,7 @@ import numpy as np
 import scipy
 
 from phibench.render.optics.ray_tracer import MirrorRays, lens_rays, reflect, trace_pixels
-from phibench.render.optics.reflection_point import MirrorPoints, mirror_points, onward
+from phibench.render.optics.reflection_point import MirrorPoints, mirror_points, onward_ways
 from phibench.render.optics.room_tracer import Deposit, GeometryLike, RoomGeometry, as_geometry, blocked_by, deposit
 from phibench.render.optics.spot_samples import FilmCloud, disc_points, film_position, slices, specular_cloud
 from phibench.render.optics.truth import mirror_angles
@@ -254,7 +254,7 @@ def _power(view: View, spot: LaserSpot, room: RoomGeometry, uv: Array, lens: Arr
     origins, directions = lens_rays(view, uv, lens)
     rays = reflect(view, origins, directions)
     found, growth = _seen_from(view, rays, points)
-    way, to_point = onward(view, found, points), found.apparent_m - rays.points_m
+    way, to_point = onward_ways(view, found, points), found.apparent_m - rays.points_m
     s2 = np.einsum("ni,ni->n", to_point, to_point)
     leaving = to_point / np.sqrt(s2)[:, None]
     reached = leaving if view.tube is None else way.directions

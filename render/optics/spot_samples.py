@@ -30,7 +30,7 @@ from numpy.polynomial.legendre import leggauss
 from scipy.special import ndtri
 
 from phibench.render.optics.faces import IntArray
-from phibench.render.optics.reflection_point import bundle_spread, mirror_points, onward
+from phibench.render.optics.reflection_point import bundle_spread, mirror_points, onward_ways
 from phibench.render.optics.room_tracer import (
     Deposit,
     GeometryLike,
@@ -39,7 +39,7 @@ from phibench.render.optics.room_tracer import (
     blocked_by,
     deposit,
     footprint,
-    is_plain,
+    is_plain_spot,
 )
 from phibench.scenes.frames import Array, BoolArray
 from phibench.scenes.laser import LaserSpot
@@ -188,7 +188,7 @@ def specular_cloud(view: View, spot: LaserSpot, room: GeometryLike, log2_pairs: 
     probes = deposit(spot, geometry, _probes(spot))
     if _is_cut(view, spot, geometry, probes):
         return _dense_cloud(view, spot, geometry, _LOG2_DENSE)
-    if not is_plain(spot, geometry, probes):
+    if not is_plain_spot(spot, geometry, probes):
         return _dense_cloud(view, spot, geometry, _LOG2_UNEVEN)
     return _node_cloud(view, spot, geometry)
 
@@ -314,7 +314,7 @@ def _connect(view: View, spot: LaserSpot, room: RoomGeometry, light: Deposit, ey
     points = light.points_m
     found = mirror_points(view, points, eyes)
     mirror, lit = found.points_m, found.lit
-    way, to_lens = onward(view, found, points), _unit(eyes - mirror)
+    way, to_lens = onward_ways(view, found, points), _unit(eyes - mirror)
     cos_i = np.einsum("ni,ni->n", to_lens, found.normals)
     cos_lens = -to_lens @ view.T_world_camera.R[:, 2]
     spread = bundle_spread(view, found, eyes, cos_i)

@@ -16,15 +16,15 @@ import numpy as np
 
 from phibench.render.optics.faces import IntArray
 from phibench.render.optics.ray_tracer import trace_pixels
-from phibench.render.optics.reflection_point import MirrorPoints, Onward, mirror_points, onward
+from phibench.render.optics.reflection_point import MirrorPoints, OnwardWays, mirror_points, onward_ways
 from phibench.render.optics.room_tracer import (
     Finder,
     GeometryLike,
-    IntoRoom,
+    RaysIntoRoom,
     RoomGeometry,
     as_geometry,
     blocked_by,
-    into_room,
+    rays_into_room,
 )
 from phibench.scenes.form_error import limb_points
 from phibench.scenes.frames import Array, BoolArray, cross
@@ -123,7 +123,7 @@ def spot_truth(view: View, spot: LaserSpot, room: GeometryLike) -> SpotTruth:
     found = mirror_points(view, point, eye)
     mirror = found.points_m
     leaving = found.apparent_m - mirror
-    way = onward(view, found, point)
+    way = onward_ways(view, found, point)
     uv = view.rig.camera.project(view.T_world_camera.inverse().points(mirror))[0]
     angles = mirror_angles(found.normals, leaving / np.linalg.norm(leaving, axis=-1)[:, None])
     cause = _cause(view, spot, room, found, way, uv)
@@ -151,7 +151,7 @@ def depth_m(point_world_m: Array, sphere_centre_down_m: Array) -> Array:
     return np.sqrt(x * x + y * y)
 
 
-def _cause(view: View, spot: LaserSpot, room: GeometryLike, found: MirrorPoints, way: Onward, uv: Array) -> str:
+def _cause(view: View, spot: LaserSpot, room: GeometryLike, found: MirrorPoints, way: OnwardWays, uv: Array) -> str:
     mirror, eye = found.points_m, view.camera_centre_m[None]
     if not np.isfinite(mirror).all():
         return NO_REFLECTION
@@ -280,7 +280,7 @@ class _Block:
     pixel: IntArray
     normals: Array
     directions: Array
-    way: IntoRoom
+    way: RaysIntoRoom
     path_m: Array
 
 
@@ -296,7 +296,7 @@ def _traced_rows(view: View, room: RoomGeometry, rows: range, columns: range) ->
     hit = np.flatnonzero(np.isfinite(rays.cos_incidence))
     points, normals, directions = (np.take(a.T, hit, axis=1).T for a in (rays.points_m, rays.normals, rays.directions))
     pixel = (v * view.rig.camera.width_px + u)[hit]
-    way = into_room(view, room, points, directions)
+    way = rays_into_room(view, room, points, directions)
     return _Block(pixel, normals, directions, way, rays.path_camera_mirror_m[hit] + way.path_m)
 
 

@@ -148,17 +148,17 @@ def shape_plugin(view: View, shape: Shape, index: int, *, lit: bool = True) -> P
     if isinstance(shape, Rectangle) and (isinstance(texture, Uniform) or light is not None):
         size, pose = _emitting_size(shape) if isinstance(light, Plugin) else (shape.size_m, shape.T_world_shape)
         half = (0.5 * size[0], 0.5 * size[1], 1.0 / MM_PER_M)
-        return _shape("rectangle", {"to_world": placed(view, pose, half)} | values, shape, index)
+        return _shape("rectangle", {"to_world": scene_transform(view, pose, half)} | values, shape, index)
     if isinstance(shape, Cuboid) and isinstance(texture, Uniform):
         half = (0.5 * shape.size_m[0], 0.5 * shape.size_m[1], 0.5 * shape.size_m[2])
-        return _shape("cube", {"to_world": placed(view, shape.T_world_shape, half)} | values, shape, index)
+        return _shape("cube", {"to_world": scene_transform(view, shape.T_world_shape, half)} | values, shape, index)
     pose = Pose("world", "shape") if isinstance(shape, Mesh) else shape.T_world_shape
     mesh = _faces_mesh(shape, index)
-    own: dict[str, Value] = {"filename": mesh, "face_normals": True, "to_world": placed(view, pose)}
+    own: dict[str, Value] = {"filename": mesh, "face_normals": True, "to_world": scene_transform(view, pose)}
     return _shape("ply", own | values, shape, index)
 
 
-def placed(view: View, pose: Pose, scale_m: tuple[float, float, float] | None = None) -> Array:
+def scene_transform(view: View, pose: Pose, scale_m: tuple[float, float, float] | None = None) -> Array:
     """Transform, shape (4, 4), of a shape's frame to the scene's; a mesh is in millimetres already."""
     matrix = np.eye(4)
     matrix[:3, :3] = pose.R * (1.0 if scale_m is None else MM_PER_M * np.array(scale_m))

@@ -26,7 +26,7 @@ from phibench.render.optics.faces import FaceTable, IntArray
 from phibench.render.optics.room_tracer import BEAM_REACH_M, RoomGeometry, deposit, room_geometry, transmittance
 from phibench.render.optics.truth import spot_truth
 from phibench.render.plugins.plugin_tree import BitmapPlugin, Plugin, Rgb, SceneSetting, Value
-from phibench.render.plugins.room_plugins import diffuse, mirror_plugin, placed, room_plugins
+from phibench.render.plugins.room_plugins import diffuse, mirror_plugin, room_plugins, scene_transform
 from phibench.render.room.camera_plugin import MM_PER_M
 from phibench.scenes.camera import Camera
 from phibench.scenes.frames import Array, Pose, Vector, as_matrix, as_vector
@@ -96,7 +96,7 @@ def spot_plugins(view: View, spot: LaserSpot, room: Room, *, alone: bool) -> dic
         name, (albedo, light) = f"spot_{number}", _wall(geometry, lit)
         radiance = lit.radiance[..., None] * bands + lit.covered[..., None] * light * (not alone)
         values: dict[str, Value] = {
-            "to_world": placed(view, _lifted(lit.pose), (*lit.half_m, 1e-3)),
+            "to_world": scene_transform(view, _lifted(lit.pose), (*lit.half_m, 1e-3)),
             "emitter": Plugin("emitter", "area", {"radiance": _picture(name, radiance)}),
             "bsdf": _ground(name, lit, albedo),
         }

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from phibench.render.optics.faces import TexelGrid, texel_sizes_m
 from phibench.render.optics.room_tracer import room_geometry
-from phibench.render.room.bounced_light import gathered
+from phibench.render.room.bounced_light import gathered_light
 from phibench.render.room.lamp_light import direct_light
 from phibench.render.room.lamp_outlines import LampOutlines
 from phibench.render.room.light_map import BakeSettings, LightMap, fixed_shapes
@@ -28,7 +28,7 @@ from phibench.render.room.mirror_intersection import MirrorBody, mirror_bands, m
 from phibench.render.room.noise_budget import BUDGET
 from phibench.render.room.refinement import render_refined
 from phibench.render.room.shading import Look
-from phibench.render.room.subpixel_grid import CellSampler, Crop, FilmGrid, Stack, points, shifts
+from phibench.render.room.subpixel_grid import CellSampler, Crop, FilmGrid, Stack, point_shifts, quasi_random_points
 from phibench.render.room.surfaces import Surfaces
 from phibench.render.room.texel_points import Texels, transmitted
 from phibench.render.setup.variant import activate
@@ -185,7 +185,8 @@ def light_carriage(
         body = mirror_body(mi, surfaces.view)
         rays = _CARRIAGE_RAYS if body is None else _HOLDER_RAYS
         direct = direct_light(mi, surfaces, texels, sun, settings.lamp_rays, _SEED, body)
-        light = 0.5 * (direct[0] + direct[1]) + gathered(mi, surfaces, texels, np.full(len(texels), rays), _SEED + 2)
+        others = gathered_light(mi, surfaces, texels, np.full(len(texels), rays), _SEED + 2)
+        light = 0.5 * (direct[0] + direct[1]) + others
         if body is not None:
             light = np.maximum(light + mirror_light(mi, surfaces, texels, body, rays, _SEED + 3), 0.0)
         full[first:] = light
@@ -214,11 +215,11 @@ def mirror_light(mi: ModuleType, surfaces: Surfaces, texels: Texels, mirror: Mir
     rim = dr.select(distance > mirror.radius, rim, -1.0)
     frame = mi.Frame3f(way_there / distance)
     key, count = (dr.opaque(mi.UInt32, value) for value in (seed, rays))
-    shift = shifts(mi, lanes, 2, key)
+    shift = point_shifts(mi, lanes, 2, key)
     dr.eval(shift, rim, frame)
 
     def body(i: Any, total: Any) -> tuple[Any, Any]:
-        x, y = points(mi, shift, i)
+        x, y = quasi_random_points(mi, shift, i)
         c = 1.0 - x * (1.0 - rim)
         sine, turn = dr.safe_sqrt(1.0 - c * c), 2.0 * dr.pi * y
         way = frame.to_world(mi.Vector3f(sine * dr.cos(turn), sine * dr.sin(turn), c))

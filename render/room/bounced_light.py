@@ -20,13 +20,13 @@ from scipy import ndimage
 
 from phibench.render.optics.faces import IntArray, TexelGrid
 from phibench.render.room.camera_plugin import MM_PER_M
-from phibench.render.room.subpixel_grid import points, shifts
+from phibench.render.room.subpixel_grid import point_shifts, quasi_random_points
 from phibench.render.room.surfaces import LookUp, Surfaces, aligned
 from phibench.render.room.texel_points import (
     Net,
     Texels,
     by_count,
-    chosen,
+    chosen_points,
     covered_texels,
     nearest_free,
     powers_of_two,
@@ -49,7 +49,7 @@ _COHERENT = 128  # rays of a texel: of fewer, those of neighbours are too far fr
 _MIRRORED_SHARE = 0.25  # of the rays that meet a coat, at least: a lamp in it is 20 times as bright as the ground
 
 
-def gathered(
+def gathered_light(
     mi: ModuleType,
     surfaces: Surfaces,
     texels: Texels,
@@ -98,7 +98,7 @@ def bounced_light(
     texels = Texels.of(mi, surfaces, coarse)
     covered = covered_texels(mi, surfaces, texels, texel_m)
     free = nearest_free(covered, coarse)
-    direct, bounced = np.maximum(coarser(fine, coarse, lit), 0.0), np.zeros((2, coarse.count, 3))
+    direct, bounced = np.maximum(coarser_values(fine, coarse, lit), 0.0), np.zeros((2, coarse.count, 3))
     surfaces.set_light(coarse, direct)
     bright = BrightTexels.of(mi, surfaces, coarse, direct)
     each = needed_rays(rays_by_area(coarse, rays, coarse_m), covered, free)
@@ -108,7 +108,7 @@ def bounced_light(
         # the same rays in every bounce: only the light at their ends changes
         bounced[:, kept.rays.texels] = kept.light(mi, surfaces)
         bounced = bounced[:, free]
-    return finer(coarse, fine, bounced.mean(axis=0)), coarse, bounced
+    return finer_values(coarse, fine, bounced.mean(axis=0)), coarse, bounced
 
 
 def rays_by_noise(rays: IntArray, grid: TexelGrid, halves: Array) -> IntArray:
@@ -156,7 +156,7 @@ class _Rays:
         self.texels = by_count(texels.order, rays)
         count = rays[self.texels]
         self._lanes = mi.UInt32(aligned(self.texels, np.uint32))
-        self._point, self._normal, self._coat = chosen(mi, texels, self._lanes)
+        self._point, self._normal, self._coat = chosen_points(mi, texels, self._lanes)
         self._frame, self._spread = mi.Frame3f(self._normal), texels.spread
         self.counts: list[IntArray] = [count] if bright is None else [count, np.maximum(count // _AIMED, 1)]
         self._all = np.sum(self.counts, axis=0)
@@ -164,7 +164,7 @@ class _Rays:
         key = dr.opaque(mi.UInt32, seed)
         self._nets = [Net.of(mi, self._lanes, each, 3, key + 2 * k) for k, each in enumerate(self.counts)]
         self._coherent = bool(count.mean() >= _COHERENT)
-        self._chance = shifts(mi, self._lanes, 1, key + 1)
+        self._chance = point_shifts(mi, self._lanes, 1, key + 1)
         self._share = mi.Float(0.0) if bright is None else mi.Float(aligned(self.counts[1] / self._all))
         dr.eval(self._frame, self._chance)
 
@@ -224,7 +224,7 @@ class _Rays:
             valid &= aim.faces & (patch == aim.patch)
         met = _Met(patch, ray(t), way, valid, mi.Bool(False), mi.Float(1.0), t)
         if surfaces.has_coats and not aims:  # rays that aim at a texel are for its ground alone
-            met = _beyond_coats(surfaces, met, points(mi, self._chance, index)[0])
+            met = _beyond_coats(surfaces, met, quasi_random_points(mi, self._chance, index)[0])
         weight = met.weight
         if self._coat is not None:
             weight = weight * transmitted(surfaces, self._coat, cos)
@@ -422,12 +422,12 @@ class BrightTexels:
 # Values on coarse and fine grids.
 
 
-def coarser(fine: TexelGrid, coarse: TexelGrid, values: Array) -> Array:
+def coarser_values(fine: TexelGrid, coarse: TexelGrid, values: Array) -> Array:
     """Means over the coarse texels, shape (coarse texels, 3)."""
     return _resampled(fine, coarse, values, _overlap)
 
 
-def finer(coarse: TexelGrid, fine: TexelGrid, values: Array) -> Array:
+def finer_values(coarse: TexelGrid, fine: TexelGrid, values: Array) -> Array:
     """Values between the coarse texels' centres, bilinear, shape (fine texels, 3)."""
     return _resampled(coarse, fine, values, _between)
 

@@ -216,7 +216,7 @@ def strips_of(grid: FilmGrid, changed: NDArray[np.bool_]) -> Iterator[Box]:
                 yield slice(first, last), slice(low, high)
 
 
-def moved(box: Box, down: int, right: int) -> Box:
+def moved_box(box: Box, down: int, right: int) -> Box:
     """Rows and columns, moved."""
     return slice(box[0].start + down, box[0].stop + down), slice(box[1].start + right, box[1].stop + right)
 

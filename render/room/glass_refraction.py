@@ -32,7 +32,7 @@ class Tube:
     def leave(self, surfaces: Surfaces, start: Any, direction: Any) -> tuple[Any, Any, Any]:
         """Rays from inside as they go on into the room, and what the glass passes; float64.
 
-        The same as `room_tracer.into_room`: what meets a face before the glass stays as it is.
+        The same as `room_tracer.rays_into_room`: what meets a face before the glass stays as it is.
         """
         import drjit as dr
 

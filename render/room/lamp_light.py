@@ -22,9 +22,9 @@ from scipy import ndimage
 from phibench.render.optics.faces import IntArray, TexelGrid
 from phibench.render.room.camera_plugin import MM_PER_M
 from phibench.render.room.mirror_intersection import MirrorBody
-from phibench.render.room.subpixel_grid import points, shifts
+from phibench.render.room.subpixel_grid import point_shifts, quasi_random_points
 from phibench.render.room.surfaces import Surfaces, aligned
-from phibench.render.room.texel_points import Net, Texels, by_count, chosen, powers_of_two, transmitted, vector
+from phibench.render.room.texel_points import Net, Texels, by_count, chosen_points, powers_of_two, transmitted, vector
 from phibench.render.setup.variant import activate
 from phibench.scenes.frames import Array, BoolArray
 from phibench.scenes.room import Sun
@@ -256,7 +256,7 @@ def _lamp_rays(
 
     texel, lamp = pairs.texel[some], pairs.lamp[some]
     lanes, owner, ids = (mi.UInt32(aligned(one, np.uint32)) for one in (texel, lamp, lamp * len(texels) + texel))
-    point, normal, coat = chosen(mi, texels, lanes)
+    point, normal, coat = chosen_points(mi, texels, lanes)
     centre, across, up, facing = (
         dr.gather(mi.Vector3f, vector(mi, pairs.lamps[:, k : k + 3]), owner) for k in (0, 3, 6, 9)
     )
@@ -345,7 +345,7 @@ def _photons(mi: ModuleType, surfaces: Surfaces, lamps: Array, seed: int) -> tup
     each = dr.gather(mi.Float, mi.Float(aligned(np.pi * lamps[:, 12] / MM_PER_M**2 / counts)), owner)
     patch = dr.gather(mi.UInt32, mi.UInt32(aligned(lamps[:, 13], np.uint32)), owner)
     lane = dr.arange(mi.UInt32, int(counts.sum()))
-    x = points(mi, shifts(mi, lane // 256, 4, dr.opaque(mi.UInt32, seed)), lane % 256)
+    x = quasi_random_points(mi, point_shifts(mi, lane // 256, 4, dr.opaque(mi.UInt32, seed)), lane % 256)
     place = mi.Point3f(centre + (x[0] - 0.5) * across + (x[1] - 0.5) * up)
     # Lambert: by the cosine, and then all photons of a lamp weigh the same
     way = mi.Frame3f(normal).to_world(mi.warp.square_to_cosine_hemisphere(mi.Point2f(x[2], x[3])))
@@ -364,17 +364,17 @@ def _sunlight(
     if len(towards) == 0 or not surfaces.table.window.any():
         return total
     lanes = mi.UInt32(aligned(towards, np.uint32))
-    point, normal, coat = chosen(mi, texels, lanes)
+    point, normal, coat = chosen_points(mi, texels, lanes)
     window = mi.Float(aligned(surfaces.table.window))
     axis = mi.Vector3f(*(dr.opaque(mi.Float, float(x)) for x in direction))
     radius, key = dr.opaque(mi.Float, sun.radius_rad), dr.opaque(mi.UInt32, seed + 7)
     count, frame = dr.opaque(mi.UInt32, _SUN_RAYS), mi.Frame3f(axis)
-    shift = shifts(mi, lanes, 2, key)
+    shift = point_shifts(mi, lanes, 2, key)
     dr.eval(shift)
 
     def body(i: Any, total: Any) -> tuple[Any, Any]:
         # a small disc: its radius in radians is the radius at distance 1
-        disc = radius * mi.warp.square_to_uniform_disk_concentric(mi.Point2f(*points(mi, shift, i)))
+        disc = radius * mi.warp.square_to_uniform_disk_concentric(mi.Point2f(*quasi_random_points(mi, shift, i)))
         way = dr.normalize(frame.to_world(mi.Vector3f(disc.x, disc.y, 1.0)))
         _, patch, valid = surfaces.hit(mi.Ray3f(point, way))
         out = valid & (dr.gather(mi.Float, window, patch, valid) > 0.0)

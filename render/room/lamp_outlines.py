@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from phibench.render.room.camera_plugin import MM_PER_M
 from phibench.render.room.shading import Look
-from phibench.render.room.surfaces import Surfaces, aligned, planes
+from phibench.render.room.surfaces import Surfaces, aligned, colour_planes
 
 _GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))  # of a spiral that fills the disc evenly
 _MEANS = (1.0 / 6.0, 1.0 / 6.0, 1.0 / 8.0, 1.0 / 8.0)  # of a second difference: half of the mean square
@@ -115,7 +115,7 @@ class LampOutlines:
         light = weight * mi.Color3f(*(mi.Float(value) for value in radiance))
         light = dr.select(known & shape.valid, light, 0.0)
         dr.eval(light, shape.crossed, shape.within)
-        lights = planes(light).reshape(3, -1, PARTS**2)
+        lights = colour_planes(light).reshape(3, -1, PARTS**2)
         whole = (lights.sum(axis=0) > 0.0).all(axis=1)
         crossed, within = (np.array(one, dtype=bool).reshape(-1, PARTS**2).T for one in (shape.crossed, shape.within))
         return LampCells(lamp, np.where(whole, lights.mean(axis=2), np.float32(0.0)), crossed, within)

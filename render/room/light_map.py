@@ -1,7 +1,7 @@
 """Light map of a room: irradiance of every texel from lamps, the sun and all bounces, smoothed. Baked once for a room.
 
 First what comes from lamps and the sun (`lamp_light`), then the bounces over a coarse grid (`bounced_light`). Last a
-gather over the fine grid from the full map, in two independent halves; what both agree on is smoothed (`smoothed`).
+gather over the fine grid from the full map, in two independent halves; `smoothed_mean` keeps what both agree on.
 Rays start all over a texel: it holds the mean of the light on what is free of it, and a shadow's edge moves by nothing.
 The mirror ball itself (12 cm), its holder and the carriage are left out of the room's light. Carriage and holder are
 lit by the map when a view is rendered (`ambient_layer`).
@@ -33,15 +33,15 @@ from phibench.render.optics.faces import IntArray, TexelGrid, face_table
 from phibench.render.room.bounced_light import (
     BrightTexels,
     bounced_light,
-    finer,
-    gathered,
+    finer_values,
+    gathered_light,
     needed_rays,
     rays_by_area,
     rays_by_noise,
 )
 from phibench.render.room.lamp_light import direct_light, lamps_in_coats
 from phibench.render.room.surfaces import Surfaces
-from phibench.render.room.texel_points import Texels, covered_texels, nearest_free, spread_out
+from phibench.render.room.texel_points import Texels, covered_texels, nearest_free, spread_texels
 from phibench.render.setup.variant import activate
 from phibench.scenes.frames import Array, BoolArray
 from phibench.scenes.rig import RobotPose, View
@@ -112,7 +112,7 @@ def bake(view: View, room: Room, settings: BakeSettings) -> LightMap:
     needed = needed_rays(np.ones(len(fine), dtype=np.int64), covered, free) > 0
     direct = direct_light(mi, surfaces, fine, room.sun, settings.lamp_rays, _SEED, needed=needed)
     one, other = ((half + lamps_in_coats(mi, surfaces, fine, _SEED + 20 + k))[free] for k, half in enumerate(direct))
-    lamps, noise = smoothed(fine.grid, one, other, _KEPT_OF_LAMPS)
+    lamps, noise = smoothed_mean(fine.grid, one, other, _KEPT_OF_LAMPS)
     bounced, coarse, pilot = bounced_light(
         mi, surfaces, fine.grid, lamps, settings.texel_m, settings.bounces, settings.bounce_rays, _SEED + 10
     )
@@ -128,7 +128,7 @@ def bake(view: View, room: Room, settings: BakeSettings) -> LightMap:
 def _spread_texels(mi: ModuleType, surfaces: Surfaces, grid: TexelGrid, near_m: float) -> tuple[Texels, BoolArray]:
     """Texels whose values are means over what is free of them, and which of them are covered."""
     texels = Texels.of(mi, surfaces, grid)
-    spread = spread_out(mi, surfaces, texels)
+    spread = spread_texels(mi, surfaces, texels)
     assert spread.spread is not None
     return spread, covered_texels(mi, surfaces, texels, near_m) & spread.spread.hidden
 
@@ -155,12 +155,12 @@ def _indirect(
     # two independent halves: half their difference is the standard error of their mean
     rays = needed_rays(rays_by_area(texels.grid, settings.final_rays, largest_m), covered, free)
     coarse, values = pilot
-    rays = rays_by_noise(rays, texels.grid, np.stack([finer(coarse, texels.grid, half) for half in values]))
-    halves = [gathered(mi, surfaces, texels, rays, 2 + 3 * i, bright, lamps=False)[free] for i in (0, 1)]
-    mean, sigma = smoothed(texels.grid, halves[0], halves[1], _KEPT_OF_SURFACES)
+    rays = rays_by_noise(rays, texels.grid, np.stack([finer_values(coarse, texels.grid, half) for half in values]))
+    halves = [gathered_light(mi, surfaces, texels, rays, 2 + 3 * i, bright, lamps=False)[free] for i in (0, 1)]
+    mean, sigma = smoothed_mean(texels.grid, halves[0], halves[1], _KEPT_OF_SURFACES)
     if texels is fine:
         return mean, sigma
-    return finer(texels.grid, fine.grid, mean), finer(texels.grid, fine.grid, sigma)
+    return finer_values(texels.grid, fine.grid, mean), finer_values(texels.grid, fine.grid, sigma)
 
 
 def interpolated_light_map(one: LightMap, other: LightMap, share: float) -> LightMap:
@@ -193,7 +193,7 @@ _AROUND = 5  # texels over which the choice is averaged
 _FEWEST = 12  # texels of a grid that is smoothed
 
 
-def smoothed(grid: TexelGrid, a: Array, b: Array, kept: int) -> tuple[Array, Array]:
+def smoothed_mean(grid: TexelGrid, a: Array, b: Array, kept: int) -> tuple[Array, Array]:
     """Mean of two halves, shape (texels, 3), smoothed, and its standard error.
 
     Parameters

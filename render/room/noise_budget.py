@@ -59,7 +59,7 @@ class NoiseBudget:
         return not self.phi_render_rad > budget * self.phi_sensor_rad
 
 
-def excess(
+def variance_excess(
     electrons_per_s: NDArray[np.float32],
     variance_per_s2: NDArray[np.float32],
     blur_sigma_px: float,

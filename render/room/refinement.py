@@ -43,7 +43,7 @@ from phibench.render.room.film_cells import (
     mean_of_nine,
     means_of_cells,
     moments_of,
-    moved,
+    moved_box,
     of_cells,
     of_rank,
     reach_px,
@@ -52,7 +52,7 @@ from phibench.render.room.film_cells import (
     sum_of_colours,
     taps_of_pixels,
 )
-from phibench.render.room.noise_budget import allowed_per_s2, excess, is_full
+from phibench.render.room.noise_budget import allowed_per_s2, is_full, variance_excess
 from phibench.render.room.subpixel_grid import RIM_PX, CellSampler, Crop, Stack
 
 _MOST_SIDE = 128  # strata along a cell
@@ -287,12 +287,12 @@ def refine(film: CellSampler, cells: Cells, pixels: Stack, box: Box, budget: flo
         Which round this is: each has its own random streams.
     """
     grid, m = cells.grid, cells.grid.margin_px
-    over = excess(pixels[0][:, *box], pixels[1][:, *box], grid.blur_sigma_px, budget)
+    over = variance_excess(pixels[0][:, *box], pixels[1][:, *box], grid.blur_sigma_px, budget)
     over[~inner(grid, cells.mirrored)[box]] = 0.0
     found = bounds(over > 1.0)
     if found is None:
         return None
-    part = moved(found, box[0].start, box[1].start)
+    part = moved_box(found, box[0].start, box[1].start)
     around = np.pad(over[found], m)  # the blur's margin belongs to the window's border
     near, close = (extreme(np.maximum, around, reach) for reach in (reach_px(grid), 1))
     allowed = sum_of_colours(allowed_per_s2(pixels[0][:, *part], grid.blur_sigma_px, budget))

@@ -26,7 +26,7 @@ from scipy.special import ndtr
 
 from phibench.render.room.lamp_outlines import PARTS, LampCells, LampOutlines
 from phibench.render.room.shading import Look
-from phibench.render.room.surfaces import aligned, planes
+from phibench.render.room.surfaces import aligned, colour_planes
 from phibench.scenes.camera import Camera
 from phibench.scenes.validation import SceneError
 
@@ -202,12 +202,12 @@ _GOLDEN = 0x9E3779B9  # between the keys of pairs of dimensions: far from those 
 _ROUNDS = 12  # of the Tiny Encryption Algorithm; with Mitsuba's usual 4, neighbouring lanes correlate by 0.48
 
 
-def shifts(mi: ModuleType, lanes: Any, dimensions: int, seed: Any) -> list[Any]:
+def point_shifts(mi: ModuleType, lanes: Any, dimensions: int, seed: Any) -> list[Any]:
     """One uniform shift per lane for each dimension; `seed`, an integer or a Dr.Jit one, from a named stream."""
-    return [_uniform(mi, word) for word in hashed(mi, lanes, dimensions, seed)]
+    return [_uniform(mi, word) for word in hashed_bits(mi, lanes, dimensions, seed)]
 
 
-def hashed(mi: ModuleType, lanes: Any, dimensions: int, seed: Any) -> list[Any]:
+def hashed_bits(mi: ModuleType, lanes: Any, dimensions: int, seed: Any) -> list[Any]:
     """32 random bits per lane for each dimension."""
     keys = [mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(d), _ROUNDS)[1] for d in range(dimensions)]
     return [mi.sample_tea_32(lanes, key, _ROUNDS)[1] for key in keys]
@@ -220,7 +220,7 @@ def paired_shifts(mi: ModuleType, lanes: Any, dimensions: int, seed: Any) -> lis
     return [_uniform(mi, word) for word in words[:dimensions]]
 
 
-def points(mi: ModuleType, shift: list[Any], index: Any) -> list[Any]:
+def quasi_random_points(mi: ModuleType, shift: list[Any], index: Any) -> list[Any]:
     """Coordinates of point number `index` (an unsigned integer array) of every lane."""
     import drjit as dr
 
@@ -286,7 +286,7 @@ class CellSampler:
         lamp = self._mi.Int32(-1) if self.lamps is None else self.lamps.of_patch(patch)
         dr.eval(value, mirrored, lamp)
         none, met = np.zeros((3, 0), dtype=np.float32), np.array(lamp, dtype=np.int32)
-        return Samples(planes(value), none, np.array(mirrored, dtype=bool), np.broadcast_to(met, numbers.shape))
+        return Samples(colour_planes(value), none, np.array(mirrored, dtype=bool), np.broadcast_to(met, numbers.shape))
 
     def _first(self, numbers: NDArray[np.uint32], stream: int, parts: int = 0) -> tuple[Any, Any, Any, Any]:
         """Light, mirror, patch and ray of the one point of each cell, as `Look.electrons` gives them."""
@@ -344,7 +344,7 @@ class CellSampler:
         lanes, sides, index = (dr.gather(mi.UInt32, one, cell) for one in (lane, m, first))
         shift = paired_shifts(mi, lanes, self._dimensions, dr.opaque(mi.UInt32, key))
         index, per_m = dr.arange(mi.UInt32, len(cell)) - index, 1.0 / mi.Float(sides)
-        x, place = points(mi, shift, index), mi.Float(index)
+        x, place = quasi_random_points(mi, shift, index), mi.Float(index)
         row = dr.floor((place + 0.5) * per_m)  # exact, and faster than a division of whole numbers
         corner, h = self._corner(lanes)
         step = h / mi.Float64(sides)
@@ -434,7 +434,7 @@ def _moments(mi: ModuleType, value: Any, first: Any, count: Any) -> tuple[Stack,
     mean = total / mi.Float(count)
     spread = dr.maximum(square / mi.Float(count) - mean * mean, 0.0)
     dr.eval(mean, spread)
-    return planes(mean), planes(spread)
+    return colour_planes(mean), colour_planes(spread)
 
 
 def _starts(cells: int) -> range:

@@ -48,7 +48,7 @@ def aligned(values: Any, dtype: type[np.generic] = np.float32) -> NDArray[Any]:
     return copy
 
 
-def planes(colour: Any) -> NDArray[np.float32]:
+def colour_planes(colour: Any) -> NDArray[np.float32]:
     """Numbers of a colour, shape (3, n), that were evaluated; Dr.Jit's own way compiles a kernel for each n."""
     result = np.empty((3, len(colour[0])), dtype=np.float32)
     for plane, values in zip(result, colour, strict=True):

@@ -19,7 +19,7 @@ from scipy import ndimage
 
 from phibench.render.optics.faces import IntArray, TexelGrid
 from phibench.render.room.camera_plugin import MM_PER_M
-from phibench.render.room.subpixel_grid import hashed
+from phibench.render.room.subpixel_grid import hashed_bits
 from phibench.render.room.surfaces import Surfaces, aligned
 from phibench.scenes.frames import Array, BoolArray
 
@@ -149,7 +149,7 @@ class Net:
 
         bits = mi.UInt32(aligned(np.log2(counts), np.uint32))
         place, sides = dr.arange(mi.UInt32, len(counts)), ((bits + 1) // 2, bits // 2, mi.UInt32(0))
-        words = hashed(mi, dr.gather(mi.UInt32, lanes, place // GROUP * GROUP), dimensions, seed)
+        words = hashed_bits(mi, dr.gather(mi.UInt32, lanes, place // GROUP * GROUP), dimensions, seed)
         net, sixteen = ([mi.UInt32(aligned(one, np.uint32)) for one in _sobol(n)] for n in (int(counts.max()), GROUP))
         own = [*(dr.gather(mi.UInt32, one, place % GROUP) for one in sixteen), place % GROUP << (_BITS - 4)]
         keys = [(word >> 8) ^ (one >> side) for word, one, side in zip(words, own, sides, strict=False)]
@@ -201,7 +201,7 @@ def covered_texels(mi: ModuleType, surfaces: Surfaces, texels: Texels, texel_m: 
     return np.asarray(~valid | (outward & ~two_sided) | near)
 
 
-def spread_out(mi: ModuleType, surfaces: Surfaces, texels: Texels) -> Texels:
+def spread_texels(mi: ModuleType, surfaces: Surfaces, texels: Texels) -> Texels:
     """Texels whose rays start all over them, but not below what stands there, nor beyond the patch's outline."""
     import drjit as dr
 
@@ -249,7 +249,7 @@ def nearest_free(covered: BoolArray, grid: TexelGrid) -> IntArray:
     return nearest
 
 
-def chosen(mi: ModuleType, texels: Texels, lanes: Any) -> tuple[Any, Any, Any]:
+def chosen_points(mi: ModuleType, texels: Texels, lanes: Any) -> tuple[Any, Any, Any]:
     """Points, normals and coats of some texels; evaluated."""
     import drjit as dr
 

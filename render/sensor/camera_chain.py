@@ -21,8 +21,8 @@ from phibench.render.sensor.electrons import (
     TILE_PX,
     FixedPattern,
     NoiseStream,
-    collected,
-    digitised,
+    collected_charge,
+    digitised_signal,
     expected_electrons,
     fixed_pattern,
     mean_charge,
@@ -40,7 +40,7 @@ from phibench.render.sensor.processing import (
     compressed,
     denoise_margin_px,
     eight_bit,
-    encoded,
+    jpeg_bytes,
     linear_rgb,
     linear_signal,
     rendered,
@@ -109,7 +109,7 @@ class Chain:
     def jpeg_bytes(self, light: Light, stream: NoiseStream) -> bytes:
         """Return the whole frame as the camera sends it, one JPEG file."""
         image = self.developed(light, stream, Region.whole(light.size))
-        return encoded(image, self.sensor)
+        return jpeg_bytes(image, self.sensor)
 
     def raw(self, light: Light, stream: NoiseStream, region: Region) -> NDArray[np.uint16]:
         """Return the converter's DN, shape (h, w)."""
@@ -119,8 +119,8 @@ class Chain:
         for band in tiles.bands(TILE_PX):
             rows, _ = band.slices(tiles)
             part = pattern.rows(rows)
-            charge = collected(mean_charge(photo[rows], s, part), s, stream, band)
-            dn[rows] = digitised(read_out(charge, s, part, stream, band), s)
+            charge = collected_charge(mean_charge(photo[rows], s, part), s, stream, band)
+            dn[rows] = digitised_signal(read_out(charge, s, part, stream, band), s)
         return dn[region.slices(tiles)]
 
     def developed(self, light: Light, stream: NoiseStream, region: Region) -> NDArray[np.uint8]:

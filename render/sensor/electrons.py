@@ -125,7 +125,7 @@ def mono(planes: Array, weights: tuple[float, float, float]) -> Array:
     return red + green + blue
 
 
-def sampled(planes: Array, sensor: Sensor, phase: tuple[int, int]) -> Array:
+def sampled_planes(planes: Array, sensor: Sensor, phase: tuple[int, int]) -> Array:
     """Planes R, G, B as the sensor's pixels sample them; all three planes if its output is electrons."""
     if sensor.output == "electrons":
         return planes
@@ -157,7 +157,7 @@ def expected_electrons(light: Light, sensor: Sensor, camera: Camera, region: Reg
     # layers are rates at their own stop: electrons are rate x time x ratio of apertures
     seconds = sensor.exposure_s * stop_factor(sensor, light)
     part = light.ambient_electrons_per_s[(slice(None), *region.slices())]
-    electrons = sampled(part, sensor, phase).astype(float) * (seconds * light.lamp_level)
+    electrons = sampled_planes(part, sensor, phase).astype(float) * (seconds * light.lamp_level)
     if light.spot is not None:
         factor = seconds * light.laser_level * flicker
         _add_spot(electrons, light.spot, factor, light.velocity_px_per_s, light, sensor, region)
@@ -190,7 +190,7 @@ def _add_spot(
     if min(common.shape) > 0:
         part = planes[(slice(None), *common.slices(window))]
         here = electrons[(..., *common.slices(region))]
-        here += factor * sampled(part, sensor, (common.v0_px, common.u0_px))
+        here += factor * sampled_planes(part, sensor, (common.v0_px, common.u0_px))
         np.maximum(here, 0.0, out=here)  # a moving spot may undershoot
 
 
@@ -256,7 +256,7 @@ def mean_charge(photo_e: Array, sensor: Sensor, pattern: FixedPattern) -> Array:
     return photo_e * pattern.responsivity + sensor.dark_e_per_s * sensor.exposure_s
 
 
-def collected(mean_e: Array, sensor: Sensor, stream: NoiseStream, region: Region) -> Array:
+def collected_charge(mean_e: Array, sensor: Sensor, stream: NoiseStream, region: Region) -> Array:
     """Charge in the wells, shape (h, w), on whole tiles: Poisson, cut at the full well."""
     charge = mean_e
     if sensor.shot_noise:
@@ -281,7 +281,7 @@ def read_out(charge_e: Array, sensor: Sensor, pattern: FixedPattern, stream: Noi
     return signal
 
 
-def digitised(signal_e: Array, sensor: Sensor) -> NDArray[np.uint16]:
+def digitised_signal(signal_e: Array, sensor: Sensor) -> NDArray[np.uint16]:
     """DN: gain, black level, rounding to the nearest code, clipping to what the converter has."""
     # the converter rounds to the nearest code and clips at both ends
     dn = np.rint(sensor.black_level_dn + sensor.dn_per_e * signal_e)

@@ -244,7 +244,7 @@ A decoded pixel depends on its own unit and, where chroma is interpolated betwee
 """
 
 
-def encoded(image: NDArray[np.uint8], sensor: Sensor) -> bytes:
+def jpeg_bytes(image: NDArray[np.uint8], sensor: Sensor) -> bytes:
     """JPEG file of an image, shape (H, W, 3), with the sensor's tables, subsampling and restart markers."""
     file, tables = io.BytesIO(), sensor.jpeg_qtables
     # Pillow scales given tables by the quality in per cent: none is given with them
@@ -255,7 +255,7 @@ def encoded(image: NDArray[np.uint8], sensor: Sensor) -> bytes:
     return file.getvalue()
 
 
-def decoded(data: bytes) -> NDArray[np.uint8]:
+def jpeg_image(data: bytes) -> NDArray[np.uint8]:
     """Image, shape (H, W, 3), in a JPEG file."""
     with Image.open(io.BytesIO(data), formats=("JPEG",)) as image:
         return np.asarray(image.convert("RGB"))
@@ -264,4 +264,4 @@ def decoded(data: bytes) -> NDArray[np.uint8]:
 def compressed(images: NDArray[np.uint8], sensor: Sensor) -> NDArray[np.uint8]:
     """Images, shape (..., H, W, 3), encoded and decoded again."""
     flat = images.reshape(-1, *images.shape[-3:])
-    return np.stack([decoded(encoded(image, sensor)) for image in flat]).reshape(images.shape)
+    return np.stack([jpeg_image(jpeg_bytes(image, sensor)) for image in flat]).reshape(images.shape)

@@ -27,7 +27,7 @@ from phibench.render.setup.llvm_library import (
     OLDEST_PROVEN,
     Llvm,
     LlvmError,
-    cache_folder,
+    llvm_cache_folder,
     load,
     probe,
     prove,
@@ -65,7 +65,7 @@ def fetch_llvm() -> None:
         except AptError:
             # Root of a container with a read-only system, or without a working dpkg: what a user can do, root can do.
             pass
-    unpack(cache_folder())
+    unpack(llvm_cache_folder())
 
 
 def install() -> None:
@@ -260,7 +260,7 @@ def use_llvm() -> Llvm:
 
 def candidates() -> list[Path]:
     """List the libraries to try, best first, each file once whatever links lead to it."""
-    ours = _libraries(str(cache_folder() / "libllvm*" / "usr/lib/*"))
+    ours = _libraries(str(llvm_cache_folder() / "libllvm*" / "usr/lib/*"))
     conda = os.environ.get("CONDA_PREFIX")
     folders = (*SYSTEM_FOLDERS, f"{glob.escape(conda)}/lib") if conda else SYSTEM_FOLDERS
     system = (path for folder in folders for path in _libraries(folder))
@@ -311,7 +311,7 @@ def _nothing_found() -> str:
     seen = sorted({hint for path in candidates() if (hint := version_hint(path))})
     rejected = f" (rejected: {', '.join(map(str, seen))})" if seen else ""
     advice = _FETCH_IT if is_offered() else _INSTALL_IT
-    return f"no LLVM {OLDEST_PROVEN} or later was found in {cache_folder()} or the system{rejected}: {advice}."
+    return f"no LLVM {OLDEST_PROVEN} or later was found in {llvm_cache_folder()} or the system{rejected}: {advice}."
 
 
 def main(arguments: list[str] | None = None) -> int:

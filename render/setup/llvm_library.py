@@ -91,14 +91,14 @@ def version_hint(path: Path) -> int:
     return int(found.group(1)) if found else 0
 
 
-def cache_folder() -> Path:
+def llvm_cache_folder() -> Path:
     """Return the folder for LLVMs of our own, in the user's cache."""
     return cache_root() / "llvm"
 
 
 def companions_of(path: Path) -> tuple[Path, ...]:
     """Return the other libraries of the fetched tree that `path` is part of; none for a library of the system."""
-    cache = cache_folder()
+    cache = llvm_cache_folder()
     if not path.is_relative_to(cache) or path.parent == cache:
         return ()
     tree = cache / path.relative_to(cache).parts[0]

@@ -7,7 +7,7 @@ h, ends at the distance s f sinc(a f / 2) in the direction h + a f / 2.
 
 The path is the true one. Slip and skid say how far the tracks ran on it. Their readings also have the random part of
 `vehicle`: a random walk whose variance grows with the track's way. A robot that knows the nominal slip and skid alone
-finds its pose by `reckoned`.
+finds its pose by `reckoned_poses`.
 """
 
 from __future__ import annotations
@@ -253,7 +253,7 @@ def robot_pose(vehicle: Vehicle, state: Array) -> RobotPose:
     return RobotPose(Pose("world", "rig", as_vector(t), as_matrix(R)), float(state[3]))
 
 
-def reckoned(vehicle: Vehicle, readings_m: Array) -> list[PlanarPose]:
+def reckoned_poses(vehicle: Vehicle, readings_m: Array) -> list[PlanarPose]:
     """Poses that the tracks' readings (N, 2) give a robot that takes slip and skid for nominal, from the start."""
     pose, poses, before = PlanarPose(-vehicle.sensor_x_m), [], np.zeros(2)
     for now in readings_m:

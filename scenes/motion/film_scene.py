@@ -245,7 +245,7 @@ class FilmScene:
         return result
 
 
-def frames_of(carriage: Carriage, rate_hz: float, drive: Drive | None = None) -> int:
+def frame_count(carriage: Carriage, rate_hz: float, drive: Drive | None = None) -> int:
     """Number of frames that show the whole motion of carriage and robot, the first one at the time 0."""
     end_s = max(carriage.duration_s, 0.0 if drive is None else drive.end_s)
     return math.floor(end_s * rate_hz + 1e-9) + 1  # a product that rounds below its whole number

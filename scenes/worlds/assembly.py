@@ -80,7 +80,7 @@ class Assembly:
     def add(self, other: Assembly, x: float, y: float, z: float, yaw_rad: float, prefix: str) -> None:
         """Add the parts of another assembly, moved and turned about the upright axis."""
         pose = Pose("world", "world", (x, y, z), rotation_xyz(z_rad=yaw_rad))
-        self.parts += moved(other.parts, pose, prefix)
+        self.parts += moved_parts(other.parts, pose, prefix)
 
     def bounds_m(self) -> Array:
         """Least and largest coordinates, shape (2, 3)."""
@@ -102,7 +102,7 @@ def part_bounds_m(shape: Shape) -> Array:
     return np.array([t - half, t + half])
 
 
-def moved(parts: Iterable[AssemblyShape], pose: Pose, prefix: str = "") -> list[AssemblyShape]:
+def moved_parts(parts: Iterable[AssemblyShape], pose: Pose, prefix: str = "") -> list[AssemblyShape]:
     """Parts in another frame, their names after a prefix if one is given."""
     R, t = pose.R, pose.t
     done = []

@@ -14,7 +14,7 @@ import numpy as np
 
 from phibench.scenes.frames import Pose, Vector, rotation_xyz
 from phibench.scenes.shapes import Rectangle, rectangle
-from phibench.scenes.worlds.assembly import Assembly, AssemblyShape, Footprint, footprint_of, moved, part_bounds_m
+from phibench.scenes.worlds.assembly import Assembly, AssemblyShape, Footprint, footprint_of, moved_parts, part_bounds_m
 from phibench.scenes.worlds.materials import Surface
 from phibench.scenes.worlds.room_properties import RoomProperties
 
@@ -187,7 +187,7 @@ class Layout:
         """Place an assembly, a millimetre above the floor; its name is its kind and a number."""
         self.counts[kind] = self.counts.get(kind, 0) + 1
         pose = Pose("world", "world", (x, y, 0.001), rotation_xyz(z_rad=yaw_rad))
-        self.parts += moved(assembly.parts, pose, f"{kind}_{self.counts[kind]}")
+        self.parts += moved_parts(assembly.parts, pose, f"{kind}_{self.counts[kind]}")
         self.taken.append(taken or footprint_of(assembly, x, y, yaw_rad))
 
     def leaves_the_robot(self, assembly: Assembly, x: float, y: float, yaw_rad: float) -> bool:

@@ -18,7 +18,7 @@ from phibench.scenes.room import Room, Sun
 from phibench.scenes.shapes import Bitmap, Rectangle, Shape, Uniform
 from phibench.scenes.validation import SceneError
 from phibench.scenes.worlds import fixtures, furniture, graphics, small_objects, standing_objects, tabletop
-from phibench.scenes.worlds.assembly import Assembly, AssemblyShape, Footprint, footprint_of, moved
+from phibench.scenes.worlds.assembly import Assembly, AssemblyShape, Footprint, footprint_of, moved_parts
 from phibench.scenes.worlds.floor_plan import FREE_DISC_M, FloorPlan, Layout, Wall, floor_plan, patch_count, shell
 from phibench.scenes.worlds.graphics import radiance_bitmap
 from phibench.scenes.worlds.lamps import EFFICACY_LM_W, band_radiance, hang_lamps
@@ -279,7 +279,7 @@ class _Generator:
         walls, floor, ceiling = self._shell_surfaces()
         parts = [AssemblyShape(surface) for surface in shell(self.plan, floor, ceiling, walls)]
         parts += self._switched_on()
-        shapes = [part.shape for part in moved(parts, self.plan.T_world_plan)]
+        shapes = [part.shape for part in moved_parts(parts, self.plan.T_world_plan)]
         lights = tuple(shape for shape in shapes if isinstance(shape, Rectangle))
         solids: tuple[Shape, ...] = tuple(shape for shape in shapes if not isinstance(shape, Rectangle))
         name = "generated:" + ":".join(str(part) for part in self.stream)

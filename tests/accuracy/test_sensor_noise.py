@@ -11,7 +11,7 @@ import pytest
 import scipy
 
 from phibench.render.sensor.camera_chain import Chain
-from phibench.render.sensor.electrons import NoiseStream, digitised, poisson
+from phibench.render.sensor.electrons import NoiseStream, digitised_signal, poisson
 from phibench.render.sensor.light import Light, Region
 from phibench.render.sensor.settings import Sensor, sensor
 
@@ -82,9 +82,9 @@ def test_the_converter_clips_at_both_ends() -> None:
     s = sensor("bayer-raw")
     electrons = np.array([-1e9, -64 / s.dn_per_e - 1.0, -802.0, 0.0, 1.0, 12000.0, 12001.0, 1e12])
     # by hand: 64 + 0.0799167 e
-    np.testing.assert_array_equal(digitised(electrons, s), [0, 0, 0, 64, 64, 1023, 1023, 1023])
+    np.testing.assert_array_equal(digitised_signal(electrons, s), [0, 0, 0, 64, 64, 1023, 1023, 1023])
     step = 1.0 / s.dn_per_e
-    np.testing.assert_array_equal(digitised(np.array([0.49, 0.51, 1.49, 1.51]) * step, s), [64, 65, 65, 66])
+    np.testing.assert_array_equal(digitised_signal(np.array([0.49, 0.51, 1.49, 1.51]) * step, s), [64, 65, 65, 66])
 
 
 def test_dark_frames_reach_neither_end() -> None:

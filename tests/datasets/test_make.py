@@ -31,7 +31,7 @@ from phibench.datasets.plan.plan import make_plan
 from phibench.datasets.recipe.load import load_recipe
 from phibench.datasets.rooms.room_sources import room_of
 from phibench.datasets.store import checksums, schema
-from phibench.datasets.store.checksums import damaged, data_files, read_checksums
+from phibench.datasets.store.checksums import damaged_files, data_files, read_checksums
 from phibench.datasets.store.layers import read_exr
 from phibench.datasets.store.metadata import read_manifest
 from phibench.datasets.store.schema import ManifestRow
@@ -61,7 +61,7 @@ def test_everything_is_there(smallest_dataset: Path) -> None:
     }
     listed = set(read_checksums(smallest_dataset))
     assert listed == views | spots | previews | single == set(data_files(smallest_dataset))
-    assert damaged(smallest_dataset) == []
+    assert damaged_files(smallest_dataset) == []
     assert (smallest_dataset / schema.RECIPE).read_bytes() == SMALLEST.read_bytes()
 
 
@@ -144,7 +144,7 @@ def test_a_folder_with_another_data_set_is_refused(smallest_dataset: Path) -> No
     assert "holds 8 finished tasks of another data set ('smallest')" in text
     assert "--replace" in text
     assert (smallest_dataset / schema.CHECKSUMS).read_text() == before
-    assert damaged(smallest_dataset) == []
+    assert damaged_files(smallest_dataset) == []
 
 
 def test_a_folder_that_cannot_be_written_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -400,7 +400,7 @@ def test_without_mitsuba_frames_may_change_and_nothing_may_be_rendered(smallest_
     child = run(frames, copy)
     assert child.returncode == 0, child.stderr
     assert json.loads((copy / schema.INFO).read_text())["recipe"]["frames"]["presets"] == ["mjpeg"]
-    assert damaged(copy) == []
+    assert damaged_files(copy) == []
     make.make(frames, copy, workers=1, console=(console := quiet()))  # with Mitsuba it is the same
     assert "nothing to do" in said(console)
     child = run(frames, tmp_path / "new")
@@ -410,4 +410,4 @@ def test_without_mitsuba_frames_may_change_and_nothing_may_be_rendered(smallest_
     assert child.returncode == 1
     assert "6 of 8 tasks are to be done, such as 'bake room', and" in child.stderr
     assert "Mitsuba is not installed" in child.stderr
-    assert damaged(copy) == []
+    assert damaged_files(copy) == []

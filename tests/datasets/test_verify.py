@@ -403,7 +403,7 @@ def test_a_sheet_says_why_a_spot_is_hidden(smallest_dataset: Path, monkeypatch: 
 
     def captioned(picture: Picture, text: str) -> Picture:
         said.append(text)
-        changed = pictures.captioned(picture, text)
+        changed = pictures.captioned_picture(picture, text)
         assert np.count_nonzero(changed != picture) > 100
         return changed
 

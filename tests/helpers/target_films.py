@@ -23,7 +23,7 @@ from scipy.optimize import brentq
 from phibench.datasets.film.film_plan import FilmPlan, film_plans
 from phibench.datasets.film.film_read import film_light
 from phibench.datasets.film.film_room import renderer
-from phibench.datasets.film.film_task import coloured, frame_spots
+from phibench.datasets.film.film_task import coloured_image, frame_spots
 from phibench.datasets.frames.sensor_card import card_of
 from phibench.datasets.plan.plan import Plan
 from phibench.datasets.recipe.load import parse_recipe
@@ -280,7 +280,7 @@ def _images(rendered: RenderedRoom, scene: FilmScene) -> tuple[list[list[RowsIma
         own, _ = frame_spots(plan, rendered.room, times)
         colour = None if n == 0 else scene.lights[n - 1].colour
         if colour is not None:
-            own = [coloured(one, colour) for one in own]
+            own = [coloured_image(one, colour) for one in own]
         images.append(own)
         places.append(chief_uv_px(alone, np.array(times)))
     return images, np.array(places)

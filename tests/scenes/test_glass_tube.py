@@ -18,12 +18,12 @@ from phibench.render.optics import certificate
 from phibench.render.optics.certificate import certify
 from phibench.render.optics.ray_tracer import trace_pixels
 from phibench.render.optics.reflection_point import mirror_points
-from phibench.render.optics.room_tracer import RoomGeometry, into_room, room_geometry
+from phibench.render.optics.room_tracer import RoomGeometry, rays_into_room, room_geometry
 from phibench.render.optics.spot_layer import spot_layer
 from phibench.render.optics.truth import spot_truth, truth_layer
 from phibench.render.setup.variant import activate
 from phibench.scenes.glass_tube import GlassTube
-from phibench.scenes.holder import OF_TUBES, Holder, fitted
+from phibench.scenes.holder import OF_TUBES, Holder, fitted_holder
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.rig import Rig, View
@@ -37,7 +37,7 @@ RIGS = {"aligned": ALIGNED, "crooked": CROOKED, "formed": FORMED}
 
 
 def rig(misalignment: Misalignment = ALIGNED, **sizes: float) -> Rig:
-    return dataclasses.replace(default_rig(), holder=fitted("tube", BALL_M, **sizes)).perturbed(misalignment)
+    return dataclasses.replace(default_rig(), holder=fitted_holder("tube", BALL_M, **sizes)).perturbed(misalignment)
 
 
 def tube(rng: np.random.Generator, inner_m: float = 0.075, wall_m: float = 0.003) -> GlassTube:
@@ -146,7 +146,7 @@ def test_accuracy_of_the_way_there_and_back(name: str) -> None:
     hit = trace_pixels(view, uv)
     seen = np.flatnonzero(hit.cos_incidence > 0.05)
     uv = uv[seen]
-    way = into_room(view, geometry, hit.points_m[seen], hit.directions[seen])
+    way = rays_into_room(view, geometry, hit.points_m[seen], hit.directions[seen])
     found = geometry.first_hit(way.starts_m, way.directions)
     wall = found.object_id < len(room.surfaces) + len(room.furniture)
     points = (way.starts_m + found.distance_m[:, None] * way.directions)[wall]
@@ -333,7 +333,7 @@ def test_a_ray_that_meets_a_plate_within_the_wall() -> None:
     crossing = view.tube.leave(points, directions)
     ends = np.flatnonzero(crossing.crosses & ~crossing.passes)
     assert len(ends) > 100
-    way = into_room(view, geometry, points[ends], directions[ends])
+    way = rays_into_room(view, geometry, points[ends], directions[ends])
     found = geometry.first_hit(way.starts_m, way.directions)
     place = way.starts_m + found.distance_m[:, None] * way.directions
     height = view.tube.height_m(place)

@@ -15,7 +15,7 @@ from phibench.render.optics.ray_tracer import trace_pixels
 from phibench.render.optics.room_tracer import first_hit, room_geometry
 from phibench.render.optics.spot_layer import spot_layer
 from phibench.render.optics.truth import spot_truth, truth_layer
-from phibench.scenes.holder import SIDES, Holder, fitted, prism_radius_m
+from phibench.scenes.holder import SIDES, Holder, fitted_holder, prism_radius_m
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.rig import Rig, View
@@ -30,7 +30,7 @@ CROOKED = Misalignment(tilt_x_rad=0.02, tilt_y_rad=-0.03, decentre_x_m=0.004, st
 
 
 def rig(kind: str, misalignment: Misalignment = ALIGNED) -> Rig:
-    return dataclasses.replace(default_rig(), holder=fitted(kind, BALL_M)).perturbed(misalignment)
+    return dataclasses.replace(default_rig(), holder=fitted_holder(kind, BALL_M)).perturbed(misalignment)
 
 
 # -- oracle: rays against round cylinders, in the holder's own frame -----------------------------------------------
@@ -192,7 +192,9 @@ def test_a_rod_cuts_a_part_of_the_light_and_the_certificate_agrees(kind: str) ->
 
 def held(shape: str, kind: str, *, aligned: bool) -> Rig:
     rig = revolved(shape, aligned=aligned)
-    return dataclasses.replace(rig, holder=fitted(kind, rig.mirror.profile.rim_radius_m, rig.mirror.profile.depth_m))
+    return dataclasses.replace(
+        rig, holder=fitted_holder(kind, rig.mirror.profile.rim_radius_m, rig.mirror.profile.depth_m)
+    )
 
 
 @pytest.mark.slow

@@ -29,8 +29,8 @@ from phibench.benchmark.scores.score_files import read_score
 from phibench.benchmark.sealed.sealed_set import read_seal
 from phibench.cli.main import main
 from phibench.datasets.common.errors import DatasetError
-from phibench.datasets.film.film_store import verify as film_faults
-from phibench.datasets.store.checksums import damaged, differing_files, read_checksums
+from phibench.datasets.film.film_store import verify_films as film_faults
+from phibench.datasets.store.checksums import damaged_files, differing_files, read_checksums
 
 
 def test_fetched_from_a_folder(made: Made, tmp_path: Path, smallest_dataset: Path) -> None:
@@ -39,7 +39,7 @@ def test_fetched_from_a_folder(made: Made, tmp_path: Path, smallest_dataset: Pat
     assert [path.name for path in tmp_path.iterdir()] == ["set"]
     found = snapshot(tmp_path / "set")
     assert found == {name: digest for name, digest in snapshot(smallest_dataset).items() if name in found}
-    assert damaged(tmp_path / "set") == []
+    assert damaged_files(tmp_path / "set") == []
     assert fetch("phibench-v4-small", tmp_path / "set", str(made.out)).fetched == 0
     fetch("films", tmp_path / "films", str(made.out))
     assert film_faults(tmp_path / "films") == []
@@ -157,7 +157,7 @@ def test_a_download_that_breaks_off_loses_nothing_and_goes_on(made: Made, tmp_pa
         assert done.fetched == len(archives) - 2
         assert server.asked[archives[0]] == server.asked[archives[1]] == 1
         assert server.asked[archives[2]] == 2
-    assert damaged(tmp_path / "set") == []
+    assert damaged_files(tmp_path / "set") == []
     assert [path.name for path in tmp_path.iterdir()] == ["set"]
 
 

@@ -26,7 +26,7 @@ from phibench.cli.main import main
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.plan.plan import make_plan
 from phibench.datasets.recipe.load import parse_recipe, recipe_text, with_numbers
-from phibench.datasets.store.checksums import damaged, differing_files, read_checksums
+from phibench.datasets.store.checksums import damaged_files, differing_files, read_checksums
 from phibench.datasets.store.metadata import read_manifest
 
 ROOT = Path(__file__).parents[3]
@@ -307,7 +307,7 @@ def test_data_sets_without_one_are_no_faults_and_a_lost_one_is(smallest_dataset:
     folder = tmp_path / "set"
     shutil.copytree(smallest_dataset, folder)
     (folder / "croissant.json").unlink()
-    assert damaged(folder) == ["croissant.json is missing"]
+    assert damaged_files(folder) == ["croissant.json is missing"]
     sums = folder / "SHA256SUMS"  # as version 0.2 wrote it
     sums.write_text("".join(x for x in sums.read_text().splitlines(True) if "croissant" not in x))
-    assert damaged(folder) == []
+    assert damaged_files(folder) == []

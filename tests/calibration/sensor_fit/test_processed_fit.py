@@ -21,7 +21,7 @@ from phibench.calibration.sensor_fit.fit_sensor import SensorFit, fit_sensor
 from phibench.calibration.sensor_fit.noise_levels import PlaneNoise, decoded_by, encoded_by
 from phibench.calibration.sensor_fit.plane_model import _rounded
 from phibench.datasets.store.files import write_bytes
-from phibench.render.sensor.processing import encoded
+from phibench.render.sensor.processing import jpeg_bytes
 from phibench.render.sensor.settings import Sensor, sensor
 
 FITTED = ("gain_dn_per_e", "read_noise_e", "sharpen_amount", "denoise_luma", "prnu")
@@ -115,7 +115,7 @@ def test_the_jpeg_header_comes_back(tmp_path: Path, s: Sensor) -> None:
     image = flat_frames(s.replace(output="srgb8"), (3e3, 3e3, 2e3), 1, "jpeg", 0, (64, 64))[0]
     (tmp_path / "flat/1").mkdir(parents=True)
     for k in range(2):
-        write_bytes(tmp_path / f"flat/1/{k}.jpg", encoded(image, s))
+        write_bytes(tmp_path / f"flat/1/{k}.jpg", jpeg_bytes(image, s))
     found = fit_sensor(tmp_path)
     again = found.file.sensor()
     assert (again.jpeg_subsampling, again.jpeg_restart_interval) == (s.jpeg_subsampling, s.jpeg_restart_interval)

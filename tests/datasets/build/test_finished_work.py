@@ -8,7 +8,7 @@ from helpers.folders import contents
 from helpers.processes import SMALLEST, quiet
 
 from phibench.datasets.build.dataset_build import plan_tasks
-from phibench.datasets.build.earlier_runs import lost_work
+from phibench.datasets.build.earlier_runs import lost_work_text
 from phibench.datasets.build.journal import Journal
 from phibench.datasets.build.workers import versions
 from phibench.datasets.common.errors import DatasetError
@@ -31,7 +31,7 @@ def lost(folder: Path, old: str = "", new: str = "") -> str | None:
     plan = make_plan(parse_recipe(SMALLEST.read_text().replace(old, new)))
     environment = read_info(folder).provenance
     keys = {name: task.key for name, task in plan_tasks(plan, versions(environment)).items()}
-    return lost_work(folder, keys, Journal(folder), dataset_info(plan, environment))
+    return lost_work_text(folder, keys, Journal(folder), dataset_info(plan, environment))
 
 
 def test_a_set_without_its_journal_is_finished_work(copy: Path) -> None:

@@ -16,7 +16,7 @@ from phibench.datasets.build.tasks import BuildTask, Made, task_key
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.film.moving_camera import _drawn_room, bake_rooms, open_baked_rooms
 from phibench.datasets.store import schema
-from phibench.datasets.store.checksums import filling, signed, write_documents
+from phibench.datasets.store.checksums import filling, with_checksums, write_documents
 from phibench.render.room.light_map import BakeSettings, LightMap, texel_count
 from phibench.scenes.room import Room
 
@@ -48,7 +48,7 @@ def filled(out: Path, done: list[str], stop: Callable[[Path], object] = lambda _
     ]
     with filling(out):
         brought = bring_all({task.name: task for task in tasks}, out, 1, quiet(), "parts")
-        write_documents(out, signed({"README.md": b"about"}, brought.hashes))
+        write_documents(out, with_checksums({"README.md": b"about"}, brought.hashes))
     return brought
 
 

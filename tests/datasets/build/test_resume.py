@@ -13,7 +13,7 @@ import pytest
 from helpers.folders import contents, done
 from helpers.processes import SMALLEST, left_of, quiet, said
 
-from phibench.datasets.build.dataset_build import claimed
+from phibench.datasets.build.dataset_build import claimed_folder
 from phibench.datasets.build.journal import Entry, FolderHead, Journal
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.make import make
@@ -230,10 +230,10 @@ def test_a_second_run_is_refused_and_a_killed_one_holds_nothing(tmp_path: Path) 
 def test_what_a_run_leaves_that_is_killed_at_once_is_no_obstacle(tmp_path: Path) -> None:
     for name in (schema.LOCK, schema.WORKING, f"{TEMPORARY_PREFIX}probe", f"{TEMPORARY_PREFIX}abc.txt"):
         (tmp_path / name).write_bytes(b"")
-    with claimed(tmp_path, "smallest"):
+    with claimed_folder(tmp_path, "smallest"):
         pass
     (tmp_path / "mine.txt").write_bytes(b"")
-    with pytest.raises(DatasetError, match="holds no data set"), claimed(tmp_path, "smallest"):
+    with pytest.raises(DatasetError, match="holds no data set"), claimed_folder(tmp_path, "smallest"):
         pass
 
 

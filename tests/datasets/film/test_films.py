@@ -21,7 +21,7 @@ from phibench.datasets.film.film_make import make_films
 from phibench.datasets.film.film_plan import check_drives, film_plans
 from phibench.datasets.film.film_preview import picture
 from phibench.datasets.film.film_read import Film, open_films
-from phibench.datasets.film.film_store import verify
+from phibench.datasets.film.film_store import verify_films
 from phibench.datasets.film.film_video import read_frames, write_frames, write_lerobot, write_mp4, write_videos
 from phibench.datasets.recipe.load import parse_recipe
 from phibench.datasets.store.layers import read_exr, write_exr
@@ -184,17 +184,17 @@ def test_damage_is_found_and_mended(film_windows: Path, tmp_path: Path, monkeypa
     monkeypatch.setattr(film_task, "frame_spots", SPOTS)
     out = tmp_path / "films"
     shutil.copytree(film_windows, out)
-    assert verify(out) == []
+    assert verify_films(out) == []
     table = out / "films" / FILM / "film.parquet"
     table.write_bytes(table.read_bytes()[:-1])
-    assert verify(out) == [f"films/{FILM}/film.parquet is damaged: its SHA-256 is not the listed one"]
+    assert verify_films(out) == [f"films/{FILM}/film.parquet is damaged: its SHA-256 is not the listed one"]
     (out / "films" / FILM / "done.json").write_text(json.dumps({"film": 3}), encoding="utf-8")
     with pytest.raises(DatasetError, match=r"done\.json is damaged.*again"):
         film_of(out)
     recipe = out / "again.toml"
     recipe.write_text(TEXT, encoding="utf-8")
     make_films(recipe, out, 1)
-    assert verify(out) == []
+    assert verify_films(out) == []
 
 
 def test_a_key_view_that_was_changed_under_its_own_header_is_rendered_again(
@@ -210,12 +210,12 @@ def test_a_key_view_that_was_changed_under_its_own_header_is_rendered_again(
     planes = {name: 2.0 * plane for name, plane in found.planes.items()}
     write_exr(view, planes, found.header, found.origin_px)
     assert view.read_bytes() != before
-    assert len(verify(out)) == 1
+    assert len(verify_films(out)) == 1
     recipe = tmp_path / "films.toml"
     recipe.write_text(TEXT, encoding="utf-8")
     assert make_films(recipe, out, 1).made == (FILM,)
     assert view.read_bytes() == before
-    assert verify(out) == []
+    assert verify_films(out) == []
 
 
 @pytest.mark.parametrize("name", ["film.avi", "film.mkv"])

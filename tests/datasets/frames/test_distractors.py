@@ -14,7 +14,7 @@ from helpers.sensor_light import room, spot_at
 
 from phibench.datasets.exposures.expected_electrons import expected_of_light
 from phibench.datasets.exposures.pair_draws import CachedSample, pair_draws
-from phibench.datasets.frames.distractors import MIN_APART_PX, Distractor, distractors, present
+from phibench.datasets.frames.distractors import MIN_APART_PX, Distractor, distractors, present_tables
 from phibench.datasets.read import Dataset, Sample, open_dataset
 from phibench.render.sensor.camera_chain import Chain
 from phibench.render.sensor.electrons import NoiseStream, expected_electrons
@@ -185,7 +185,7 @@ def test_they_are_a_pure_function_of_the_sample(bench_dataset: Path, found: list
 
 def test_they_come_as_often_as_the_recipe_says(bench_dataset: Path) -> None:
     dataset = many(bench_dataset, 2000, distractors=[{"kind": "spot", "probability": 0.3}, {"kind": "spot"}])
-    numbers = [present(sample.stream_names, sample.dataset.recipe.distractors) for sample in dataset]
+    numbers = [present_tables(sample.stream_names, sample.dataset.recipe.distractors) for sample in dataset]
     # binomial, n = 2000, p = 0.3: sigma 20.5; 4 sigma, false alarms 6e-5
     assert abs(sum(0 in found for found in numbers) - 600) < 82
     assert all(1 in found for found in numbers)

@@ -29,7 +29,7 @@ from phibench.datasets.frames.frame_files import (
 from phibench.datasets.frames.frame_request import FrameOptions
 from phibench.datasets.frames.frame_source import Frame
 from phibench.datasets.read import open_dataset
-from phibench.datasets.store.checksums import damaged, strays
+from phibench.datasets.store.checksums import damaged_files, stray_files
 from phibench.datasets.store.layers import read_exr
 from phibench.render.sensor.light import Region
 
@@ -186,7 +186,7 @@ def test_the_default_folder_is_beside_the_data_set(tiny_dataset: Path, tmp_path:
     copy = Path(shutil.copytree(tiny_dataset, tmp_path / "copy"))
     assert run(copy, "--region", 8, "--sample", SEEN) == 0
     assert (tmp_path / "copy-frames" / INDEX).is_file()
-    assert damaged(copy) == strays(copy) == []
+    assert damaged_files(copy) == stray_files(copy) == []
 
 
 def test_samples_without_a_place_for_a_region_are_named(

@@ -21,7 +21,7 @@ from phibench.cli.main import main
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.read import open_finished
 from phibench.datasets.store import schema
-from phibench.datasets.store.checksums import strays
+from phibench.datasets.store.checksums import stray_files
 from phibench.datasets.store.sensitivity_file import read_sensitivities, sensitivity_bytes, sensitivity_fault
 from phibench.datasets.verify import verify
 from phibench.estimator.geometry.sensitivity_table import columns, keep_sensitivities
@@ -43,7 +43,7 @@ def test_it_is_written_once_read_and_in_order(copy: Path) -> None:
     table = open_finished(copy).sensitivities()
     assert tuple(table.columns) == columns()
     assert len(table) == len(open_finished(copy)) * len(ESTIMATORS)
-    assert strays(copy) == []
+    assert stray_files(copy) == []
     assert faults(copy) == ()
     before = path.stat().st_mtime_ns
     assert keep_sensitivities(copy) == path

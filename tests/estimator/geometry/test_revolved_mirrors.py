@@ -19,7 +19,7 @@ from phibench.estimator.geometry.triangulate import ESTIMATORS, depth_exact
 from phibench.render.optics.ray_tracer import trace_pixels
 from phibench.render.optics.reflection_point import mirror_points
 from phibench.scenes.frames import Array, rotation_xyz
-from phibench.scenes.holder import fitted
+from phibench.scenes.holder import fitted_holder
 from phibench.scenes.mirror import OF_REVOLVED
 from phibench.scenes.misalignment import PARAMETERS as MISALIGNMENT
 from phibench.scenes.misalignment import Misalignment
@@ -138,7 +138,7 @@ def test_accuracy_exact_depth_from_true_pixels(shape: str) -> None:
 def test_accuracy_exact_depth_through_a_glass_tube(shape: str) -> None:
     """D to 1e-9 and images to 1e-9 px by the simulator's pixels, off axis: Snell's law there, closed forms here."""
     rig = revolved(shape, aligned=False)
-    holder = fitted("tube", rig.mirror.profile.rim_radius_m, rig.mirror.profile.depth_m)
+    holder = fitted_holder("tube", rig.mirror.profile.rim_radius_m, rig.mirror.profile.depth_m)
     rig, rng = dataclasses.replace(rig, holder=holder), rng_of("tube", shape)
     turn, D = rng.uniform(0.0, 2.0 * np.pi, 60), rng.uniform(1.0, 4.0, 60)
     heights = rng.uniform(1.05, 1.2, 60) if shape == "cone" else rng.uniform(0.2, 0.5, 60)

@@ -11,7 +11,7 @@ from phibench.estimator.geometry.reflection import image_of
 from phibench.estimator.geometry.sphere_image import SphereImager
 from phibench.estimator.geometry.status import Status
 from phibench.estimator.spots.spot_prediction import Laser, spot_electrons_per_s
-from phibench.scenes.holder import fitted
+from phibench.scenes.holder import fitted_holder
 from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.random_streams import generator
 from phibench.scenes.rig import Rig
@@ -62,6 +62,6 @@ def test_other_mirrors_are_refused() -> None:
     bent = Rig().perturbed(Misalignment(form_20_m=1e-5))
     with pytest.raises(SceneError, match="perfect sphere"):
         SphereImager(bent)
-    in_glass = dataclasses.replace(Rig(), holder=fitted("tube", 0.06))
+    in_glass = dataclasses.replace(Rig(), holder=fitted_holder("tube", 0.06))
     with pytest.raises(SceneError, match="perfect sphere"):
         SphereImager(in_glass)

@@ -12,7 +12,7 @@ from phibench.render.optics.room_tracer import room_geometry
 from phibench.render.optics.spot_layer import spot_layer
 from phibench.render.optics.truth import spot_truth
 from phibench.scenes.frames import Array, Pose, as_matrix, as_vector
-from phibench.scenes.holder import fitted
+from phibench.scenes.holder import fitted_holder
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.motion.carriage import Carriage, Vibration
@@ -108,7 +108,7 @@ def test_a_waypoint_within_an_exposure_parts_it() -> None:
 
 RODS = replace(
     DRIVING,
-    rig=replace(Rig(), holder=fitted("rods", 0.06)),
+    rig=replace(Rig(), holder=fitted_holder("rods", 0.06)),
     vibrations=(),
     drive=Drive(Vehicle(), (DriveLeg(0.0, 0.1, 0.6, None, 0.5, 3.0),), 0.05, 1.4),
 )

@@ -30,7 +30,7 @@ from phibench.render.optics.correspondence import (
 )
 from phibench.render.optics.truth import truth_layer
 from phibench.scenes.frames import Pose
-from phibench.scenes.holder import fitted
+from phibench.scenes.holder import fitted_holder
 from phibench.scenes.rig import Rig, View
 from phibench.scenes.room import Room, default_rig, lab
 
@@ -222,7 +222,7 @@ def at_both(rig: Rig) -> tuple[View, View]:
 def test_every_cause_occurs_and_says_what_is_in_the_way() -> None:
     """A holder of rods, a mirror with a rim, and a mirror so near that its image is cut."""
     rig = small(default_rig())
-    held = replace(rig, holder=fitted("rods", 0.060))
+    held = replace(rig, holder=fitted_holder("rods", 0.060))
     found = correspondence(lab(()), held.at(STROKE_M), held.at(0.0))
     counts = found.counts()
     assert {"none", "nothing", "robot", "holder", "back_side"} <= set(counts)
@@ -240,14 +240,14 @@ def test_every_cause_occurs_and_says_what_is_in_the_way() -> None:
 def test_a_mirror_in_glass_sees_the_same_points() -> None:
     """Through 3 mm of glass a seen pixel's place, traced back through the glass, meets the same room point."""
     from phibench.render.optics.ray_tracer import trace_pixels
-    from phibench.render.optics.room_tracer import first_hit, into_room, room_geometry
+    from phibench.render.optics.room_tracer import first_hit, rays_into_room, room_geometry
 
-    rig = replace(small(default_rig()), holder=fitted("tube", 0.060, wall_m=0.003, rise_m=0.063))
+    rig = replace(small(default_rig()), holder=fitted_holder("tube", 0.060, wall_m=0.003, rise_m=0.063))
     down, up = rig.at(0.0), rig.at(STROKE_M)
     found: Correspondence = correspondence(lab(()), down, up)
     v, u = np.argwhere(found.seen)[::11].T
     rays, geometry = trace_pixels(up, found.uv_px[v, u]), room_geometry(lab(()), up)
-    way = into_room(up, geometry, rays.points_m, rays.directions)
+    way = rays_into_room(up, geometry, rays.points_m, rays.directions)
     back = way.starts_m + first_hit(geometry, way.starts_m, way.directions).distance_m[:, None] * way.directions
     assert len(v) > 200
     # 1e-12 px of rounding in a place is 1e-11 m at 4 m; flat incidence magnifies it by some hundred

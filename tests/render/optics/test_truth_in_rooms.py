@@ -21,7 +21,7 @@ from phibench.render.optics.truth import truth_layer
 from phibench.render.room.ambient_layer import view_surfaces
 from phibench.scenes.frames import Pose, rotation_xyz
 from phibench.scenes.glass_tube import GlassTube
-from phibench.scenes.holder import Holder, fitted
+from phibench.scenes.holder import Holder, fitted_holder
 from phibench.scenes.rig import Rig, View
 from phibench.scenes.room import Room, default_rig
 
@@ -187,7 +187,7 @@ def test_accuracy_of_truth_in_generated_rooms(number: int) -> None:
 @pytest.mark.parametrize("number", of_each(1, 3, 5))
 def test_accuracy_of_truth_through_a_glass_tube(number: int) -> None:
     """Walls of 3 to 15 mm around the mirror; plates, camera and robot inside and outside of it."""
-    holder = fitted("tube", 0.060, wall_m=0.003 * (number + 1), glass_index=1.4 + 0.1 * number, rise_m=0.063)
+    holder = fitted_holder("tube", 0.060, wall_m=0.003 * (number + 1), glass_index=1.4 + 0.1 * number, rise_m=0.063)
     check(generated(number), number, holder)
 
 

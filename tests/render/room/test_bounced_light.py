@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from phibench.render.optics.faces import TexelGrid, face_table
-from phibench.render.room.bounced_light import FEWEST, BrightTexels, gathered, rays_by_area, rays_by_noise
+from phibench.render.room.bounced_light import FEWEST, BrightTexels, gathered_light, rays_by_area, rays_by_noise
 from phibench.render.room.lamp_light import whole_lamp
 from phibench.render.room.surfaces import Surfaces
 from phibench.render.room.texel_points import Texels
@@ -50,7 +50,7 @@ def test_rays_that_aim_at_what_is_bright_find_its_light(
     mi, rays = activate(), np.full(len(texels), RAYS)
     bright = BrightTexels.of(mi, surfaces, texels.grid, light)
     assert bright is not None
-    aimed, chance = (gathered(mi, surfaces, texels, rays, 3, how)[:400, 0] for how in (bright, None))
+    aimed, chance = (gathered_light(mi, surfaces, texels, rays, 3, how)[:400, 0] for how in (bright, None))
     assert aimed.mean() == pytest.approx(exact.mean(), rel=0.005)
     assert np.sqrt(np.mean((aimed / exact - 1.0) ** 2)) < 0.05
     assert np.sqrt(np.mean((chance / exact - 1.0) ** 2)) > 0.5

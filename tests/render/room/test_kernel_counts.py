@@ -22,7 +22,7 @@ from phibench.render.room.rendered_panorama import rendered_panorama
 from phibench.render.room.subpixel_grid import CellSampler, Samples
 from phibench.render.room.texel_points import Net
 from phibench.render.setup.variant import activate
-from phibench.scenes.holder import fitted
+from phibench.scenes.holder import fitted_holder
 from phibench.scenes.room import Room, default_rig, lab
 from phibench.scenes.shapes import Rectangle, rectangle
 
@@ -135,7 +135,7 @@ def test_a_view_takes_few_samples_and_few_kernels(baked: tuple[LightMap, list[di
 
 def test_a_view_lights_its_holder_once(baked: tuple[LightMap, list[dict[str, Any]]]) -> None:
     """Lamps as above, what the mirror takes and gives, and the gather."""
-    view = dataclasses.replace(RIG, holder=fitted("rods", RIG.mirror.radius_m)).at(0.3)
+    view = dataclasses.replace(RIG, holder=fitted_holder("rods", RIG.mirror.radius_m)).at(0.3)
     surfaces = view_surfaces(view, ROOM)
     _, found = kernels(lambda: view_film(view, ROOM, baked[0], SETTINGS, 2, 0, surfaces))
     assert tracing(found) == OF_LAMPS + 1 + 1

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from phibench.render.optics.faces import TexelGrid, face_table
-from phibench.render.room.bounced_light import _between, _overlap, coarser, finer
-from phibench.render.room.light_map import line_fit, smoothed
+from phibench.render.room.bounced_light import _between, _overlap, coarser_values, finer_values
+from phibench.render.room.light_map import line_fit, smoothed_mean
 from phibench.render.room.texel_points import nearest_free
 from phibench.scenes.shapes import Rectangle, rectangle
 
@@ -27,7 +27,7 @@ def test_smooth_light_loses_two_thirds_of_its_noise_and_states_the_rest() -> Non
 
     2400 x 3 texels: the stated variance is that of the errors within a factor of 1.5, neighbours being correlated.
     """
-    mean, sigma = smoothed(GRID, *halves(SLOW, 0), kept=9)
+    mean, sigma = smoothed_mean(GRID, *halves(SLOW, 0), kept=9)
     error = mean - SLOW.reshape(-1, 3)
     assert np.sqrt(np.mean(error**2)) < SIGMA / np.sqrt(2.0) / 3.0
     assert 1 / 1.5 < np.mean(sigma**2) / np.mean(error**2) < 1.5
@@ -35,7 +35,7 @@ def test_smooth_light_loses_two_thirds_of_its_noise_and_states_the_rest() -> Non
 
 def test_a_shadow_keeps_its_edge() -> None:
     """A step of 0.6, twenty times the noise: no texel beside it is off by more than 5 of the unsmoothed errors."""
-    mean, _ = smoothed(GRID, *halves(SHADOW, 1), kept=5)
+    mean, _ = smoothed_mean(GRID, *halves(SHADOW, 1), kept=5)
     error = (mean - SHADOW.reshape(-1, 3)).reshape(40, 60, 3)
     assert np.abs(error[:, 26:34]).max() < 5.0 * SIGMA / np.sqrt(2.0)
 
@@ -51,7 +51,7 @@ def test_bright_texels_lose_no_light_to_dark_ones() -> None:
     kept = []
     for _ in range(16):
         a, b = ((lit * (1.0 + 0.1 * rng.normal(size=lit.shape))).reshape(-1, 3) for _ in range(2))
-        mean, _ = smoothed(GRID, a, b, 5)
+        mean, _ = smoothed_mean(GRID, a, b, 5)
         kept.append([mean[part].sum() / (0.5 * (a + b))[part].sum() - 1.0 for part in (slice(None), bright)])
     print(np.mean(kept, axis=0), np.std(kept, axis=0) / 4.0)
     assert np.all(np.abs(np.mean(kept, axis=0)) < (1e-3, 3e-3))
@@ -78,8 +78,8 @@ def test_grids_of_one_shape_are_treated_as_if_each_were_alone() -> None:
 
     def of(shapes: list[Rectangle], a: np.ndarray, b: np.ndarray, covered: np.ndarray) -> list[np.ndarray]:
         grid, coarse = (TexelGrid.of(face_table(shapes), np.full(len(shapes), size)) for size in (0.1, 0.2))
-        free, means = nearest_free(covered, grid), coarser(grid, coarse, a)
-        return [*smoothed(grid, a, b, 5), a[free], finer(coarse, grid, means)]
+        free, means = nearest_free(covered, grid), coarser_values(grid, coarse, a)
+        return [*smoothed_mean(grid, a, b, 5), a[free], finer_values(coarse, grid, means)]
 
     grid = TexelGrid.of(face_table(walls), np.full(len(walls), 0.1))
     a, b = (1.0 + 0.1 * rng.normal(size=(grid.count, 3)) for _ in range(2))

@@ -26,10 +26,10 @@ from phibench.render.room.noise_budget import (
     BUDGETS,
     _bayer,
     allowed_per_s2,
-    excess,
     is_full,
     noise_budget,
     phi_gradient,
+    variance_excess,
     webcam,
 )
 from phibench.render.room.subpixel_grid import (
@@ -38,7 +38,7 @@ from phibench.render.room.subpixel_grid import (
     Samples,
     golden_steps,
     paired_shifts,
-    shifts,
+    point_shifts,
 )
 from phibench.render.setup.variant import activate
 from phibench.scenes.laser import LaserSpot, beam_diameter_m
@@ -120,7 +120,7 @@ def test_whole_pixels_are_summed_as_their_cells() -> None:
         assert np.allclose(pixels[k], wanted, rtol=1e-6, atol=0.0)
 
 
-@pytest.mark.parametrize("shifts", [shifts, paired_shifts])
+@pytest.mark.parametrize("shifts", [point_shifts, paired_shifts])
 def test_shifts_of_neighbouring_lanes_are_independent(shifts) -> None:
     """Correlation of 2^18 pairs scatters by 1/512; 5 sigma for 42 comparisons (false alarm 2e-5).
 
@@ -384,13 +384,13 @@ def test_pixels_that_look_full_by_chance_are_refined(
 
 
 def _excess(mean: np.ndarray, variance: np.ndarray) -> np.ndarray:
-    return excess(mean.astype(np.float32), variance.astype(np.float32), RIG.camera.blur_sigma_px)
+    return variance_excess(mean.astype(np.float32), variance.astype(np.float32), RIG.camera.blur_sigma_px)
 
 
 def test_training_quality_stops_at_its_own_budget(light: LightMap) -> None:
     layer = render_ambient(VIEW, ROOM, light, SETTINGS, 2, 0, EDGES, budget=BUDGETS["training"])
     worst = {
-        name: excess(layer.electrons_per_s, layer.variance_per_s2, RIG.camera.blur_sigma_px, budget).max()
+        name: variance_excess(layer.electrons_per_s, layer.variance_per_s2, RIG.camera.blur_sigma_px, budget).max()
         for name, budget in BUDGETS.items()
     }
     assert worst["training"] <= 1.0 < worst["reference"]

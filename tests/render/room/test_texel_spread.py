@@ -8,7 +8,7 @@ import pytest
 from phibench.render.optics.faces import TexelGrid, face_table
 from phibench.render.room.lamp_light import direct_light, whole_lamp
 from phibench.render.room.surfaces import Surfaces
-from phibench.render.room.texel_points import Texels, spread_out
+from phibench.render.room.texel_points import Texels, spread_texels
 from phibench.render.setup.variant import activate
 from phibench.scenes.room import default_rig
 from phibench.scenes.shapes import Mesh, Shape, Uniform, cuboid, rectangle
@@ -24,7 +24,7 @@ def spread(*shapes: Shape) -> tuple[Surfaces, Texels]:
     surfaces = Surfaces(mi, VIEW, face_table(shapes))
     texels = Texels.of(mi, surfaces, TexelGrid.of(surfaces.table, TEXEL_M))
     surfaces.set_light(texels.grid, np.zeros((len(texels), 3)))
-    return surfaces, spread_out(mi, surfaces, texels)
+    return surfaces, spread_texels(mi, surfaces, texels)
 
 
 def places(texels: Texels, side: int) -> tuple[slice, np.ndarray, np.ndarray]:

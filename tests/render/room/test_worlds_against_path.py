@@ -17,7 +17,7 @@ from phibench.render.optics.faces import TexelGrid
 from phibench.render.room.ambient_layer import light_carriage, render_ambient, view_surfaces
 from phibench.render.room.light_map import BakeSettings, LightMap, bake, fixed_shapes
 from phibench.scenes.frames import Pose, rotation_xyz
-from phibench.scenes.holder import fitted
+from phibench.scenes.holder import fitted_holder
 from phibench.scenes.room import Room, Sun, default_rig
 from phibench.scenes.shapes import Bitmap, Mesh, Prism, Uniform, cuboid, rectangle
 
@@ -121,7 +121,7 @@ HELD = {  # kind of the mirror's holder, and a window of which a rod, or the pla
 def test_holders_against_path_tracing(lit: tuple[Room, LightMap], name: str) -> None:
     """As above. Without the light that the ball takes and gives, the window of the rod is 1.3 to 1.8 % too bright."""
     kind, crop = HELD[name]
-    view = dataclasses.replace(RIG, holder=fitted(kind, RIG.mirror.radius_m)).at(0.3)
+    view = dataclasses.replace(RIG, holder=fitted_holder(kind, RIG.mirror.radius_m)).at(0.3)
     place, light = lit
     traced = np.array([path_trace(view, place, 64, 30, seed, crop) for seed in range(4)]).mean(axis=(2, 3))
     mean, error = traced.mean(axis=0), traced.std(axis=0, ddof=1) / 2.0
@@ -147,7 +147,7 @@ def test_holders_of_mirrors_of_revolution_against_path_tracing(lit: tuple[Room, 
     """The same. The tracer's mesh of the mirror is black from behind, as is the disc that closes it here."""
     shape, kind, crop = HELD_REVOLVED[name]
     rig, (place, light) = revolved(shape), lit
-    holder = fitted(kind, rig.mirror.profile.rim_radius_m, rig.mirror.profile.depth_m)
+    holder = fitted_holder(kind, rig.mirror.profile.rim_radius_m, rig.mirror.profile.depth_m)
     view, bare = dataclasses.replace(rig, holder=holder).at(0.3), rig.at(0.3)
     traced = np.array([path_trace(view, place, 64, 30, seed, crop) for seed in range(4)]).mean(axis=(2, 3))
     mean, error = traced.mean(axis=0), traced.std(axis=0, ddof=1) / 2.0

@@ -16,7 +16,7 @@ from phibench.render.sensor import processing
 from phibench.render.sensor.camera_chain import Chain, auto_exposed, mean_level
 from phibench.render.sensor.electrons import NoiseStream, mosaic
 from phibench.render.sensor.light import Light
-from phibench.render.sensor.processing import compressed, decoded, encoded
+from phibench.render.sensor.processing import compressed, jpeg_bytes, jpeg_image
 from phibench.render.sensor.settings import sensor
 from phibench.render.sensor.srgb import srgb_decoded
 
@@ -97,10 +97,10 @@ def test_a_stack_of_images_is_compressed_one_by_one() -> None:
     stack = np.stack([SMALL, 255 - SMALL]).reshape(2, 1, *SMALL.shape)
     s = sensor("mjpeg", jpeg_quality=70)
     result = compressed(stack, s)
-    np.testing.assert_array_equal(result[1, 0], decoded(encoded(255 - SMALL, s)))
+    np.testing.assert_array_equal(result[1, 0], jpeg_image(jpeg_bytes(255 - SMALL, s)))
     reference = io.BytesIO()
     Image.fromarray(SMALL).save(reference, "JPEG", quality=70, subsampling=1)
-    assert encoded(SMALL, s) == reference.getvalue()
+    assert jpeg_bytes(SMALL, s) == reference.getvalue()
 
 
 @pytest.mark.parametrize("matrix", [processing.IDENTITY, MATRIX])

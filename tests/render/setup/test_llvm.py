@@ -309,7 +309,7 @@ def asked(tools: Path, word: str) -> list[str]:
 
 
 def test_unpacking_renews_lists_of_its_own_and_takes_what_is_missing(tools: Path) -> None:
-    tree = llvm.unpack(llvm_library.cache_folder())
+    tree = llvm.unpack(llvm_library.llvm_cache_folder())
     assert tree == tools / "cache/llvm/libllvm20"
     found = llvm.find_llvm()
     assert found.path == tree / FOLDER / "libLLVM.so.20.1"
@@ -322,12 +322,12 @@ def test_unpacking_renews_lists_of_its_own_and_takes_what_is_missing(tools: Path
 
 def test_unpacking_uses_the_lists_of_the_system_where_there_are_some(tools: Path) -> None:
     put(tools / "lists", "")
-    llvm.unpack(llvm_library.cache_folder())
+    llvm.unpack(llvm_library.llvm_cache_folder())
     assert asked(tools, "update") == []
 
 
 def test_a_failed_fetch_leaves_nothing_and_can_be_repeated(tools: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    cache = llvm_library.cache_folder()
+    cache = llvm_library.llvm_cache_folder()
     monkeypatch.setenv("OFFLINE", "yes")
     with pytest.raises(LlvmError, match="no network") as caught:
         llvm.unpack(cache)
@@ -340,15 +340,15 @@ def test_a_failed_fetch_leaves_nothing_and_can_be_repeated(tools: Path, monkeypa
 
 def test_a_broken_tree_is_replaced_and_a_good_one_is_kept(tools: Path) -> None:
     library = put(tools / "cache/llvm/libllvm20" / FOLDER / "libLLVM.so.20.1", "broken")
-    llvm.unpack(llvm_library.cache_folder())
+    llvm.unpack(llvm_library.llvm_cache_folder())
     assert library.read_text().strip() == "20.1.2"
     put(library, "20.9.9")
-    llvm.unpack(llvm_library.cache_folder())
+    llvm.unpack(llvm_library.llvm_cache_folder())
     assert library.read_text() == "20.9.9"
 
 
 def test_what_a_killed_process_left_goes_after_a_day(tools: Path) -> None:
-    cache = llvm_library.cache_folder()
+    cache = llvm_library.llvm_cache_folder()
     old, young = put(cache / ".partial-a/x", ""), put(cache / ".partial-b/x", "")
     os.utime(old.parent, (0, 0))
     llvm.unpack(cache)
@@ -380,7 +380,7 @@ def test_a_user_never_asks_to_install(tools: Path, monkeypatch: pytest.MonkeyPat
 def test_a_cache_that_cannot_be_written_is_one_sentence(tools: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PHIBENCH_CACHE", str(put(tools / "file", "")))
     with pytest.raises(LlvmError, match="set PHIBENCH_CACHE") as caught:
-        llvm.unpack(llvm_library.cache_folder())
+        llvm.unpack(llvm_library.llvm_cache_folder())
     assert one_sentence(caught.value)
 
 
@@ -388,7 +388,7 @@ def test_a_cache_that_cannot_be_written_is_one_sentence(tools: Path, monkeypatch
 @pytest.mark.skipif(not llvm.is_offered(), reason="fetching is for machines with apt-get; others install by hand")
 def test_a_real_fetch_without_root_is_found_and_proven(machine: Path) -> None:
     try:
-        tree = llvm.unpack(llvm_library.cache_folder())
+        tree = llvm.unpack(llvm_library.llvm_cache_folder())
     except llvm.AptError as error:
         if "resolve" in str(error) or "onnect" in str(error):
             pytest.skip(f"no network: {error}")
@@ -396,5 +396,5 @@ def test_a_real_fetch_without_root_is_found_and_proven(machine: Path) -> None:
     found = llvm.ensure_llvm(fetch=False)
     assert found.path.is_relative_to(tree)
     assert found.is_proven
-    assert [path.name for path in llvm_library.cache_folder().iterdir()] == [tree.name]
+    assert [path.name for path in llvm_library.llvm_cache_folder().iterdir()] == [tree.name]
     shutil.rmtree(tree)

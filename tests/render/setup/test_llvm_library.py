@@ -20,11 +20,11 @@ def test_the_cache_folder_follows_the_environment(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setenv("PHIBENCH_CACHE", "/a")
     monkeypatch.setenv("XDG_CACHE_HOME", "/b")
     monkeypatch.setenv("HOME", "/c")
-    assert llvm_library.cache_folder() == Path("/a/llvm")
+    assert llvm_library.llvm_cache_folder() == Path("/a/llvm")
     monkeypatch.delenv("PHIBENCH_CACHE")
-    assert llvm_library.cache_folder() == Path("/b/phibench/llvm")
+    assert llvm_library.llvm_cache_folder() == Path("/b/phibench/llvm")
     monkeypatch.delenv("XDG_CACHE_HOME")
-    assert llvm_library.cache_folder() == Path("/c/.cache/phibench/llvm")
+    assert llvm_library.llvm_cache_folder() == Path("/c/.cache/phibench/llvm")
 
 
 def test_versions_are_compared_as_numbers() -> None:

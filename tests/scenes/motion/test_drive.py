@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from phibench.scenes.misalignment import Misalignment, Motion
-from phibench.scenes.motion.drive import Drive, DriveLeg, placement, reckoned, robot_pose
+from phibench.scenes.motion.drive import Drive, DriveLeg, placement, reckoned_poses, robot_pose
 from phibench.scenes.motion.vehicle import PlanarPose, Vehicle, rig_placement, stance
 from phibench.scenes.rig import Rig
 from phibench.scenes.room import FLIPPER_RAD, chassis, escalade360
@@ -82,10 +82,10 @@ def test_a_robot_that_knows_slip_and_skid_finds_its_way_and_another_errs() -> No
     times = np.linspace(0.0, 18.0, 200)
     exact = Vehicle(slip=0.06, skid=1.7, track_noise=0.0)
     read = Drive(exact, LEGS, 0.06, 1.7).readings_m(times)
-    found = np.array([(p.x_m, p.y_m, p.heading_rad) for p in reckoned(exact, read)])
+    found = np.array([(p.x_m, p.y_m, p.heading_rad) for p in reckoned_poses(exact, read)])
     # arcs between readings: the chords of a leg's parts meet on its circle
     np.testing.assert_allclose(found, DRIVE.state(times)[:, :3], atol=1e-12)
-    wrong = reckoned(Vehicle(), read)[-1]
+    wrong = reckoned_poses(Vehicle(), read)[-1]
     assert abs(wrong.heading_rad - found[-1, 2]) > 0.05
 
 

@@ -5,7 +5,7 @@ import pytest
 
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.motion.carriage import Carriage, Vibration
-from phibench.scenes.motion.film_scene import FilmScene, SpotPath, Waypoint, across_and_up, frames_of
+from phibench.scenes.motion.film_scene import FilmScene, SpotPath, Waypoint, across_and_up, frame_count
 from phibench.scenes.motion.film_times import BlinkCode, FilmTimes
 from phibench.scenes.rig import Rig
 from phibench.scenes.validation import SceneError
@@ -68,4 +68,4 @@ def test_a_film_must_hold_the_whole_code() -> None:
 def test_rows_must_not_outlast_their_frame() -> None:
     with pytest.raises(SceneError, match=r"exposure_s = 0\.05.*0\.0333"):
         FilmTimes(9, 30.0, 0.05, 0.03, 720)
-    assert frames_of(Carriage((0.0,), (1.0,)), 30.0) == 31
+    assert frame_count(Carriage((0.0,), (1.0,)), 30.0) == 31
