@@ -31,8 +31,8 @@ from phibench.benchmark.pair_sets.dataset_pairs import DatasetPairs, dataset_pai
 from phibench.benchmark.pair_sets.frames_set import frames_row, frames_set_documents
 from phibench.benchmark.sealed.dense_set import DENSE_SEAL, DENSE_TRUTH
 from phibench.benchmark.sealed.sealed_set import SEAL
-from phibench.datasets.build.parts import Brought, bring_all
-from phibench.datasets.build.tasks import BuildTask, Made
+from phibench.datasets.build.parts import BroughtParts, bring_all
+from phibench.datasets.build.tasks import BuildTask, TaskResult
 from phibench.datasets.common.errors import DatasetError, whole_number
 from phibench.datasets.common.input_files import InputFile
 from phibench.datasets.common.progress import progress_console
@@ -157,13 +157,13 @@ def export_frames_sets(
     return out
 
 
-def make_shard(out: Path, shard: Shard) -> Made:
+def make_shard(out: Path, shard: Shard) -> TaskResult:
     """Task: make one shard; the result is a `ShardResult`."""
     dataset = shard.request.part_of(open_dataset(shard.dataset))
     pairs, scored = _scored_pairs(dataset, shard) if shard.request.scored else (_drawn_pairs(dataset, shard), [])
     drawn = [(pair.sample_id, {"key": pair.key, "split": shard.split, **pair.added}) for pair in pairs]
     files = write_shard(out, shard.name, shard.request, pairs, pair_table(dataset.rows, drawn))
-    return Made(tuple(files), {"drawn": drawn, "scored": scored})
+    return TaskResult(tuple(files), {"drawn": drawn, "scored": scored})
 
 
 def _drawn_pairs(dataset: Dataset, shard: Shard) -> list[DrawnPair]:
@@ -310,7 +310,9 @@ def _claim(out: Path, dataset: Dataset, request: ExportRequest) -> None:
     write_text(path, json.dumps(meant, indent=1, allow_nan=False) + "\n")
 
 
-def _finish(dataset: Dataset, request: ExportRequest, out: Path, shards: Sequence[Shard], brought: Brought) -> None:
+def _finish(
+    dataset: Dataset, request: ExportRequest, out: Path, shards: Sequence[Shard], brought: BroughtParts
+) -> None:
     """Write index, card, Croissant and hashes."""
     results = brought.results(ShardResult)
     table = pair_table(dataset.rows, [pair for result in results for pair in result.drawn])

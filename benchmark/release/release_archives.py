@@ -14,7 +14,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import IO
 
-from phibench.datasets.build.tasks import BuildTask, Made
+from phibench.datasets.build.tasks import BuildTask, TaskResult
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.store import schema
 from phibench.datasets.store.checksums import read_checksums
@@ -77,7 +77,7 @@ def _shares(folder: Path, members: Mapping[str, str], most: int) -> Iterator[lis
         yield share
 
 
-def write_archive(out: Path, archive: str, title: str, folder: Path, members: Mapping[str, str]) -> Made:
+def write_archive(out: Path, archive: str, title: str, folder: Path, members: Mapping[str, str]) -> TaskResult:
     """Task: write an archive of a folder's files, each with its SHA-256.
 
     Raises
@@ -86,7 +86,7 @@ def write_archive(out: Path, archive: str, title: str, folder: Path, members: Ma
         If one has another hash.
     """
     write_atomic(out / archive, lambda path: _write_tar(path, title, folder, members))
-    return Made((archive,))
+    return TaskResult((archive,))
 
 
 def _write_tar(path: Path, title: str, folder: Path, members: Mapping[str, str]) -> None:

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from filelock import FileLock, Timeout
 
-from phibench.datasets.build.tasks import Made
+from phibench.datasets.build.tasks import TaskResult
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import InputFile
 from phibench.datasets.common.parallel import return_memory
@@ -265,7 +265,7 @@ def bake_settings(ambient: AmbientTable) -> BakeSettings:
     return BakeSettings(**{name: getattr(ambient, name) for name in BakeSettings.__dataclass_fields__})
 
 
-def bake_room(out: Path, rig: Rig, room_id: str, source: RoomSource, ambient: AmbientTable) -> Made:
+def bake_room(out: Path, rig: Rig, room_id: str, source: RoomSource, ambient: AmbientTable) -> TaskResult:
     """Task: write a room's light map below `out`, if it has any light; the result is its `RoomInfo`."""
     room, view, file = room_of(source, out / schema.ROOM_FILES), rig.at(0.0), schema.light_map_file(room_id)
     info = RoomInfo(
@@ -273,11 +273,11 @@ def bake_room(out: Path, rig: Rig, room_id: str, source: RoomSource, ambient: Am
     )
     if not room.lit:
         (out / file).unlink(missing_ok=True)
-        return Made((), info.model_dump(mode="json"))
+        return TaskResult((), info.model_dump(mode="json"))
     return_memory()  # a bake's arrays do not fit into what views have left, and would come on top of it
     write_bytes(out / file, light_map_bytes(light_map(view, room, bake_settings(ambient))))
     return_memory()
-    return Made((file,), info.model_dump(mode="json"))
+    return TaskResult((file,), info.model_dump(mode="json"))
 
 
 def read_light_map(out: Path, room_id: str) -> LightMap:

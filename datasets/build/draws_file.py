@@ -17,7 +17,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import InputFile
-from phibench.datasets.plan.draws import Causes, Kept, KeptSample, room_files
+from phibench.datasets.plan.draws import Causes, KeptSample, KeptSamples, room_files
 from phibench.datasets.plan.pair_forecasts import pair_forecasts
 from phibench.datasets.plan.plan import Plan
 from phibench.datasets.plan.sampling import HIDDEN_TRIES
@@ -41,7 +41,7 @@ def seen_causes(plan: Plan) -> dict[str, Causes]:
     return {pair.sample_id: known[pair.sample_id] for pair in plan.pairs}
 
 
-def read_draws(out: Path, recipe: Recipe, files: RoomFiles) -> Kept:
+def read_draws(out: Path, recipe: Recipe, files: RoomFiles) -> KeptSamples:
     """Draws that a folder keeps of a recipe's samples; none where they are of something else, or damaged."""
     path = out / schema.DRAWS
     if recipe.random is None or not path.is_file():

@@ -158,7 +158,7 @@ class _Queue:
 
 
 @dataclass(frozen=True)
-class Brought:
+class BroughtParts:
     """Outcome: the entry of every part, in the order of the tasks, and the names of those that were made now."""
 
     entries: Mapping[str, Entry]
@@ -194,7 +194,7 @@ def bring_all(
     state: Path | None = None,
     sign: str = schema.CHECKSUMS,
     diary: bool = False,
-) -> Brought:
+) -> BroughtParts:
     """Make those of a folder's parts that are not whole, on this machine.
 
     Parameters
@@ -226,7 +226,7 @@ def bring_all(
         journal.refusals.clear()
         if not journal.is_written(NO_HEAD, tasks):
             journal.begin(NO_HEAD, tasks)  # in the order of the tasks: the same bytes in whatever order they end
-        return Brought({name: journal.entries[name] for name in tasks}, tuple(todo))
+        return BroughtParts({name: journal.entries[name] for name in tasks}, tuple(todo))
 
 
 @contextlib.contextmanager

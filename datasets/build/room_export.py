@@ -19,7 +19,7 @@ from rich.console import Console
 from phibench.datasets.build.bake_task import bake_settings, light_map
 from phibench.datasets.build.dataset_build import missing_room_files
 from phibench.datasets.build.parts import schedule
-from phibench.datasets.build.tasks import BuildTask, Failed, Made
+from phibench.datasets.build.tasks import BuildTask, Failed, TaskResult
 from phibench.datasets.build.workers import WorkerPool
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.progress import Steps
@@ -47,7 +47,7 @@ _CLOSED = 0.75  # part of the directions from a point of a room that meet a surf
 
 
 @dataclass(frozen=True)
-class Exported:
+class ExportedRoomFile:
     """A file of a room, and the table of a recipe that reads it."""
 
     path: Path
@@ -97,7 +97,7 @@ def _property(text: str) -> tuple[str, float | str]:
 
 def export_panorama(
     room: Room, out: Path, point_m: Vector, heading_deg: float = 0.0, rows: int = 512, settings: BakeSettings = SETTINGS
-) -> Exported:
+) -> ExportedRoomFile:
     """Write the radiance at a point of a room, W/(m^2 sr), as an OpenEXR file of `rows` x 2 `rows` pixels.
 
     Raises
@@ -135,10 +135,10 @@ def export_panorama(
         f"box_m = {[round(x, 4) for x in box]}  # around all surfaces",
         "radiance_scale = 1.0  # the file holds W/(m^2 sr)",
     )
-    return Exported(out, "\n".join(lines))
+    return ExportedRoomFile(out, "\n".join(lines))
 
 
-def export_mesh(room: Room, out: Path) -> Exported:
+def export_mesh(room: Room, out: Path) -> ExportedRoomFile:
     """Write a room as glTF, textures inside, lamps and screens as emission.
 
     Raises
@@ -159,7 +159,7 @@ def export_mesh(room: Room, out: Path) -> Exported:
         "emission_w_m2_sr = 1.0  # the file holds W/(m^2 sr)",
         "largest_albedo = 1.0",
     )
-    return Exported(out, "\n".join(lines))
+    return ExportedRoomFile(out, "\n".join(lines))
 
 
 def bounds_m(room: Room) -> tuple[np.ndarray, np.ndarray]:
@@ -240,7 +240,7 @@ def export_task(source: UnexportedRoom, ambient: AmbientTable) -> BuildTask:
     return BuildTask(f"{kind} {source.settings.path.stem}", "", write_room_file, (source, ambient))
 
 
-def write_room_file(out: Path, source: UnexportedRoom, ambient: AmbientTable) -> Made:
+def write_room_file(out: Path, source: UnexportedRoom, ambient: AmbientTable) -> TaskResult:
     """Task: write a room's panorama or mesh below `out`, whole or not at all."""
     name, room = schema.room_file(source.file), source.generated()
     settings = source.settings
@@ -248,4 +248,4 @@ def write_room_file(out: Path, source: UnexportedRoom, ambient: AmbientTable) ->
         export_panorama(room, out / name, settings.point_m, settings.heading_deg, source.rows, bake_settings(ambient))
     else:
         export_mesh(room, out / name)
-    return Made((name,))
+    return TaskResult((name,))

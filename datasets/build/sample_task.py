@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from phibench.datasets.build.tasks import Made
+from phibench.datasets.build.tasks import TaskResult
 from phibench.datasets.common.errors import RefusedSampleError
 from phibench.datasets.plan.plan import PairPlan
 from phibench.datasets.rooms.room_sources import RoomSource, room_of
@@ -26,7 +26,7 @@ from phibench.scenes.laser import LaserSpot
 from phibench.scenes.rig import POSITIONS, Rig, Stroke, View
 
 
-def finish_sample(out: Path, pair: PairPlan, rig: Rig, source: RoomSource, spot: LaserSpot, quality: str) -> Made:
+def finish_sample(out: Path, pair: PairPlan, rig: Rig, source: RoomSource, spot: LaserSpot, quality: str) -> TaskResult:
     """Task: the picture of one sample, and as its result the `NoiseRow` of both positions.
 
     Raises
@@ -48,7 +48,7 @@ def finish_sample(out: Path, pair: PairPlan, rig: Rig, source: RoomSource, spot:
         sides.append(PositionImages(position, _at_light(truth, window), frame, planes))
     file = schema.preview_file(pair.sample_id)
     save_png(out / file, sample_picture(sides, rig.camera.detector))
-    return Made((file,), rows)
+    return TaskResult((file,), rows)
 
 
 def spot_noise(

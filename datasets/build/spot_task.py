@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from phibench.datasets.build.tasks import Made
+from phibench.datasets.build.tasks import TaskResult
 from phibench.datasets.common.errors import RefusedSampleError
 from phibench.datasets.plan.plan import PairPlan
 from phibench.datasets.rooms.room_sources import RoomSource, room_of
@@ -61,7 +61,7 @@ def answer_spot(view: View, spot: LaserSpot, room: Room) -> SpotAnswer:
     return SpotAnswer(truth, layer, certificate, _reaches(view, _window(layer)))
 
 
-def make_spot(out: Path, dataset: str, rig: Rig, source: RoomSource, spot: LaserSpot, pair: PairPlan) -> Made:
+def make_spot(out: Path, dataset: str, rig: Rig, source: RoomSource, spot: LaserSpot, pair: PairPlan) -> TaskResult:
     """Task: both spot layers of a sample and its row of the manifest.
 
     Raises
@@ -79,7 +79,7 @@ def make_spot(out: Path, dataset: str, rig: Rig, source: RoomSource, spot: Laser
         file = _write_layer(out, dataset, pair, position, answer)
         rows[position] = _spot_row(pair.pose_id(position), views[position], answer, file)
     row = manifest_row(rig, spot, pair, rows["down"], rows["up"])
-    return Made(tuple(r.spot_file for r in rows.values() if r.spot_file is not None), row.model_dump(mode="json"))
+    return TaskResult(tuple(r.spot_file for r in rows.values() if r.spot_file is not None), row.model_dump(mode="json"))
 
 
 OUT_OF_TOLERANCE = "a certificate is out of tolerance"

@@ -28,7 +28,7 @@ from phibench.scenes.validation import SceneError
 
 
 @dataclass(frozen=True)
-class Made:
+class TaskResult:
     """Result of a task's function: the files it wrote, relative to the folder, and a JSON document."""
 
     files: tuple[str, ...]
@@ -46,7 +46,7 @@ class BuildTask:
     key : str
         SHA-256 of inputs, code and versions, and of the keys of `needs`.
     function : callable
-        Of a module, called as ``function(out, *arguments)``; returns `Made`. It writes every file atomically.
+        Of a module, called as ``function(out, *arguments)``; returns `TaskResult`. It writes every file atomically.
     arguments : tuple
         Can be pickled; no paths.
     needs : tuple of str
@@ -55,7 +55,7 @@ class BuildTask:
 
     name: str
     key: str
-    function: Callable[..., Made]
+    function: Callable[..., TaskResult]
     arguments: tuple[Any, ...] = ()
     needs: tuple[str, ...] = ()
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from phibench.datasets.build.bake_task import bake_settings, read_light_map
-from phibench.datasets.build.tasks import Made
+from phibench.datasets.build.tasks import TaskResult
 from phibench.datasets.common.parallel import keep_memory
 from phibench.datasets.plan.plan import PosePlan
 from phibench.datasets.recipe.tables import AmbientTable
@@ -30,7 +30,9 @@ def start_renderer() -> dict[str, Any]:
     return {**renders_with(), "threads_per_process": THREADS}
 
 
-def render_view(out: Path, dataset: str, rig: Rig, source: RoomSource, pose: PosePlan, ambient: AmbientTable) -> Made:
+def render_view(
+    out: Path, dataset: str, rig: Rig, source: RoomSource, pose: PosePlan, ambient: AmbientTable
+) -> TaskResult:
     """Task: render one pose and write its three files below `out`."""
     from phibench.render.optics.room_tracer import room_geometry
     from phibench.render.optics.truth import truth_layer
@@ -59,4 +61,4 @@ def render_view(out: Path, dataset: str, rig: Rig, source: RoomSource, pose: Pos
     detector = rig.camera.detector
     picture = to_srgb(planes, detector, display_exposure_s(planes, detector))
     save_png(out / schema.view_file(pose.pose_id, "preview"), picture)
-    return Made(tuple(schema.view_file(pose.pose_id, name) for name in ("ambient", "truth", "preview")))
+    return TaskResult(tuple(schema.view_file(pose.pose_id, name) for name in ("ambient", "truth", "preview")))

@@ -50,7 +50,7 @@ _SAVE_EVERY_S = 2.0  # or twenty times what saving takes
 
 
 @dataclass(frozen=True)
-class Drawn:
+class DrawnFrames:
     """Outcome of a run: the folder, the numbers of files written and kept, and notes on what was left out."""
 
     folder: Path
@@ -100,7 +100,7 @@ def draw_frames(
     laser_off: bool = False,
     workers: int | None = None,
     console: Console | None = None,
-) -> Drawn:
+) -> DrawnFrames:
     """Write frames of a data set as files; what is there and undamaged is kept.
 
     Parameters
@@ -128,7 +128,7 @@ def draw_frames(
     jobs, notes = _jobs(dataset, target, options, _items(options, draws, laser_off), samples)
     with filling(target):
         made, kept = _draw(jobs, dataset, target, options, count, console)
-    return Drawn(target, made, kept, tuple(notes))
+    return DrawnFrames(target, made, kept, tuple(notes))
 
 
 def perform_job(job: SampleJob) -> tuple[list[FrameRow], int]:

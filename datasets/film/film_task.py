@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from phibench.datasets.build.journal import NO_HEAD, Journal
-from phibench.datasets.build.tasks import Made
+from phibench.datasets.build.tasks import TaskResult
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.film.film_plan import FilmPlan
 from phibench.datasets.film.film_room import key_view_name, key_views, renderer
@@ -47,7 +47,7 @@ from phibench.scenes.room import Room
 _UNEVEN = 5e-3  # of the flux: what it changes from frame to frame beside its own course
 
 
-def make_film(out: Path, plan: Plan, key: str, film: FilmPlan) -> Made:
+def make_film(out: Path, plan: Plan, key: str, film: FilmPlan) -> TaskResult:
     """Task: make one film below `out`.
 
     Raises
@@ -87,7 +87,7 @@ def make_film(out: Path, plan: Plan, key: str, film: FilmPlan) -> Made:
         sha256={name: sha256(folder.path / name) for name in names},
     )
     write_document(folder.done, info)
-    return Made(tuple((folder.path / name).relative_to(out).as_posix() for name in (*names, folder.done.name)))
+    return TaskResult(tuple((folder.path / name).relative_to(out).as_posix() for name in (*names, folder.done.name)))
 
 
 def _make_lights(film: FilmPlan, room: Room, folder: FilmFolder) -> list[str]:

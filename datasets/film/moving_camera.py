@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from phibench.datasets.build.parts import bring_all
-from phibench.datasets.build.tasks import BuildTask, Made, task_key
+from phibench.datasets.build.tasks import BuildTask, TaskResult, task_key
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import FileName, InputFile
 from phibench.datasets.common.progress import progress_console
@@ -135,7 +135,7 @@ def _bake_task(
 
 def bake_drawn_room(
     out: Path, settings: BakeSettings, stream: tuple[Name, ...], number: int, fits: Callable[[Room], bool] | None
-) -> Made:
+) -> TaskResult:
     """Task: write the light map of a drawn room below `out`; the result is its `BakedRoomInfo`."""
     from phibench.datasets.build.bake_task import light_map
     from phibench.datasets.build.view_task import start_renderer
@@ -149,7 +149,7 @@ def bake_drawn_room(
     name = f"room{number:03d}"
     write_bytes(out / f"{name}.npz", light_map_bytes(light))
     info = BakedRoomInfo(name=name, source=to_json(source), digest=room.digest, texel_m=settings.texel_m)
-    return Made((f"{name}.npz",), info.model_dump(mode="json"))
+    return TaskResult((f"{name}.npz",), info.model_dump(mode="json"))
 
 
 def _drawn_room(fits: Callable[[Room], bool] | None, *stream: Name) -> tuple[GeneratedRoom, Room]:

@@ -338,12 +338,12 @@ class KeptSample:
     causes: Causes
 
 
-Kept = Mapping[int, KeptSample | str]
+KeptSamples = Mapping[int, KeptSample | str]
 """Outcome by number of a sample; of one that stays impossible its reason."""
 
 
 def rebuilt_samples(
-    recipe: Recipe, table: RandomTable, rooms: Sequence[str], kept: Kept, wanted: range
+    recipe: Recipe, table: RandomTable, rooms: Sequence[str], kept: KeptSamples, wanted: range
 ) -> dict[int, RandomSample]:
     """Kept samples of the wanted numbers; `rooms` are the ids of all rooms. One that is no draw of this is left out."""
     first = first_points(

@@ -12,7 +12,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from phibench.datasets.common.errors import DatasetError, RecipeError
-from phibench.datasets.plan.draws import Kept, draw_rigs, draw_rooms, rebuilt_samples, room_files
+from phibench.datasets.plan.draws import KeptSamples, draw_rigs, draw_rooms, rebuilt_samples, room_files
 from phibench.datasets.plan.sampling import RandomSample, draw_samples, have_own_rigs
 from phibench.datasets.recipe.recipe_scene import build_misalignment, build_rig, build_spot, true_stroke_m
 from phibench.datasets.recipe.tables import DrawnRigsTable, RandomTable, Recipe
@@ -170,7 +170,7 @@ class Plan:
 
 
 def make_plan(
-    recipe: Recipe, files: RoomFiles | None = None, shard: str | None = None, kept: Kept | None = None
+    recipe: Recipe, files: RoomFiles | None = None, shard: str | None = None, kept: KeptSamples | None = None
 ) -> Plan:
     """Plan of a recipe or of a shard of it; `files` are those of its rooms, where it has panoramas or meshes.
 
@@ -275,7 +275,7 @@ def _random_plan(
     rooms: dict[str, RoomSource],
     files: RoomFiles,
     wanted: range | None,
-    kept: Kept,
+    kept: KeptSamples,
 ) -> Plan:
     """Equal rigs share an id, and so their views; the first sample that has one names it, so that more change none."""
     held: dict[int, RandomSample | str] = {number: one for number, one in kept.items() if isinstance(one, str)}

@@ -26,7 +26,7 @@ class CuttingError(ValueError):
 
 
 @dataclass
-class Cutting:
+class CuttingBudget:
     """Rest of `MOST_CUTTING`: one for each file."""
 
     left: int = field(default_factory=lambda: MOST_CUTTING)
@@ -38,7 +38,7 @@ class Cutting:
             raise CuttingError("concave polygons of too many corners")
 
 
-def triangulated(points: Array, cutting: Cutting) -> NDArray[np.int64]:
+def triangulated(points: Array, cutting: CuttingBudget) -> NDArray[np.int64]:
     """Triangles of one polygon by the numbers of its corners, shape (n - 2, 3).
 
     Parameters
@@ -120,7 +120,7 @@ def _is_convex(flat: Array, size: float) -> bool:
     return abs(around - 2.0 * np.pi) < 1.0  # once around: a star that winds twice is not convex
 
 
-def _by_ears(flat: Array, size: float, cutting: Cutting) -> NDArray[np.int64]:
+def _by_ears(flat: Array, size: float, cutting: CuttingBudget) -> NDArray[np.int64]:
     left, triangles = list(range(len(flat))), []
     while len(left) > 3:
         ear = next((k for k in range(len(left)) if _is_ear(flat, left, k, size, cutting)), None)
@@ -132,7 +132,7 @@ def _by_ears(flat: Array, size: float, cutting: Cutting) -> NDArray[np.int64]:
     return np.array(triangles, np.int64)
 
 
-def _is_ear(flat: Array, left: list[int], k: int, size: float, cutting: Cutting) -> bool:
+def _is_ear(flat: Array, left: list[int], k: int, size: float, cutting: CuttingBudget) -> bool:
     cutting.take(_TURN_COST)
     a, b, c = left[k - 1], left[k], left[(k + 1) % len(left)]
     if float(_turn(flat[a], flat[b], flat[c])) <= _FLAT * size:

@@ -33,7 +33,7 @@ from phibench.datasets.rooms.mesh_parts import (
     leaves_picture,
     three_numbers,
 )
-from phibench.datasets.rooms.mesh_polygons import QUAD, Cutting, plain_quads, triangulated
+from phibench.datasets.rooms.mesh_polygons import QUAD, CuttingBudget, plain_quads, triangulated
 from phibench.render.sensor.srgb import srgb_decoded
 from phibench.scenes.frames import Array, Vector, as_vector
 from phibench.scenes.validation import printable_line
@@ -210,7 +210,7 @@ def obj_parts(file: InputFile, companions: Companions) -> list[MeshPart]:
     colours = tints if len(tints) == len(points) else None
     if len(tints) and colours is None:
         raise file.fault(f"has {len(points)} vertices and colours of {len(tints)} of them: give all a colour, or none")
-    parts, vertices, cutting = [], _Vertices(points, places, colours), Cutting()
+    parts, vertices, cutting = [], _Vertices(points, places, colours), CuttingBudget()
     for (label, name), group in reader.groups.items():
         material = _material_of(file, materials, name) if name and reader.libraries else None
         if material is not None and material.is_hidden:
@@ -263,7 +263,7 @@ def _part(
     group: _Group,
     vertices: _Vertices,
     material: _Material | None,
-    cutting: Cutting,
+    cutting: CuttingBudget,
 ) -> MeshPart:
     points, places, colours = vertices.points, vertices.places, vertices.colours
     corners, uv_corners = [], []

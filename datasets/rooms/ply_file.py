@@ -27,7 +27,7 @@ from phibench.datasets.rooms.mesh_parts import (
     check_count,
     damage_error,
 )
-from phibench.datasets.rooms.mesh_polygons import QUAD, Cutting, plain_quads, triangulated
+from phibench.datasets.rooms.mesh_polygons import QUAD, CuttingBudget, plain_quads, triangulated
 from phibench.render.sensor.srgb import srgb_decoded
 from phibench.scenes.frames import Array
 from phibench.scenes.validation import printable_line
@@ -314,7 +314,7 @@ def _triangles(file: InputFile, points: Array, polygons: Any) -> tuple[NDArray[n
     triangles: list[Any] = []
     owner: list[int] = []
     corner: list[Any] = []
-    total, cutting, plain = 0, Cutting(), plain_quads(points, polygons)
+    total, cutting, plain = 0, CuttingBudget(), plain_quads(points, polygons)
     for number, polygon in enumerate(polygons):
         index = _whole(file, polygon)
         if len(index) < 3:

@@ -43,7 +43,7 @@ Plane = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
-class Exr:
+class ExrFile:
     """Content of one EXR file.
 
     Attributes
@@ -95,7 +95,7 @@ def write_exr(
     return write_atomic(path, lambda temporary: _write(temporary, arrays, text, origin_px, half))
 
 
-def read_exr(path: Path, most_planes: int = MOST_PLANES) -> Exr:
+def read_exr(path: Path, most_planes: int = MOST_PLANES) -> ExrFile:
     """Read a file that `write_exr` wrote; one with more planes is refused before they are decoded.
 
     Raises
@@ -166,7 +166,7 @@ def _check_readable(path: Path) -> None:
         raise DatasetError(f"{path} is not readable: {error.strerror or error}") from error
 
 
-def _content(path: Path, header: dict[str, Any], planes: dict[str, Plane]) -> Exr:
+def _content(path: Path, header: dict[str, Any], planes: dict[str, Plane]) -> ExrFile:
     if ATTRIBUTE not in header:
         raise DatasetError(f"{path} was not written by phibench: it has no attribute '{ATTRIBUTE}'")
     document = InputFile(path, "render it again").json(header[ATTRIBUTE].encode())
@@ -175,7 +175,7 @@ def _content(path: Path, header: dict[str, Any], planes: dict[str, Plane]) -> Ex
     if {name: zlib.crc32(np.ascontiguousarray(plane).data) for name, plane in planes.items()} != document.get("crc32"):
         raise DatasetError(f"{path} is damaged: its pixels do not have the checksums of its header")
     u0, v0 = (int(x) for x in header["dataWindow"][0])
-    return Exr(
+    return ExrFile(
         {name: plane.astype(np.float32, copy=False) for name, plane in planes.items()}, document["header"], (u0, v0)
     )
 
@@ -296,7 +296,7 @@ def read_ambient_pair(path: Path, **owner: str) -> tuple[NDArray[np.float32], ND
     return planes, np.square(_scaled(path, file, "sd."))
 
 
-def _scaled(path: Path, file: Exr, prefix: str) -> NDArray[np.float32]:
+def _scaled(path: Path, file: ExrFile, prefix: str) -> NDArray[np.float32]:
     scale = file.header.get("scale", 1.0)
     if not isinstance(scale, float | int) or not 0.0 < scale < math.inf:
         raise DatasetError(f"{path} has the scale {printable_line(str(scale), 60)} instead of a number above 0")
@@ -339,7 +339,7 @@ def read_spot(path: Path, **owner: str) -> SpotWindow:
     return SpotWindow(*file.origin_px, *stacks)
 
 
-def read_layer(path: Path, kind: str, planes: tuple[str, ...], **owner: str) -> Exr:
+def read_layer(path: Path, kind: str, planes: tuple[str, ...], **owner: str) -> ExrFile:
     """Read a layer and check what it is.
 
     Parameters

@@ -56,7 +56,7 @@ _LIFT_M, _BEHIND_M = 1e-4, 1e-3
 
 
 @dataclass(frozen=True)
-class Lit:
+class LitRectangle:
     """Rectangle on a face that a spot lies on.
 
     Attributes
@@ -114,17 +114,17 @@ def _band_ratios(view: View, spot: LaserSpot, cos_incidence: float) -> Array:
     return of_laser / of_bands * float(mirror.reflectance(cos, spot.wavelength_nm)) / np.array(shown)
 
 
-def _flat(spot: LaserSpot) -> Lit:
+def _flat(spot: LaserSpot) -> LitRectangle:
     a, b = spot.tangents()
     axes = np.stack([a, b, np.array(spot.normal_world)], axis=1)
     half = _reach(spot) * spot.scale_m
     x, y = _places(half, half)
     inside = np.ones((_TEXELS, _TEXELS))
     pose = Pose("world", "shape", spot.position_world_m, as_matrix(axes))
-    return Lit(pose, (half, half), _means(spot.radiance_w_m2_sr(np.hypot(x, y))), inside, -1)
+    return LitRectangle(pose, (half, half), _means(spot.radiance_w_m2_sr(np.hypot(x, y))), inside, -1)
 
 
-def _on_faces(spot: LaserSpot, geometry: RoomGeometry, mirror_m: Array) -> list[Lit]:
+def _on_faces(spot: LaserSpot, geometry: RoomGeometry, mirror_m: Array) -> list[LitRectangle]:
     """Rectangles on every face that a beam meets."""
     steps = _reach(spot) * np.linspace(-1.0, 1.0, _PROBES)
     disc = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
@@ -148,7 +148,7 @@ def _planes(table: FaceTable, patches: IntArray) -> list[list[int]]:
     return planes
 
 
-def _on_plane(spot: LaserSpot, geometry: RoomGeometry, patches: list[int], mirror_m: Array) -> Lit:
+def _on_plane(spot: LaserSpot, geometry: RoomGeometry, patches: list[int], mirror_m: Array) -> LitRectangle:
     beam, table, patch = np.array(spot.beam_direction_world), geometry.without_robot.table, patches[0]
     normal = table.normal[patch]
     normal = -normal if normal @ beam > 0.0 else normal
@@ -173,7 +173,7 @@ def _on_plane(spot: LaserSpot, geometry: RoomGeometry, patches: list[int], mirro
         strength = strength * transmittance(np.maximum(towards @ normal, 0.0), np.full(x.shape, coat))
     radiance = strength / np.pi * cos * spot.irradiance_w_m2(radius)
     pose = Pose("world", "shape", as_vector(centre), as_matrix(axes))
-    return Lit(pose, half, _means(radiance), _means(here.astype(float)), patch)
+    return LitRectangle(pose, half, _means(radiance), _means(here.astype(float)), patch)
 
 
 def _reach(spot: LaserSpot) -> float:
@@ -196,7 +196,7 @@ def _lifted(pose: Pose) -> Pose:
     return replace(pose, translation_m=as_vector(pose.t + _LIFT_M * pose.R[:, 2]))
 
 
-def _wall(geometry: RoomGeometry, lit: Lit) -> tuple[Vector, Array]:
+def _wall(geometry: RoomGeometry, lit: LitRectangle) -> tuple[Vector, Array]:
     """Albedo of the wall in the bands, and its own light, shape (3,), in the rectangle's middle; black without a wall.
 
     Of a flat spot it is the face right behind.
@@ -220,7 +220,7 @@ def _wall(geometry: RoomGeometry, lit: Lit) -> tuple[Vector, Array]:
     return (dark, value) if table.is_radiance[patch] else (as_vector(value), np.zeros(3))
 
 
-def _ground(name: str, lit: Lit, albedo: Vector) -> Plugin:
+def _ground(name: str, lit: LitRectangle, albedo: Vector) -> Plugin:
     """Material of the rectangle: the wall's, and nothing where it reaches beyond the face."""
     material = diffuse(Rgb(albedo))
     if lit.covered.min() == 1.0:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from phibench.datasets.build.tasks import BuildTask, Made
+from phibench.datasets.build.tasks import BuildTask, TaskResult
 from phibench.datasets.store.files import write_bytes
 
 # what tasks run, and not what runs tasks
@@ -21,7 +21,7 @@ _CODE = re.compile(
 )
 _TASK = re.compile(r"phibench\.datasets\.build\.\w+_task$")
 _MOST_BYTES = 200_000_000
-_KEPT: dict[tuple[str, str, int], tuple[Made, dict[str, bytes]]] = {}
+_KEPT: dict[tuple[str, str, int], tuple[TaskResult, dict[str, bytes]]] = {}
 _ANSWERS: dict[tuple[Any, ...], Any] = {}
 _STATES: list[list[Any]] = []  # they hold what they name, so that no address is given twice
 
@@ -61,7 +61,7 @@ class Remembered:
 
     task: BuildTask
 
-    def __call__(self, out: Path, *arguments: Any) -> Made:
+    def __call__(self, out: Path, *arguments: Any) -> TaskResult:
         """Write the files that the task wrote before, or do it."""
         if not self.task.key:  # an export of a room: what it depends on stands in no key
             return self.task.function(out, *arguments)

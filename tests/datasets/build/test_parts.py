@@ -11,8 +11,8 @@ import pytest
 from helpers.processes import quiet
 
 from phibench.datasets.build.journal import NO_HEAD, Entry, Journal
-from phibench.datasets.build.parts import Brought, bring_all
-from phibench.datasets.build.tasks import BuildTask, Made, task_key
+from phibench.datasets.build.parts import BroughtParts, bring_all
+from phibench.datasets.build.tasks import BuildTask, TaskResult, task_key
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.film.moving_camera import _drawn_room, bake_rooms, open_baked_rooms
 from phibench.datasets.store import schema
@@ -23,7 +23,7 @@ from phibench.scenes.room import Room
 NAMES = ("a", "b", "c")
 
 
-def write_part(out: Path, name: str, text: str, done: list[str]) -> Made:
+def write_part(out: Path, name: str, text: str, done: list[str]) -> TaskResult:
     """Task: two files, the second of which is named like a folder of the first."""
     if text == "impossible":
         raise DatasetError(f"{name} cannot be made")
@@ -31,13 +31,13 @@ def write_part(out: Path, name: str, text: str, done: list[str]) -> Made:
     for file in (f"{name}/one", f"{name}/two"):
         (out / file).parent.mkdir(exist_ok=True)
         (out / file).write_text(text)
-    return Made((f"{name}/one", f"{name}/two"), {"length": len(text)})
+    return TaskResult((f"{name}/one", f"{name}/two"), {"length": len(text)})
 
 
-def filled(out: Path, done: list[str], stop: Callable[[Path], object] = lambda _: None, **texts: str) -> Brought:
+def filled(out: Path, done: list[str], stop: Callable[[Path], object] = lambda _: None, **texts: str) -> BroughtParts:
     """Fill a folder as every product does."""
 
-    def make(out: Path, *arguments: Any) -> Made:
+    def make(out: Path, *arguments: Any) -> TaskResult:
         stop(out)
         return write_part(out, *arguments)
 
@@ -176,9 +176,9 @@ def test_baked_rooms_are_kept_one_by_one(tmp_path: Path, monkeypatch: pytest.Mon
 
 @pytest.mark.parametrize("result", [None, 3, {"length": "long"}, [1]])
 def test_a_result_of_another_form_is_one_sentence(result: object) -> None:
-    brought = Brought({name: Entry(name, "", {}, {"length": 3}) for name in NAMES}, ())
+    brought = BroughtParts({name: Entry(name, "", {}, {"length": 3}) for name in NAMES}, ())
     assert brought.results(dict[str, int]) == [{"length": 3}] * 3
-    damaged = Brought({"a": Entry("a", "", {}, result)}, ())
+    damaged = BroughtParts({"a": Entry("a", "", {}, result)}, ())
     with pytest.raises(DatasetError, match=r"^journal\.txt has a damaged result of a part: .*again$") as caught:
         damaged.results(dict[str, int])
     assert "\n" not in str(caught.value)

@@ -12,11 +12,11 @@ import pytest
 from phibench.datasets.build.forecast import Pace, TaskProgress
 from phibench.datasets.build.journal import Entry, FolderHead, Journal
 from phibench.datasets.build.parts import AHEAD, TRIALS, schedule
-from phibench.datasets.build.tasks import BuildTask, Done, Failed, Made
+from phibench.datasets.build.tasks import BuildTask, Done, Failed, TaskResult
 
 
-def nothing(out: Path) -> Made:
-    return Made(())
+def nothing(out: Path) -> TaskResult:
+    return TaskResult(())
 
 
 def task(name: str, *needs: str) -> BuildTask:

@@ -24,7 +24,7 @@ from helpers.processes import SMALLEST, left_of, living, quiet, said, wait_for
 
 from phibench.datasets.build import workers
 from phibench.datasets.build.parts import schedule
-from phibench.datasets.build.tasks import BuildTask, Done, Failed, Made
+from phibench.datasets.build.tasks import BuildTask, Done, Failed, TaskResult
 from phibench.datasets.build.workers import _checked, describe, local_environment, local_workers
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.make import make
@@ -35,27 +35,27 @@ PAGE = (ROOT / "docs" / "cluster.md").read_text(encoding="utf-8")
 BIN = Path(sys.executable).parent
 
 
-def square(out: Path, number: int) -> Made:
+def square(out: Path, number: int) -> TaskResult:
     time.sleep(0.05)
-    return Made((), number * number)
+    return TaskResult((), number * number)
 
 
-def die(out: Path, signum: int) -> Made:
+def die(out: Path, signum: int) -> TaskResult:
     time.sleep(0.2)
     os.kill(os.getpid(), signum)
     time.sleep(60.0)
-    return Made(())
+    return TaskResult(())
 
 
-def leave(out: Path, status: int) -> Made:
+def leave(out: Path, status: int) -> TaskResult:
     os._exit(status)
 
 
-def bug(out: Path) -> Made:
+def bug(out: Path) -> TaskResult:
     raise ZeroDivisionError
 
 
-def told(out: Path) -> Made:
+def told(out: Path) -> TaskResult:
     raise DatasetError("no such spot")
 
 

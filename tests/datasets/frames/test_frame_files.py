@@ -15,7 +15,7 @@ from PIL import Image
 
 from phibench.cli import main as cli
 from phibench.datasets.common.errors import DatasetError
-from phibench.datasets.exposures.draw_frames import Drawn, draw_frames
+from phibench.datasets.exposures.draw_frames import DrawnFrames, draw_frames
 from phibench.datasets.frames.frame_files import (
     INDEX,
     INDEX_TABLE,
@@ -294,7 +294,7 @@ def test_a_frame_that_goes_while_others_are_drawn_ends_the_run(
         (folder / f"{SEEN}-down-on-0000.jpg").unlink()
         return write_index(folder, rows)
 
-    def again() -> Drawn:
+    def again() -> DrawnFrames:
         return draw_frames(smallest_dataset, FrameOptions("mjpeg", {}), out=tmp_path, samples=[SEEN], workers=1)
 
     with monkeypatch.context() as patch:

@@ -91,7 +91,7 @@ def test_convex_polygons_of_four_corners_are_told_at_once() -> None:
     plain = mesh_polygons.plain_quads(points, polygons)
     assert not plain[300:].any()
     for polygon, is_plain in zip(polygons[:300], plain, strict=False):
-        pieces = mesh_polygons.triangulated(points[list(polygon)], mesh_polygons.Cutting())
+        pieces = mesh_polygons.triangulated(points[list(polygon)], mesh_polygons.CuttingBudget())
         if is_plain:
             np.testing.assert_array_equal(pieces, mesh_polygons.QUAD)
     assert 20 < plain.sum() < 280

@@ -14,7 +14,7 @@ from PIL import Image
 
 from phibench.datasets.rooms.mesh_parts import MeshPart
 from phibench.datasets.rooms.mesh_placement import read_mesh
-from phibench.datasets.rooms.mesh_polygons import Cutting, triangulated
+from phibench.datasets.rooms.mesh_polygons import CuttingBudget, triangulated
 from phibench.datasets.rooms.room_files import RoomError
 
 # -- OBJ -----------------------------------------------------------------------------------------------------------
@@ -61,7 +61,7 @@ def test_random_polygons_are_covered_once() -> None:
         shoelace = 0.5 * abs(float(x @ np.roll(y, -1) - y @ np.roll(x, -1)))
         Q, _ = np.linalg.qr(rng.normal(size=(3, 3)))
         points = flat @ Q[:, :2].T
-        three = points[triangulated(points, Cutting())]
+        three = points[triangulated(points, CuttingBudget())]
         areas = 0.5 * np.linalg.norm(np.cross(three[:, 1] - three[:, 0], three[:, 2] - three[:, 0]), axis=1)
         assert len(three) == count - 2
         assert areas.sum() == pytest.approx(shoelace, rel=1e-9)
