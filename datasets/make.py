@@ -44,8 +44,8 @@ from phibench.datasets.build.earlier_runs import (
 )
 from phibench.datasets.build.forecast import Forecast, forecast, slowdown
 from phibench.datasets.build.journal import Journal
-from phibench.datasets.build.parts import unfinished_tasks
 from phibench.datasets.build.room_export import damaged_exports, export_lines, export_rooms, held_files, own_files
+from phibench.datasets.build.task_runner import unfinished_tasks
 from phibench.datasets.build.workers import Environment, NoRendererError, WorkerPool
 from phibench.datasets.common.errors import DatasetError, IncompleteError
 from phibench.datasets.common.progress import progress_console

@@ -24,7 +24,7 @@ from unittest.mock import patch
 from phibench.calibration.captures.measure import measure, read_setting
 from phibench.calibration.captures.pair_photos import PairPhotos, PositionPhotos
 from phibench.calibration.captures.picture_files import read_photo
-from phibench.datasets.build.parts import OwnProcess
+from phibench.datasets.build.task_runner import OwnProcess
 from phibench.datasets.build.workers import describe
 from phibench.datasets.common.progress import progress_console
 from phibench.datasets.make import make

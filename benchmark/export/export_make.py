@@ -1,6 +1,6 @@
 """Export of a data set's pairs in formats of other tools, with index, card, licence and hashes; and its check.
 
-Each shard is a part of the folder (`datasets.build.parts`), so that a run that ended early goes on where it was.
+Each shard is a part of the folder (`datasets.build.task_runner`), so that a run that ended early goes on where it was.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from phibench.benchmark.pair_sets.dataset_pairs import DatasetPairs, dataset_pai
 from phibench.benchmark.pair_sets.frames_set import frames_row, frames_set_documents
 from phibench.benchmark.sealed.dense_set import DENSE_SEAL, DENSE_TRUTH
 from phibench.benchmark.sealed.sealed_set import SEAL
-from phibench.datasets.build.parts import BroughtParts, bring_all
+from phibench.datasets.build.task_runner import BroughtParts, bring_all
 from phibench.datasets.build.tasks import BuildTask, TaskResult
 from phibench.datasets.common.errors import DatasetError, whole_number
 from phibench.datasets.common.input_files import InputFile

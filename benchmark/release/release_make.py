@@ -41,7 +41,7 @@ from phibench.benchmark.sealed.dense_set import (
 )
 from phibench.benchmark.sealed.sealed_set import secret_seed
 from phibench.datasets.build.forecast import megabytes
-from phibench.datasets.build.parts import bring_all
+from phibench.datasets.build.task_runner import bring_all
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import InputFile
 from phibench.datasets.common.progress import progress_console

@@ -22,9 +22,9 @@ from rich.console import Console
 from phibench.datasets.build.bake_task import bake_room, bake_settings
 from phibench.datasets.build.forecast import Pace, TaskProgress, forecast, megabytes, slowdown
 from phibench.datasets.build.journal import Entry, FolderHead, Journal
-from phibench.datasets.build.parts import log_outcome, run_tasks
 from phibench.datasets.build.sample_task import finish_sample
 from phibench.datasets.build.spot_task import make_spot
+from phibench.datasets.build.task_runner import log_outcome, run_tasks
 from phibench.datasets.build.tasks import BuildTask, Done, Failed, task_key
 from phibench.datasets.build.view_task import render_view
 from phibench.datasets.build.workers import Environment, WorkerPool, versions

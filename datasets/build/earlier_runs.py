@@ -1,4 +1,4 @@
-"""Work that earlier runs left in a folder: finished, which no run loses unasked, or refused.
+"""Work that earlier runs left in a folder: finished samples that a run would lose, refused ones, sentences on both.
 
 Work is finished when the journal has its line and its files have the bytes that the line tells. Where lines of the
 journal are lost, SHA256SUMS of a finished data set vouches for files. Camera frames are no such work: they are drawn
@@ -22,7 +22,7 @@ from typing import Any
 
 from phibench.datasets.build.dataset_build import held_head, listed_text, plan_tasks, sample_task_name
 from phibench.datasets.build.journal import Entry, FolderHead, Journal, is_intact
-from phibench.datasets.build.parts import intact
+from phibench.datasets.build.task_runner import intact
 from phibench.datasets.build.tasks import BuildTask
 from phibench.datasets.build.workers import versions
 from phibench.datasets.common.errors import DatasetError

@@ -18,7 +18,7 @@ from rich.console import Console
 
 from phibench.datasets.build.bake_task import bake_settings, light_map
 from phibench.datasets.build.dataset_build import missing_room_files
-from phibench.datasets.build.parts import schedule
+from phibench.datasets.build.task_runner import schedule
 from phibench.datasets.build.tasks import BuildTask, Failed, TaskResult
 from phibench.datasets.build.workers import WorkerPool
 from phibench.datasets.common.errors import DatasetError

@@ -1,4 +1,4 @@
-"""Films of a recipe in a folder: each film is a part of it (`build.parts`); what is finished and whole is kept.
+"""Films of a recipe in a folder: each film is a part of it (`build.task_runner`); what is finished and whole is kept.
 
 A killed run loses the view or film that it was at: `film_task` makes one film, view by view.
 """
@@ -16,7 +16,7 @@ import polars
 from rich.console import Console
 
 from phibench.datasets.build.journal import Journal
-from phibench.datasets.build.parts import bring_all, unfinished_tasks
+from phibench.datasets.build.task_runner import bring_all, unfinished_tasks
 from phibench.datasets.build.tasks import BuildTask
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.progress import progress_console

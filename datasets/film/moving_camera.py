@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
-from phibench.datasets.build.parts import bring_all
+from phibench.datasets.build.task_runner import bring_all
 from phibench.datasets.build.tasks import BuildTask, TaskResult, task_key
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import FileName, InputFile

@@ -1,4 +1,4 @@
-"""Samplers of glTF, and clamped pictures of OBJ, as bitmaps of a room: bilinear, and repeated without end.
+"""Clamped, mirrored and nearest textures of glTF and OBJ, changed into bilinear bitmaps that repeat, as rooms have.
 
 A picture that ends at its edges gets a frame of its outermost texels, so that its other side does not shine through. Of
 one with the nearest texel each becomes several equal ones, so that its neighbours reach into it by little.

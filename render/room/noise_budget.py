@@ -1,4 +1,4 @@
-"""Noise budget: the renderer's noise as an error of phi, beside the sensor's own.
+"""Noise budget of rendering: a pixel's allowed variance beside the sensor's noise, and the errors of phi by both.
 
 A spot at (u, v) is located from raw Bayer pixels with the Fisher weights of a known shape (Huang 2013). Let mu be the
 expected electrons of a pixel, r the read noise, w = 1/(mu + r^2), d = dmu/d(u, v) and F = sum d d^T w. The estimate is

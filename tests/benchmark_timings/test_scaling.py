@@ -9,7 +9,7 @@ from helpers.processes import quiet
 
 from phibench.datasets.build.dataset_build import plan_tasks
 from phibench.datasets.build.forecast import START_S, Pace, forecast, slowdown
-from phibench.datasets.build.parts import schedule
+from phibench.datasets.build.task_runner import schedule
 from phibench.datasets.build.tasks import Done
 from phibench.datasets.build.workers import local_environment, local_workers, versions
 from phibench.datasets.make import make

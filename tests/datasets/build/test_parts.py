@@ -11,7 +11,7 @@ import pytest
 from helpers.processes import quiet
 
 from phibench.datasets.build.journal import NO_HEAD, Entry, Journal
-from phibench.datasets.build.parts import BroughtParts, bring_all
+from phibench.datasets.build.task_runner import BroughtParts, bring_all
 from phibench.datasets.build.tasks import BuildTask, TaskResult, task_key
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.film.moving_camera import _drawn_room, bake_rooms, open_baked_rooms

@@ -11,7 +11,7 @@ import pytest
 
 from phibench.datasets.build.forecast import Pace, TaskProgress
 from phibench.datasets.build.journal import Entry, FolderHead, Journal
-from phibench.datasets.build.parts import AHEAD, TRIALS, schedule
+from phibench.datasets.build.task_runner import AHEAD, TRIALS, schedule
 from phibench.datasets.build.tasks import BuildTask, Done, Failed, TaskResult
 
 

@@ -23,7 +23,7 @@ from helpers.listeners import listeners
 from helpers.processes import SMALLEST, left_of, living, quiet, said, wait_for
 
 from phibench.datasets.build import workers
-from phibench.datasets.build.parts import schedule
+from phibench.datasets.build.task_runner import schedule
 from phibench.datasets.build.tasks import BuildTask, Done, Failed, TaskResult
 from phibench.datasets.build.workers import _checked, describe, local_environment, local_workers
 from phibench.datasets.common.errors import DatasetError
