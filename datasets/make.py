@@ -31,11 +31,11 @@ from phibench.datasets.build.draws_file import draws_bytes, read_draws, seen_cau
 from phibench.datasets.build.earlier_runs import (
     OR_REPLACE,
     LostWorkError,
-    finished_without,
     forget_others,
     incomplete_text,
-    kept_samples,
+    kept_sample_count,
     left_out_line,
+    left_out_sentence,
     left_out_text,
     lost_work_text,
     possible_tasks,
@@ -235,7 +235,7 @@ def _planned(
     if wanted.samples is not None or wanted.seed is not None:
         text = with_numbers(text, source, wanted.samples, wanted.seed)
     asked = parse_recipe(text, source)
-    held = None if wanted.replace or wanted.shard is not None else kept_samples(out, asked)
+    held = None if wanted.replace or wanted.shard is not None else kept_sample_count(out, asked)
     if held is not None and asked.random is not None:
         text, count = with_numbers(text, source, held, None), asked.random.samples
         note = f"{out} keeps its {held} samples; the first {count} of them are those that were asked for"
@@ -346,7 +346,7 @@ def _lost(build: Build, leave_out: bool) -> str | None:
     keys = {name: task.key for name, task in build.tasks.items()}
     if lost := lost_work_text(build.out, keys, build.journal, dataset_info(build.plan, build.environment)):
         return f"{lost}; {OR_REPLACE}"
-    return None if leave_out else finished_without(build.out, build.journal)
+    return None if leave_out else left_out_sentence(build.out, build.journal)
 
 
 def _todo(build: Build, leave_out: bool) -> list[str]:

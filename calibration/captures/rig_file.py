@@ -22,7 +22,7 @@ from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import SETTINGS_BYTES, InputFile
 from phibench.datasets.recipe.distributions import Table
 from phibench.datasets.recipe.mirror_tables import HolderTable, MirrorTable
-from phibench.datasets.recipe.recipe_scene import build_rig, idle_holder_keys
+from phibench.datasets.recipe.recipe_scene import build_rig, idle_holder_faults
 from phibench.datasets.recipe.tables import LaserTable, RigTable
 from phibench.scenes.laser import Beam
 from phibench.scenes.rig import Rig
@@ -86,7 +86,7 @@ def read_rig_file(path: Path) -> MeasuredRig:
         raise file.fault("; ".join(map(str, faults)))
     document = RigFile.model_validate(raw)
     table = document.rig
-    if idle := idle_holder_keys("rig.holder", sorted(table.holder.model_fields_set), (table.holder.kind,)):
+    if idle := idle_holder_faults("rig.holder", sorted(table.holder.model_fields_set), (table.holder.kind,)):
         raise file.fault(str(idle[0]))
     if fault := _focal_fault(table):
         raise file.fault(fault)

@@ -69,7 +69,7 @@ def lost_work_text(out: Path, keys: Mapping[str, str], journal: Journal, wanted:
     return f"{out} holds {what} that this run would delete or make again, they were made with {causes}"
 
 
-def finished_without(out: Path, journal: Journal) -> str | None:
+def left_out_sentence(out: Path, journal: Journal) -> str | None:
     """Sentence on a finished data set that leaves samples out, which a run that needs them all would undo."""
     info = _held_info(out, journal)
     if info is None or not info.left_out or not (out / schema.CHECKSUMS).is_file():
@@ -149,7 +149,7 @@ def _table_cause(name: str, old: Any, new: Any) -> str:
     return f"{old['samples']} samples" if drawn and {**old, "samples": new["samples"]} == new else f"another [{name}]"
 
 
-def kept_samples(out: Path, recipe: Recipe) -> int | None:
+def kept_sample_count(out: Path, recipe: Recipe) -> int | None:
     """Number of samples of the finished data set in a folder, if it has more of the same than a recipe asks for."""
     if recipe.random is None or not (out / schema.CHECKSUMS).is_file():
         return None  # experiments have no number of samples

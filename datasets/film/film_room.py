@@ -2,7 +2,7 @@
 
 Key views are kept one by one, named by their place: a killed run, and one with twice as many, find those that are
 there. The number of key views of a part of the poses is doubled until a view that was left out agrees with the
-interpolated one (`key_views`).
+interpolated one (`made_key_views`).
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ def light_views(rig: Rig, film: FilmPlan) -> Iterator[tuple[Array, list[View]]]:
         yield places, [replace(parts.view(number, float(at)), rig=rig, offset_m=0.0, motion=None) for at in places]
 
 
-def key_views(
+def made_key_views(
     film: FilmPlan, folder: FilmFolder, key: str, render: Render, images: Sequence[RowsImage], journal: Journal
 ) -> tuple[list[Array], ViewError]:
     """Render key views until views that were left out agree; return their places, part by part, and the worst error.

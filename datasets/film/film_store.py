@@ -312,7 +312,7 @@ def finite_or_none(value: float) -> float | None:
 # Checksums.
 
 
-def data_files(out: Path, films: Sequence[str]) -> list[str]:
+def film_files(out: Path, films: Sequence[str]) -> list[str]:
     """Names of all files of a data set of films, relative to its folder, sorted."""
     names = [INFO, RECIPE, *([CROISSANT] if (out / CROISSANT).exists() else [])]  # films of version 0.2 have none
     for film in films:
@@ -334,5 +334,5 @@ def verify_films(out: Path) -> list[str]:
     if not (out / CHECKSUMS).is_file():
         raise DatasetError(f"{out} has no {CHECKSUMS}: it was not finished; {_AGAIN}")
     listed, info = read_checksums(out), read_document(out / INFO, SetInfo)
-    faults = [f"{name} is not listed in {CHECKSUMS}" for name in data_files(out, info.films) if name not in listed]
+    faults = [f"{name} is not listed in {CHECKSUMS}" for name in film_files(out, info.films) if name not in listed]
     return faults + differing_files(out, listed)

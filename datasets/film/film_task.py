@@ -16,7 +16,7 @@ from phibench.datasets.build.journal import NO_HEAD, Journal
 from phibench.datasets.build.tasks import TaskResult
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.film.film_plan import FilmPlan
-from phibench.datasets.film.film_room import key_view_name, key_views, renderer
+from phibench.datasets.film.film_room import key_view_name, made_key_views, renderer
 from phibench.datasets.film.film_store import (
     FILM,
     LIGHT_IMAGES,
@@ -64,7 +64,7 @@ def make_film(out: Path, plan: Plan, key: str, film: FilmPlan) -> TaskResult:
     _check_seen(film, rows)
     with Journal(folder.path) as journal:
         journal.begin(NO_HEAD, list(journal.entries))
-        places, error = key_views(film, folder, key, render, images, journal)
+        places, error = made_key_views(film, folder, key, render, images, journal)
         at = [(part, float(place)) for part, places_ in enumerate(places) for place in places_]
         journal.begin(NO_HEAD, [key_view_name(*pose) for pose in at])  # in one order, whatever a kill left
     write_spots(folder.path / SPOTS, images)

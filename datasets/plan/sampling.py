@@ -33,7 +33,7 @@ from phibench.datasets.recipe.recipe_scene import (
     text_by_keys,
     true_stroke_m,
 )
-from phibench.datasets.recipe.spot_placement import Boards, Placed, place, shown_as
+from phibench.datasets.recipe.spot_placement import Boards, Placed, causes_or_fault, place
 from phibench.datasets.recipe.tables import DRAWABLE, MisalignmentTable, RandomTable, Recipe, RigTable
 from phibench.datasets.rooms.room_sources import ONLY_ROOM, MeshRoom, PanoramaRoom, RoomSource, is_exported, room_of
 from phibench.scenes.frames import Array
@@ -333,7 +333,7 @@ class _Makers:
             return fault
         causes: tuple[str, ...] | str = ()
         if "spot.hidden" in values:
-            causes = shown_as(values["spot.hidden"] == HIDDEN, rigs.rig, rigs.stroke_m, placed[1], self._room)
+            causes = causes_or_fault(values["spot.hidden"] == HIDDEN, rigs.rig, rigs.stroke_m, placed[1], self._room)
         if isinstance(causes, str):
             return causes
         place = (self._room_id, rigs.rig, *placed)

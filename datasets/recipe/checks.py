@@ -22,13 +22,13 @@ from phibench.datasets.recipe.recipe_scene import (
     ceiling_m,
     drawn_mirror_faults,
     fixed_conic_faults,
-    idle_holder_keys,
-    idle_mirror_keys,
+    idle_holder_faults,
+    idle_mirror_faults,
     rig_fault_of,
     text_by_keys,
     true_stroke_m,
 )
-from phibench.datasets.recipe.room_checks import low_rooms, room_faults, tables_of_rooms
+from phibench.datasets.recipe.room_checks import low_room_faults, room_faults, room_table_faults
 from phibench.datasets.recipe.spot_placement import free_margin_m
 from phibench.datasets.recipe.tables import (
     DRAWABLE,
@@ -69,7 +69,7 @@ def table_faults(raw: dict[str, Any]) -> Iterator[Fault]:
         yield Fault("rigs", "given together with [random], whose samples have rigs of their own; remove one")
     if isinstance(rigs := raw.get("rigs"), dict) and rigs and not rigs.get("misalignment"):
         yield Fault("rigs.misalignment", "draws nothing; add distributions of keys of [misalignment] or remove [rigs]")
-    yield from tables_of_rooms(raw)
+    yield from room_table_faults(raw)
     drawn: Any = raw
     for key in ("random", "rig"):
         drawn = drawn.get(key) if isinstance(drawn, dict) else None
@@ -294,8 +294,8 @@ def _holder(scene: _Scene) -> Iterator[Fault]:
     fixed, drawn = scene.recipe.rig.holder, getattr(scene.drawn_rig, "holder", RandomHolderTable())
     drawn_kind = getattr(drawn, "kind", None)
     kinds = (fixed.kind,) if drawn_kind is None else drawn_kind.choice
-    yield from idle_holder_keys("rig.holder", sorted(fixed.model_fields_set), kinds)
-    yield from idle_holder_keys("random.rig.holder", sorted(drawn.model_fields_set), kinds)
+    yield from idle_holder_faults("rig.holder", sorted(fixed.model_fields_set), kinds)
+    yield from idle_holder_faults("random.rig.holder", sorted(drawn.model_fields_set), kinds)
 
 
 def _mirror(scene: _Scene) -> Iterator[Fault]:
@@ -307,7 +307,7 @@ def _mirror(scene: _Scene) -> Iterator[Fault]:
             yield Fault("rig.mirror", "missing; [random.rig.mirror] draws keys of it, give at least its shape")
         return  # a sphere
     shapes = getattr(getattr(drawn, "shape", None), "choice", (table.shape,))
-    yield from idle_mirror_keys("rig.mirror", table, shapes)
+    yield from idle_mirror_faults("rig.mirror", table, shapes)
     yield from drawn_mirror_faults("random.rig.mirror", {} if drawn is None else dict(drawn), shapes)
     if {"shape", "conic"} & given == {"shape"}:
         yield from fixed_conic_faults("rig.mirror", table, shapes)
@@ -337,7 +337,7 @@ def _rig(scene: _Scene) -> Iterator[Fault]:
     if too_high is not None:
         yield too_high
     if recipe.rooms is not None:
-        yield from low_rooms(recipe, rig)
+        yield from low_room_faults(recipe, rig)
     if not rig.in_image():
         yield Fault("rig", "the mirror is outside of the image; move it or the principal point")
         return  # so would be the true one's

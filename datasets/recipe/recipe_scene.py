@@ -77,7 +77,7 @@ def rig_fault_of(error: SceneError) -> Fault:
     return Fault("rig", str(error)) if match is None else Fault(match[1], match[2])
 
 
-def idle_holder_keys(path: str, given: Iterable[str], kinds: Iterable[str]) -> list[Fault]:
+def idle_holder_faults(path: str, given: Iterable[str], kinds: Iterable[str]) -> list[Fault]:
     """Faults of keys of a holder that have no effect on any of the kinds that it may be of."""
     possible, faults = sorted(set(kinds) - {"none"}), []
     for key in given:
@@ -113,7 +113,7 @@ def _rig(table: RigTable) -> Rig:
 _VERTEX_M = 0.220  # from the lens: rims of 60 mm fit the image
 
 
-def idle_mirror_keys(path: str, table: MirrorTable, shapes: Sequence[str] = ()) -> list[Fault]:
+def idle_mirror_faults(path: str, table: MirrorTable, shapes: Sequence[str] = ()) -> list[Fault]:
     """Faults of keys of `[rig.mirror]` that belong to none of its possible shapes, and of one that a shape needs."""
     shapes = shapes or (table.shape,)
     given = [key for key in OF_SHAPES if getattr(table, key) is not None]

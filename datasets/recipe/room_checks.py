@@ -15,7 +15,7 @@ from phibench.scenes.validation import Fault, SceneError
 from phibench.scenes.worlds.room_properties import PROPERTIES
 
 
-def tables_of_rooms(raw: dict[str, Any]) -> Iterator[Fault]:
+def room_table_faults(raw: dict[str, Any]) -> Iterator[Fault]:
     """Tables of a document that do not go with its rooms: it has boards, or rooms with spots that rays find."""
     if "rooms" not in raw:
         if raw.get("targets") in (None, []):
@@ -78,7 +78,7 @@ def _settings_fault(path: str, one: PanoramaTable | MeshTable, recipe: Recipe) -
 # Heights.
 
 
-def low_rooms(recipe: Recipe, rig: Rig) -> Iterator[Fault]:
+def low_room_faults(recipe: Recipe, rig: Rig) -> Iterator[Fault]:
     """Rooms whose ceiling the mirror's top reaches with the shortest stroke; longer ones are drawn again."""
     stroke_m = _least_stroke_m(recipe)
     top_m = float(rig.at(stroke_m).sphere_centre_m[2]) + rig.mirror.bound_m

@@ -210,7 +210,7 @@ def place(laser: LaserTable, room: Room, targets: Mapping[str, TargetTable], val
 _DARK = 0.01  # of the spot's light in the image that shows it: what a hidden spot may still send into the other one
 
 
-def shown_as(hidden: bool, rig: Rig, stroke_m: float, spot: LaserSpot, room: Room) -> tuple[str, ...] | str:
+def causes_or_fault(hidden: bool, rig: Rig, stroke_m: float, spot: LaserSpot, room: Room) -> tuple[str, ...] | str:
     """Causes of both views, or why a spot is not shown as it should be: by exactly one image if `hidden`, else by both.
 
     The hidden image must hold no light of the spot either. Where a chief ray just fails, half of the spot may be seen:

@@ -103,7 +103,7 @@ def export_scene(sample: Sample, out: Path, positions: Sequence[str] = POSITIONS
     for position in positions:
         view = sample.view(position)
         write_bytes(out / f"{position}.glb", scene_glb(view, sample.room, sample.laser_spot))
-    losses = tuple(what_is_lost(sample.view(positions[0]), sample.room))
+    losses = tuple(loss_sentences(sample.view(positions[0]), sample.room))
     return ExportedScene(tuple(scenes), write_text(out / README, _readme(sample, positions, losses)), losses)
 
 
@@ -159,7 +159,7 @@ def in_exported_pixels(camera: Camera, plane: Array, order: int = 1) -> Array:
     return np.asarray(ndimage.map_coordinates(plane, at, order=order, cval=np.nan))
 
 
-def what_is_lost(view: View, room: Room) -> list[str]:
+def loss_sentences(view: View, room: Room) -> list[str]:
     """Sentences on what the scene of a view does not carry."""
     camera, scene = view.rig.camera, exported_camera(view.rig.camera)
     lost = [f"The Gaussian blur of the lens, sigma {camera.blur_sigma_px:g} px: pixels are means over their square."]

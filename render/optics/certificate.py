@@ -108,7 +108,7 @@ def _differences(
 ) -> _Differences:
     """Differences of layer and traced rays; 0 where both are dark."""
     traced = trace_spot(view, spot, room, truth, log2_rays)
-    plane = brightest(layer)
+    plane = brightest_plane(layer)
     gain = view.rig.camera.detector.laser_electrons_per_joule(spot.wavelength_nm)[plane]
     total = float(layer.electrons_per_s[plane].sum())
     if total == 0.0 and traced.watts * gain == 0.0:
@@ -124,14 +124,14 @@ def _differences(
     )
 
 
-def brightest(layer: SpotLayer) -> int:
+def brightest_plane(layer: SpotLayer) -> int:
     """Index of the brightest plane."""
     return int(np.argmax(layer.electrons_per_s.sum(axis=(1, 2))))
 
 
 def pixel_centroid(layer: SpotLayer) -> Array:
     """Centroid (u, v), shape (2,), of the brightest plane's pixels."""
-    image = layer.electrons_per_s[brightest(layer)]
+    image = layer.electrons_per_s[brightest_plane(layer)]
     v, u = np.indices(image.shape)
     with np.errstate(invalid="ignore"):
         total = image.sum()

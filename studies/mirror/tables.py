@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import Field
 
 from phibench.datasets.recipe.mirror_tables import SHAPES, MirrorTable
-from phibench.datasets.recipe.recipe_scene import build_rig, idle_mirror_keys
+from phibench.datasets.recipe.recipe_scene import build_rig, idle_mirror_faults
 from phibench.datasets.recipe.tables import RigTable
 from phibench.scenes.frames import Array, BoolArray
 from phibench.scenes.rig import Rig
@@ -65,7 +65,7 @@ class MirrorEntry(Settings):
                 raise SceneError(f'{next(iter(given))} has no effect on shape = "sphere"; remove it')
             return build_rig(RigTable(radius_m=rim_radius_m))
         table = MirrorTable(shape=self.shape, rim_radius_m=rim_radius_m, **given)
-        if faults := idle_mirror_keys("", table):
+        if faults := idle_mirror_faults("", table):
             raise SceneError("; ".join(f"{fault.path.removeprefix('.')} {fault.text}" for fault in faults))
         return build_rig(RigTable(mirror=table))
 

@@ -13,7 +13,7 @@ from phibench.datasets.common.errors import RefusedSampleError
 from phibench.datasets.plan.plan import PairPlan
 from phibench.datasets.read import Dataset, Sample
 from phibench.datasets.recipe.distributions import quantile
-from phibench.datasets.recipe.spot_placement import by_ray, shown_as
+from phibench.datasets.recipe.spot_placement import by_ray, causes_or_fault
 from phibench.datasets.rooms.room_sources import SOURCES, RoomSource
 from phibench.datasets.store.json_forms import from_json
 from phibench.datasets.store.schema import ManifestRow
@@ -52,7 +52,7 @@ def _rows(sample: Sample, folder: Path, count: int, number: int, seed: int) -> l
         keys = (table.azimuth_deg, table.height_m, table.elevation_deg)
         [placed] = by_ray(recipe.laser, room, *(quantile(t, x) for t, x in zip(keys, u, strict=True) if t is not None))
         rig: Rig = sample.rig
-        if isinstance(placed, str) or isinstance(shown_as(False, rig, row.stroke_m, placed[1], room), str):
+        if isinstance(placed, str) or isinstance(causes_or_fault(False, rig, row.stroke_m, placed[1], room), str):
             continue
         name = f"random-{1000 * (number + 1) + len(rows):06d}"
         strokes_m = row.stroke_m, row.nominal_stroke_m
