@@ -44,7 +44,7 @@ def triangulated(points: Array, cutting: CuttingBudget) -> NDArray[np.int64]:
     Parameters
     ----------
     points : shape (n, 3), n from 3 up
-    cutting : Cutting
+    cutting : CuttingBudget
 
     Raises
     ------

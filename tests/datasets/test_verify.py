@@ -407,7 +407,7 @@ def test_a_sheet_says_why_a_spot_is_hidden(smallest_dataset: Path, monkeypatch: 
         assert np.count_nonzero(changed != picture) > 100
         return changed
 
-    monkeypatch.setattr(show_module, "captioned", captioned)
+    monkeypatch.setattr(show_module, "captioned_picture", captioned)
     show_module.contact_sheet(open_dataset(smallest_dataset), Console(file=io.StringIO()))
     [text] = said  # the other three spots are seen
     assert "occluded:crate_red" in text
