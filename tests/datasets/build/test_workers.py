@@ -62,13 +62,13 @@ def told(out: Path) -> TaskResult:
 LASTING = """
 import sys, time
 from pathlib import Path
-from phibench.datasets.build.tasks import Made, BuildTask
+from phibench.datasets.build.tasks import TaskResult, BuildTask
 from phibench.datasets.build.workers import local_workers
 
 def last(out, number):
     (out / f"begun-{number}").touch()
     time.sleep(300.0)
-    return Made(())
+    return TaskResult(())
 
 if __name__ == "__main__":
     with local_workers(2, Path(sys.argv[1])) as pool:
@@ -148,14 +148,14 @@ if "spawn_main" in " ".join(sys.orig_argv):
 START = """
 import sys
 from pathlib import Path
-from phibench.datasets.build.tasks import Made, BuildTask
+from phibench.datasets.build.tasks import TaskResult, BuildTask
 from phibench.datasets.build.workers import local_workers
 from phibench.cli import main as cli
 
 def try_workers() -> None:
     with local_workers(2, Path(sys.argv[1])) as pool:
         for number in range(2):
-            pool.submit(BuildTask(f"nothing {number}", "", Made))
+            pool.submit(BuildTask(f"nothing {number}", "", TaskResult))
         print(pool.next(), "the workers are there")
 
 cli.app.command(try_workers)
