@@ -127,12 +127,12 @@ def independent_bake(room: Room, settings: BakeSettings, number: int) -> LightMa
 
     The stated standard errors do not serve here: smoothing correlates them, and bounces are not in them.
     """
-    gathered = light_map.gathered
+    gathered_light = light_map.gathered_light
 
     def others(mi: Any, surfaces: Any, texels: Any, rays: Any, seed: int, *rest: Any, **named: Any) -> Any:
-        return gathered(mi, surfaces, texels, rays, seed + 1000 * number, *rest, **named)
+        return gathered_light(mi, surfaces, texels, rays, seed + 1000 * number, *rest, **named)
 
-    with patch.object(light_map, "gathered", others), patch.object(light_map, "_SEED", 1000 * number):
+    with patch.object(light_map, "gathered_light", others), patch.object(light_map, "_SEED", 1000 * number):
         return bake(RIG.at(0.0), room, settings)
 
 
