@@ -21,7 +21,7 @@ from image_statistics import ImageStatistics, image_statistics
 from scipy.stats import ks_2samp, wasserstein_distance
 
 from phibench.datasets.rooms.panorama_files import read_panorama
-from phibench.estimator.geometry.panorama import PanoramaGrid, pixels_by_model, unrolled
+from phibench.estimator.geometry.panorama import PanoramaGrid, pixels_by_model, unrolled_values
 
 WIDTH, HALF_DEG = 256, 40.0
 NAMES = ("red", "green", "blue", "contrast", "slope", "mean_step", "flat", "edges")
@@ -36,7 +36,7 @@ def rendered() -> list[ImageStatistics]:
     places = pixels_by_model(rig.at(STROKE_M), PanoramaGrid(WIDTH, -high, high), _SCENE_M)
     gain = np.array(rig.camera.detector.band_electrons_per_joule())
     layers = np.load(VIEWS)["electrons_per_s"]
-    return [image_statistics(unrolled(np.moveaxis(layer, 0, -1) / gain, places)) for layer in layers]
+    return [image_statistics(unrolled_values(np.moveaxis(layer, 0, -1) / gain, places)) for layer in layers]
 
 
 def photographed(path: Path) -> ImageStatistics:

@@ -26,7 +26,7 @@ from phibench.render.sensor.settings import sensor
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import Rig
 from phibench.scenes.room import TargetBoard, lab
-from phibench.studies.isotropy.azimuth_errors import sideways
+from phibench.studies.isotropy.azimuth_errors import sideways_rig
 from phibench.studies.isotropy.binocular import Binocular, Laws, binocular_results
 from phibench.studies.misaligned_rigs import spot_of
 
@@ -84,7 +84,7 @@ def main() -> None:
     sheet.resize(size, Image.Resampling.LANCZOS).save(
         Path(__file__).with_name("binocular.jpg"), quality=74, optimize=True
     )
-    found = float(depth_exact(sideways(Rig()), APART_M, *pixels).depth_m)
+    found = float(depth_exact(sideways_rig(Rig()), APART_M, *pixels).depth_m)
     print(f"D from both pictures {found:.4f} m, true {DEPTH_M:.4f} m", flush=True)
     for finding in binocular_results(both, HEIGHTS_M, Laws(DRAWS), np.array(LIGHT_E_PER_S), sensor("bayer-raw")):
         interval = "" if finding.low is None else f" ({finding.low:.2f} to {finding.high:.2f})"

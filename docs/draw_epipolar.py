@@ -14,7 +14,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from phibench.datasets.read import Sample, open_dataset
-from phibench.estimator.geometry.panorama import PanoramaGrid, frame, nominal_view, panorama
+from phibench.estimator.geometry.panorama import PanoramaGrid, nominal_view, panorama, view_picture
 from phibench.estimator.geometry.reflection import reflect
 from phibench.estimator.spots.detect import epipolar_curve, mirror_box
 from phibench.scenes.frames import Array
@@ -38,7 +38,7 @@ def mirror_panel(sample: Sample, curves: Array, down_px: Array) -> Image.Image:
     """Image of the up position with the lines, the down pixels that they belong to, and the spot."""
     box = mirror_box(sample.nominal_rig)
     origin, scale = np.array([box.u0_px, box.v0_px]) - 0.5, SIDE / max(box.width_px, box.height_px)
-    part = frame(sample, "up")[box.v0_px : box.v0_px + box.height_px, box.u0_px : box.u0_px + box.width_px]
+    part = view_picture(sample, "up")[box.v0_px : box.v0_px + box.height_px, box.u0_px : box.u0_px + box.width_px]
     image = Image.fromarray(part).resize((SIDE, round(scale * box.height_px)), Image.Resampling.LANCZOS)
     pen = ImageDraw.Draw(image)
     for curve, pixel in zip(scale * (curves - origin), scale * (down_px - origin), strict=True):

@@ -24,7 +24,7 @@ from phibench.datasets.frames.frame_source import frame_stream, noise_draw
 from phibench.datasets.frames.sensor_card import card_of
 from phibench.datasets.read import open_finished
 from phibench.estimator.learned.network_graphs import CROP
-from phibench.estimator.learned.network_input import crop_input, crop_origin, cut
+from phibench.estimator.learned.network_input import crop_input, crop_origin, cut_part
 from phibench.estimator.learned.networks import Network
 from phibench.render.sensor.light import Region
 from phibench.scenes.frames import Array
@@ -106,7 +106,7 @@ def _asked(test: Path, preset: str, rows: list[dict[str, Any]], networks: dict[s
             place = np.array([row["u_px"], row["v_px"]]) - first
             for _ in range(2):  # once more about the answer
                 origin = crop_origin((float(place[0]), float(place[1])))
-                answer = network.position(crop_input(cut(on, origin), cut(off, origin), card, response))
+                answer = network.position(crop_input(cut_part(on, origin), cut_part(off, origin), card, response))
                 place = answer.uv_px + origin
             every[name][0].append(place + first - [row["u_true_px"], row["v_true_px"]])
             every[name][1].append(answer.covariance_px2)

@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
-from phibench.benchmark.scores.answer_errors import whitened
+from phibench.benchmark.scores.answer_errors import whitened_errors
 from phibench.benchmark.scores.metrics import FAR_SIGMAS
 from phibench.benchmark.scores.score_files import read_records, read_score
 from phibench.benchmark.scores.strata import light_shift
@@ -43,7 +43,7 @@ def claims_of(folder: Path, preset: str, method: str) -> pl.DataFrame:
     table = records.filter(pl.col("visible") & pl.col("mahalanobis2").is_not_null())
     error = table.select(pl.col("u_px") - pl.col("u_axis_px"), pl.col("v_px") - pl.col("v_axis_px")).to_numpy()
     uu, uv, vv = (table[f"claimed_{name}_px2"].to_numpy() for name in ("uu", "uv", "vv"))
-    pulls = whitened(error, np.stack([np.stack([uu, uv], -1), np.stack([uv, vv], -1)], -2))
+    pulls = whitened_errors(error, np.stack([np.stack([uu, uv], -1), np.stack([uv, vv], -1)], -2))
     table = table.with_columns(
         shift_px=light_shift(),
         claimed_px=(0.5 * (pl.col("claimed_uu_px2") + pl.col("claimed_vv_px2"))).sqrt(),

@@ -272,12 +272,12 @@ class Drawing:
 
 @contextmanager
 def canvas(width_in: float = 9.0, height_in: float = 4.0) -> Iterator[Figure]:
-    """A figure in the style of all studies; draw and call `drawn` inside of the block."""
+    """A figure in the style of all studies; draw and call `finished_drawing` inside of the block."""
     with figures.styled_figure(figures.STYLE, (width_in, height_in), layout="constrained", dpi=130) as figure:
         yield figure
 
 
-def drawn(name: str, figure: Figure, alt: str, kind: str = "svg") -> Drawing:
+def finished_drawing(name: str, figure: Figure, alt: str, kind: str = "svg") -> Drawing:
     """The finished drawing; the same marks give the same bytes."""
     return Drawing(name, figures.encoded_figure(figure, kind), alt, kind)
 

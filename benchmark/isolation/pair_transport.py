@@ -145,7 +145,7 @@ class MemoryFile:
 
     def write(self, parts: list[memoryview]) -> list[int]:
         """Write parts one after the other; where each begins, and where the last ends."""
-        starts = np.cumsum([0] + [aligned(view.nbytes) for view in parts]).tolist()
+        starts = np.cumsum([0] + [aligned_bytes(view.nbytes) for view in parts]).tolist()
         for view, start in zip(parts, starts, strict=False):
             self._space[start : start + view.nbytes] = view
         return list(starts)
@@ -179,14 +179,14 @@ def _seal(handle: int) -> None:
         fcntl.fcntl(handle, fcntl.F_ADD_SEALS, _OLD_SEALS)
 
 
-def aligned(count: int) -> int:
+def aligned_bytes(count: int) -> int:
     """Bytes that a part takes in the memory, at least."""
     return -(-max(count, 1) // _ALIGNED) * _ALIGNED
 
 
 def needed_bytes(pair: AnyPair) -> int:
     """Memory that the images of a pair take."""
-    return sum(aligned(image.nbytes) for image in _arrays(pair).values())
+    return sum(aligned_bytes(image.nbytes) for image in _arrays(pair).values())
 
 
 class SharedPages:

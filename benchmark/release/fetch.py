@@ -230,7 +230,7 @@ def _archives(place: Source, stage: Path, title: str, part: ReleasedPart, consol
     with Steps(console, title, len(todo), running=running) as steps:
         for current in todo:
             path = place.get(current.name, stage / _ARCHIVES, current)
-            unpack(path, stage / _SET, title, part.size, part.files)
+            unpack_archive(path, stage / _SET, title, part.size, part.files)
             done.append(current.sha256)
             _write_state(stage, state | {"unpacked": done})
             path.unlink()  # a disk need not hold all archives beside the set
@@ -247,7 +247,7 @@ def _remove_strays(folder: Path, archives: Sequence[Archive]) -> None:
             path.unlink()
 
 
-def unpack(archive: Path, folder: Path, title: str, most: int, files: int) -> None:
+def unpack_archive(archive: Path, folder: Path, title: str, most: int, files: int) -> None:
     """Unpack an archive of plain files below `title/`; all names and sizes are looked at before a file is written.
 
     Parameters

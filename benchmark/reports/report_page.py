@@ -221,7 +221,7 @@ def _ranking(
     frames, frame_of = _frames(number, scores)
     return Ranking(
         title=title,
-        verdict=" ".join([verdict(scores, by), *left_out, *failed]),
+        verdict=" ".join([report_verdict(scores, by), *left_out, *failed]),
         pair_set=pair_set,
         scores=scores,
         keys=method_keys(names),
@@ -241,7 +241,7 @@ def _ranking(
     )
 
 
-def verdict(scores: Mapping[str, ScoreDocument], by: str) -> str:
+def report_verdict(scores: Mapping[str, ScoreDocument], by: str) -> str:
     """Sentences on which method is best and what fails.
 
     Parameters

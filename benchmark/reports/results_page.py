@@ -41,10 +41,10 @@ from phibench.benchmark.scores.score_tables import (
     frames_line,
     head,
     light_line,
-    ranked,
+    ranked_scores,
     refusal_text,
     shown_parts,
-    starred,
+    starred_value,
 )
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.shown_text import TextTable, markdown, markdown_cell, markdown_text, table_lines
@@ -121,7 +121,7 @@ def _part(
     tables = {document.method.name: table for document, table in group}
     refusals = {name: why for name, table in tables.items() if (why := refusal_text(table))}
     documents = [document for document, _ in group]
-    order = ranked([one for one in documents if one.method.name not in refusals] or documents, by)
+    order = ranked_scores([one for one in documents if one.method.name not in refusals] or documents, by)
     base = next((one for one in order if one.method.name == against), order[0])
     name = base.method.name
     rules = Rules()
@@ -163,7 +163,9 @@ def _head(name: str) -> str:
 def _board(part: ScoreGroup, title: str, names: Sequence[str]) -> TextTable:
     rows = []
     for score in part.scores:
-        cells = (starred(shown_parts(m, score.metrics[m])) if applies(m, score.method.sees) else "" for m in names)
+        cells = (
+            starred_value(shown_parts(m, score.metrics[m])) if applies(m, score.method.sees) else "" for m in names
+        )
         words = division_and_rig(score) if names is _BOARD else ()
         rows.append((f"{score.method.name}{FLAGGED if score.flags else ''}", *words, *cells))
     heads, columns = (BY_WORD, "lll") if names is _BOARD else ((), "l")
@@ -186,7 +188,7 @@ _SIGNS = {"second": " **", "first": " **", "no difference shown": "", "too few s
 
 def _change(one: Difference) -> str:
     factor = METRICS[one.name].shown[0]
-    return starred(cell_parts(one.difference, factor, DIGITS, significant=True)) + _SIGNS[one.better]
+    return starred_value(cell_parts(one.difference, factor, DIGITS, significant=True)) + _SIGNS[one.better]
 
 
 def _strata(part: ScoreGroup) -> TextTable:
@@ -208,7 +210,7 @@ def _in_stratum(one: ScoreDocument, wanted: StratumScore) -> str:
         if (stratum.by, stratum.label) == (wanted.by, wanted.label):
             shown, _ = shown_parts("detection_rate", stratum.metrics["detection_rate"])
             median = stratum.metrics["median_px"].estimate
-            return f"{shown}; {starred(cell_parts(median, METRICS['median_px'].shown[0], 2, significant=True))}"
+            return f"{shown}; {starred_value(cell_parts(median, METRICS['median_px'].shown[0], 2, significant=True))}"
     return ""
 
 

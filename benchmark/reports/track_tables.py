@@ -13,7 +13,14 @@ from dataclasses import dataclass
 from phibench.benchmark.pair_sets.dataset_pairs import TRACKS, Track, tracks_of
 from phibench.benchmark.scores.metrics import METRICS
 from phibench.benchmark.scores.score_document import ScoreDocument
-from phibench.benchmark.scores.score_tables import BY_WORD, FLAGGED, RANKS_OF_TRACKS, rig_known, shown_parts, starred
+from phibench.benchmark.scores.score_tables import (
+    BY_WORD,
+    FLAGGED,
+    RANKS_OF_TRACKS,
+    rig_known,
+    shown_parts,
+    starred_value,
+)
 from phibench.datasets.common.shown_text import TextTable
 
 
@@ -105,4 +112,4 @@ def _beside(track: Track, documents: Sequence[ScoreDocument]) -> TextTable:
 
 
 def _cell(name: str, document: ScoreDocument | None) -> str:
-    return "" if document is None else starred(shown_parts(name, document.metrics[name]))
+    return "" if document is None else starred_value(shown_parts(name, document.metrics[name]))

@@ -244,7 +244,7 @@ def usable_covariance(covariance_px2: Array) -> Array:
     return np.where((symmetric & definite & finite)[:, None, None], C, np.nan)
 
 
-def whitened(error_px: Array, covariance_px2: Array) -> Array:
+def whitened_errors(error_px: Array, covariance_px2: Array) -> Array:
     """L^-1 e, shape (n, 2), with C = L L^T (Cholesky, lower): independent with variance 1 if C is right.
 
     Parameters

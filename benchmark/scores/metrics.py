@@ -353,7 +353,7 @@ def prepared_records(records: pl.DataFrame) -> pl.DataFrame:
     )
 
 
-def measure(
+def metric_estimates(
     records: pl.DataFrame, rules: Rules, *stream: Name, names: tuple[str, ...] | None = None
 ) -> dict[str, MetricEstimate]:
     """All metrics of some records, or those of `names`.

@@ -24,7 +24,7 @@ from phibench.benchmark.scores.answer_errors import (
     pixel_errors,
     rank_squares,
     usable_covariance,
-    whitened,
+    whitened_errors,
     with_kept_results,
 )
 from phibench.benchmark.scores.beyond_images import searched_px2
@@ -126,7 +126,7 @@ def _image_columns(
     detected = visible & np.where(known, near, given)
     false = given & ~detected
     claimed = usable_covariance(_claimed(answers))
-    pull = whitened(np.stack([error.du_px, error.dv_px], -1), claimed)
+    pull = whitened_errors(np.stack([error.du_px, error.dv_px], -1), claimed)
     bound, raw = (_bounds(spots, name) for name in ("bound_px2", "raw_bound_px2"))
     return {
         "image": [position] * len(spots),

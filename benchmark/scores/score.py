@@ -35,7 +35,7 @@ from phibench.benchmark.scores.records import in_order, missed_relative, record_
 from phibench.benchmark.scores.score_document import Declared, Division, MethodCard, ScoreDocument, document_of
 from phibench.benchmark.scores.score_files import UnfinishedError, records_kept, write_score
 from phibench.benchmark.scores.score_tables import score_table
-from phibench.benchmark.scores.worst_images import Worst, worst, worst_of, worst_records
+from phibench.benchmark.scores.worst_images import Worst, worst_images, worst_of, worst_records
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.progress import Steps, progress_console
 from phibench.datasets.common.shown_text import ShortForm, text_of
@@ -220,7 +220,7 @@ def examine(
     truths = [pairs.truth(outcome.number) for outcome in outcomes]
     table = record_table(truths, outcomes, rules)
     table = with_causes(table, pairs, rules, fits or KeptFits())
-    return Examined(table, worst(table, pairs, before=before), worst_records(table, before=before))
+    return Examined(table, worst_images(table, pairs, before=before), worst_records(table, before=before))
 
 
 def _scored(

@@ -61,7 +61,7 @@ _STRATA = ("detection_rate", "false_rate", "rms_px", "rms_phi_rad", "rms_depth_r
 # -- scores --------------------------------------------------------------------------------------------------------
 
 
-def ranked(documents: Sequence[ScoreDocument], by: str = "phi") -> list[ScoreDocument]:
+def ranked_scores(documents: Sequence[ScoreDocument], by: str = "phi") -> list[ScoreDocument]:
     """Scores, the best first."""
     return sorted(documents, key=lambda document: rank_key(document, by))
 
@@ -121,7 +121,7 @@ def leaderboard(documents: Sequence[ScoreDocument], by: str = "phi", wide: bool 
     first = documents[0]
     names = tuple(HEADS) if wide else (*_ranking_of_tracks(first), *HEADS)[:NARROW]
     rows = []
-    for document in ranked(documents, by):
+    for document in ranked_scores(documents, by):
         sees = document.method.sees
         cells = (_cell(name, document.metrics[name], wide) if applies(name, sees) else "" for name in names)
         words = division_and_rig(document) if wide else ()
@@ -171,7 +171,7 @@ def strata_table(document: ScoreDocument, wide: bool = False) -> TextTable:
 
 def _in_stratum(name: str, value: Value, wide: bool) -> str:
     shown, interval = shown_parts(name, value)
-    return starred((shown, interval if wide or interval.startswith("(") else ""))
+    return starred_value((shown, interval if wide or interval.startswith("(") else ""))
 
 
 def cause_table(documents: Sequence[ScoreDocument]) -> TextTable:
@@ -400,7 +400,7 @@ def scores_csv(documents: Sequence[ScoreDocument], by: str = "phi") -> str:
     ends = {name: ("", "_low", "_high", *(("_share",) if METRICS[name].family in CHOSEN else ())) for name in METRICS}
     names = [f"{name}{end}" for name in METRICS for end in ends[name]]
     rows = []
-    for document in ranked(documents, by):
+    for document in ranked_scores(documents, by):
         values = ((document.metrics[name], len(ends[name])) for name in METRICS)
         numbers = [
             x for estimate, n in values for x in (estimate.value, estimate.low, estimate.high, estimate.share)[:n]
@@ -413,7 +413,7 @@ def scores_csv(documents: Sequence[ScoreDocument], by: str = "phi") -> str:
 
 def scores_json(documents: Sequence[ScoreDocument], by: str = "phi") -> str:
     """One JSON object a line: a score without its pictures."""
-    bare = (d.model_copy(update={"worst": []}) for d in ranked(documents, by))
+    bare = (d.model_copy(update={"worst": []}) for d in ranked_scores(documents, by))
     return "".join(json.dumps(d.model_dump(mode="json"), allow_nan=False) + "\n" for d in bare)
 
 
@@ -447,7 +447,7 @@ def _cell(name: str, value: Value, wide: bool) -> str:
     return f"{shown}\n{interval}" if wide and interval else shown
 
 
-def starred(parts: tuple[str, str]) -> str:
+def starred_value(parts: tuple[str, str]) -> str:
     """Value and interval on one line, with a star in place of the reason why there is none."""
     value, interval = parts
     return f"{value} *" if interval.startswith("(") else f"{value} {interval}".strip()

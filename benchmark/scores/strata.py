@@ -15,7 +15,7 @@ from itertools import pairwise
 import polars as pl
 
 from phibench.benchmark.scores.answer_errors import Rules
-from phibench.benchmark.scores.metrics import METRICS, OF_PAIRS, MetricEstimate, measure, prepared_records
+from phibench.benchmark.scores.metrics import METRICS, OF_PAIRS, MetricEstimate, metric_estimates, prepared_records
 from phibench.datasets.store.schema import Document
 from phibench.scenes.random_streams import Name
 
@@ -99,12 +99,12 @@ def stratum_metrics(stratum: Stratum, rules: Rules, *stream: Name) -> dict[str, 
     """Metrics of a stratum, resampled from a stream of its own."""
     names = (*stream, stratum.by, stratum.label)
     if stratum.pairs is None:
-        return measure(stratum.images, rules, *names, names=_IMAGE_METRICS)
+        return metric_estimates(stratum.images, rules, *names, names=_IMAGE_METRICS)
     if stratum.pairs is stratum.images:
-        return measure(stratum.images, rules, *names)
+        return metric_estimates(stratum.images, rules, *names)
     pair_metrics = tuple(name for name in METRICS if name not in _IMAGE_METRICS)
-    both = measure(stratum.images, rules, *names, names=_IMAGE_METRICS)
-    both |= measure(stratum.pairs, rules, *names, names=pair_metrics)
+    both = metric_estimates(stratum.images, rules, *names, names=_IMAGE_METRICS)
+    both |= metric_estimates(stratum.pairs, rules, *names, names=pair_metrics)
     return {name: both[name] for name in METRICS}
 
 

@@ -32,7 +32,9 @@ _GAMMA = 1.0 / 2.2  # raw pixels are linear in the light
 _JPEG_QUALITY = 70  # of frames in the report: to look at, not to measure
 
 
-def worst(records: pl.DataFrame, pairs: Pairs, count: int = COUNT, before: pl.DataFrame | None = None) -> list[Worst]:
+def worst_images(
+    records: pl.DataFrame, pairs: Pairs, count: int = COUNT, before: pl.DataFrame | None = None
+) -> list[Worst]:
     """Worst images first: wrong positions by distance, then no position, then detected spots by distance.
 
     Only visible spots, and one image of a sample: ten draws of one spot would show one thing ten times. `before` are

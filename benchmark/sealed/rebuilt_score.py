@@ -53,7 +53,7 @@ def outcomes_of_records(table: pl.DataFrame) -> list[Outcome]:
     return [_outcome(down, up) for down, up in zip(rows, rows, strict=True)]
 
 
-def rebuilt(
+def score_from_records(
     document: ScoreDocument, table: pl.DataFrame, pairs: PairSet, told: Callable[[int], None] = lambda done: None
 ) -> Scored:
     """Score of the same answers, made anew: truth, errors, bounds, pulls, ranks, causes, metrics and worst images.

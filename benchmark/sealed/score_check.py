@@ -21,7 +21,7 @@ from rich.console import Console
 from phibench.benchmark.isolation.run_limits import RunLimits
 from phibench.benchmark.pair_sets.dataset_pairs import BOX_PX, TASK_VERSION, TRACKS
 from phibench.benchmark.pair_sets.wanted_pairs import PairChoice, wanted_pairs
-from phibench.benchmark.scores.answer_errors import Rules, usable_covariance, whitened
+from phibench.benchmark.scores.answer_errors import Rules, usable_covariance, whitened_errors
 from phibench.benchmark.scores.record_columns import COLUMN_TYPES
 from phibench.benchmark.scores.records import missed_relative, with_missed
 from phibench.benchmark.scores.score_document import ScoreDocument, document_of, results_sha256
@@ -37,7 +37,7 @@ from phibench.benchmark.sealed.rebuilt_score import (
     check_run,
     column_differences,
     pictures_alike,
-    rebuilt,
+    score_from_records,
     short_value,
 )
 from phibench.datasets.common.errors import DatasetError
@@ -240,7 +240,7 @@ def _impossible(table: pl.DataFrame) -> Iterator[str]:
 def _of_errors(table: pl.DataFrame, document: ScoreDocument) -> Iterator[str]:
     """Columns that follow from others of the same row."""
     given, visible = pl.col("u_px").is_not_null(), pl.col("visible")
-    pull = whitened(_arrays(table, "du_px", "dv_px"), usable_covariance(_matrices(table, "claimed")))
+    pull = whitened_errors(_arrays(table, "du_px", "dv_px"), usable_covariance(_matrices(table, "claimed")))
     claims = table.with_columns(first=pl.Series(pull[:, 0]).fill_nan(None), second=pl.Series(pull[:, 1]).fill_nan(None))
     placed = pl.col("u_true_px").is_not_null()
     near = (pl.col("distance_px") <= document.rules.get("match_px", math.nan)).fill_null(False)
@@ -300,7 +300,7 @@ def _built_again(
         return _Again((f"pairs is {document.pairs}, and {told}: score all of them",))
     try:
         with Steps(console, "built again", len(pairs)) as steps:
-            right = rebuilt(document, table, pairs, steps.reach)
+            right = score_from_records(document, table, pairs, steps.reach)
     except DatasetError as error:
         return _Again((str(error),))
     names = [name for name in right.records.columns if name not in GIVEN]

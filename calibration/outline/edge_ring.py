@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from phibench.calibration.outline.limb_image import convolved
+from phibench.calibration.outline.limb_image import convolution
 from phibench.scenes.frames import Array, BoolArray
 
 Circle = tuple[float, float, float]
@@ -276,5 +276,5 @@ class LimbRing(EdgeRing):
         k = np.arange(-reach, reach + 0.5 * fine, fine)
         kernel = np.exp(-0.5 * np.square(k / self.blur_px))
         T = 2.0 * np.arccos(np.clip(1.0 + d / self.circle[2], 0.0, 1.0))
-        turned, squared = (convolved(f, kernel / kernel.sum())[::_FINE] for f in (T, T * T))
+        turned, squared = (convolution(f, kernel / kernel.sum())[::_FINE] for f in (T, T * T))
         return np.stack([np.ones(len(x)), turned, squared], axis=-1)

@@ -308,7 +308,7 @@ def line_spread(camera: Camera, depth_m: float, blur_px2: float) -> Array:
     disc_px = camera.aperture_radius_m * camera.fx_px * abs(1.0 / camera.focus_distance_m - 1.0 / depth_m)
     if disc_px > 2.0 * STEP_PX:
         half = len(x) // 2
-        kernel = convolved(np.pad(kernel, half), np.sqrt(np.clip(disc_px**2 - x * x, 0.0, None)))
+        kernel = convolution(np.pad(kernel, half), np.sqrt(np.clip(disc_px**2 - x * x, 0.0, None)))
     return np.asarray(kernel / kernel.sum())
 
 
@@ -316,10 +316,10 @@ def blurred_light(sharp: Array, kernel: Array) -> Array:
     """Light of a table, shape (n,), through a line spread."""
     half = len(kernel) // 2
     padded = np.concatenate([np.full(half, sharp[0]), sharp, np.full(half, sharp[-1])])
-    return convolved(padded, kernel)
+    return convolution(padded, kernel)
 
 
-def convolved(values: Array, kernel: Array) -> Array:
+def convolution(values: Array, kernel: Array) -> Array:
     """Convolution where the kernel lies within the values, by FFT: what `scipy.signal`, slow to import, gives."""
     length = fft.next_fast_len(len(values), real=True)
     product = fft.rfft(values, length) * fft.rfft(kernel, length)

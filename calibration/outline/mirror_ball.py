@@ -27,7 +27,7 @@ from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.rooms.panorama_room import PanoramaSettings
 from phibench.datasets.store.layers import write_exr
 from phibench.datasets.store.pictures import save_png
-from phibench.estimator.geometry.panorama import PanoramaGrid, unrolled
+from phibench.estimator.geometry.panorama import PanoramaGrid, unrolled_values
 from phibench.estimator.geometry.reflection import image_of
 from phibench.estimator.spots.camera_codes import linear_to_srgb
 from phibench.estimator.spots.image_planes import ImageError
@@ -224,7 +224,7 @@ def unwrap(light: NDArray[np.float32], ball: Ball, surroundings_m: float, width_
         rows = slice(first, min(first + _ROWS_AT_ONCE, width // 2))
         fine = slice(rows.start * parts, rows.stop * parts)
         uv, shown = table.pixels(grid.directions(fine))
-        values = unrolled(light, uv)
+        values = unrolled_values(light, uv)
         cells = (rows.stop - rows.start, parts, width, parts)
         result[rows] = values.reshape(*cells, 3).mean(axis=(1, 3))
         seen[rows] = shown.reshape(cells).all(axis=(1, 3))

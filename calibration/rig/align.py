@@ -329,7 +329,7 @@ def sharpness_in_words(value: float) -> str:
     return f"sharpness in the mirror: {value:.3f}; turn the lens until it is largest, in pictures of the same scene"
 
 
-def verdict(found: Alignment) -> str:
+def alignment_verdict(found: Alignment) -> str:
     """Judgement in one sentence: centred or not, and how well the outline fits."""
     off = float(np.linalg.norm(found.move_world_m)) / found.sigma_m if found.sigma_m > 0.0 else math.inf
     mark = (

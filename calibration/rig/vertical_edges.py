@@ -69,7 +69,7 @@ class Unwrapped:
         return self.centre_px + radius[:, None] * np.stack([np.cos(azimuth), np.sin(azimuth)], axis=-1)
 
 
-def unwrapped(picture: Array, circle: Circle) -> Unwrapped:
+def unwrapped_picture(picture: Array, circle: Circle) -> Unwrapped:
     """Unwrap a picture, shape (H, W), about the circle of an outline."""
     centre, radius_px = np.array(circle[:2]), circle[2]
     low, high = (share * radius_px for share in RADII)
@@ -90,7 +90,7 @@ def edges_of(picture: Array, rig: Rig) -> list[Array]:
 
 def edges_about(picture: Array, circle: Circle) -> list[Array]:
     """The same about the circle of an outline, for a picture of an unknown camera."""
-    polar = unwrapped(picture, circle)
+    polar = unwrapped_picture(picture, circle)
     # upright edges are radial: the step of light lies along the azimuth
     across = _gradient(polar.light)
     edges, taken = [], np.zeros(across.shape, bool)

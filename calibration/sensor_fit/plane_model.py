@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from phibench.calibration.sensor_fit.noise_levels import BOX_PX, NoiseLevel, PlaneNoise, decoded_by
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.estimator.spots.camera_codes import RGB_FROM_YCC, YCC_FROM_RGB, noisy_code
-from phibench.estimator.spots.image_planes import demosaiced
+from phibench.estimator.spots.image_planes import demosaiced_planes
 from phibench.scenes.frames import Array
 
 _SIDE = 16  # of the torus: answers reach 4 pixels, lags 3
@@ -278,5 +278,5 @@ def _pulses() -> Array:
     for row, column in _PLACES:
         pulse = np.zeros((_SIDE, _SIDE))
         pulse[_SIDE // 2 + row, _SIDE // 2 + column] = 1.0
-        planes.append(demosaiced(pulse))
+        planes.append(demosaiced_planes(pulse))
     return np.stack(planes)

@@ -15,7 +15,7 @@ from phibench.scenes.shapes import Cuboid
 _END_M = 1e-6  # a segment may touch the surface that it ends on
 
 
-def blocked(solid: Cuboid, start_m: Array, end_m: Array) -> BoolArray:
+def blocked_segments(solid: Cuboid, start_m: Array, end_m: Array) -> BoolArray:
     """Segments, shape (..., 3), that pass through a box: bool, shape (...).
 
     The part of the segment inside each pair of planes is an interval of its parameter; the box is hit where the three
@@ -39,12 +39,12 @@ def blocked(solid: Cuboid, start_m: Array, end_m: Array) -> BoolArray:
 def first_blocker(solids: Sequence[Cuboid], legs: Sequence[tuple[Array, Array]]) -> str | None:
     """Name of the first solid that stands in any leg (start, end), shapes (..., 3), of any ray; None if none does."""
     for solid in solids:
-        if any(np.any(blocked(solid, start, end)) for start, end in legs):
+        if any(np.any(blocked_segments(solid, start, end)) for start, end in legs):
             return solid.name
     return None
 
 
-def unhidden(rig: Rig, points_m: Array, offset_m: float) -> BoolArray:
+def unhidden_places(rig: Rig, points_m: Array, offset_m: float) -> BoolArray:
     """Places that robot, mast and housing do not hide on the way to the mirror, shape (n,)."""
     view = rig.at(offset_m)
     lowered = points_m - offset_m * np.array(rig.stroke_axis_world)  # seen as the points by the raised rig
@@ -53,7 +53,9 @@ def unhidden(rig: Rig, points_m: Array, offset_m: float) -> BoolArray:
     start = np.where(known[:, None], mirror, view.sphere_centre_m)
     solids = escalade360(view)
     inside = [_holds(solid.T_world_shape.inverse().points(points_m), solid.size_m) for solid in solids]
-    return np.asarray(known & ~np.any([*inside, *(blocked(solid, start, points_m) for solid in solids)], axis=0))
+    return np.asarray(
+        known & ~np.any([*inside, *(blocked_segments(solid, start, points_m) for solid in solids)], axis=0)
+    )
 
 
 def _holds(points_m: Array, size_m: Sequence[float]) -> BoolArray:

@@ -122,7 +122,7 @@ def pixels_by_model(view: View, grid: PanoramaGrid, distance_m: float = FAR_M) -
     return uv.reshape(grid.height_px, grid.width_px, 2)
 
 
-def unrolled(image: NDArray[np.generic], uv_px: Array) -> Array:
+def unrolled_values(image: NDArray[np.generic], uv_px: Array) -> Array:
     """Image values at pixels, bilinear between the four around each; NaN where the pixel is.
 
     Parameters
@@ -243,19 +243,21 @@ def panorama(
     image: Array | None = None,
 ) -> Panorama:
     """Unroll a picture, shape (h, w, 3), uint8, or the noise-free view with the laser on."""
-    picture = frame(sample, position) if image is None else image
+    picture = view_picture(sample, position) if image is None else image
     height, width = sample.nominal_rig.camera.height_px, sample.nominal_rig.camera.width_px
     if picture.shape[:2] != (height, width):
         raise DatasetError(
             f"the picture has {picture.shape[1]} x {picture.shape[0]} pixels, the rig's camera {width} x {height}: "
             "give a whole frame of this camera"
         )
-    values = unrolled(picture, places(sample, position, grid, by, distance_m))
+    values = unrolled_values(picture, grid_pixels(sample, position, grid, by, distance_m))
     seen = np.isfinite(values[..., 0])
     return Panorama(np.rint(np.where(seen[..., None], values, 0.0)).astype(np.uint8), float(seen.mean()))
 
 
-def places(sample: Sample, position: str, grid: PanoramaGrid, by: By = "model", distance_m: float = FAR_M) -> Array:
+def grid_pixels(
+    sample: Sample, position: str, grid: PanoramaGrid, by: By = "model", distance_m: float = FAR_M
+) -> Array:
     """Image pixel of every grid point, shape (H, W, 2), by the nominal rig or by the truth layer of the true one."""
     if by == "model":
         return pixels_by_model(nominal_view(sample, position), grid, distance_m)
@@ -269,7 +271,7 @@ def nominal_view(sample: Sample, position: str) -> View:
     return sample.nominal_rig.at(0.0 if position == "down" else sample.row.nominal_stroke_m)
 
 
-def frame(sample: Sample, position: str, preset: str = LAYERS) -> NDArray[Any]:
+def view_picture(sample: Sample, position: str, preset: str = LAYERS) -> NDArray[Any]:
     """Colour picture of the view, laser on, shape (h, w, 3), uint8.
 
     Parameters

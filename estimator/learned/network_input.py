@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.estimator.interface import Box, Image
-from phibench.estimator.spots.image_planes import colour_planes, demosaiced, variance_e2
+from phibench.estimator.spots.image_planes import colour_planes, demosaiced_planes, variance_e2
 from phibench.estimator.spots.raw_pixels import raw_electrons
 from phibench.scenes.frames import Array, BoolArray
 
@@ -92,7 +92,7 @@ def crop_origin(uv_px: tuple[float, float]) -> tuple[int, int]:
     return int(u0), int(v0)
 
 
-def cut(image: Image, origin_px: tuple[int, int], side_px: int = WINDOW_PX) -> Image:
+def cut_part(image: Image, origin_px: tuple[int, int], side_px: int = WINDOW_PX) -> Image:
     """Part of an image, shape (H, W, ...), that may reach over its border.
 
     Beyond the border stands what is mirrored about the border pixel, which keeps the mosaic's colours in order.
@@ -113,7 +113,7 @@ def filter_planes(image: Image, card: SensorCard) -> tuple[Array, BoolArray]:
     """Electrons behind R, G, B, shape (3, h, w), and full pixels, shape (h, w), of a part that begins with red."""
     if card.output == "raw":
         signal = raw_electrons(image, card)
-        return demosaiced(signal), np.asarray(signal >= card.saturation_e)
+        return demosaiced_planes(signal), np.asarray(signal >= card.saturation_e)
     height, width = image.shape[:2]
     colours = colour_planes(image, card, Box(0, 0, width, height))
     return np.asarray(colours.values_e, float), np.asarray(colours.full.any(axis=0))

@@ -31,7 +31,7 @@ from phibench.datasets.store.files import write_bytes
 from phibench.estimator.interface import Image, Spot
 from phibench.estimator.learned.network_file import NetworkFileError, Node, read_model, require_layers
 from phibench.estimator.learned.network_graphs import CROP, DETECT, GRAPHS, Weights, weight_shapes
-from phibench.estimator.learned.network_input import SIDE_PX, WINDOW_PX, CropInput, crop_input, crop_origin, cut
+from phibench.estimator.learned.network_input import SIDE_PX, WINDOW_PX, CropInput, crop_input, crop_origin, cut_part
 from phibench.scenes.frames import Array, BoolArray
 from phibench.scenes.validation import printable_line
 
@@ -325,7 +325,7 @@ def refined_position(
     """
     origin = crop_origin(uv_px)
     for _ in range(_LOOKS):
-        made = crop_input(cut(image, origin), None if dark is None else cut(dark, origin), card, response)
+        made = crop_input(cut_part(image, origin), None if dark is None else cut_part(dark, origin), card, response)
         answer = found.position(made, scale)
         if not np.abs(answer.uv_px - (SIDE_PX - 1) / 2.0).max() < _REACH_PX:
             return Spot.missing("no spot near the place")

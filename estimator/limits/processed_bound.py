@@ -45,7 +45,7 @@ from phibench.estimator.processed.chain_model import (
 from phibench.estimator.processed.fit_processed_images import codes_are_independent
 from phibench.estimator.processed.fit_processed_region import grid_px
 from phibench.estimator.processed.quasi_score import CoefficientWindow
-from phibench.estimator.spots.camera_codes import hidden_share, quantised
+from phibench.estimator.spots.camera_codes import hidden_share, quantised_output
 from phibench.estimator.spots.gaussian_spot import (
     LASER_RESPONSE,
     SpotBlur,
@@ -386,7 +386,7 @@ def _off_frames_of_window(
     D = derivatives[0, :3].reshape(3, -1)
     spot, mean_e = theta[2] * D[2], mean.ravel()
     on, off = _readings(model, mean_e), _readings(model, mean_e - spot)
-    output = quantised(on.mean, on.sigma, model.step)
+    output = quantised_output(on.mean, on.sigma, model.step)
     noise = (on.factor * output.slope).T @ (on.factor * output.slope)
     np.fill_diagonal(noise, output.variance)
     extra_e2 = raw_variance_e2(model, mean_e - spot) / frames.off + (card.prnu * spot) ** 2

@@ -26,7 +26,14 @@ from phibench.estimator.methods.pair_light import SIGMA_OF_MAD
 from phibench.estimator.spots.camera_codes import rgb_codes
 from phibench.estimator.spots.detect import Detection, PairDetection, detect
 from phibench.estimator.spots.gaussian_spot import SpotBlur
-from phibench.estimator.spots.image_planes import demosaiced, full_scale_e, kind_of, linear_planes, redness, variance_e2
+from phibench.estimator.spots.image_planes import (
+    demosaiced_planes,
+    full_scale_e,
+    kind_of,
+    linear_planes,
+    redness,
+    variance_e2,
+)
 from phibench.estimator.spots.simple_spots import SpotPositions
 from phibench.estimator.spots.spot_prediction import spot_blur
 from phibench.scenes.frames import Array, BoolArray
@@ -279,7 +286,7 @@ class SearchRegion:
         pixels = rgb_codes(self.pixels, self.pair.card, self.origin_px).astype(float)
         if kind_of(self.pair.card) != "bayer-raw":
             return pixels
-        return np.moveaxis(demosaiced(pixels, self.origin_px), 0, -1)
+        return np.moveaxis(demosaiced_planes(pixels, self.origin_px), 0, -1)
 
     @property
     def red(self) -> Array:

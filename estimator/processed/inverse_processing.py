@@ -32,7 +32,7 @@ from phibench.estimator.spots.camera_codes import (
     tone_of,
     tone_slope,
 )
-from phibench.estimator.spots.image_planes import demosaiced, full_scale_e
+from phibench.estimator.spots.image_planes import demosaiced_planes, full_scale_e
 from phibench.estimator.spots.raw_pixels import bayer_filters
 from phibench.scenes.frames import Array
 
@@ -118,7 +118,7 @@ def _own_colours(raw: Array, corner: NDArray[np.int64], card: SensorCard) -> Arr
     """Electrons behind each pixel's own colour after demosaicing, curve and chroma means, shape (h, w)."""
     u, v = (int(k) for k in corner + np.asarray(card.mosaic_phase))
     mix = np.asarray(card.colour_matrix) * np.asarray(card.white_balance) / full_scale_e(card)
-    linear = np.einsum("ij,jhw->ihw", mix, demosaiced(raw, (u, v)))
+    linear = np.einsum("ij,jhw->ihw", mix, demosaiced_planes(raw, (u, v)))
     code = tone_of(np.clip(linear, 0.0, 1.0), card)
     light = light_of(np.clip(_mean_chroma(code, corner, card), 0.0, 1.0), card)
     filters = bayer_filters(np.array([[u, v]]), raw.shape)[0]

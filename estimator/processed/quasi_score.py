@@ -28,7 +28,7 @@ from phibench.estimator.processed.chain_model import (
     noise_factor,
     raw_variance_e2,
 )
-from phibench.estimator.spots.camera_codes import quantised, step_correlation
+from phibench.estimator.spots.camera_codes import quantised_output, step_correlation
 from phibench.estimator.spots.gaussian_spot import SpotPixels, limited_step, scoring_step
 from phibench.estimator.spots.pixel_statistics import CutPixels, cut_pixels
 from phibench.scenes.frames import Array
@@ -207,7 +207,7 @@ class CoefficientWindow:
         rest = excess_variance(model, at, rows.transform) + rows.rounding + room
         # diagonal of F^T F, and what is white beside it
         sigma = np.sqrt(np.einsum("rn,rn->n", F, F) + rest)
-        output = quantised(at.mean @ rows.transform + rows.shift + offset, sigma, rows.step)
+        output = quantised_output(at.mean @ rows.transform + rows.shift + offset, sigma, rows.step)
         variance = np.maximum(output.variance, _LEAST * rows.step**2)
         slope = output.slope
         if live is None:
@@ -268,7 +268,7 @@ class CoefficientWindow:
         """Whitened residuals, shape (m, l), and derivatives of the mean, shape (m, k - first, l), as `means`."""
         rows = noise.rows
         mean, slopes = self.means(theta, rows, first)
-        output = quantised(mean, noise.sigma, rows.step)
+        output = quantised_output(mean, noise.sigma, rows.step)
         slopes *= output.slope[:, None, :]
         m, k, count = slopes.shape
         both = np.concatenate([(self.z[rows.index] - output.mean)[:, None], slopes], axis=1)

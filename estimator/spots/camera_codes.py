@@ -32,7 +32,7 @@ from phibench.scenes.frames import Array
 # coefficient c lies anywhere in its step s, with the variance s^2 / 12. Where the room is flat, the high frequencies
 # are 0 and their step says nothing: of a coefficient whose neighbours have the mean square P the error has the variance
 # (s^2 / 12) P / (P + s^2 / 12), Wiener's for two Gaussian laws.
-# * `quantised`: mean, slope and variance of a Gaussian behind a uniform quantiser. Steps and values in the same unit.
+# * `quantised_output`: mean, slope, variance of a Gaussian behind a uniform quantiser. Steps are in the unit of values.
 
 
 Tables = tuple[tuple[int, ...], tuple[int, ...]]
@@ -190,7 +190,7 @@ _LEAST = 1e-4  # standard deviation in steps; a smaller one would make slopes th
 
 
 @dataclass(frozen=True)
-class Quantised:
+class QuantisedOutput:
     """Output for Gaussian inputs, arrays of the inputs' shape.
 
     Attributes
@@ -205,11 +205,13 @@ class Quantised:
     variance: Array
 
 
-def quantised(mean: Array, sigma: Array, step: Array) -> Quantised:
+def quantised_output(mean: Array, sigma: Array, step: Array) -> QuantisedOutput:
     """Round to multiples of `step`, halves either way; arrays broadcast together."""
     m, s, q = np.broadcast_arrays(mean / step, np.maximum(sigma / step, _LEAST), step)
     fine = s >= _FINE
-    result = Quantised(m * q, np.ones_like(m), (s**2 + 1.0 / 12.0) * q**2)  # Sheppard: rounding adds a uniform error
+    result = QuantisedOutput(
+        m * q, np.ones_like(m), (s**2 + 1.0 / 12.0) * q**2
+    )  # Sheppard: rounding adds a uniform error
     if fine.all():
         return result
     coarse = ~fine

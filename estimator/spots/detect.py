@@ -99,7 +99,7 @@ def choose(rig: Rig, stroke_m: float, down: Candidates, up: Candidates, least: T
     sure : bool
         The candidates are known to be red or the laser's; otherwise a pair is always preferred.
     """
-    fits = consistent(rig, stroke_m, down.uv_px[:_MOST], up.uv_px[:_MOST])
+    fits = consistent_pairs(rig, stroke_m, down.uv_px[:_MOST], up.uv_px[:_MOST])
     ratio = up.electrons[None, :_MOST] / np.maximum(down.electrons[:_MOST, None], 1e-9)  # no light: far beyond `most`
     z_down, z_up = down.z[:_MOST, None], up.z[None, :_MOST]
     most = np.where(np.minimum(z_down, z_up) >= least.alone, _FLUX_RATIO_ALONE, _FLUX_RATIO)
@@ -122,7 +122,7 @@ def choose(rig: Rig, stroke_m: float, down: Candidates, up: Candidates, least: T
     return _single(down, up, (alone[0] if outshone[0] else None, alone[1] if outshone[1] else None))
 
 
-def consistent(rig: Rig, stroke_m: float, uv_down_px: Array, uv_up_px: Array) -> BoolArray:
+def consistent_pairs(rig: Rig, stroke_m: float, uv_down_px: Array, uv_up_px: Array) -> BoolArray:
     """Pairs of pixels, (n, 2) and (m, 2), that can show one point, shape (n, m), bool."""
     if len(uv_down_px) == 0 or len(uv_up_px) == 0:
         return np.zeros((len(uv_down_px), len(uv_up_px)), bool)

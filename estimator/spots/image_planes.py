@@ -85,11 +85,11 @@ def linear_planes(image: NDArray[Any], card: SensorCard, origin_px: tuple[int, i
     signal = raw_electrons(image, card) / full_scale_e(card)
     if card.mosaic == "mono":
         return signal[None]
-    balanced = demosaiced(signal, origin_px) * np.array(card.white_balance)[:, None, None]
+    balanced = demosaiced_planes(signal, origin_px) * np.array(card.white_balance)[:, None, None]
     return np.einsum("ij,jhw->ihw", np.array(card.colour_matrix), balanced)
 
 
-def demosaiced(signal: Array, origin_px: tuple[int, int] = (0, 0)) -> Array:
+def demosaiced_planes(signal: Array, origin_px: tuple[int, int] = (0, 0)) -> Array:
     """Bilinear interpolation of an RGGB mosaic, shape (h, w), to planes, shape (3, h, w).
 
     Beyond the border stands what is mirrored about the border pixel, which keeps the mosaic's colours in order.

@@ -215,6 +215,7 @@ def align(
     from phibench.calibration.outline.first_circle import rig_circle
     from phibench.calibration.rig.align import (
         alignment,
+        alignment_verdict,
         camera_in_words,
         circle_in_words,
         circle_of,
@@ -224,7 +225,6 @@ def align(
         rig_of_numbers,
         sharpness,
         sharpness_in_words,
-        verdict,
         write_alignment_picture,
         write_circle_picture,
     )
@@ -253,7 +253,7 @@ def align(
         print(sharpness_in_words(sharpness(pixels, card, circle.circle_px)))
         return 0
     result = alignment(pixels, known, card, *doubts.numbers, vertical)
-    print(verdict(result))
+    print(alignment_verdict(result))
     print(f"{write_alignment_picture(out, pixels, known, result)}: outline, and the move drawn 20 times as long")
     print(in_words(result))
     if vertical:

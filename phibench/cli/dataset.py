@@ -400,9 +400,11 @@ class ViewOptions:
     def picture(self, sample: Sample) -> NDArray[Any]:
         """Picture to unroll: a file's, or a frame of the sample."""
         from phibench.calibration.captures.picture_files import read_picture
-        from phibench.estimator.geometry.panorama import frame
+        from phibench.estimator.geometry.panorama import view_picture
 
-        return frame(sample, self.position, self.preset) if self.image is None else read_picture(self.image).pixels
+        return (
+            view_picture(sample, self.position, self.preset) if self.image is None else read_picture(self.image).pixels
+        )
 
 
 _FIRST_VIEW = ViewOptions()

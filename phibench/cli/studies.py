@@ -118,7 +118,7 @@ def _tables(directory: Path, calibration: Path | None, wide: bool, out: Path | N
     from phibench.datasets.common.shown_text import show_grid, table_console
     from phibench.datasets.read import open_finished
     from phibench.studies.paper.paper_tables import bias_table, table
-    from phibench.studies.paper.paper_tables import score as score_dataset
+    from phibench.studies.paper.paper_tables import score_estimators as score_dataset
 
     dataset = open_finished(directory)
     calibrated = None if calibration is None else read_calibration(calibration)

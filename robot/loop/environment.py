@@ -362,7 +362,7 @@ class ApproachTargetFlat(gymnasium.Env[NDArray[Any], NDArray[Any]]):
         self.render_mode = self.inner.render_mode
         if self.inner.setup.fidelity != "exact":
             raise SceneError("the flat environment is that of the exact model: pixels make no vector of float32")
-        size = len(scaled(self.inner.reset(seed=0)[0], self._bounds))
+        size = len(scaled_observation(self.inner.reset(seed=0)[0], self._bounds))
         self.action_space = spaces.Box(-1.0, 1.0, (len(self._actions),), np.float32)
         self.observation_space = spaces.Box(-1.0, 1.0, (size,), np.float32)
 
@@ -380,7 +380,7 @@ class ApproachTargetFlat(gymnasium.Env[NDArray[Any], NDArray[Any]]):
         """Begin an episode: that of `ApproachTarget` with the same seed."""
         super().reset(seed=seed)
         observation, info = self.inner.reset(seed=seed, options=options)
-        return scaled(observation, self._bounds), info
+        return scaled_observation(observation, self._bounds), info
 
     def step(self, action: NDArray[Any]) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
         """Perform one step.
@@ -390,8 +390,8 @@ class ApproachTargetFlat(gymnasium.Env[NDArray[Any], NDArray[Any]]):
         SceneError
             If the action has another length or a number outside, or the episode is over.
         """
-        observation, reward, over, late, info = self.inner.step(unscaled(action, self._actions))
-        return scaled(observation, self._bounds), reward, over, late, info
+        observation, reward, over, late, info = self.inner.step(action_of_scaled(action, self._actions))
+        return scaled_observation(observation, self._bounds), reward, over, late, info
 
     def render(self) -> NDArray[np.uint8] | None:
         """Picture of `ApproachTarget`."""
@@ -415,7 +415,7 @@ def numbers_of_action(action: NDArray[Any], names: tuple[str, ...]) -> NDArray[n
     return numbers
 
 
-def unscaled(vector: NDArray[Any], space: spaces.Dict) -> dict[str, Any]:
+def action_of_scaled(vector: NDArray[Any], space: spaces.Dict) -> dict[str, Any]:
     """Action of a vector of -1 to 1.
 
     Raises
@@ -436,7 +436,7 @@ def unscaled(vector: NDArray[Any], space: spaces.Dict) -> dict[str, Any]:
     return values
 
 
-def scaled(observation: dict[str, Any], space: spaces.Dict) -> NDArray[np.float32]:
+def scaled_observation(observation: dict[str, Any], space: spaces.Dict) -> NDArray[np.float32]:
     """Vector of -1 to 1 of an observation of the exact model; electrons by their logarithm."""
     parts = []
     for name, own in space.items():

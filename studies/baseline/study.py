@@ -31,8 +31,8 @@ from phibench.studies.framework import (
     StudyDatasets,
     StudyResult,
     canvas,
-    drawn,
     error_bars,
+    finished_drawing,
     rms,
     text_table,
 )
@@ -131,8 +131,8 @@ def _rendered(recipe: str, datasets: StudyDatasets) -> pl.DataFrame:
                 "recipe": recipe,
                 "sample_id": row.sample_id,
                 "sense": sense,
-                "rendered_error_m": float(tables.estimates(sense, rig, strokes, *spots_px)[i] - row.depth_m),
-                "closed_form_error_m": float(tables.estimates(sense, rig, strokes, down, up)[i] - true[i]),
+                "rendered_error_m": float(tables.depth_estimates(sense, rig, strokes, *spots_px)[i] - row.depth_m),
+                "closed_form_error_m": float(tables.depth_estimates(sense, rig, strokes, down, up)[i] - true[i]),
             }
             for sense in tables.SENSES
             for i, row in enumerate(rows)
@@ -374,7 +374,7 @@ def curves_drawing(table: pl.DataFrame, bands: pl.DataFrame, method: str, alt: s
             ax.set(title=title, xlabel=_AXES[axis], ylabel="error of D (m)")
         handles, labels = figure.axes[0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", ncols=4)
-        return drawn("curves", figure, alt)
+        return finished_drawing("curves", figure, alt)
 
 
 def laws_drawing(table: pl.DataFrame, laws: list[tables.LawFit], alt: str) -> Drawing:
@@ -390,7 +390,7 @@ def laws_drawing(table: pl.DataFrame, laws: list[tables.LawFit], alt: str) -> Dr
         ax.set(xlabel="eq. (7) with the bound of the disparity (m)", ylabel="standard deviation of D (m)")
         ax.legend()
         _exponents(other, laws)
-        return drawn("laws", figure, alt)
+        return finished_drawing("laws", figure, alt)
 
 
 def _panel(ax: Any, rows: pl.DataFrame, axis: str) -> None:

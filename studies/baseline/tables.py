@@ -197,7 +197,7 @@ def seen_pixels(rig: Rig, misalignment: Misalignment, points_m: Array, strokes_m
     return down, up, np.hypot(away[:, 0], away[:, 1])
 
 
-def estimates(sense: str, rig: Rig, strokes_m: Array, down_px: Array, up_px: Array) -> Array:
+def depth_estimates(sense: str, rig: Rig, strokes_m: Array, down_px: Array, up_px: Array) -> Array:
     """D by eq. (4) with phi in one sense, or by the exact estimator, shape (..., n), from pixels (..., n, 2).
 
     The rig is an aligned one, so that phi does not depend on the carriage.
@@ -215,7 +215,7 @@ def drawn_errors(
     """Errors of D, shape (count, n), metres, in every sense of phi, of an aligned reader of drawn rigs."""
     pictures = [seen_pixels(rig, drawn_misalignment(rig, random), points_m, strokes_m) for _ in range(count)]
     down, up, true = (np.stack(rows) for rows in zip(*pictures, strict=True))
-    return {sense: estimates(sense, rig, strokes_m, down, up) - true for sense in SENSES}
+    return {sense: depth_estimates(sense, rig, strokes_m, down, up) - true for sense in SENSES}
 
 
 _NOWHERE = (float("nan"), float("nan"))
@@ -341,11 +341,11 @@ def experiment_table(experiments: list[Experiment], rig: Rig, spots: Mapping[str
                 "stroke_m": published.baseline_m,
                 "published_m": published.estimated_depth_m,
                 "sense": sense,
-                "noise_free_m": float(estimates(sense, rig, stroke, *experiment.true_px)),
+                "noise_free_m": float(depth_estimates(sense, rig, stroke, *experiment.true_px)),
             }
             for method, uv in found.uv_px.items():
                 rows.append(
-                    {**common, "method": method, **_statistics(estimates(sense, rig, stroke, *uv.swapaxes(0, 1)))}
+                    {**common, "method": method, **_statistics(depth_estimates(sense, rig, stroke, *uv.swapaxes(0, 1)))}
                 )
     bounds = pl.DataFrame([bound_row(experiment, rig, spots[experiment.sample_id]) for experiment in experiments])
     return pl.DataFrame(rows).join(bounds, on="sample_id", how="left", maintain_order="left")

@@ -235,7 +235,7 @@ class DepthModel:
         return np.array([self.log_likelihood(point) for point in points])
 
 
-def standardised(model: DepthModel, points: Array, independent: bool = False) -> Array:
+def standardised_residuals(model: DepthModel, points: Array, independent: bool = False) -> Array:
     """Residuals made independent with unit variance, shape (..., n).
 
     By the Cholesky factor of their covariance, or by their own deviations where they count as independent.

@@ -48,7 +48,7 @@ class Posterior:
         return self.points[np.linspace(0, len(self.points) - 1, min(count, len(self.points))).astype(int)]
 
 
-def pooled(runs: Sequence[Posterior], *names: Name) -> Posterior:
+def pooled_posterior(runs: Sequence[Posterior], *names: Name) -> Posterior:
     """One posterior of several independent samplings of a model.
 
     The evidence is the mean of theirs, with the larger of the samplers' own error and of their scatter; draws are taken
@@ -257,7 +257,7 @@ def pooled_runs(
     result = dict(posteriors)
     for explanation in settings.explanations:
         key = ("published", explanation.name)
-        result[key] = pooled([posteriors[(*key, *again)] for again in _again(settings.repeats)], *key)
+        result[key] = pooled_posterior([posteriors[(*key, *again)] for again in _again(settings.repeats)], *key)
     return result
 
 

@@ -36,8 +36,8 @@ from phibench.studies.framework import (
     StudyDatasets,
     StudyResult,
     canvas,
-    drawn,
     ends_text,
+    finished_drawing,
     text_table,
 )
 
@@ -334,7 +334,7 @@ def predictive_drawing(settings: CauseSettings, posteriors: Posteriors, alt: str
             ax.set(title=_TITLES[table], xlabel=_axis(across), ylabel="error of D (m)")
         handles, labels = figure.axes[0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", ncols=2)
-        return drawn("predictive", figure, alt)
+        return finished_drawing("predictive", figure, alt)
 
 
 def evidence_drawing(table: pl.DataFrame, scales: pl.DataFrame, alt: str) -> Drawing:
@@ -355,7 +355,7 @@ def evidence_drawing(table: pl.DataFrame, scales: pl.DataFrame, alt: str) -> Dra
         ax.set_yticks(range(len(rows)), rows["text"])
         ax.set(xlabel="log evidence against the one at 0 (bars: 1 sigma; decided: two bars or more outside the band)")
         ax.legend(loc="lower right", fontsize=7)
-        return drawn("evidence", figure, alt)
+        return finished_drawing("evidence", figure, alt)
 
 
 def posterior_drawing(settings: CauseSettings, posteriors: Posteriors, alt: str) -> Drawing:
@@ -377,7 +377,7 @@ def posterior_drawing(settings: CauseSettings, posteriors: Posteriors, alt: str)
         plane.set(xlabel="tilt (deg)", ylabel="decentre along the tilt (mm)")
         for ax in (noise, plane):
             ax.legend(fontsize=6, markerscale=4)
-        return drawn("posterior", figure, alt)
+        return finished_drawing("posterior", figure, alt)
 
 
 def _histogram(ax: Any, values: Any, i: int, label: str) -> None:

@@ -26,7 +26,7 @@ from phibench.studies.cause.model import (
     DepthModel,
     brute_force,
     simulate,
-    standardised,
+    standardised_residuals,
     without_table,
 )
 from phibench.studies.cause.nested_sampling import CauseSettings, Posterior, Run
@@ -85,7 +85,7 @@ def fit_of(model: DepthModel, points: Array, random: np.random.Generator) -> Fit
     heavy = model.explanation.tails == "student"
     depth = np.mean(model.reading(points).depth_m, axis=0)
     relative = (model.experiments.estimate_m - depth) / model.experiments.depth_m
-    seen = standardised(model, points, independent=heavy)
+    seen = standardised_residuals(model, points, independent=heavy)
     replica = random.standard_t(FREEDOM, seen.shape) if heavy else random.normal(size=seen.shape)
     (chi2, chi2_of), (trend, trend_of) = (
         (f(seen), f(replica)) for f in (lambda z: np.sum(z * z, axis=-1), lambda z: _trend(z, model.experiments))
@@ -172,7 +172,8 @@ def evidence_error(measured: float, repeats: int) -> float:
     Parameters
     ----------
     measured : float
-        Larger of the sampler's own error and of the scatter of repeats, of their mean (`nested_sampling.pooled`).
+        Larger of the sampler's own error and of the scatter of repeats, of their mean
+        (`nested_sampling.pooled_posterior`).
     repeats : int
         Independent samplings; of fewer than `ENOUGH` the error is at least `FLOOR`.
     """

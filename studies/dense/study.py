@@ -61,8 +61,8 @@ from phibench.studies.framework import (
     StudyDatasets,
     StudyResult,
     canvas,
-    drawn,
     error_bars,
+    finished_drawing,
     line_style,
 )
 
@@ -181,7 +181,7 @@ def drawing(
         alt += "Near space right: " + "; ".join(
             f"{name} {parts[name, ALL_PAIRS, 'near space right'].value:.0f} %" for name in ANSWERS
         )
-        return drawn("dense", figure, alt + ".")
+        return finished_drawing("dense", figure, alt + ".")
 
 
 def _line(ax: Axes, i: int, strokes: Sequence[float], values: Sequence[Estimate], label: str) -> None:

@@ -41,9 +41,9 @@ from phibench.studies.framework import (
     Finding,
     Row,
     canvas,
-    drawn,
     ends_text,
     error_bars,
+    finished_drawing,
     line_style,
     text_table,
 )
@@ -84,7 +84,7 @@ class BaselinePair:
         return math.degrees(math.atan2(y, x)) % 360.0
 
 
-def sideways(rig: Rig) -> Rig:
+def sideways_rig(rig: Rig) -> Rig:
     """The rig with its baseline along world x."""
     return replace(rig, stroke_axis_world=(1.0, 0.0, 0.0))
 
@@ -377,7 +377,9 @@ def noise_drawing(curves: Mapping[str, tuple[Array, Array]], noise: Mapping[str,
         ax.set_xticks(range(0, 361, 45))
         figure.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=8)
         parts = "; ".join(f"{name} {_range(rows)} mm" for name, rows in noise.items())
-        return drawn("noise", figure, f"Standard deviation of D against the azimuth of the spot, measured: {parts}.")
+        return finished_drawing(
+            "noise", figure, f"Standard deviation of D against the azimuth of the spot, measured: {parts}."
+        )
 
 
 def _range(rows: Sequence[AzimuthNoise]) -> str:

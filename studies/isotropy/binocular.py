@@ -22,7 +22,7 @@ from phibench.scenes.rig import Rig, View
 from phibench.scenes.room import carriage
 from phibench.scenes.shapes import Mesh, Shape, Uniform
 from phibench.studies.framework import Finding
-from phibench.studies.isotropy.azimuth_errors import NORMAL_95, fitted_px, flat_pair, sideways
+from phibench.studies.isotropy.azimuth_errors import NORMAL_95, fitted_px, flat_pair, sideways_rig
 from phibench.studies.isotropy.lines import moved_rig
 from phibench.studies.misaligned_rigs import spot_of
 
@@ -167,7 +167,7 @@ def scatter_gain(both: Binocular, light: Array, sensor: Sensor, draws: int) -> G
     for du in _PLACES_PX:
         for dv in _PLACES_PX:
             camera = replace(both.rig.camera, cx_px=both.rig.camera.cx_px + du, cy_px=both.rig.camera.cy_px + dv)
-            pair = flat_pair(sideways(replace(both.rig, camera=camera)), b, point, light)
+            pair = flat_pair(sideways_rig(replace(both.rig, camera=camera)), b, point, light)
             if pair is None:
                 return None  # one of the cameras does not see it
             uv = fitted_px(pair, sensor, each, "study", "isotropy", "binocular", f"{D:g}", f"{b:g}", f"{du:g} {dv:g}")

@@ -22,7 +22,7 @@ from phibench.render.optics.room_tracer import blocked_by
 from phibench.scenes.frames import Array, Pose, as_vector
 from phibench.scenes.rig import Rig, View
 from phibench.scenes.room import carriage
-from phibench.studies.framework import COLOURS, Drawing, Finding, canvas, drawn
+from phibench.studies.framework import COLOURS, Drawing, Finding, canvas, finished_drawing
 from phibench.studies.misaligned_rigs import centroids_px, seen_px
 
 
@@ -239,4 +239,4 @@ def lines_drawing(aligned: Sequence[Line], tilted: Sequence[Line], centre_px: Ar
             "Epipolar lines: radial in the image and vertical in the panorama for the aligned rig "
             f"({bend[0]:.1e} columns), up to {bend[1]:.2g} columns off for the misaligned one."
         )
-        return drawn("lines", figure, alt)
+        return finished_drawing("lines", figure, alt)

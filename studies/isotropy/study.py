@@ -19,7 +19,7 @@ from pydantic import Field
 from phibench.benchmark.scores.answer_errors import Rules
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.read import Dataset, Sample
-from phibench.estimator.geometry.panorama import PanoramaGrid, pixels_by_model, unrolled
+from phibench.estimator.geometry.panorama import PanoramaGrid, pixels_by_model, unrolled_values
 from phibench.estimator.geometry.phi import outline_circle
 from phibench.render.sensor.settings import sensor
 from phibench.scenes.frames import Array
@@ -36,7 +36,7 @@ from phibench.studies.framework import (
     StudyDatasets,
     StudyResult,
     canvas,
-    drawn,
+    finished_drawing,
     line_style,
     text_table,
 )
@@ -55,7 +55,7 @@ from phibench.studies.isotropy.azimuth_errors import (
     noise_table,
     pairs_of,
     scatter_findings,
-    sideways,
+    sideways_rig,
 )
 from phibench.studies.isotropy.binocular import Binocular, Laws, binocular_results
 from phibench.studies.isotropy.lines import (
@@ -196,7 +196,7 @@ def _curves(settings: IsotropySettings, scene: _Scene) -> tuple[Array, dict[str,
     """Azimuths in degrees and bounds by baseline; azimuths and the vertical bound averaged over the pixel grid."""
     card = sensor(settings.preset)
     points = circle(scene.depth_m, scene.height_m, settings.bound_azimuths)
-    rigs = {VERTICAL: scene.rig, HORIZONTAL: sideways(scene.rig)}
+    rigs = {VERTICAL: scene.rig, HORIZONTAL: sideways_rig(scene.rig)}
     curves = {name: bounds(rig, scene.baseline_m, points, scene.background, card) for name, rig in rigs.items()}
     few = circle(scene.depth_m, scene.height_m, settings.grid_azimuths)
     averaged = bounds_over_grid(scene.rig, scene.baseline_m, few, scene.background, card)
@@ -214,7 +214,7 @@ def _misalignment(dataset: Dataset) -> Misalignment:
 def _misaligned(scene: _Scene, true: Misalignment, azimuths_deg: Array) -> dict[str, Array]:
     """Relative errors of the exact estimator with the aligned rig as nominal."""
     spots = Places(np.array([scene.depth_m]), np.radians(azimuths_deg), scene.height_m, scene.baseline_m)
-    rigs = {VERTICAL: scene.rig, HORIZONTAL: sideways(scene.rig)}
+    rigs = {VERTICAL: scene.rig, HORIZONTAL: sideways_rig(scene.rig)}
     return {name: errors(rig, true, spots, ("exact",))[0, 0] for name, rig in rigs.items()}
 
 
@@ -245,7 +245,7 @@ def _edges(settings: IsotropySettings, dataset: Dataset) -> tuple[SeenEdge, ...]
     sample: Sample = dataset.samples[0]
     grid = PanoramaGrid(settings.panorama_width_px, _LOW_RAD, _HIGH_RAD)
     nominal = sample.nominal_rig.at(0.0)
-    image = unrolled(np.asarray(sample.ambient("down"), float).sum(axis=0), pixels_by_model(nominal, grid))
+    image = unrolled_values(np.asarray(sample.ambient("down"), float).sum(axis=0), pixels_by_model(nominal, grid))
     edges = vertical_edges(dataset.room, settings.edges)
     edges_seen = (seen_edge(image, grid, e.name, track(sample.rig.at(0.0), nominal, grid, e)) for e in edges)
     return tuple(edge for edge in edges_seen if edge is not None)
@@ -355,7 +355,7 @@ def misaligned_drawing(azimuths_deg: Array, errors: dict[str, Array], words: str
         ax.set_xticks(range(0, 361, 45))
         ax.legend()
         parts = "; ".join(f"{k} {100 * np.nanmin(v):+.2g} to {100 * np.nanmax(v):+.2g} %" for k, v in errors.items())
-        return drawn("misaligned", figure, f"Error of D of a misaligned rig against the azimuth: {parts}.")
+        return finished_drawing("misaligned", figure, f"Error of D of a misaligned rig against the azimuth: {parts}.")
 
 
 STUDY = Study(

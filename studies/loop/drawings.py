@@ -19,7 +19,7 @@ from phibench.robot.loop.robot_pixels import Window
 from phibench.robot.loop.simulator import REACHED, RUNNING, Observation, Setup, Simulator
 from phibench.scenes.frames import Array
 from phibench.scenes.room import ROBOT_SIZE_M
-from phibench.studies.framework import Drawing, canvas, drawn
+from phibench.studies.framework import Drawing, canvas, finished_drawing
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -90,7 +90,7 @@ def process_drawing(seed: int = 4) -> Drawing:
                            va="top", fontsize=7)  # fmt: skip
         end, way = track.time_s[-1], simulator.driven_m
         alt = f"One episode: {simulator.outcome} after {end:.1f} s, {way:.2f} m, {simulator.strokes} strokes"
-        return drawn("process", figure, alt + ".")
+        return finished_drawing("process", figure, alt + ".")
 
 
 def phases(track: Track) -> list[tuple[float, str]]:
@@ -212,7 +212,9 @@ def frame_axes(ax: Axes, simulator: Simulator, policy: Any, observation: Observa
 
     camera = simulator.setup.rig.camera
     if observation.windows:
-        ax.imshow(pasted(observation.windows, (camera.height_px, camera.width_px)), cmap="gray", vmin=0.0, vmax=1.0)
+        ax.imshow(
+            pasted_pixels(observation.windows, (camera.height_px, camera.width_px)), cmap="gray", vmin=0.0, vmax=1.0
+        )
     if simulator.setup.fidelity != "frames":
         ax.fill(*simulator.setup.rig.outline_px(180).T, fill=False, edgecolor="grey", linewidth=0.8)
     for spot in observation.spots:
@@ -229,7 +231,7 @@ def frame_axes(ax: Axes, simulator: Simulator, policy: Any, observation: Observa
     ax.set_xlabel("rings: spots that were read; cross: where the target is expected", fontsize=8)
 
 
-def pasted(windows: Sequence[Window], size: tuple[int, int]) -> Array:
+def pasted_pixels(windows: Sequence[Window], size: tuple[int, int]) -> Array:
     """Raw pixels as a grey picture of the whole image, 0 to 1; black where there are none."""
     picture = np.zeros(size)
     for window in windows:

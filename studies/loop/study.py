@@ -39,8 +39,8 @@ from phibench.studies.framework import (
     StudyDatasets,
     StudyResult,
     canvas,
-    drawn,
     error_bars,
+    finished_drawing,
     number,
     rms,
     text_table,
@@ -111,11 +111,11 @@ def conditions(settings: LoopSettings) -> Iterator[Condition]:
     for lights in settings.lights:
         yield Condition("other lights", f"{lights}", (_with_task(lights=lights),), n)
     for size in settings.misalignments:
-        rigs = tuple(Setup(misalignment=misaligned(size, k)) for k in range(settings.rigs))
+        rigs = tuple(Setup(misalignment=rig_deviation(size, k)) for k in range(settings.rigs))
         yield Condition("misalignment", f"{size:g} of as built", rigs, n)
     for size in settings.misalignments:
         told = replace(base, rig_covariance=covariance(size))
-        rigs = tuple(replace(told, misalignment=misaligned(size, k)) for k in range(settings.rigs))
+        rigs = tuple(replace(told, misalignment=rig_deviation(size, k)) for k in range(settings.rigs))
         for policy in ("paper", "greedy") if size == max(settings.misalignments) else ("paper",):
             yield Condition("covariance told", f"{size:g} of as built, {policy}", rigs, n, policy)
     for sigma in settings.slip_sigmas:
@@ -153,7 +153,7 @@ def _with_vehicle(**numbers: Any) -> Setup:
     return Setup(vehicle=Vehicle(**numbers))
 
 
-def misaligned(size: float, number: int) -> Misalignment:
+def rig_deviation(size: float, number: int) -> Misalignment:
     """Deviations of a rig, `size` times those of a rig that was built by hand; the carriage is exact."""
     rng = generator(STREAM, "rig", number)
     sigmas = {name: sigma for name, sigma in PRIOR_SIGMA.items() if name not in (*STROKE_PARAMETERS, *_NO_EFFECT)}
@@ -331,7 +331,7 @@ def condition_drawing(main: dict[Condition, ConditionSummary]) -> Drawing:
         alt = "Share of episodes that were reached: " + "; ".join(
             f"{name} {100 * n.reached[0]:.0f} %" for name, n in zip(names, main.values(), strict=True)
         )
-        return drawn("conditions", figure, alt + ".")
+        return finished_drawing("conditions", figure, alt + ".")
 
 
 def _notes(settings: LoopSettings) -> tuple[str, ...]:

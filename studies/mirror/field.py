@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from phibench.estimator.geometry.line_of_sight import blocked
+from phibench.estimator.geometry.line_of_sight import blocked_segments
 from phibench.estimator.geometry.reflection import reflect, reflect_jacobian
 from phibench.estimator.geometry.status import Status
 from phibench.scenes.frames import Array, BoolArray
@@ -139,4 +139,4 @@ def _robot_seen(rig: Rig, rays: Meridian, offset_m: float, azimuth_rad: float) -
     uv = rig.camera.project(rig.sphere_in_camera_m) + rays.radius_px[:, None] * across
     ray = reflect(view, uv)
     end = ray.origin_world_m + _REACH_M * ray.direction_world
-    return np.asarray(np.any([blocked(solid, ray.origin_world_m, end) for solid in escalade360(view)], axis=0))
+    return np.asarray(np.any([blocked_segments(solid, ray.origin_world_m, end) for solid in escalade360(view)], axis=0))

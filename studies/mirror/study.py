@@ -25,7 +25,7 @@ from phibench.studies.framework import (
     StudyDatasets,
     StudyResult,
     canvas,
-    drawn,
+    finished_drawing,
 )
 from phibench.studies.mirror import misalignment_costs, place_bounds, tables, visible_places
 from phibench.studies.mirror.field import disc_shares, meridian, outline_radius_px
@@ -283,7 +283,7 @@ def comparison_drawing(found: Mapping[str, tables.MirrorComparison], settings: t
             "Four panels: pixels per degree against theta; bound of D against D; outlines of the places that are "
             f"measured; error of D by deviations of the usual size. Bounds at {far:g} m: {parts}."
         )
-        return drawn("mirror", figure, alt, "png")
+        return finished_drawing("mirror", figure, alt, "png")
 
 
 def _style(i: int) -> dict[str, Any]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from phibench.estimator.geometry.line_of_sight import unhidden
+from phibench.estimator.geometry.line_of_sight import unhidden_places
 from phibench.estimator.geometry.reflection import MirrorImage, image_of
 from phibench.estimator.geometry.status import Status
 from phibench.estimator.limits.stroke_curve import outline_distance_px
@@ -29,7 +29,7 @@ def measured_places(rig: Rig, points_m: Array, stroke_m: float, edge_px: float, 
     """
     turned = [points_m @ _about_z(a).T for a in azimuths_rad]
     fine = [shown_places(rig, points_m, offset, edge_px) for offset in (0.0, stroke_m)]
-    free = [unhidden(rig, points, offset) for points in turned for offset in (0.0, stroke_m)]
+    free = [unhidden_places(rig, points, offset) for points in turned for offset in (0.0, stroke_m)]
     return np.asarray(np.all([*fine, *free], axis=0))
 
 

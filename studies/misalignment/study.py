@@ -36,8 +36,8 @@ from phibench.studies.framework import (
     StudyDatasets,
     StudyResult,
     canvas,
-    drawn,
     error_bars,
+    finished_drawing,
     line_style,
     text_table,
 )
@@ -347,7 +347,7 @@ def azimuth_drawing(
             f"as lines and rendered as crosses, at D = {depths[0]:g} and {depths[1]:g} m; largest at {depths[1]:g} m: "
             f"{parts}."
         )
-        return drawn("azimuth", figure, alt)
+        return finished_drawing("azimuth", figure, alt)
 
 
 def ranking_drawing(by_estimator: Mapping[str, Sequence[tables.Rank]], depth_index: int) -> Drawing:
@@ -371,7 +371,7 @@ def ranking_drawing(by_estimator: Mapping[str, Sequence[tables.Rank]], depth_ind
         ax.legend()
         top = ", ".join(f"{one.parameter} {tables.percent_text(one.rms[depth_index])} %" for one in order[:3])
         alt = f"Cost of each misalignment at D = {D:g} m by estimator, logarithmic; exact with nominal numbers: {top}."
-        return drawn("ranking", figure, alt)
+        return finished_drawing("ranking", figure, alt)
 
 
 def interaction_drawing(drawn_at_once: Sequence[Interactions]) -> Drawing:
@@ -396,7 +396,7 @@ def interaction_drawing(drawn_at_once: Sequence[Interactions]) -> Drawing:
             f"{error_of.total.max():.2f}, "
             f"{error_of.parameters[int(np.argmax(error_of.total))]}."
         )
-        return drawn("interactions", figure, alt)
+        return finished_drawing("interactions", figure, alt)
 
 
 def _curve(

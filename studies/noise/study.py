@@ -33,8 +33,8 @@ from phibench.studies.framework import (
     StudyDatasets,
     StudyResult,
     canvas,
-    drawn,
     error_bars,
+    finished_drawing,
     line_style,
 )
 from phibench.studies.noise import tables
@@ -184,7 +184,7 @@ def error_drawing(table: pl.DataFrame, sample: str, preset: str) -> Drawing:
         seen = {label: handle for ax in axes for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)}
         figure.legend(list(seen.values()), list(seen), loc="outside lower center", ncols=5, frameon=False)
         figure.suptitle(f"{sample}, {preset}")
-        return drawn(f"errors-{preset}-{sample}", figure, _alt(mine, sample, preset), "png")
+        return finished_drawing(f"errors-{preset}-{sample}", figure, _alt(mine, sample, preset), "png")
 
 
 def ranking_drawing(found: Sequence[tables.Elasticity], sample: str, presets: Sequence[str]) -> Drawing:
@@ -192,7 +192,7 @@ def ranking_drawing(found: Sequence[tables.Elasticity], sample: str, presets: Se
     with canvas(9.0, 3.6) as figure:
         ax, names = figure.subplots(), [n for n in FACTORS if any(e.factor == n for e in found if e.sample == sample)]
         for k, preset in enumerate(presets):
-            mine = {e.factor: e for e in tables.ranked(found, sample, preset, tables.REFERENCE[preset])}
+            mine = {e.factor: e for e in tables.ranked_elasticities(found, sample, preset, tables.REFERENCE[preset])}
             here = [(i, mine[n]) for i, n in enumerate(names) if n in mine]
             _bars(ax, here, (k - 0.5 * (len(presets) - 1)) * 0.3, k, f"{tables.REFERENCE[preset]} on {preset}")
         ax.axhline(0.0, color="black", linewidth=0.8)
@@ -200,7 +200,7 @@ def ranking_drawing(found: Sequence[tables.Elasticity], sample: str, presets: Se
         ax.set_ylabel("d ln rms / d ln factor")
         ax.legend(frameon=False, fontsize=8)
         figure.suptitle(f"{sample}: what the error does when a factor changes; crosses: the bound")
-        return drawn(f"ranking-{sample}", figure, _ranking_alt(found, sample, presets))
+        return finished_drawing(f"ranking-{sample}", figure, _ranking_alt(found, sample, presets))
 
 
 def _panel(ax: Any, part: pl.DataFrame, factor: str, methods: Sequence[str]) -> None:
@@ -247,7 +247,7 @@ def _alt(mine: pl.DataFrame, sample: str, preset: str) -> str:
 def _ranking_alt(found: Sequence[tables.Elasticity], sample: str, presets: Sequence[str]) -> str:
     parts = []
     for preset in presets:
-        mine = tables.ranked(found, sample, preset, tables.REFERENCE[preset])
+        mine = tables.ranked_elasticities(found, sample, preset, tables.REFERENCE[preset])
         if mine:
             parts.append(f"{preset}: largest {tables.name_of(mine[0])} {mine[0].estimate.value:+.2f}")
     return f"Elasticities of the error of position in {sample}. " + "; ".join(parts) + "."

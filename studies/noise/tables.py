@@ -15,7 +15,7 @@ import polars as pl
 
 from phibench.benchmark.scores.answer_errors import Rules
 from phibench.benchmark.scores.intervals import Estimate, Statistic, estimates
-from phibench.benchmark.scores.metrics import measure, prepared_records
+from phibench.benchmark.scores.metrics import metric_estimates, prepared_records
 from phibench.scenes.frames import Array
 from phibench.scenes.random_streams import generator
 from phibench.studies.framework import Finding, Row, ends_text, text_table
@@ -115,7 +115,7 @@ def scatter_and_bias_px(records: pl.DataFrame) -> tuple[float, float]:
 
 def _row(records: pl.DataFrame, rules: Rules, key: tuple[Any, ...]) -> dict[str, Any]:
     # one stream for all methods of a case: they are resampled alike
-    measured = measure(prepared_records(records), rules, *NAMES, *map(str, key[:-1]), names=METRICS)
+    measured = metric_estimates(prepared_records(records), rules, *NAMES, *map(str, key[:-1]), names=METRICS)
     scatter, bias = scatter_and_bias_px(records)
     row: dict[str, Any] = {"places": records["sample_id"].n_unique(), "images": len(records)}
     for name, metric in measured.items():
@@ -219,7 +219,7 @@ def limit_findings(table: pl.DataFrame, sample: str, preset: str) -> Iterator[Fi
 
 def ranking_findings(found: Sequence[Elasticity], sample: str, preset: str) -> Iterator[Finding]:
     """Elasticities of the reference method about the base, largest first, and the lead of the first factor."""
-    lead, mine = f"{preset}, {sample}", ranked(found, sample, preset, REFERENCE[preset])
+    lead, mine = f"{preset}, {sample}", ranked_elasticities(found, sample, preset, REFERENCE[preset])
     for e in mine:
         yield Finding(f"{lead}: d ln rms / d ln {name_of(e)}", *e.estimate.ends).judged("!=", 0.0)
     if len(mine) > 1:
@@ -229,7 +229,7 @@ def ranking_findings(found: Sequence[Elasticity], sample: str, preset: str) -> I
         yield replace(ahead, verdict="met" if _apart(first, second) else "undecided")
 
 
-def ranked(found: Sequence[Elasticity], sample: str, preset: str, method: str) -> list[Elasticity]:
+def ranked_elasticities(found: Sequence[Elasticity], sample: str, preset: str, method: str) -> list[Elasticity]:
     """Elasticities of one method, largest size first, without those that have no value or an optimum at the base."""
     mine = [e for e in found if (e.sample, e.preset, e.method) == (sample, preset, method) and FACTORS[e.factor].ranked]
     return sorted((e for e in mine if math.isfinite(e.estimate.value)), key=lambda e: -abs(e.estimate.value))
@@ -261,7 +261,7 @@ def base_table(table: pl.DataFrame, sample: str, preset: str) -> tuple[Row, ...]
 def ranking_table(found: Sequence[Elasticity], sample: str, preset: str) -> tuple[Row, ...]:
     """Elasticities of the reference method beside those of the bound."""
     return text_table(
-        ranked(found, sample, preset, REFERENCE[preset]),
+        ranked_elasticities(found, sample, preset, REFERENCE[preset]),
         {
             "factor": name_of,
             "from": lambda e: f"{e.low:.3g}",

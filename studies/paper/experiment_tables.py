@@ -133,7 +133,7 @@ def run_experiments(
     for rig in _rigs(dataset, rigs):
         bundle = calibrate_rig(dataset, rig, procedure)
         measured = [s for s in _of_rig(dataset, rig) if s.row.experiment != procedure.calibration]
-        rows += measure(dataset, measured, bundle, procedure)
+        rows += experiment_rows(dataset, measured, bundle, procedure)
         told(rig)
     return pl.DataFrame(rows, schema=_SCHEMA)
 
@@ -162,7 +162,9 @@ def calibrate_rig(dataset: Dataset, rig: str, procedure: Procedure) -> Bundle:
     return calibrate(known[0].nominal_rig, mean_outline(outlines), spots)
 
 
-def measure(dataset: Dataset, samples: Sequence[Sample], bundle: Bundle, procedure: Procedure) -> list[dict[str, Any]]:
+def experiment_rows(
+    dataset: Dataset, samples: Sequence[Sample], bundle: Bundle, procedure: Procedure
+) -> list[dict[str, Any]]:
     """Rows of `COLUMNS` for samples of one rig, by its calibration."""
     pairs, rows = _pairs(dataset, samples, procedure, procedure.draws), []
     for number, pair_draw in enumerate(pairs.pair_draws):

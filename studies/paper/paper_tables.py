@@ -101,7 +101,7 @@ class _Nominal:
         return cls(calibration.rig, stroke_m, calibration.covariance)
 
 
-def score(dataset: Dataset, calibration: Calibration | None = None) -> tuple[Score, ...]:
+def score_estimators(dataset: Dataset, calibration: Calibration | None = None) -> tuple[Score, ...]:
     """Score all estimators on all samples, from true pixels and from noise-free frames.
 
     Parameters

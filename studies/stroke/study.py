@@ -34,8 +34,8 @@ from phibench.studies.framework import (
     StudyPreset,
     StudyResult,
     canvas,
-    drawn,
     error_bars,
+    finished_drawing,
     line_style,
 )
 from phibench.studies.stroke.perturbed_rigs import RenderedCheck, RenderedOutcome, measured_outcome
@@ -97,7 +97,7 @@ def run(settings: StrokeSettings, datasets: StudyDatasets) -> StudyResult:
         best_by_case[name, d] = best_stroke(
             d, rig, covariance_rig=rigs[name], strokes_m=settings.strokes_m, around=around, card=card, spot=spot
         )
-    todo = planned(settings, rig, {k: rigs[k] for k in (AS_BUILT, EXACT)})
+    todo = planned_checks(settings, rig, {k: rigs[k] for k in (AS_BUILT, EXACT)})
     checks = datasets.map(measured_outcome, todo, "stroke, frames")
     names, top = tuple(rigs), settings.strokes_m[1]
     findings = [row for name in names for row in best_findings(best_by_case, name, tuple(longest))]
@@ -151,7 +151,7 @@ def tolerances(rig: Rig, outline_sigma_um: Sequence[float]) -> dict[str, Array]:
     }
 
 
-def planned(settings: StrokeSettings, rig: Rig, rigs: Mapping[str, Array]) -> list[RenderedCheck]:
+def planned_checks(settings: StrokeSettings, rig: Rig, rigs: Mapping[str, Array]) -> list[RenderedCheck]:
     """Cells of the check that lie within the limits."""
     wanted, card = settings.check, sensor_card(settings.check.preset)
     taken = (wanted.preset, wanted.power_mw, wanted.draws)
@@ -225,7 +225,7 @@ def best_drawing(found: Found, tolerances: Sequence[str], depths_m: Sequence[flo
             f"{t}: {a.stroke_m:.2f} m at D = {a.depth_m:g} m to {b.stroke_m:.2f} m at {b.depth_m:g} m"
             for t, (a, b) in ends.items()
         )
-        return drawn("best", figure, alt + ".")
+        return finished_drawing("best", figure, alt + ".")
 
 
 def curves_drawing(found: Found, tolerances: Sequence[str], longest_m: Mapping[float, float]) -> Drawing:
@@ -249,7 +249,7 @@ def curves_drawing(found: Found, tolerances: Sequence[str], longest_m: Mapping[f
         alt = "Predicted error of D against the stroke; markers at the smallest: " + "; ".join(
             f"D = {d:g} m, {t} {found[t, d].stroke_m:.2f} m" for d in longest_m for t in tolerances
         )
-        return drawn("curves", figure, alt + ".")
+        return finished_drawing("curves", figure, alt + ".")
 
 
 def check_drawing(checks: Sequence[RenderedOutcome]) -> Drawing:
@@ -272,7 +272,7 @@ def check_drawing(checks: Sequence[RenderedOutcome]) -> Drawing:
             ax.legend(frameon=False, fontsize=8)
         ratios = [c.rms_m.value / c.check.predicted_m for c in checks]
         alt = f"Rms error of D in frames over the predicted: from {min(ratios):.2f} to {max(ratios):.2f}."
-        return drawn("checks", figure, alt)
+        return finished_drawing("checks", figure, alt)
 
 
 STUDY = Study(

@@ -17,7 +17,7 @@ from phibench.cli.main import main
 from phibench.datasets.read import Dataset, open_dataset
 from phibench.datasets.recipe.load import find_recipe
 from phibench.datasets.verify import verify
-from phibench.studies.paper.paper_tables import Score, score, summarise
+from phibench.studies.paper.paper_tables import Score, score_estimators, summarise
 
 
 @pytest.fixture(scope="module", params=["some", pytest.param("all", marks=pytest.mark.slow)])
@@ -35,7 +35,7 @@ def paper(request: pytest.FixtureRequest, shared: Any, tmp_path_factory: pytest.
 
 @pytest.fixture(scope="module")
 def scores(paper: Dataset) -> tuple[Score, ...]:
-    return score(paper)
+    return score_estimators(paper)
 
 
 def _of(scores: tuple[Score, ...], estimator: str, source: str) -> list[Score]:

@@ -12,7 +12,7 @@ import pytest
 from helpers.revolved_rigs import revolved
 
 from phibench.datasets.frames.sensor_card import card_of
-from phibench.estimator.geometry.panorama import PanoramaGrid, pixels_by_model, unrolled
+from phibench.estimator.geometry.panorama import PanoramaGrid, pixels_by_model, unrolled_values
 from phibench.estimator.limits.best_stroke import best_stroke, spot_bound
 from phibench.estimator.spots.spot_prediction import spot_blur
 from phibench.render.optics.spot_layer import spot_layer
@@ -79,7 +79,7 @@ def test_benchmark_panorama_by_the_model(benchmark) -> None:
     """1440 x 360 pixels, geometry and interpolation."""
     view, grid = Rig().at(0.0), PanoramaGrid(1440, math.radians(-60.0), math.radians(30.0))
     image = np.ones((720, 1280, 3))
-    found = benchmark.pedantic(lambda: unrolled(image, pixels_by_model(view, grid)), rounds=3)
+    found = benchmark.pedantic(lambda: unrolled_values(image, pixels_by_model(view, grid)), rounds=3)
     assert found.shape == (grid.height_px, 1440, 3)
 
 

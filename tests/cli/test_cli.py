@@ -91,7 +91,7 @@ def test_score_of_a_folder_that_is_not_there(tmp_path, capsys):
 def test_scores_are_written_to_a_file(monkeypatch, tmp_path, capsys):
     scores = (Score("a", "mine", 2.0, 0.5, "exact", "truth", 2.1, 0.1, 0.05, math.nan, "ok"),)
     monkeypatch.setattr("phibench.datasets.read.open_finished", lambda directory: None)
-    monkeypatch.setattr("phibench.studies.paper.paper_tables.score", lambda dataset, calibration: scores)
+    monkeypatch.setattr("phibench.studies.paper.paper_tables.score_estimators", lambda dataset, calibration: scores)
     assert cli.main(["paper", "x", "--out", str(tmp_path / "scores.json")]) == 0
     document = json.loads((tmp_path / "scores.json").read_text())
     assert document["scores"][0]["estimate_m"] == 2.1

@@ -35,7 +35,7 @@ from phibench.scenes.misalignment import PARAMETERS, Misalignment, Motion
 from phibench.scenes.rig import Rig
 from phibench.scenes.room import c310_rig, carriage, default_rig
 from phibench.scenes.validation import SceneError
-from phibench.studies.paper.paper_tables import score
+from phibench.studies.paper.paper_tables import score_estimators
 
 EPS = 1e-14  # metres or cosines: a few roundings of numbers of order 1
 
@@ -356,7 +356,11 @@ def test_a_data_set_says_what_is_true_and_what_is_nominal(misaligned_dataset: Pa
 
 def test_scores_are_those_of_who_believes_the_nominal_rig(misaligned_dataset: Path) -> None:
     dataset = open_finished(misaligned_dataset)
-    exact = {s.sample_id: s for s in score(dataset) if (s.estimator, s.source, s.status) == ("exact", "truth", "ok")}
+    exact = {
+        s.sample_id: s
+        for s in score_estimators(dataset)
+        if (s.estimator, s.source, s.status) == ("exact", "truth", "ok")
+    }
     assert exact
     for name, result in exact.items():
         sample = dataset[name]

@@ -24,9 +24,9 @@ from phibench.studies.baseline.tables import (
     LawFit,
     PowerLaw,
     auto_exposed_draws,
+    depth_estimates,
     drawn_errors,
     drawn_misalignment,
-    estimates,
     experiments_of,
     fit_power_law,
     published_curve,
@@ -80,7 +80,7 @@ def test_estimates_are_those_of_the_score(sense: str) -> None:
     """Many strokes at once against one at a time, where phi is taken at the raised carriage."""
     rig = Rig()
     down, up, true = seen_pixels(rig, Misalignment(), POINTS_M, STROKE_M)
-    ours = estimates(sense, rig, STROKE_M, down, up)
+    ours = depth_estimates(sense, rig, STROKE_M, down, up)
     name = sense if sense == "exact" else f"paper_{sense}"
     theirs = [float(ESTIMATORS[name](rig, float(h), *uv).depth_m) for h, *uv in zip(STROKE_M, down, up, strict=True)]
     assert ours == pytest.approx(theirs, rel=1e-9)

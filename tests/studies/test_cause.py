@@ -18,7 +18,7 @@ from phibench.scenes.frames import Array
 from phibench.scenes.random_streams import generator
 from phibench.scenes.rig import Rig
 from phibench.studies.cause.model import COMMON, NOISE, DepthModel, Explanation, Prior, simulate, without_table
-from phibench.studies.cause.nested_sampling import CauseSettings, Posterior, all_runs, nested_sample, pooled
+from phibench.studies.cause.nested_sampling import CauseSettings, Posterior, all_runs, nested_sample, pooled_posterior
 from phibench.studies.cause.paper_reading import Reader, published_experiments, read_depths
 from phibench.studies.cause.study import (
     STUDY,
@@ -135,14 +135,14 @@ def test_pooled_runs() -> None:
     """Evidence is the mean of the runs' (not of their logarithms); a run without evidence gives no draws."""
     first = Posterior(np.zeros((50, 2)), 0.0, 0.1, 10)
     second = Posterior(np.ones((40, 2)), np.log(3.0), 0.1, 20)
-    both = pooled([first, second], "test")
+    both = pooled_posterior([first, second], "test")
     assert both.log_evidence == pytest.approx(np.log(2.0))
     assert both.evaluations == 30
     assert both.log_evidence_error == pytest.approx(np.log(3.0) / 2.0)  # deviation log(3)/sqrt(2) over sqrt(2)
     assert 0.5 < both.points.mean() < 0.95  # 50 draws with probability 3/4: 0.06 of deviation
     nothing = Posterior(np.ones((40, 2)), -1e4, 0.1, 20)
-    assert pooled([first, nothing], "test").points.max() == 0.0
-    assert pooled([first], "test") is first
+    assert pooled_posterior([first, nothing], "test").points.max() == 0.0
+    assert pooled_posterior([first], "test") is first
 
 
 @pytest.mark.slow

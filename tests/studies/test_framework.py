@@ -24,8 +24,8 @@ from phibench.studies.framework import (
     StudyDatasets,
     StudyResult,
     canvas,
-    drawn,
     findings_table,
+    finished_drawing,
     markdown_table,
     number,
     read_settings,
@@ -45,7 +45,7 @@ def _count(settings: Counting, datasets: StudyDatasets) -> StudyResult:
     numbers = list(range(0, settings.upto, settings.step))
     with canvas() as figure:
         figure.subplots().plot(numbers, numbers)
-        drawing = drawn("line", figure, f"A line up to {numbers[-1]}.")
+        drawing = finished_drawing("line", figure, f"A line up to {numbers[-1]}.")
     return StudyResult(
         {"table": pl.DataFrame({"number": numbers})},
         (Finding("count of numbers", len(numbers)).judged(">=", 3),),

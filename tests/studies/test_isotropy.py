@@ -32,7 +32,7 @@ from phibench.studies.isotropy.azimuth_errors import (
     flat_pair,
     isotropy,
     scatter_findings,
-    sideways,
+    sideways_rig,
 )
 from phibench.studies.isotropy.lines import (
     best_line_distances,
@@ -156,7 +156,7 @@ def test_the_horizontal_bound_grows_as_one_over_the_sine() -> None:
     card = sensor("bayer-raw", read_noise_e=2.0)
     angles = np.radians([90.0, 20.0, 6.0])
     points = [np.array([2.5 * math.cos(a), 2.5 * math.sin(a), 0.5]) for a in angles]
-    pairs = [flat_pair(sideways(RIG), 0.425, point, LIGHT) for point in points]
+    pairs = [flat_pair(sideways_rig(RIG), 0.425, point, LIGHT) for point in points]
     found = np.array([bound_m(pair, card) for pair in pairs if pair is not None])
     assert found.size == 3
     # the grid's factor is up to 2 (p95 over median, docs/limits.md); the sines' are 2.9 and 9.6

@@ -18,8 +18,8 @@ from phibench.robot.loop.simulator import REACHED, WRONG, Setup
 from phibench.scenes.motion.vehicle import PARAMETERS
 from phibench.scenes.random_streams import generator
 from phibench.studies.framework import StudyDatasets, read_settings, rms
-from phibench.studies.loop.drawings import episode_steps, pasted, phases, picture, show_episode
-from phibench.studies.loop.study import STUDY, conditions, delay, interval, misaligned, summary
+from phibench.studies.loop.drawings import episode_steps, pasted_pixels, phases, picture, show_episode
+from phibench.studies.loop.study import STUDY, conditions, delay, interval, rig_deviation, summary
 
 TINY = """
 episodes = 2
@@ -80,7 +80,7 @@ def test_intervals_cover() -> None:
 
 
 def test_misaligned_rigs_grow_with_their_size() -> None:
-    one, two, other = misaligned(0.5, 0), misaligned(1.0, 0), misaligned(1.0, 1)
+    one, two, other = rig_deviation(0.5, 0), rig_deviation(1.0, 0), rig_deviation(1.0, 1)
     assert two.decentre_x_m == pytest.approx(2.0 * one.decentre_x_m)
     assert two != other
     assert (two.stroke_relative, two.roughness_alpha) == (0.0, 0.0)
@@ -117,7 +117,7 @@ def test_pictures_of_an_episode(tmp_path: Path) -> None:
 
 def test_windows_are_pasted_at_their_places() -> None:
     pixels = np.arange(64, dtype=np.uint16).reshape(8, 8)
-    image = pasted((Window(4, 2, pixels),), (16, 20))
+    image = pasted_pixels((Window(4, 2, pixels),), (16, 20))
     assert image[2:10, 4:12].max() == 1.0
     image[2:10, 4:12] = 0.0
     assert not image.any()

@@ -13,7 +13,7 @@ from rich.console import Console
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.recipe.recipe_scene import build_rig
 from phibench.datasets.recipe.tables import RigTable
-from phibench.estimator.geometry.line_of_sight import unhidden
+from phibench.estimator.geometry.line_of_sight import unhidden_places
 from phibench.estimator.geometry.reflection import image_of
 from phibench.estimator.geometry.sensitivities import PARAMETERS, sensitivity
 from phibench.estimator.geometry.triangulate import depth_exact
@@ -169,7 +169,7 @@ def test_the_robot_hides_what_the_tracer_says() -> None:
         view = rig.at(offset)
         mirror = mirror_points(view, points, np.broadcast_to(view.camera_centre_m, points.shape)).points_m
         free = blocked_by(escalade360(view), points, mirror) < 0
-        assert np.array_equal(unhidden(rig, points, offset), free)
+        assert np.array_equal(unhidden_places(rig, points, offset), free)
         assert least <= (~free).sum() < 350
 
 

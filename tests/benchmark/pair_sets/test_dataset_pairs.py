@@ -28,7 +28,7 @@ from phibench.benchmark.pair_sets.dataset_pairs import (
 )
 from phibench.benchmark.pair_sets.wanted_pairs import PairChoice
 from phibench.benchmark.scored_dataset import open_dataset as scored_dataset
-from phibench.benchmark.scores.worst_images import worst
+from phibench.benchmark.scores.worst_images import worst_images
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.exposures.expected_electrons import expected_of_light, expected_region
 from phibench.datasets.exposures.pair_draws import CachedSample, FrameCounts
@@ -116,7 +116,7 @@ def test_a_report_shows_yuyv_in_colour(dataset: Dataset) -> None:
     row = {"number": 0, "image": "down", "sample_id": truth.sample_id, "depth_m": truth.depth_m, "electrons": 1.0}
     row |= {"status": "no spot", "cause": "method", "visible": True, "detected": False, "u_true_px": u, "v_true_px": v}
     missing = {"distance_px": None, "u_px": None, "v_px": None}
-    [shown] = worst(pl.DataFrame([row | missing]), pairs)
+    [shown] = worst_images(pl.DataFrame([row | missing]), pairs)
     for picture in (shown.crop, shown.frame):
         assert picture
         with Image.open(io.BytesIO(base64.b64decode(picture.base64))) as opened:

@@ -21,7 +21,7 @@ from helpers.small_release import Made, flip, snapshot
 from helpers.strange_releases import member
 
 from phibench.benchmark.export.export_make import verify_export
-from phibench.benchmark.release.fetch import Fetched, fetch, unpack
+from phibench.benchmark.release.fetch import Fetched, fetch, unpack_archive
 from phibench.benchmark.release.release_parts import STARTER_PAIRS, Archive
 from phibench.benchmark.release.release_source import SOURCE
 from phibench.benchmark.scored_dataset import open_dataset
@@ -362,5 +362,5 @@ def test_archives_of_others_write_nothing_elsewhere(tmp_path: Path, strange: tup
         for info, data in (member("title/good", b"good"), strange):
             tar.addfile(info, io.BytesIO(data))
     with pytest.raises(DatasetError, match="nothing of it is used"):
-        unpack(archive, folder, "title", 100, 10)
+        unpack_archive(archive, folder, "title", 100, 10)
     assert sorted(path.name for path in tmp_path.rglob("*")) == ["a.tar", "inside"]

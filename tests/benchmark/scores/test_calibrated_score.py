@@ -15,7 +15,7 @@ from helpers.bench_cases import RIG, Cases, cases, records
 from phibench.benchmark.pair_sets.wanted_pairs import CalibratedPairs, samples_of_calibration
 from phibench.benchmark.reports import bench as benching
 from phibench.benchmark.scores.answer_errors import Rules
-from phibench.benchmark.scores.metrics import measure, prepared_records
+from phibench.benchmark.scores.metrics import metric_estimates, prepared_records
 from phibench.benchmark.sealed.score_check import check_score
 from phibench.calibration.rig.bundle import Bundle
 from phibench.calibration.rig.calibration_file import Calibration, CalibrationError, read_calibration, write_calibration
@@ -27,7 +27,7 @@ from phibench.estimator.interface import Answer, Outcome, Spot
 from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.random_streams import generator
 from phibench.scenes.rig import Rig
-from phibench.studies.paper.paper_tables import GENERAL, score
+from phibench.studies.paper.paper_tables import GENERAL, score_estimators
 
 SIGMAS = 0.05 * prior_sigmas()
 COVARIANCE = np.diag(SIGMAS**2)
@@ -116,7 +116,7 @@ def test_coverage_is_that_of_the_pulls() -> None:
     rng = generator("tests", "coverage")
     table = prepared_records(records(base, noisy_answers(base, rng), Rules()))
     pulls = table.filter(image="down")["depth_pull"].to_numpy()
-    found = measure(table, Rules(), "tests", names=("coverage_depth",))["coverage_depth"]
+    found = metric_estimates(table, Rules(), "tests", names=("coverage_depth",))["coverage_depth"]
     assert found.n == 40
     assert found.estimate.value == pytest.approx(np.mean(np.abs(pulls) <= 1.96), abs=1e-12)
     assert 0.8 <= found.estimate.value <= 1.0  # 95 % of 40: below 32 hits in 3e-4 of the cases
@@ -179,9 +179,9 @@ def test_of_several_true_rigs_the_calibrated_one_is_taken(misaligned: Dataset) -
 def test_estimators_get_the_calibrated_rig_and_stroke(misaligned: Dataset) -> None:
     """A yaw of 0.02 rad between the images is left, which no calibration knows: the rays miss each other, p says so."""
     nominal = misaligned.samples[0].nominal_rig
-    before = {(s.estimator, s.source): s for s in score(misaligned) if s.status == "ok"}
+    before = {(s.estimator, s.source): s for s in score_estimators(misaligned) if s.status == "ok"}
     made = calibration(truth_of_rig(misaligned), nominal)
-    after = {(s.estimator, s.source): s for s in score(misaligned, made) if s.status == "ok"}
+    after = {(s.estimator, s.source): s for s in score_estimators(misaligned, made) if s.status == "ok"}
     assert set(after) - set(before) == {(GENERAL, "truth"), (GENERAL, "frame")}
     for source in ("truth", "frame"):
         assert abs(before["exact", source].relative_error) > 0.02

@@ -44,7 +44,7 @@ from phibench.benchmark.scores.beyond_images import (
     most_found,
     searched_px2,
 )
-from phibench.benchmark.scores.metrics import measure, prepared_records
+from phibench.benchmark.scores.metrics import metric_estimates, prepared_records
 from phibench.datasets.read import open_finished
 from phibench.estimator.interface import Answer, Spot
 from phibench.estimator.pair_set import CachedPairs, PairTruth
@@ -87,7 +87,9 @@ def marked(oracle: Oracle, of: Cases | None = None) -> dict[str, str]:
 
 def ranks(oracle: Oracle, of: Cases | None = None) -> tuple[float, float]:
     names = ("rank_phi_rad", "rank_depth")
-    phi, depth = (measure(table(oracle, of), RULES, "cheats", names=names)[name].estimate.value for name in names)
+    phi, depth = (
+        metric_estimates(table(oracle, of), RULES, "cheats", names=names)[name].estimate.value for name in names
+    )
     return phi, depth
 
 
@@ -358,7 +360,7 @@ def test_a_cheat_that_knows_nothing_gains_no_rank(name: str) -> None:
 def test_claims_change_no_position_and_no_rank() -> None:
     """What a huge or tiny covariance changes is seen in pulls and in the share beyond 5 sigma."""
     names = ("pull_rms", "beyond_5_sigma")
-    huge, tiny = (measure(table(claiming(x)), RULES, "cheats", names=names) for x in (1e6, 1e-6))
+    huge, tiny = (metric_estimates(table(claiming(x)), RULES, "cheats", names=names) for x in (1e6, 1e-6))
     assert huge["pull_rms"].estimate.value < 0.01
     assert tiny["beyond_5_sigma"].estimate.value > 0.99
     assert ranks(claiming(1e6)) == ranks(claiming(1e-6)) == ranks(HONEST)

@@ -26,7 +26,7 @@ from phibench.benchmark.scores.intervals import (
     rms_of,
     rms_ratio_of,
 )
-from phibench.benchmark.scores.metrics import measure, prepared_records
+from phibench.benchmark.scores.metrics import metric_estimates, prepared_records
 
 RULES = Rules(resamples=999)
 SINGLE = 50
@@ -220,7 +220,7 @@ def test_few_samples_have_a_value_and_no_interval():
 def test_a_95th_percentile_of_few_samples_has_no_interval(samples, note):
     pairs = cases(samples)
     table = prepared_records(records(pairs, outcomes(pairs, sampler()), RULES))
-    measured = measure(table, RULES, "tests", names=("p95_px", "median_px", "p95_depth_m"))
+    measured = metric_estimates(table, RULES, "tests", names=("p95_px", "median_px", "p95_depth_m"))
     for name in ("p95_px", "p95_depth_m"):
         assert measured[name].estimate.note == note
         assert math.isnan(measured[name].estimate.low) == bool(note)

@@ -23,7 +23,7 @@ from helpers.bench_cases import (
 from scipy.optimize import minimize_scalar
 
 from phibench.benchmark.scores.answer_errors import MATCH_PX, Rules
-from phibench.benchmark.scores.metrics import METRICS, measure, prepared_records
+from phibench.benchmark.scores.metrics import METRICS, metric_estimates, prepared_records
 from phibench.benchmark.scores.record_columns import COLUMNS, COUNTED
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.estimator.interface import Answer, Spot
@@ -33,7 +33,7 @@ RULES = Rules(resamples=999)
 
 def score(pairs, oracle):
     table = records(pairs, outcomes(pairs, oracle), RULES)
-    return table, measure(prepared_records(table), RULES, "tests")
+    return table, metric_estimates(prepared_records(table), RULES, "tests")
 
 
 def value(measured, name):

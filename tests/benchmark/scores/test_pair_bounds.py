@@ -29,7 +29,7 @@ from scipy.linalg import block_diag
 from phibench.benchmark.isolation.method_references import resolve
 from phibench.benchmark.scores.answer_errors import Rules
 from phibench.benchmark.scores.beyond_images import MODEL_MARGIN, RAW_MARGIN, excesses
-from phibench.benchmark.scores.metrics import METRICS, PAIR_TWINS, applies, measure, prepared_records
+from phibench.benchmark.scores.metrics import METRICS, PAIR_TWINS, applies, metric_estimates, prepared_records
 from phibench.benchmark.scores.score import score_outcomes
 from phibench.benchmark.scores.score_document import Flag, MethodCard
 from phibench.benchmark.scores.score_tables import leaderboard, scores_csv, scores_json
@@ -111,7 +111,7 @@ def test_a_pair_method_at_its_bound_is_above_1_against_single_images_and_at_1_ag
     Against single images it is above 1 by sqrt(4 / 3), if all coordinates are alike.
     """
     rows = table(at_the_pairs_bound())
-    found = measure(rows, RULES, "tests", names=(*PAIR_TWINS, *PAIR_TWINS.values()))
+    found = metric_estimates(rows, RULES, "tests", names=(*PAIR_TWINS, *PAIR_TWINS.values()))
     for single, pair in PAIR_TWINS.items():
         assert abs(found[pair].estimate.value - 1.0) < 0.15, pair
         assert found[single].estimate.value >= found[pair].estimate.value * (1.0 - 1e-9)
@@ -123,7 +123,7 @@ def test_a_missing_bound_or_spot_gives_no_pair_bound():
     rows = table(truth_itself, Cases((t,)))
     assert rows["pair_bound_px2"].null_count() == 2
     assert rows["possible_depth_m2"].null_count() == 2
-    found = measure(rows, RULES, "tests", names=("efficiency_pair_px",))["efficiency_pair_px"].estimate
+    found = metric_estimates(rows, RULES, "tests", names=("efficiency_pair_px",))["efficiency_pair_px"].estimate
     assert found.note == "no bound for these pairs, or none below a third of 3 px"
     assert {one.quantity: one.part.partition(" ")[0] for one in excesses(rows)} == {"positions": "all", "phi": "all"}
     assert not {"D", "faint spots"} & {one.quantity for one in excesses(rows)}  # of the down image alone
@@ -185,7 +185,7 @@ def test_whoever_knows_the_boards_is_flagged():
     # what they gain where the bound is that of single images: the table of docs/sealed.md
     names = ("efficiency_px", "efficiency_phi", "efficiency_depth")
     for oracle in (sampler(), at_the_pairs_bound(), knows_boards()):
-        gained = measure(table(oracle), RULES, "tests", names=names)
+        gained = metric_estimates(table(oracle), RULES, "tests", names=names)
         print({name: round(gained[name].estimate.value, 2) for name in names})
     assert min(gained[name].estimate.value for name in names) > 1.3
     # also with 30 pairs, and where the bound is that of a model

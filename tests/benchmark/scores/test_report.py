@@ -23,7 +23,7 @@ from phibench.benchmark.reports.figures import (
     plain_number,
     pull_histogram,
 )
-from phibench.benchmark.reports.report_page import report_html, verdict, write_report
+from phibench.benchmark.reports.report_page import report_html, report_verdict, write_report
 from phibench.benchmark.reports.report_sections import Section, time_section
 from phibench.benchmark.reports.results_page import read_parts, told_programs
 from phibench.benchmark.scores.answer_errors import Rules
@@ -137,13 +137,13 @@ def test_the_page_begins_with_who_is_best_and_what_fails(html, scores):
     assert text.startswith("phibench report cases.")
     assert f"ideal is best by phi: {1000 * phi.value:.3g} mrad" in text[:120]
     guesses = {"ideal": scores[0][0], "guess": scored("guess", constant)[0]}
-    assert "Less than half of the spots: guess." in verdict(guesses, "phi")
-    assert "False detections in 20 % of the images or more: guess." in verdict(guesses, "depth")
-    assert verdict({"guess": guesses["guess"]}, "phi") == "No method finds a spot on these pairs."
+    assert "Less than half of the spots: guess." in report_verdict(guesses, "phi")
+    assert "False detections in 20 % of the images or more: guess." in report_verdict(guesses, "depth")
+    assert report_verdict({"guess": guesses["guess"]}, "phi") == "No method finds a spot on these pairs."
     whole = {name: one.model_copy(update={"pair_set": {"hinted": 0}}) for name, one in guesses.items()}
     found = whole["ideal"].metrics["find"]
     first = f"Track find: ideal, {found.value:.3g} [{found.low:.3g}, {found.high:.3g}]. Track depth: ideal, "
-    assert verdict(whole, "phi").startswith(first)
+    assert report_verdict(whole, "phi").startswith(first)
 
 
 def test_a_dark_page_and_a_narrow_one_have_their_rules(html):

@@ -21,9 +21,9 @@ from phibench.benchmark.scores.metrics import METRICS
 from phibench.benchmark.scores.score import saved_scores, score_methods, score_outcomes
 from phibench.benchmark.scores.score_document import MethodCard, ScoreDocument, results_sha256
 from phibench.benchmark.scores.score_files import read_records, read_score, write_score
-from phibench.benchmark.scores.score_tables import leaderboard, number, ranked
+from phibench.benchmark.scores.score_tables import leaderboard, number, ranked_scores
 from phibench.benchmark.scores.strata import STRATA
-from phibench.benchmark.scores.worst_images import crop, worst
+from phibench.benchmark.scores.worst_images import crop, worst_images
 from phibench.cli import main as cli
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.frames.sensor_file import SensorFile, write_sensor_file
@@ -149,9 +149,9 @@ def test_ranks_go_by_phi_with_missed_spots_and_by_depth_where_asked():
     easy = scored(lambda t: good(t) if t.number % 2 else silent(t), pairs, name="easy").document
     every = scored(half, pairs, name="every").document
     assert easy.metrics["rms_px"].value < every.metrics["rms_px"].value
-    assert [d.method.name for d in ranked([easy, every])] == ["every", "easy"]
+    assert [d.method.name for d in ranked_scores([easy, every])] == ["every", "easy"]
     deep = scored(lambda t: replace(half(t), depth_m=t.depth_m), pairs, name="deep").document  # phi as `every`, D exact
-    assert [d.method.name for d in ranked([easy, every, deep], "depth")] == ["deep", "every", "easy"]
+    assert [d.method.name for d in ranked_scores([easy, every, deep], "depth")] == ["deep", "every", "easy"]
     # Both are marked: `every` is off by the same in every image. The squares of `easy` are (0.5 * 1.15)^2 of what is
     # possible: 40 +- 5 of 120 in 40 pairs. 25 tests in all leave a mark below 67, where chi^2 is with 1e-3 / 32.
     assert [row[0] for row in leaderboard([easy, every]).rows] == ["every !", "easy !"]
@@ -165,7 +165,7 @@ def test_worst_images_of_parts_are_those_of_all_at_once():
     pairs = cases(70)  # five parts
     for make in (sampler(seed=3), shifted(0.2)):
         found = score_outcomes(MethodCard.of("m"), pairs, outcomes(pairs, make), RULES)
-        assert found.document.worst == worst(found.records, pairs)
+        assert found.document.worst == worst_images(found.records, pairs)
         assert len(found.document.worst) == 10
 
 

@@ -10,7 +10,7 @@ import pytest
 from helpers.bench_cases import cases, constant, outcomes, sampler, shifted, silent
 
 from phibench.benchmark.reports import figures
-from phibench.benchmark.reports.report_page import report_html, verdict
+from phibench.benchmark.reports.report_page import report_html, report_verdict
 from phibench.benchmark.scores.answer_errors import Rules
 from phibench.benchmark.scores.compare import compare_records, print_comparison
 from phibench.benchmark.scores.failure_causes import KINDS
@@ -246,5 +246,7 @@ def test_the_cause_of_the_method_itself_has_words(scored):
     wrong = {cause: dict.fromkeys(KINDS, 0) for cause in one.document.causes}
     wrong["method"]["missed"] = 3
     document = one.document.model_copy(update={"causes": wrong})
-    assert "most of the others are missed by its own fault: the light was there" in verdict({"one": document}, "phi")
+    assert "most of the others are missed by its own fault: the light was there" in report_verdict(
+        {"one": document}, "phi"
+    )
     assert cause_table([document, document]).rows[0][-1] == "the method's own 3"

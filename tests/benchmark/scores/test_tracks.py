@@ -12,7 +12,7 @@ from helpers.bench_cases import Cases, cases, change, outcomes, records, sampler
 
 from phibench.benchmark.pair_sets.dataset_pairs import BOX_PX, tracks_of
 from phibench.benchmark.scores.answer_errors import MATCH_PX, Rules
-from phibench.benchmark.scores.metrics import measure, prepared_records
+from phibench.benchmark.scores.metrics import metric_estimates, prepared_records
 from phibench.benchmark.scores.record_columns import LEAST_RATIO, THRESHOLDS, perfect_log
 from phibench.estimator.interface import Answer, Outcome, Spot
 from phibench.estimator.pair_set import PairTruth
@@ -26,7 +26,7 @@ def table(pairs: Cases, oracle) -> pl.DataFrame:
 
 
 def values(frame: pl.DataFrame, *names: str) -> dict[str, float]:
-    return {name: found.estimate.value for name, found in measure(frame, RULES, "test", names=names).items()}
+    return {name: found.estimate.value for name, found in metric_estimates(frame, RULES, "test", names=names).items()}
 
 
 @pytest.mark.parametrize("ratio", [1.0, 2.5, 30.0])
@@ -74,7 +74,9 @@ def test_only_spots_with_a_bound_below_1_px_are_localised() -> None:
     first = cases(20).truths[0]
     wide = change(first, "down", bound_px2=np.eye(2) * 0.6)
     hidden = change(first, "up", visible=False, bound_px2=None, raw_bound_px2=None)
-    found = measure(table(Cases((wide, replace(hidden, number=1))), truth_itself), RULES, "test", names=("localise",))
+    found = metric_estimates(
+        table(Cases((wide, replace(hidden, number=1))), truth_itself), RULES, "test", names=("localise",)
+    )
     assert found["localise"].n == 2  # of four: "up" of the first, "down" of the second
 
 
@@ -175,7 +177,7 @@ def test_the_pair_set_tells_its_tracks(document: dict[str, object], tracks: tupl
 
 
 def test_every_number_has_an_interval() -> None:
-    found = measure(table(cases(), sampler()), RULES, "test", names=NAMES)
+    found = metric_estimates(table(cases(), sampler()), RULES, "test", names=NAMES)
     for name in set(NAMES) - {"false_per_empty"}:
         low, value, high = (getattr(found[name].estimate, key) for key in ("low", "value", "high"))
         assert low <= value <= high, name

@@ -19,7 +19,7 @@ from phibench.benchmark.scores.record_columns import COLUMN_TYPES
 from phibench.benchmark.scores.score import Scored, score
 from phibench.benchmark.scores.score_files import read_records, read_score, write_score
 from phibench.benchmark.sealed import score_check
-from phibench.benchmark.sealed.rebuilt_score import GIVEN, column_differences, outcomes_of_records, rebuilt
+from phibench.benchmark.sealed.rebuilt_score import GIVEN, column_differences, outcomes_of_records, score_from_records
 from phibench.benchmark.sealed.score_check import check_score
 from phibench.cli import main as cli
 from phibench.datasets.read import open_finished
@@ -55,13 +55,13 @@ def honest(bench_dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Hon
     score(bench_dataset, f"{method}:extract", "bayer-raw", out=path, console=quiet())
     document = read_score(path)
     pairs = dataset_pairs(open_finished(bench_dataset), "bayer-raw")
-    return Honest(path, method, rebuilt(document, read_records(path, document), pairs))
+    return Honest(path, method, score_from_records(document, read_records(path, document), pairs))
 
 
 @pytest.fixture
 def once(honest: Honest, monkeypatch: pytest.MonkeyPatch) -> None:
     """The score is not built again for each forgery whose answers are the same: it is that of the unchanged file."""
-    monkeypatch.setattr(score_check, "rebuilt", lambda *arguments: honest.again)
+    monkeypatch.setattr(score_check, "score_from_records", lambda *arguments: honest.again)
 
 
 def faults(path: Path, data: Path, **others: Any) -> tuple[str, ...]:

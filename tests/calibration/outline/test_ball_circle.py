@@ -15,7 +15,7 @@ from phibench.calibration.outline.ball_circle import BallCircle, find_circle, po
 from phibench.calibration.outline.edge_ring import TURNS, EdgeRing, log_colours
 from phibench.calibration.outline.outline import find_outline
 from phibench.calibration.outline.outline_result import require_near
-from phibench.calibration.rig.align import alignment, verdict
+from phibench.calibration.rig.align import alignment, alignment_verdict
 from phibench.estimator.spots.image_planes import ImageError
 from phibench.scenes.frames import Pose, as_vector
 from phibench.scenes.rig import Rig
@@ -162,7 +162,7 @@ def test_where_the_light_is_not_steels_the_edge_is_the_outline(rig_and_light) ->
     assert error @ np.linalg.solve(found.covariance_m2, error) < limit
     off = error + 5.0 * found.sigma_m
     assert off @ np.linalg.solve(found.covariance_m2, off) > limit
-    assert "by the edge in the picture alone" in verdict(moved)
+    assert "by the edge in the picture alone" in alignment_verdict(moved)
 
 
 @pytest.mark.slow  # four fits that do not come to rest

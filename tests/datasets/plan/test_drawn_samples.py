@@ -32,7 +32,7 @@ from phibench.datasets.store.metadata import read_manifest
 from phibench.datasets.verify import verify
 from phibench.render.optics.truth import spot_truth
 from phibench.scenes.rig import POSITIONS
-from phibench.studies.paper.paper_tables import score
+from phibench.studies.paper.paper_tables import score_estimators
 
 TINY = Path(__file__).resolve().parents[2] / "tiny_random.toml"
 
@@ -234,14 +234,20 @@ def test_headers_name_the_rigs_pose(made: Path) -> None:
 
 def test_estimators_use_each_samples_rig(made: Path) -> None:
     dataset = open_finished(made)
-    exact = [s for s in score(dataset) if s.estimator == "exact" and s.source == "truth" and s.status == "ok"]
+    exact = [
+        s for s in score_estimators(dataset) if s.estimator == "exact" and s.source == "truth" and s.status == "ok"
+    ]
     assert len(exact) == sum(row.down.visible and row.up.visible for row in dataset.rows) >= 2
     for one in exact:
         assert abs(one.relative_error) < 1e-11  # as for random rigs in test_triangulate
     rows = [
         row.model_copy(update={"nominal_rig": dataset.rows[0].rig}) for row in dataset.rows
     ]  # the first rig for all
-    wrong = [s for s in score(replace(dataset, rows=tuple(rows))) if s.estimator == "exact" and s.source == "truth"]
+    wrong = [
+        s
+        for s in score_estimators(replace(dataset, rows=tuple(rows)))
+        if s.estimator == "exact" and s.source == "truth"
+    ]
     assert max(abs(s.relative_error) for s in wrong[1:] if s.status == "ok") > 1e-3
 
 

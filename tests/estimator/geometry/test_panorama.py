@@ -16,12 +16,12 @@ from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.read import open_dataset
 from phibench.estimator.geometry.panorama import (
     PanoramaGrid,
+    grid_pixels,
     panorama,
     pixels_by_model,
     pixels_by_truth,
-    places,
     ray_directions,
-    unrolled,
+    unrolled_values,
 )
 from phibench.render.optics.truth import spot_truth, truth_layer
 from phibench.scenes.laser import LaserSpot
@@ -70,7 +70,7 @@ def test_distance_matters_because_a_sphere_has_no_single_viewpoint() -> None:
 def test_model_and_truth_layer_agree(tiny_dataset: Path, position: str) -> None:
     """The truth layer's float32 (0.2 um at 4 m, 6e-8 rad) is 2e-5 px, and so is its quadratic between pixels."""
     sample = open_dataset(tiny_dataset).samples[0]
-    by_model, by_truth = (places(sample, position, GRID, by) for by in ("model", "truth"))
+    by_model, by_truth = (grid_pixels(sample, position, GRID, by) for by in ("model", "truth"))
     both = np.isfinite(by_model).all(axis=-1) & np.isfinite(by_truth).all(axis=-1)
     assert both.mean() > 0.9
     assert np.max(np.abs(by_model - by_truth)[both]) < 1e-3
@@ -81,7 +81,7 @@ def test_model_and_truth_layer_agree(tiny_dataset: Path, position: str) -> None:
 @pytest.mark.slow
 def test_truth_of_a_misaligned_rig_differs_from_the_nominal_model(misaligned_dataset: Path) -> None:
     sample = open_dataset(misaligned_dataset).samples[0]
-    by_model, by_truth = (places(sample, "down", GRID, by) for by in ("model", "truth"))
+    by_model, by_truth = (grid_pixels(sample, "down", GRID, by) for by in ("model", "truth"))
     true = pixels_by_model(sample.view("down"), GRID)
     both = np.isfinite(by_model + by_truth + true).all(axis=-1)
     assert both.mean() > 0.9
@@ -126,11 +126,11 @@ def test_unrolled_is_bilinear_and_empty_where_nothing_is_seen() -> None:
     v, u = np.mgrid[:10, :12]
     image = 2.0 * u + 3.0 * v + 0.5 * u * v  # what bilinear interpolation keeps
     where = np.array([[[3.25, 4.5], [np.nan, 1.0], [10.9, 8.75]]])
-    found = unrolled(image, where)
+    found = unrolled_values(image, where)
     expected = 2.0 * where[..., 0] + 3.0 * where[..., 1] + 0.5 * where[..., 0] * where[..., 1]
     assert np.allclose(found[0, [0, 2]], expected[0, [0, 2]], rtol=1e-13)
     assert np.isnan(found[0, 1])
-    assert unrolled(np.stack([image] * 3, axis=-1), where).shape == (1, 3, 3)
+    assert unrolled_values(np.stack([image] * 3, axis=-1), where).shape == (1, 3, 3)
 
 
 def _striped(grid: PanoramaGrid, edge_px: np.ndarray, blur_px: float) -> np.ndarray:

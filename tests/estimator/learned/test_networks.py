@@ -23,7 +23,7 @@ from phibench.estimator.learned.network_input import (
     CropInput,
     crop_input,
     crop_origin,
-    cut,
+    cut_part,
     filter_planes,
     frame_input,
 )
@@ -67,10 +67,10 @@ def test_beyond_the_border_stands_its_mirror_image_in_the_mosaics_order() -> Non
     v, u = np.indices((40, 50))
     colours = v % 2 + u % 2
     for origin in ((-6, -4), (30, 20), (8, 2)):
-        part = cut(colours, origin)
+        part = cut_part(colours, origin)
         assert part.shape == (WINDOW_PX, WINDOW_PX)
         np.testing.assert_array_equal(part, (np.indices(part.shape) % 2).sum(axis=0))
-    np.testing.assert_array_equal(cut(u, (7, 2)), u[2:35, 7:40])
+    np.testing.assert_array_equal(cut_part(u, (7, 2)), u[2:35, 7:40])
 
 
 DEV = (1.0, 0.10, 0.03)  # response of the filters of `bench-dev`

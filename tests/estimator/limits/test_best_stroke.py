@@ -15,7 +15,7 @@ from scipy.special import erf
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.frames.sensor_card import sensor_card
 from phibench.estimator.geometry.least_squares_depth import depth_general
-from phibench.estimator.geometry.line_of_sight import blocked, first_blocker
+from phibench.estimator.geometry.line_of_sight import blocked_segments, first_blocker
 from phibench.estimator.geometry.reflection import image_of
 from phibench.estimator.geometry.rig_parameters import PARAMETERS, changed_rig, prior_sigmas, stroke_of
 from phibench.estimator.limits import best_stroke as best_stroke_module
@@ -90,7 +90,7 @@ def test_segments_are_blocked_as_the_ray_caster_says() -> None:
     hits = misses = 0
     for solid, start, end in _boxes():
         outside = np.array([not (solid.contains(a) or solid.contains(b)) for a, b in zip(start, end, strict=True)])
-        found, expected = blocked(solid, start, end), blocked_by((solid,), start, end) >= 0
+        found, expected = blocked_segments(solid, start, end), blocked_by((solid,), start, end) >= 0
         assert np.array_equal(found[outside], expected[outside])
         hits, misses = hits + int(found[outside].sum()), misses + int((~found[outside]).sum())
     assert hits > 100
@@ -100,8 +100,8 @@ def test_segments_are_blocked_as_the_ray_caster_says() -> None:
 def test_a_segment_along_a_face_and_one_that_ends_on_it_are_free() -> None:
     box = Cuboid("box", Pose("world", "shape", (0.0, 0.0, 0.0)), (2.0, 2.0, 2.0))
     start, end = np.array([[-3.0, 0.0, 1.0], [-3.0, 0.0, 0.0]]), np.array([[3.0, 0.0, 1.0], [-1.0, 0.0, 0.0]])
-    assert not blocked(box, start, end).any()
-    assert blocked(box, start[1], np.array([3.0, 0.0, 0.0]))
+    assert not blocked_segments(box, start, end).any()
+    assert blocked_segments(box, start[1], np.array([3.0, 0.0, 0.0]))
     assert first_blocker((box,), ((start[1], np.array([3.0, 0.0, 0.0])),)) == "box"
     assert first_blocker((box,), ((start, end),)) is None
 

@@ -19,7 +19,7 @@ from phibench.estimator.limits.processed_bound import (
     processed_on_off_limit,
 )
 from phibench.estimator.processed.chain_model import chain_model, codes, raw_variance_e2
-from phibench.estimator.spots.camera_codes import quantised, step_correlation
+from phibench.estimator.spots.camera_codes import quantised_output, step_correlation
 from phibench.estimator.spots.gaussian_spot import LASER_RESPONSE, SpotBlur, SpotModel, SpotPixels
 from phibench.estimator.spots.raw_pixels import noise_before_rounding
 from phibench.render.sensor.light import Light
@@ -129,7 +129,7 @@ def test_jpeg_bound_is_that_of_explicit_unknowns(counts: tuple[int, int], steps:
 
     K, V = by_raw(on), raw_variance_e2(model, mean)
     rest = [at.excess @ model.transform**2 + model.rounding for at in (on, off)]
-    output = quantised(on.mean @ T + model.shift, np.sqrt(V @ K**2 + rest[0]), model.step)
+    output = quantised_output(on.mean @ T + model.shift, np.sqrt(V @ K**2 + rest[0]), model.step)
     live = output.variance > 2e-3 * model.step**2
     S = (K.T * V) @ K * np.outer(output.slope, output.slope)
     np.fill_diagonal(S, output.variance)
@@ -163,7 +163,7 @@ def test_codes_with_off_frames_lie_between_raw_pixels_and_a_jpeg() -> None:
 def test_correlation_of_a_quantisers_error(sigma: float) -> None:
     """Against the mean of the squared expected error over places, by sums over thresholds."""
     place = (np.arange(2000) + 0.5) / 2000.0 - 0.5
-    expected = quantised(place, np.full(2000, sigma), np.ones(2000)).mean - place
+    expected = quantised_output(place, np.full(2000, sigma), np.ones(2000)).mean - place
     assert float(step_correlation(np.array(sigma))) == pytest.approx(12.0 * np.mean(expected**2), abs=1e-3)
 
 

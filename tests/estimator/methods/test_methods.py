@@ -21,7 +21,7 @@ from phibench.estimator.methods.spot_search import SharedPair, box_at, clipped_b
 from phibench.estimator.spots.camera_codes import linear_to_srgb, srgb_to_linear
 from phibench.estimator.spots.image_planes import (
     KINDS,
-    demosaiced,
+    demosaiced_planes,
     kind_of,
     linear_planes,
     redness,
@@ -343,7 +343,7 @@ def test_red_peak_of_nothing_is_none() -> None:
 def test_interpolation_is_the_cameras_inside_of_a_border(origin: tuple[int, int]) -> None:
     raw = generator("demosaic").uniform(0.0, 1.0, (14, 16))
     u0, v0 = origin
-    ours = demosaiced(raw[v0:, u0:], origin)
+    ours = demosaiced_planes(raw[v0:, u0:], origin)
     theirs = processing.demosaic(raw)[:, v0:, u0:]
     np.testing.assert_allclose(ours[:, 1:-1, 1:-1], theirs[:, 1:-1, 1:-1], rtol=0, atol=1e-14)
     if origin == (0, 0):

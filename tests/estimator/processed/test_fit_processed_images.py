@@ -22,7 +22,7 @@ from phibench.estimator.spots.camera_codes import (
     linear_to_srgb,
     noisy_code,
     quantisation,
-    quantised,
+    quantised_output,
     quantiser_steps,
     srgb_slope,
     srgb_to_linear,
@@ -122,7 +122,7 @@ def test_quantiser_against_its_sum_and_against_draws() -> None:
     for mean, sigma in ((0.3, 0.05), (0.49, 0.05), (2.2, 0.3), (-1.4, 0.7), (0.5, 1.5)):
         k = np.arange(-40, 41)
         p = np.diff(scipy.stats.norm.cdf(np.append(k - 0.5, 40.5), mean, sigma))
-        one = quantised(np.array([4.0 * mean]), np.array([4.0 * sigma]), np.array([4.0]))
+        one = quantised_output(np.array([4.0 * mean]), np.array([4.0 * sigma]), np.array([4.0]))
         h = 1e-5
         shifted = [np.diff(scipy.stats.norm.cdf(np.append(k - 0.5, 40.5), mean + d, sigma)) @ k for d in (h, -h)]
         assert one.mean[0] == pytest.approx(4.0 * (p @ k), abs=1e-5)

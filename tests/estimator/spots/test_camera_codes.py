@@ -21,7 +21,7 @@ from phibench.estimator.processed.fit_processed_region import grid_px
 from phibench.estimator.spots.camera_codes import (
     coefficients,
     light_of,
-    quantised,
+    quantised_output,
     rgb_codes,
     rgb_picture,
     tone_of,
@@ -163,7 +163,7 @@ def test_model_of_the_outputs_against_the_chain(name: str) -> None:
     drawn = outputs(np.stack([before.frame(light, NoiseStream(("means", k)), window) for k in range(n)]), s)
     deviation = drawn.std(axis=0, ddof=1)
     if s.output != "mjpeg":  # codes are rounded, whose mean a small noise leaves beside that of the input
-        wanted = quantised(wanted, np.sqrt(np.maximum(deviation**2 - 1.0 / 12.0, 0.01)), np.array(1.0)).mean
+        wanted = quantised_output(wanted, np.sqrt(np.maximum(deviation**2 - 1.0 / 12.0, 0.01)), np.array(1.0)).mean
     error, live = deviation / np.sqrt(n), deviation > 0.3
     z = ((drawn.mean(axis=0) - wanted) / np.maximum(error, 1e-9))[live]
     off = 0.3 * (outputs(np.ones((1, h, w, 3)), s)[0] if s.output == "mjpeg" else 1.0)

@@ -32,7 +32,7 @@ from phibench.estimator.spots.detect import (
     Choice,
     PairDetection,
     choose,
-    consistent,
+    consistent_pairs,
     detect,
     epipolar_curve,
     mirror_box,
@@ -286,19 +286,19 @@ def test_the_curve_goes_through_the_up_image_of_the_point_for_a_tilted_rig_too()
     rig = replace(RIG, stroke_axis_world=(0.02, -0.01, 1.0))
     down = np.array([image_of(rig.at(0.0), np.array(p)).uv_px for p in places(10)])
     up = np.array([image_of(rig.at(STROKE_M), np.array(p)).uv_px for p in places(10)])
-    fits = consistent(rig, STROKE_M, down, up)
+    fits = consistent_pairs(rig, STROKE_M, down, up)
     assert np.diag(fits).all()
     assert 10 <= fits.sum() < 60  # others are on other azimuths
     curve = epipolar_curve(rig, STROKE_M, down)
     assert np.isfinite(curve).all()
-    assert consistent(rig, STROKE_M, down[:0], up).shape == (0, 10)
+    assert consistent_pairs(rig, STROKE_M, down[:0], up).shape == (0, 10)
 
 
 def test_far_candidates_are_not_consistent_with_a_spot_beyond_the_range() -> None:
     """A point at 0.2 m lies before the nearest D: its up image is off the curve's end."""
     point = np.array([0.2, 0.0, 0.6])
     down, up = (image_of(RIG.at(offset), point).uv_px[None] for offset in (0.0, STROKE_M))
-    assert not consistent(RIG, STROKE_M, down, up).any()
+    assert not consistent_pairs(RIG, STROKE_M, down, up).any()
 
 
 # -- what methods see --------------------------------------------------------------------------------------------------

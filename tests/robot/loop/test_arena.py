@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from phibench.estimator.geometry.line_of_sight import blocked
+from phibench.estimator.geometry.line_of_sight import blocked_segments
 from phibench.robot.loop.arena import Boxes, arena_of, boxes_of, generated_arena, plain_arena
 from phibench.scenes.frames import Array, rotation_xyz
 from phibench.scenes.random_streams import generator
@@ -43,7 +43,9 @@ def test_lines_of_sight_agree_with_points_along_them_and_with_the_scalar_test() 
     found = boxes.block(starts, ends)
     steps = np.linspace(0.0, 0.999, 400)[:, None]
     sampled = np.array([inside(boxes, a + steps * (b - a)).any() for a, b in zip(starts, ends, strict=True)])
-    scalar = np.array([any(blocked(solid, a, b) for solid in solids) for a, b in zip(starts, ends, strict=True)])
+    scalar = np.array(
+        [any(blocked_segments(solid, a, b) for solid in solids) for a, b in zip(starts, ends, strict=True)]
+    )
     assert 60 < scalar.sum() < 240
     assert not np.any(sampled & ~found)
     # points 15 mm apart miss corners that are cut by less; the last 3 mm of a line are left out

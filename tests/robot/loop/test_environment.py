@@ -17,10 +17,10 @@ from phibench.robot.loop.environment import (
     FLAT,
     ApproachTarget,
     action_of,
+    action_of_scaled,
     flat_observation,
     register,
-    scaled,
-    unscaled,
+    scaled_observation,
 )
 from phibench.robot.loop.simulator import (
     COLLISION,
@@ -201,21 +201,23 @@ def test_the_flat_one_passes_the_checks_of_gymnasium(vectors) -> None:
 def test_vectors_are_the_dicts_scaled(env, vectors) -> None:
     """The ends of each range, and the same episode as the other environment's."""
     space = env.action_space
-    low, high = (unscaled(np.full(len(space), x), space) for x in (-1.0, 1.0))
+    low, high = (action_of_scaled(np.full(len(space), x), space) for x in (-1.0, 1.0))
     assert low["drive_m_per_s"] == -high["drive_m_per_s"] == space["drive_m_per_s"].low[0]
     assert (low["state"], high["state"], high["exposure"]) == (0, 1, space["exposure"].n - 1)
-    assert vectors.reset(seed=7)[0] == pytest.approx(scaled(env.reset(seed=7)[0], env.observation_space), abs=0.0)
+    assert vectors.reset(seed=7)[0] == pytest.approx(
+        scaled_observation(env.reset(seed=7)[0], env.observation_space), abs=0.0
+    )
     action = np.array([0.3, -0.2, 0.0, 0.0, 0.1, 0.5, -1.0, 0.0], np.float32)
     seen, reward, *_ = vectors.step(action)
-    other, expected, *_ = env.step(unscaled(action, space))
+    other, expected, *_ = env.step(action_of_scaled(action, space))
     assert reward == expected
-    assert np.array_equal(seen, scaled(other, env.observation_space))
+    assert np.array_equal(seen, scaled_observation(other, env.observation_space))
     assert seen.dtype == np.float32
     assert np.abs(seen).max() <= 1.0
     with pytest.raises(SceneError, match=r"action \w+ = 1.1: give a number from -1 to 1"):
-        unscaled(np.full(8, 1.1), space)
+        action_of_scaled(np.full(8, 1.1), space)
     with pytest.raises(SceneError, match="action of 3 numbers: give 8 from -1 to 1"):
-        unscaled(np.zeros(3), space)
+        action_of_scaled(np.zeros(3), space)
 
 
 @pytest.mark.slow

@@ -31,7 +31,7 @@ from phibench.robot.loop.sensing import SEEN, SpotReading
 from phibench.robot.loop.simulator import CODES, COLLISION, REACHED, Action, Observation, Setup, Simulator, Task
 from phibench.scenes.motion.vehicle import PlanarPose
 from phibench.scenes.validation import SceneError
-from phibench.studies.loop.study import misaligned, summary
+from phibench.studies.loop.study import rig_deviation, summary
 
 
 @pytest.mark.slow
@@ -236,7 +236,7 @@ def test_rigs_whose_covariance_is_stated(capsys, policy: str) -> None:
     rooms = tuple(generated_arena("loop test 4", k) for k in range(20))
     setup, rows = Setup(arenas=rooms, rig_covariance=rig_covariance(1.0)), []
     for number in range(200):
-        own = replace(setup, misalignment=misaligned(1.0, 6000 + number))
+        own = replace(setup, misalignment=rig_deviation(1.0, 6000 + number))
         rows += [replace(one, number=number) for one in run_episodes(own, policy, 1, "told rooms 2", number)]
     found = summary(rows)
     with capsys.disabled():

@@ -18,7 +18,15 @@ from phibench.datasets.common.shown_text import show_grid
 from phibench.estimator.geometry.paper_depth import find_published, load_published
 from phibench.estimator.geometry.triangulate import ESTIMATORS
 from phibench.scenes.rig import Rig
-from phibench.studies.paper.paper_tables import GENERAL, SOURCES, as_records, bias_table, score, summarise, table
+from phibench.studies.paper.paper_tables import (
+    GENERAL,
+    SOURCES,
+    as_records,
+    bias_table,
+    score_estimators,
+    summarise,
+    table,
+)
 
 RIG = Rig()
 
@@ -60,7 +68,7 @@ def make_dataset(*samples):
 def three():
     """Three of the paper's experiments; the last is hidden at the up position."""
     cases = paper_cases()
-    return score(
+    return score_estimators(
         make_dataset(make_sample(*cases[0]), make_sample(*cases[10]), make_sample(*cases[21], up="behind robot"))
     )
 
@@ -105,7 +113,7 @@ def test_hidden_sample_counts_with_its_cause(three):
 def test_wrong_pixels_get_a_bad_score():
     """A scorer that cannot see an error of a tenth of a pixel scores nothing."""
     case = paper_cases()[10]
-    right, wrong = (score(make_dataset(make_sample(*case, shift_px=x))) for x in (0.0, 0.1))
+    right, wrong = (score_estimators(make_dataset(make_sample(*case, shift_px=x))) for x in (0.0, 0.1))
     errors = [next(abs(s.relative_error) for s in scores if s.estimator == "exact") for scores in (right, wrong)]
     assert errors[0] < 1e-12
     assert errors[1] > 1e-4
@@ -113,7 +121,7 @@ def test_wrong_pixels_get_a_bad_score():
 
 def test_frames_are_scored_by_what_they_show_not_by_the_truth():
     case = paper_cases()[10]
-    scores = score(make_dataset(make_sample(*case, frame=lambda uv: draw(uv + [0.2, 0.0]))))
+    scores = score_estimators(make_dataset(make_sample(*case, frame=lambda uv: draw(uv + [0.2, 0.0]))))
     errors = {s.source: abs(s.relative_error) for s in scores if s.estimator == "exact"}
     assert errors["truth"] < 1e-12
     assert errors["frame"] > 1e-4
@@ -121,7 +129,7 @@ def test_frames_are_scored_by_what_they_show_not_by_the_truth():
 
 def test_frame_without_a_spot_has_its_cause():
     case = paper_cases()[10]
-    scores = score(make_dataset(make_sample(*case, frame=lambda uv: np.zeros((3, 720, 1280)))))
+    scores = score_estimators(make_dataset(make_sample(*case, frame=lambda uv: np.zeros((3, 720, 1280)))))
     assert {s.status for s in scores if s.source == "frame"} == {"down: no spot, up: no spot"}
     assert {s.status for s in scores if s.source == "truth"} == {"ok"}
 
@@ -135,7 +143,7 @@ def test_summary_is_over_the_estimates_alone(three):
 
 
 def test_summary_without_estimates():
-    only = score(make_dataset(make_sample(*paper_cases()[0], down="outside image")))
+    only = score_estimators(make_dataset(make_sample(*paper_cases()[0], down="outside image")))
     assert all(s.n == 0 and s.missing == 1 and math.isnan(s.rms) for s in summarise(only))
     for shown in (text(table(only)), text(table(only, wide=True)), text(bias_table(only))):
         assert "nan" not in shown
@@ -209,7 +217,7 @@ def test_records_are_json_without_nan(three):
 def test_sample_that_is_not_of_the_paper_has_no_published_value():
     published, spot = paper_cases()[0]
     other = SimpleNamespace(experiment="mine", real_depth_m=2.18, baseline_m=0.8)
-    assert all(math.isnan(s.published_m) for s in score(make_dataset(make_sample(other, spot))))
+    assert all(math.isnan(s.published_m) for s in score_estimators(make_dataset(make_sample(other, spot))))
     assert find_published("table1", 2.18, 0.8) == published
 
 
