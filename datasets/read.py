@@ -1,4 +1,4 @@
-"""Reader of data sets. It needs neither Mitsuba nor a recipe: everything comes out of the folder.
+"""Reader of data sets (`Dataset`, `Sample`): without Mitsuba or a recipe, everything comes out of the folder.
 
 >>> import phibench
 >>> dataset = phibench.open_dataset("out/paper")  # doctest: +SKIP

@@ -1,4 +1,4 @@
-"""Draws of a plan: rooms, rigs of a recipe with `[rigs]`, and samples that were drawn before."""
+"""Draws of a plan: rooms and their files, rigs of a recipe with `[rigs]`, and samples that were drawn before."""
 
 from __future__ import annotations
 

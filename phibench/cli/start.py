@@ -1,4 +1,4 @@
-"""Commands `phibench start`, `demo`, `recipe ...` and `method ...`: what a newcomer asks for first."""
+"""Commands `phibench start`, `demo`, `recipe ...`, `method ...`: first steps, shipped recipes, checks of methods."""
 
 from __future__ import annotations
 
