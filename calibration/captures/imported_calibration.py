@@ -37,7 +37,7 @@ from phibench.estimator.geometry.least_squares_depth import depth_general
 from phibench.estimator.geometry.rig_parameters import stroke_of
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.estimator.interface import Pair
-from phibench.estimator.methods.raw_likelihood import with_posteriors
+from phibench.estimator.methods.joint_fit import with_posteriors
 from phibench.estimator.methods.registry import method_for
 from phibench.estimator.methods.spot_search import SharedPair, joint_or_separate
 from phibench.estimator.spots.image_planes import ImageError

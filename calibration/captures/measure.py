@@ -68,7 +68,7 @@ from phibench.estimator.geometry.least_squares_depth import GeneralDepth, depth_
 from phibench.estimator.geometry.rig_parameters import PARAMETERS, prior_sigmas, stroke_of
 from phibench.estimator.geometry.status import Status, describe
 from phibench.estimator.interface import Answer, Image, Pair, Spot
-from phibench.estimator.methods.raw_likelihood import with_posteriors
+from phibench.estimator.methods.joint_fit import with_posteriors
 from phibench.estimator.methods.registry import method_for
 from phibench.estimator.methods.spot_search import SharedPair, joint_or_separate
 from phibench.estimator.spots.detect import detect

@@ -61,7 +61,7 @@ class Sensitivity:
 def sensitivity(
     estimator: str, nominal_rig: Rig, nominal_stroke_m: float, true_rig: Rig, true_stroke_m: float, point_world_m: Array
 ) -> Sensitivity:
-    """Sensitivities of an estimator of `score.ESTIMATORS` to every parameter, for a spot at a world point, shape (3,).
+    """Sensitivities of one of `triangulate.ESTIMATORS` to every parameter, for a spot at a world point, shape (3,).
 
     Everything is NaN where the spot is not seen or the estimator has no answer.
     """
@@ -215,4 +215,4 @@ PIXEL_GRADIENTS: dict[str, PixelGradient] = {
     "approx_ray": partial(_paper_pixel_gradient, "ray", False),
     "exact": exact_gradient,
 }
-"""dD/d(u1, v1, u2, v2), shape (4,), metres per pixel, of every estimator of `score.ESTIMATORS`."""
+"""dD/d(u1, v1, u2, v2), shape (4,), metres per pixel, of every estimator of `triangulate.ESTIMATORS`."""

@@ -1,4 +1,4 @@
-"""Likelihood maps of spots of processed images, flux and levels profiled out; the covariance that a fit may claim.
+"""Likelihood of a spot in one image, and its map over places, flux and levels profiled out; covariances to claim.
 
 The quasi-likelihood is that of `chain_fit`: r^T C^-1 r of a JPEG's coefficients with C kept from the fit, or the law
 of each raw pixel or own code. At each place flux and levels come from one step of Gauss-Newton, and what a second would
@@ -256,3 +256,9 @@ def _part_profiled(one: SpotLikelihood, theta: Array, evaluations: int) -> tuple
             break
     value[steep] = least[steep]
     return value / one.excess, theta
+
+
+def place_covariance(one: SpotLikelihood) -> Array:
+    """Covariance of the place, shape (2, 2), pixels squared, by the curvature at the best hypothesis."""
+    _, _, fisher = one.scores(one.theta[None], 0)
+    return covariance_bound(fisher[0]) * one.excess

@@ -1,4 +1,4 @@
-"""Built-in methods by likelihood: each spot on raw pixels, both spots as one point; posteriors of faint spots.
+"""Built-in method `raw_maximum_likelihood`: each spot by itself on raw pixels; those pixels with their law.
 
 `raw_maximum_likelihood` takes as known the card's noise (PRNU and DSNU count as noise), the rig's detector for the
 filters' response at the laser line, and the oblique blur that the rig predicts at the pixel (`spot_blur`), with the
@@ -6,50 +6,23 @@ beam's size once the pair's distance is known. A rough mirror's blur is not pred
 well. The room behind is the laser-off frame, smoothed as far as it is flat (`background_of`). Without one it is a level
 per filter, or, where that does not describe it, what surrounds the spot. A misfit that is left widens the covariance.
 
-`joint_fit` first fits each image by itself: raw pixels by `raw_maximum_likelihood`, processed ones by `chain_fit`. It
-then gives means, covariances and a 95 % interval of the posterior of both images (`joint_posterior`), which knows of
-valleys and of several minima; D is the posterior's mean. Of raw pixels with laser-off frames the likelihood is that of
-on - off, with the noise of both and the pattern of the spot alone. Where the maps do not hold the posterior, raw pixels
-are fitted together (`spots.fit_joint`) and the positions of processed ones combined by their covariances
-(`least_squares_depth`). Where the two are not one point, the separate answer stands, without a depth of its own.
-
 Several frames: means are fitted. Photons, read noise and rounding fall with their number; what frames share does not.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from phibench.datasets.frames.sensor_card import SensorCard
-from phibench.estimator.geometry.joint_posterior import JointPosterior, joint_posterior, single_posterior
-from phibench.estimator.geometry.least_squares_depth import CombinedEstimate, combine
 from phibench.estimator.geometry.status import Status, describe
-from phibench.estimator.interface import Answer, Image, Matrix2, Pair, Spot
-from phibench.estimator.methods.chain_fit import chain_fit, spot_likelihood
-from phibench.estimator.methods.likelihood_maps import (
-    FAINT_PX,
-    SpotLikelihood,
-    claimed_px2,
-    likelihood_map,
-    pixels_likelihood,
-)
-from phibench.estimator.methods.spot_search import (
-    SearchRegion,
-    SharedPair,
-    at_detection,
-    each_spot_twice,
-    joint_or_separate,
-    once,
-    pair_blur,
-    seen_depth_m,
-)
-from phibench.estimator.spots.fit_joint import JointFit, fit_joint
+from phibench.estimator.interface import Answer, Image, Pair, Spot
+from phibench.estimator.methods.likelihood_maps import claimed_px2, pixels_likelihood
+from phibench.estimator.methods.spot_search import SearchRegion, at_detection, each_spot_twice, once, pair_blur
 from phibench.estimator.spots.fit_raw import MISFIT_SIGMAS, SpotData, SpotFit, fit_law, spot_data
-from phibench.estimator.spots.gaussian_spot import SpotModel, covariance_bound
+from phibench.estimator.spots.gaussian_spot import SpotModel
 from phibench.estimator.spots.raw_pixels import (
     Background,
     GaussLaw,
@@ -62,10 +35,10 @@ from phibench.estimator.spots.raw_pixels import (
     spot_regions,
 )
 from phibench.scenes.frames import Array
-from phibench.scenes.rig import POSITIONS
 
 _FLAT_SIGMAS = 4.0  # by which the chi2 of a fit with flat levels must exceed 1 for the room to have structure
 _SHOT_SIGMAS = 4.0  # of a full pixel in one frame, by which the mean of several must be below it
+_SIDE_PX = {True: 15, False: 9}  # with a laser-off frame, and without: a level is flat over a few pixels only
 
 
 def raw_maximum_likelihood(region: SearchRegion) -> Spot:
@@ -155,145 +128,12 @@ def _fitted_spot(fit: SpotFit, data: SpotData) -> Spot:
     return Spot((float(fit.uv_px[0, 0]), float(fit.uv_px[0, 1])), ((a, b), (c, d)))
 
 
-_SIDE_PX = {True: 15, False: 9}  # with a laser-off frame, and without: a level is flat over a few pixels only
-_OTHER_SHAPE = 4.0  # by which a claim's variance exceeds the model's own where the light is not the model's
-_MOST_CHI2 = 24.0  # of one degree of freedom: 1e-6 by chance
-
 _each = each_spot_twice(raw_maximum_likelihood)
 
 
 def raw_likelihood(pair: Pair) -> Answer:
     """Both spots by `raw_maximum_likelihood`, each by itself."""
     return once(pair, "raw_maximum_likelihood", _each)
-
-
-def joint_fit(pair: Pair) -> Answer:
-    """Positions and depth of a pair; the separate answers where one image has no spot or the two are not one point.
-
-    Nor are they taken from a spot that left the place where it was seen (`spot_boxes`).
-    """
-    shared = pair if isinstance(pair, SharedPair) else SharedPair.of(pair)
-    separate = raw_likelihood(shared) if pair.card.output == "raw" else chain_fit(shared)
-    return joint_or_separate(shared, separate, joint_of(shared, separate))
-
-
-def joint_of(pair: Pair, separate: Answer) -> Answer:
-    """Answer for both images together, from that for each by itself: `raw_maximum_likelihood`'s or `chain_fit`'s."""
-    if separate.down.covariance_px2 is None or separate.up.covariance_px2 is None:
-        return separate
-    return (_raw if pair.card.output == "raw" else _processed)(pair, separate)
-
-
-def with_posteriors(pair: Pair, separate: Answer) -> Answer:
-    """Answer with mean and covariance of each image's own posterior for its faint spots; the rig enters nowhere."""
-    depth_m = seen_depth_m(pair, separate)
-    down, up = (_with_posterior(pair, name, getattr(separate, name), depth_m) for name in POSITIONS)
-    return Answer(down, up)
-
-
-def _with_posterior(pair: Pair, position: str, spot: Spot, depth_m: float | None) -> Spot:
-    if spot.covariance_px2 is None or np.trace(spot.covariance_px2) < 2.0 * FAINT_PX**2:
-        return spot
-    of_spot = _likelihood(pair, position, spot, depth_m)
-    places = None if of_spot is None else likelihood_map(of_spot)
-    posterior = None if places is None else single_posterior(places)
-    return spot if posterior is None else _joint_spot(*posterior)
-
-
-def _likelihood(pair: Pair, position: str, spot: Spot, depth_m: float | None) -> SpotLikelihood | None:
-    if pair.card.output != "raw":
-        return spot_likelihood(pair, position, spot, depth_m)
-    uv = np.array(spot.uv_px, float)
-    return pixels_likelihood(_over_known_room(pair, position, uv, depth_m), uv)
-
-
-def _over_known_room(pair: Pair, position: str, start: Array, depth_m: float | None) -> SpotData:
-    """Pixels of the fit, over the room that the laser-off frame shows, smoothed where it is flat.
-
-    On - off, as the joint fit takes it, has the noise of both frames: errors are then 1.2 times as large.
-    """
-    card, near = pair.card, _around(pair, position, start)
-    if near.off is None:
-        return raw_spot_data(pair, position, start, depth_m)
-    noise, pattern, frames = noise_of(card, pattern_known=True), PatternNoise.of(card), pair.count(position)
-    x, off = raw_electrons(near.on, card)[None], raw_electrons(near.off, card)[None]
-    variance = noise.variance_e2(off) / pair.count(f"{position}_off")
-    room = background_of(off, variance, np.ones(off.shape), pattern)
-    law = GaussLaw(noise, room.variance_e2, frames, pattern.prnu, room.mean_e)
-    regions = spot_regions(x, near.corner_px, x < _full_from_e(card, frames))
-    return spot_data(regions, law, pair_blur(pair, start, depth_m), SpotModel(_response(pair), room.mean_e))
-
-
-def _raw(pair: Pair, separate: Answer) -> Answer:
-    starts = [np.array([spot.uv_px], float) for spot in (separate.down, separate.up)]
-    depth_m = seen_depth_m(pair, separate)
-    down, up = (raw_spot_data(pair, p, start[0], depth_m) for p, start in zip(POSITIONS, starts, strict=True))
-    likelihoods = [pixels_likelihood(data, start[0]) for data, start in zip((down, up), starts, strict=True)]
-    if _of_other_shape(separate, likelihoods):
-        return _combined(pair, separate)
-    posterior = _posterior(pair, likelihoods)
-    if posterior is not None and posterior.status == Status.OK:
-        return separate if not posterior.misfit < _MOST_CHI2 else _posterior_answer(posterior)
-    return _answer(fit_joint(pair.rig, pair.stroke_m, down, up, *starts), separate)
-
-
-def _processed(pair: Pair, separate: Answer) -> Answer:
-    depth_m = seen_depth_m(pair, separate)
-    likelihoods = [spot_likelihood(pair, p, getattr(separate, p), depth_m) for p in POSITIONS]
-    if _of_other_shape(separate, likelihoods):
-        return _combined(pair, separate)
-    posterior = _posterior(pair, likelihoods)
-    if posterior is not None and posterior.status == Status.OK:
-        return separate if not posterior.misfit < _MOST_CHI2 else _posterior_answer(posterior)
-    return _combined(pair, separate)
-
-
-def _of_other_shape(separate: Answer, likelihoods: Sequence[SpotLikelihood | None]) -> bool:
-    """True if a fit claims far more than its model's likelihood: its light has another shape, as on an edge.
-
-    Not of faint spots: their likelihood has valleys, and the posterior says what they claim.
-    """
-    for position, likelihood in zip(POSITIONS, likelihoods, strict=True):
-        own = math.inf if likelihood is None else float(np.trace(place_covariance(likelihood)))
-        claimed = np.trace(np.array(getattr(separate, position).covariance_px2))
-        if own < 2.0 * FAINT_PX**2 and claimed > _OTHER_SHAPE * own:
-            return True
-    return False
-
-
-def _combined(pair: Pair, separate: Answer) -> Answer:
-    """Answer from both positions and their claims, pixels left aside."""
-    (uv1, C1), (uv2, C2) = (
-        (np.array([spot.uv_px], float), np.array([spot.covariance_px2], float)) for spot in (separate.down, separate.up)
-    )
-    return _answer(combine(pair.rig, pair.stroke_m, uv1, C1, uv2, C2), separate)
-
-
-def _posterior(pair: Pair, likelihoods: Sequence[SpotLikelihood | None]) -> JointPosterior | None:
-    """Posterior of both images; None where one has no likelihood about its fit."""
-    down, up = (None if likelihood is None else likelihood_map(likelihood) for likelihood in likelihoods)
-    return None if down is None or up is None else joint_posterior(pair.rig, pair.stroke_m, down, up)
-
-
-def _posterior_answer(found: JointPosterior) -> Answer:
-    return Answer(
-        _joint_spot(found.uv_down_px, found.covariance_down_px2),
-        _joint_spot(found.uv_up_px, found.covariance_up_px2),
-        found.depth_m,
-        found.sigma_m,
-        found.interval_m,
-    )
-
-
-def _answer(found: JointFit | CombinedEstimate, separate: Answer) -> Answer:
-    if int(found.status[0]) != Status.OK or not found.chi2[0] < _MOST_CHI2:
-        return separate
-    return Answer(
-        _joint_spot(found.uv_down_px[0], found.covariance_down_px2[0]),
-        _joint_spot(found.uv_up_px[0], found.covariance_up_px2[0]),
-        float(found.depth_m[0]),
-        float(found.sigma_m[0]),
-    )
 
 
 def raw_spot_data(pair: Pair, position: str, start: Array, depth_m: float | None) -> SpotData:
@@ -315,6 +155,23 @@ def raw_spot_data(pair: Pair, position: str, start: Array, depth_m: float | None
     return spot_data(spot_regions(np.where(used, x, 0.0), near.corner_px, used), law, blur, SpotModel(_response(pair)))
 
 
+def over_known_room(pair: Pair, position: str, start: Array, depth_m: float | None) -> SpotData:
+    """Square of raw pixels around a start, over the room that the laser-off frame shows, smoothed where it is flat.
+
+    On - off, as the joint fit takes it, has the noise of both frames: errors are then 1.2 times as large.
+    """
+    card, near = pair.card, _around(pair, position, start)
+    if near.off is None:
+        return raw_spot_data(pair, position, start, depth_m)
+    noise, pattern, frames = noise_of(card, pattern_known=True), PatternNoise.of(card), pair.count(position)
+    x, off = raw_electrons(near.on, card)[None], raw_electrons(near.off, card)[None]
+    variance = noise.variance_e2(off) / pair.count(f"{position}_off")
+    room = background_of(off, variance, np.ones(off.shape), pattern)
+    law = GaussLaw(noise, room.variance_e2, frames, pattern.prnu, room.mean_e)
+    regions = spot_regions(x, near.corner_px, x < _full_from_e(card, frames))
+    return spot_data(regions, law, pair_blur(pair, start, depth_m), SpotModel(_response(pair), room.mean_e))
+
+
 @dataclass(frozen=True)
 class _Square:
     """Pixels around a place, shape (n, n), with the laser on and off, and the image pixel (u, v) of their corner."""
@@ -333,15 +190,3 @@ def _around(pair: Pair, position: str, start: Array) -> _Square:
     v0 = min(max(round(start[1]) - side // 2, 0), max(height - side, 0))
     window = (slice(v0, v0 + side), slice(u0, u0 + side))
     return _Square(image[window], None if dark is None else dark[window], (u0, v0))
-
-
-def _joint_spot(uv_px: Array, covariance_px2: Array) -> Spot:
-    (a, b), (c, d) = covariance_px2.tolist()
-    matrix: Matrix2 = ((a, b), (c, d))
-    return Spot((float(uv_px[0]), float(uv_px[1])), matrix)
-
-
-def place_covariance(one: SpotLikelihood) -> Array:
-    """Covariance of the place, shape (2, 2), pixels squared, by the curvature at the best hypothesis."""
-    _, _, fisher = one.scores(one.theta[None], 0)
-    return covariance_bound(fisher[0]) * one.excess

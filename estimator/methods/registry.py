@@ -20,7 +20,8 @@ from phibench.estimator.learned.network_graphs import CROP, DETECT
 from phibench.estimator.learned.network_input import ACCEPTED, frame_input
 from phibench.estimator.learned.networks import Network, heat_peaks, network, refined_position, shipped_network
 from phibench.estimator.methods.chain_fit import chain_fit
-from phibench.estimator.methods.raw_likelihood import joint_fit, raw_likelihood
+from phibench.estimator.methods.joint_fit import joint_fit
+from phibench.estimator.methods.raw_likelihood import raw_likelihood
 from phibench.estimator.methods.spot_search import (
     SearchRegion,
     at_detection,

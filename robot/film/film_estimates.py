@@ -18,11 +18,11 @@ from phibench.datasets.frames.sensor_card import card_of
 from phibench.datasets.recipe.film_tables import TARGET
 from phibench.estimator.spots.raw_pixels import raw_electrons
 from phibench.estimator.spots.spot_prediction import spot_blur
-from phibench.robot.film.blink_identity import TargetCode, TargetTracker
 from phibench.robot.film.film_bundle import FilmDepth, consensus_frames, deviations2, expected_sigma_m, film_depth
 from phibench.robot.film.film_frames import LIT, FilmFrames, Index
 from phibench.robot.film.film_positions import FilmPositions, fit_positions, stepped_positions
 from phibench.robot.film.room_interpolation import has_near_off_frame, room_weights
+from phibench.robot.film.target_tracker import TargetCode, TargetTracker
 from phibench.scenes.frames import Array, BoolArray
 from phibench.scenes.laser import Beam
 from phibench.scenes.motion.carriage import Carriage

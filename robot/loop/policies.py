@@ -17,8 +17,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from phibench.estimator.geometry.rig_parameters import RigBias
 from phibench.robot.loop.belief import Belief
+from phibench.robot.loop.rig_bias import RigBias
 from phibench.robot.loop.sensing import Direction, SpotReading, direction_read
 from phibench.robot.loop.simulator import CODES, Action, Known, Observation, Simulator
 from phibench.robot.loop.smoothing import belief_of

@@ -26,10 +26,11 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from phibench.estimator.geometry.reflection import reflect
-from phibench.estimator.geometry.rig_parameters import RigBias, changed_rig, stroke_of
+from phibench.estimator.geometry.rig_parameters import changed_rig, stroke_of
 from phibench.robot.film.film_positions import FilmPositions
 from phibench.robot.loop.belief import ANY_TARGET, LEAST_Q, SKID, SLIP, VELOCITY, Belief, TargetBelief, TargetPrior
 from phibench.robot.loop.frame_history import Course, FrameHistory, TrackSteps, shared_by_motion, shared_px2
+from phibench.robot.loop.rig_bias import RigBias
 from phibench.robot.loop.sensing import (
     Direction,
     angle_slopes,

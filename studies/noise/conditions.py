@@ -22,7 +22,7 @@ from phibench.benchmark.scores.answer_errors import Rules
 from phibench.benchmark.scores.records import record_table
 from phibench.datasets.read import Dataset, open_dataset
 from phibench.estimator.interface import Answer, Outcome, Pair
-from phibench.estimator.methods.raw_likelihood import joint_of
+from phibench.estimator.methods.joint_fit import joint_of
 from phibench.estimator.methods.registry import METHODS
 from phibench.render.sensor.settings import Sensor, sensor
 from phibench.scenes.frames import as_vector

@@ -34,7 +34,7 @@ from phibench.estimator.drawn_pairs import pairs_of
 from phibench.estimator.geometry.least_squares_depth import GeneralDepth, depth_general
 from phibench.estimator.geometry.status import describe
 from phibench.estimator.interface import OK, Answer, Pair
-from phibench.estimator.methods.raw_likelihood import joint_of
+from phibench.estimator.methods.joint_fit import joint_of
 from phibench.estimator.methods.registry import method_for
 from phibench.estimator.pair_set import PairTruth
 from phibench.scenes.rig import POSITIONS

@@ -20,7 +20,8 @@ from phibench.estimator.drawn_pairs import DrawnPairs, pairs_of
 from phibench.estimator.geometry.least_squares_depth import combine
 from phibench.estimator.interface import Answer, Pair
 from phibench.estimator.methods.chain_fit import chain_fit
-from phibench.estimator.methods.raw_likelihood import joint_of, raw_maximum_likelihood
+from phibench.estimator.methods.joint_fit import joint_of
+from phibench.estimator.methods.raw_likelihood import raw_maximum_likelihood
 from phibench.estimator.methods.spot_search import each_spot_twice
 from phibench.render.sensor.light import Region
 from phibench.studies.paper.experiment_bounds import spot_bounds

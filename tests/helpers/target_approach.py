@@ -9,9 +9,10 @@ from functools import lru_cache
 
 import numpy as np
 
-from phibench.estimator.geometry.rig_parameters import PARAMETERS, PRIOR_SIGMA, RIG_PARAMETERS, RigBias
+from phibench.estimator.geometry.rig_parameters import PARAMETERS, PRIOR_SIGMA, RIG_PARAMETERS
 from phibench.estimator.geometry.sphere_image import SphereImager
 from phibench.robot.loop.belief import Belief, TargetPrior
+from phibench.robot.loop.rig_bias import RigBias
 from phibench.robot.loop.sensing import SEEN, Direction, Sensing, SpotOnSurface, SpotReading, direction_of
 from phibench.robot.loop.smoothing import belief_of
 from phibench.scenes.motion.vehicle import PlanarPose, Stance, Vehicle, rig_placement, stance

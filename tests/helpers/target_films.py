@@ -38,7 +38,7 @@ from phibench.render.sensor.camera_chain import Chain
 from phibench.render.sensor.electrons import NoiseStream, mosaic
 from phibench.render.sensor.light import Light, Region
 from phibench.render.sensor.settings import sensor
-from phibench.robot.film.blink_identity import TargetCode, TargetTracker
+from phibench.robot.film.target_tracker import TargetCode, TargetTracker
 from phibench.scenes.frames import Array
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.motion.carriage import Carriage

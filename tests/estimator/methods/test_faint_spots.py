@@ -14,8 +14,8 @@ from phibench.datasets.read import open_dataset
 from phibench.estimator.drawn_pairs import pairs_of
 from phibench.estimator.interface import Answer
 from phibench.estimator.methods import raw_likelihood
+from phibench.estimator.methods.joint_fit import with_posteriors
 from phibench.estimator.methods.likelihood_maps import SpotLikelihood, claimed_px2
-from phibench.estimator.methods.raw_likelihood import with_posteriors
 from phibench.estimator.methods.registry import METHODS
 from phibench.scenes.rig import POSITIONS
 

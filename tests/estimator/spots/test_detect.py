@@ -22,7 +22,7 @@ from phibench.datasets.read import open_dataset
 from phibench.estimator.geometry.reflection import image_of
 from phibench.estimator.interface import Box, Pair
 from phibench.estimator.limits.position_bound import spot_limit
-from phibench.estimator.methods.raw_likelihood import joint_fit
+from phibench.estimator.methods.joint_fit import joint_fit
 from phibench.estimator.methods.registry import detected_spots
 from phibench.estimator.methods.spot_search import box_around, spot_boxes
 from phibench.estimator.spots.candidates import Candidates, candidates_at, lattice

@@ -21,18 +21,10 @@ from phibench.datasets.frames.sensor_card import SensorCard, card_of
 from phibench.estimator.interface import Box
 from phibench.render.sensor.light import Region
 from phibench.render.sensor.settings import sensor
-from phibench.robot.film.blink_identity import (
-    LOCK,
-    Evidence,
-    Exposures,
-    TargetCode,
-    TargetTracker,
-    _by_chance,
-    _likelihood,
-    evidence,
-)
+from phibench.robot.film.blink_identity import Evidence, Exposures, _by_chance, _likelihood, evidence
 from phibench.robot.film.film_estimates import found_rows, track_film, tracked_positions
 from phibench.robot.film.spot_tracks import FrameSearch, FrameSpots, SpotTrack, _assigned, _motion
+from phibench.robot.film.target_tracker import LOCK, TargetCode, TargetTracker
 from phibench.robot.loop.smoothing import film_beliefs
 from phibench.scenes.frames import Array
 from phibench.scenes.motion.carriage import Carriage, Encoder

@@ -22,10 +22,11 @@ from helpers.target_approach import (
 from scipy.optimize import least_squares
 
 from phibench.estimator.geometry.reflection import image_of
-from phibench.estimator.geometry.rig_parameters import PARAMETERS, PRIOR_SIGMA, RigBias, drawn_deviation
+from phibench.estimator.geometry.rig_parameters import PARAMETERS, PRIOR_SIGMA, drawn_deviation
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.robot.film.film_positions import FilmPositions
 from phibench.robot.loop.belief import Belief, TargetBelief, TargetPrior
+from phibench.robot.loop.rig_bias import RigBias
 from phibench.robot.loop.sensing import direction_of, direction_read
 from phibench.robot.loop.smoothing import SmoothedBelief, belief_of, film_beliefs
 from phibench.scenes.frames import Array
