@@ -1,4 +1,4 @@
-"""Data sets made, repaired and merged (`make`, `repair`, `merge`), the table of sensitivities in them.
+"""Data sets made, repaired and merged (`make`, `repair`, `merge`), with the table of sensitivities in them.
 
 `phibench.make` and the command line call these. They render through `datasets`, which may not import the estimators
 that the table needs, and write the table beside the result.

@@ -1,4 +1,4 @@
-"""Interface of a method: the pair of images (down, up) that it gets, its answer, and the outcome of asking it.
+"""Interface of a method: the pair of images (down, up) that it gets, boxes of spots, its answer, and the outcome.
 
 >>> from phibench.estimator.interface import Answer, Pair, Spot
 >>> def extract(pair: Pair) -> Answer:

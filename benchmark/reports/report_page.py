@@ -1,4 +1,4 @@
-"""Report on scores as one HTML page, with sections that others add: all is in the file, nothing fetched, no script.
+"""Report on scores as one HTML page: ranking, verdict, figures, sections that others add; nothing fetched, no script.
 
 The template is `report.html.j2`. Scores of the same pairs by the same rules make one ranking, in the units of
 `score_tables`.

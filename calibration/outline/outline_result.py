@@ -1,4 +1,4 @@
-"""Outline of a mirror found in an image: place, covariance, quality; `PoseMeasurement`; what outline fits share."""
+"""Outlines found in an image (`Outline`), measured poses, their means, a moved mirror; base and checks of fits."""
 
 from __future__ import annotations
 

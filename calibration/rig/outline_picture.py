@@ -1,4 +1,4 @@
-"""Picture of a mirror's outline on its frame, with the residuals enlarged. Long frames are drawn smaller."""
+"""Pictures of a rig's frames: a mirror's outline with its residuals enlarged, and any frame as 8 bits."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Vertical of the world in the camera frame, from upright edges of the room in the mirror.
+"""Vertical of the world in the camera frame, from upright edges in the mirror; edges that agree on one shift.
 
 1. Edges. The image is unwrapped about the middle of the outline: columns are azimuth, half a pixel at the middle
    radius, rows radius, one pixel. A vertical edge of the room is an upright line there. Canny's edges and a

@@ -1,4 +1,4 @@
-"""Policies of others, each in a process as a method has one: `isolation.guest_process.GuestProcess`.
+"""Policies of others: the function of a Python file (`PolicyFile`), asked in a process of its own (`PolicyProcess`).
 
 What is known and what is observed go there as pickles of ours. What comes back is JSON: seven numbers, or a sentence.
 `serve` runs in the process.

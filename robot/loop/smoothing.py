@@ -1,4 +1,4 @@
-"""Belief over a target of a rig that is not known exactly: both fitted to all frames so far, by Gauss-Newton.
+"""Belief over a target with a rig not known exactly, both fitted to all frames (`SmoothedBelief`); beliefs of a film.
 
 A filter that takes frame after frame commits itself to the straight line on which it took each: directions in a rig as
 built by hand bend by a tenth of their shift, many times the noise, and all frames share that bend. `SmoothedBelief`

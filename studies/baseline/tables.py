@@ -1,4 +1,4 @@
-"""Tables of the study `baseline`: D from simulated frames beside the paper's, and how errors follow D and h.
+"""Tables of the study `baseline`: spots found, D by sense of phi beside the paper's, power laws, drawn rigs.
 
 The paper's experiments are in one table: published estimate, our estimates with scatter, and bounds. Drawn rigs are in
 closed form; an aligned reader makes estimates of what they show. Power laws y = c D^p h^q are fitted to logarithms.
