@@ -1,4 +1,4 @@
-"""Output of a process: the end that is kept, the place of a stack, and advice on what was out of reach."""
+"""Printed output of a method's process: its end is kept; place of a stack; advice on what isolation denied."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Widths of the converter's codes, by how often each comes: codes that are missing, doubled, or of uneven width.
+"""Widths of the converter's codes by how often each comes; faults of changed codes: bytes, bits, signs, text.
 
 The values of a level have a smooth distribution where its noise is about a code or more: that of the pixels' means,
 widened by the noise. A code that comes w times as often as its neighbours let expect is w codes wide. Wide codes add
