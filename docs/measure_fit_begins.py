@@ -16,7 +16,8 @@ from pathlib import Path
 
 import numpy as np
 
-from phibench.datasets.exposures.pair_draws import CachedSample, PairDraw, search_boxes
+from phibench.datasets.exposures.pair_draws import CachedSample, PairDraw
+from phibench.datasets.exposures.search_boxes import search_boxes
 from phibench.datasets.frames.frame_request import FrameRequest
 from phibench.datasets.frames.frame_source import FrameSource
 from phibench.datasets.read import Dataset, Sample, open_dataset

@@ -19,7 +19,7 @@ class LaserSpot:
     """A laser spot on diffuse (Lambertian) surfaces.
 
     Without a beam the spot is a flat disc in the plane of its normal. With a beam it is what parallel light of this
-    profile leaves on the room's surfaces, over edges and around corners (`render.optics.room_tracer`).
+    profile leaves on the room's surfaces, over edges and around corners (`render.optics.beam_deposit`).
 
     Parameters
     ----------

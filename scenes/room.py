@@ -322,6 +322,37 @@ def cut_part(view: View, plate: Cuboid) -> str | None:
     return next((part.name.replace("_", " ") for part in (*carriage(view), *boxes) if plate.meets(part)), None)
 
 
+_HOUSING_REACH_M = 0.1  # housing and mast stay within this of the lens
+
+
+class Boards:
+    """Boards of a room, for many rigs: nearly all are too far from the carriage to be asked."""
+
+    def __init__(self, targets: Sequence[TargetBoard]) -> None:
+        self._plates = [board(target) for target in targets]
+        self._centres_m = np.array([plate.T_world_shape.translation_m for plate in self._plates]).reshape(-1, 3)
+
+    def cut_by(self, rig: Rig, stroke_m: float) -> str | None:
+        """Say which board a rig cuts at an end of its stroke; None if none."""
+        lens_m = rig.T_world_camera.t
+        wide_m = rig.mirror.bound_m if rig.holder is None else rig.holder.plate_m
+        reach_m = float(np.linalg.norm(rig.sphere_in_camera_m[:2])) + wide_m + _HOUSING_REACH_M
+        reach_m += abs(stroke_m) * math.hypot(*rig.stroke_axis_world[:2]) + rig.sphere_in_camera_m[2] * _tilt(rig)
+        if rig.motion is not None:  # at most: the sphere swings about the lens as far as it is from it, twice
+            reach_m += math.hypot(*rig.motion.translation_m) + 2.0 * float(np.linalg.norm(rig.sphere_in_camera_m))
+        near = np.hypot(*(self._centres_m - lens_m)[:, :2].T) < reach_m + math.hypot(*BOARD_SIZE_M)
+        for k in np.flatnonzero(near):
+            for offset_m in (0.0, stroke_m):
+                if hit := cut_part(rig.at(offset_m), self._plates[k]):
+                    return f"the {self._plates[k].name} cuts the {hit} at stroke {offset_m:g} m"
+        return None
+
+
+def _tilt(rig: Rig) -> float:
+    """Sine of the angle between the optical axis and the vertical."""
+    return math.hypot(*rig.T_world_camera.R[:2, 2])
+
+
 def default_rig() -> Rig:
     """Aligned rig without distortion, focused on the virtual image at z_c - R/2; numbers in docs/model.md."""
     return Rig()

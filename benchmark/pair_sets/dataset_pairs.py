@@ -19,7 +19,8 @@ import numpy as np
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.shown_text import ShortForm
 from phibench.datasets.exposures.expected_electrons import ExpectedRegion, expected_of_light
-from phibench.datasets.exposures.pair_draws import CachedSample, FrameCounts, PairDraw, pair_draws, search_boxes
+from phibench.datasets.exposures.pair_draws import CachedSample, FrameCounts, PairDraw, pair_draws
+from phibench.datasets.exposures.search_boxes import search_boxes
 from phibench.datasets.frames.frame_source import FrameSource, PositionLight
 from phibench.datasets.frames.sensor_card import SensorCard, card_of
 from phibench.datasets.frames.sensor_file import SensorFile

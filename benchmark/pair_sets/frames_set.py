@@ -26,7 +26,7 @@ from phibench.benchmark.pair_sets.dataset_pairs import BOX_MARGIN_PX, BOX_PX, TA
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import SETTINGS_BYTES, InputFile, Name
 from phibench.datasets.common.shown_text import ShortForm
-from phibench.datasets.exposures.pair_draws import search_box
+from phibench.datasets.exposures.search_boxes import search_box
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.datasets.store.files import sha256
 from phibench.datasets.store.json_forms import from_json, to_json

@@ -15,8 +15,9 @@ import numpy as np
 
 from phibench.datasets.build.bake_task import bake_settings, is_cached
 from phibench.datasets.build.forecast import START_S, duration, light_map_s, megabytes, slowdown
+from phibench.datasets.film.drive_collisions import check_drives
 from phibench.datasets.film.film_make import unfinished_films
-from phibench.datasets.film.film_plan import FilmPlan, check_drives, film_plans
+from phibench.datasets.film.film_plan import FilmPlan, film_plans
 from phibench.datasets.film.film_room import light_views
 from phibench.datasets.plan.plan import Plan
 from phibench.datasets.recipe.load import load_recipe, recipe_files

@@ -20,7 +20,8 @@ from phibench.datasets.build.task_runner import bring_all, unfinished_tasks
 from phibench.datasets.build.tasks import BuildTask
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.progress import progress_console
-from phibench.datasets.film.film_plan import FilmPlan, check_drives, film_plans
+from phibench.datasets.film.drive_collisions import check_drives
+from phibench.datasets.film.film_plan import FilmPlan, film_plans
 from phibench.datasets.film.film_store import (
     FILM,
     INFO,

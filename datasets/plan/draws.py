@@ -38,7 +38,6 @@ from phibench.datasets.recipe.recipe_scene import (
     true_stroke_m,
 )
 from phibench.datasets.recipe.room_tables import RoomPropertiesTable, RoomsTable
-from phibench.datasets.recipe.spot_placement import Boards
 from phibench.datasets.recipe.tables import DrawnRigsTable, RandomTable, Recipe
 from phibench.datasets.rooms.mesh_placement import MeshSettings
 from phibench.datasets.rooms.panorama_room import PanoramaSettings
@@ -57,7 +56,7 @@ from phibench.scenes.laser import LaserSpot
 from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.random_streams import generator
 from phibench.scenes.rig import Rig
-from phibench.scenes.room import Room
+from phibench.scenes.room import Boards, Room
 from phibench.scenes.validation import SceneError
 from phibench.scenes.worlds.floor_plan import floor_plan
 from phibench.scenes.worlds.room_properties import drawn_properties

@@ -33,7 +33,7 @@ from phibench.datasets.recipe.recipe_scene import (
     text_by_keys,
     true_stroke_m,
 )
-from phibench.datasets.recipe.spot_placement import Boards, Placed, causes_or_fault, place
+from phibench.datasets.recipe.spot_placement import Placed, causes_or_fault, place
 from phibench.datasets.recipe.tables import DRAWABLE, MisalignmentTable, RandomTable, Recipe, RigTable
 from phibench.datasets.rooms.room_sources import ONLY_ROOM, MeshRoom, PanoramaRoom, RoomSource, is_exported, room_of
 from phibench.scenes.frames import Array
@@ -43,7 +43,7 @@ from phibench.scenes.misalignment import PARAMETERS as MISALIGNMENT
 from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.random_streams import generator
 from phibench.scenes.rig import Rig
-from phibench.scenes.room import Room
+from phibench.scenes.room import Boards, Room
 from phibench.scenes.validation import SceneError
 
 Sequence = Literal["sobol", "independent"]

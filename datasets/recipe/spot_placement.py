@@ -1,12 +1,9 @@
-"""Positions of drawn laser spots: on a target board, or where a ray from the axis meets the room.
-
-The first part finds boards that the carriage would hit, the last one spots that an image does not show.
-"""
+"""Positions of drawn laser spots, on a board or where a ray meets the room, and whether both images show them."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,45 +11,15 @@ import numpy as np
 
 from phibench.datasets.recipe.recipe_scene import build_spot, grown_diameter_m, make_spot
 from phibench.datasets.recipe.tables import OWN_ALBEDO, LaserTable, TargetTable
+from phibench.render.optics.beam_deposit import BEAM_REACH_M
 from phibench.render.optics.faces import FaceTable
-from phibench.render.optics.room_tracer import BEAM_REACH_M, RoomGeometry, RoomHits, own_geometry, room_geometry
+from phibench.render.optics.room_tracer import RoomGeometry, RoomHits, own_geometry, room_geometry
 from phibench.render.optics.spot_layer import spot_layer
 from phibench.render.optics.truth import VISIBLE, spot_truth
 from phibench.scenes.frames import Array, as_vector
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.rig import POSITIONS, Rig, Stroke
-from phibench.scenes.room import BOARD_SIZE_M, Room, TargetBoard, board, cut_part
-
-_HOUSING_REACH_M = 0.1  # housing and mast stay within this of the lens
-
-
-class Boards:
-    """Boards of a room, for many rigs: nearly all are too far from the carriage to be asked."""
-
-    def __init__(self, targets: Sequence[TargetBoard]) -> None:
-        self._plates = [board(target) for target in targets]
-        self._centres_m = np.array([plate.T_world_shape.translation_m for plate in self._plates]).reshape(-1, 3)
-
-    def cut_by(self, rig: Rig, stroke_m: float) -> str | None:
-        """Say which board a rig cuts at an end of its stroke; None if none."""
-        lens_m = rig.T_world_camera.t
-        wide_m = rig.mirror.bound_m if rig.holder is None else rig.holder.plate_m
-        reach_m = float(np.linalg.norm(rig.sphere_in_camera_m[:2])) + wide_m + _HOUSING_REACH_M
-        reach_m += abs(stroke_m) * math.hypot(*rig.stroke_axis_world[:2]) + rig.sphere_in_camera_m[2] * _tilt(rig)
-        if rig.motion is not None:  # at most: the sphere swings about the lens as far as it is from it, twice
-            reach_m += math.hypot(*rig.motion.translation_m) + 2.0 * float(np.linalg.norm(rig.sphere_in_camera_m))
-        near = np.hypot(*(self._centres_m - lens_m)[:, :2].T) < reach_m + math.hypot(*BOARD_SIZE_M)
-        for k in np.flatnonzero(near):
-            for offset_m in (0.0, stroke_m):
-                if hit := cut_part(rig.at(offset_m), self._plates[k]):
-                    return f"the {self._plates[k].name} cuts the {hit} at stroke {offset_m:g} m"
-        return None
-
-
-def _tilt(rig: Rig) -> float:
-    """Sine of the angle between the optical axis and the vertical."""
-    return math.hypot(*rig.T_world_camera.R[:2, 2])
-
+from phibench.scenes.room import BOARD_SIZE_M, Room
 
 Placed = tuple[str, LaserSpot] | str
 """Name of what carries the spot, and the spot; or why there can be none."""

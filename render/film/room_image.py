@@ -22,10 +22,11 @@ from numpy.polynomial.legendre import leggauss
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
+from phibench.render.optics.beam_deposit import footprint
 from phibench.render.optics.faces import FaceTable, IntArray
 from phibench.render.optics.ray_tracer import lens_rays, reflect
 from phibench.render.optics.reflection_point import bundle_spread, mirror_points
-from phibench.render.optics.room_tracer import RoomGeometry, RoomHits, footprint
+from phibench.render.optics.room_tracer import RoomGeometry, RoomHits
 from phibench.render.optics.spot_layer import SpotLayer, splat
 from phibench.render.optics.spot_samples import FilmCloud, film_position
 from phibench.render.sensor.light import Region

@@ -17,9 +17,10 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
+from phibench.render.optics.beam_deposit import Deposit, deposit
 from phibench.render.optics.ray_tracer import MirrorRays, lens_rays, reflect, trace_pixels
 from phibench.render.optics.reflection_point import MirrorPoints, mirror_points, onward_ways
-from phibench.render.optics.room_tracer import Deposit, GeometryLike, RoomGeometry, as_geometry, blocked_by, deposit
+from phibench.render.optics.room_tracer import GeometryLike, RoomGeometry, as_geometry, blocked_by
 from phibench.render.optics.spot_samples import FilmCloud, disc_points, film_position, slices, specular_cloud
 from phibench.render.optics.truth import mirror_angles
 from phibench.scenes.frames import Array, as_vector

@@ -29,18 +29,10 @@ from numpy.polynomial.laguerre import laggauss
 from numpy.polynomial.legendre import leggauss
 from scipy.special import ndtri
 
+from phibench.render.optics.beam_deposit import Deposit, deposit, footprint, is_plain_spot
 from phibench.render.optics.faces import IntArray
 from phibench.render.optics.reflection_point import bundle_spread, mirror_points, onward_ways
-from phibench.render.optics.room_tracer import (
-    Deposit,
-    GeometryLike,
-    RoomGeometry,
-    as_geometry,
-    blocked_by,
-    deposit,
-    footprint,
-    is_plain_spot,
-)
+from phibench.render.optics.room_tracer import GeometryLike, RoomGeometry, as_geometry, blocked_by
 from phibench.scenes.frames import Array, BoolArray
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.random_streams import sobol

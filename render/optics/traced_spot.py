@@ -23,9 +23,10 @@ from itertools import pairwise
 import numpy as np
 from scipy.special import ndtri
 
+from phibench.render.optics.beam_deposit import BEAM_REACH_M
 from phibench.render.optics.faces import FaceTable, IntArray
 from phibench.render.optics.ray_tracer import MirrorRays, lens_rays, reflect, through_glass
-from phibench.render.optics.room_tracer import BEAM_REACH_M, GeometryLike, RoomGeometry, as_geometry, blocked_by
+from phibench.render.optics.room_tracer import GeometryLike, RoomGeometry, as_geometry, blocked_by
 from phibench.render.optics.spot_samples import ImagePart, image_parts
 from phibench.render.optics.truth import SpotTruth
 from phibench.scenes.frames import Array, BoolArray

@@ -22,8 +22,9 @@ from typing import Literal
 
 import numpy as np
 
+from phibench.render.optics.beam_deposit import BEAM_REACH_M, deposit, transmittance
 from phibench.render.optics.faces import FaceTable, IntArray
-from phibench.render.optics.room_tracer import BEAM_REACH_M, RoomGeometry, deposit, room_geometry, transmittance
+from phibench.render.optics.room_tracer import RoomGeometry, room_geometry
 from phibench.render.optics.truth import spot_truth
 from phibench.render.plugins.plugin_tree import BitmapPlugin, Plugin, Rgb, SceneSetting, Value
 from phibench.render.plugins.room_plugins import diffuse, mirror_plugin, room_plugins, scene_transform

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from helpers.oracles import TARGETS, alhazen_quartic, fermat_path, paper_cases, random_rig, random_spot, true_pixel
 
+from phibench.render.optics.beam_deposit import deposit
 from phibench.render.optics.certificate import CENTROID_TOLERANCE_PX, certify, pixel_centroid
 from phibench.render.optics.reflection_point import mirror_points, reflection_points
-from phibench.render.optics.room_tracer import RoomGeometry, deposit, room_geometry
+from phibench.render.optics.room_tracer import RoomGeometry, room_geometry
 from phibench.render.optics.spot_layer import splat, spot_layer
 from phibench.render.optics.spot_samples import FilmCloud, film_position, specular_cloud
 from phibench.render.optics.traced_spot import RayBundle, aim, through_chief_point

@@ -18,8 +18,9 @@ from helpers.recipes import changed, complaints
 from phibench.datasets.build.dataset_build import plan_tasks
 from phibench.datasets.build.journal import Journal
 from phibench.datasets.common.errors import DatasetError, RecipeError
-from phibench.datasets.exposures import pair_draws as module
-from phibench.datasets.exposures.pair_draws import BOX_MARGIN_PX, CachedSample, PairDraw, pair_draws
+from phibench.datasets.exposures import search_boxes as module
+from phibench.datasets.exposures.pair_draws import CachedSample, PairDraw, pair_draws
+from phibench.datasets.exposures.search_boxes import BOX_MARGIN_PX
 from phibench.datasets.frames.frame_source import noise_draw
 from phibench.datasets.frames.sensor_file import SensorFile
 from phibench.datasets.make import make, make_from_plan

@@ -16,9 +16,10 @@ from helpers.remembered_spots import SPOTS, RememberedSpots
 
 from phibench.datasets.common.errors import DatasetError, RecipeError
 from phibench.datasets.film import film_room, film_task
+from phibench.datasets.film.drive_collisions import check_drives
 from phibench.datasets.film.film_forecast import films_forecast, forecast_lines
 from phibench.datasets.film.film_make import make_films
-from phibench.datasets.film.film_plan import check_drives, film_plans
+from phibench.datasets.film.film_plan import film_plans
 from phibench.datasets.film.film_preview import picture
 from phibench.datasets.film.film_read import Film, open_films
 from phibench.datasets.film.film_store import verify_films

@@ -8,10 +8,11 @@ import math
 import numpy as np
 import pytest
 
+from phibench.render.optics.beam_deposit import deposit, inside_reflectance, transmittance
 from phibench.render.optics.certificate import CENTROID_TOLERANCE_PX, FLUX_TOLERANCE, _differences, certify
 from phibench.render.optics.faces import face_table
 from phibench.render.optics.ray_tracer import trace_pixels
-from phibench.render.optics.room_tracer import RoomGeometry, deposit, inside_reflectance, transmittance
+from phibench.render.optics.room_tracer import RoomGeometry
 from phibench.render.optics.spot_layer import spot_layer, spot_light
 from phibench.render.optics.spot_samples import disc_nodes
 from phibench.render.optics.truth import spot_truth
