@@ -1,4 +1,4 @@
-"""Camera and detector: a thin lens with OpenCV intrinsics and Brown distortion, and the sensor's colour filters.
+"""Camera as a thin lens with OpenCV intrinsics and Brown distortion; its detector: electrons per joule by filter.
 
 A point of the plane of focus has one image for the whole aperture, at the pixel that `Camera.project` gives for it.
 The chief ray goes through the lens centre undeviated. The natural (cos^4) fall-off follows from this geometry and is

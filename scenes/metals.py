@@ -1,4 +1,4 @@
-"""Polished metals, of which mirrors of all shapes are: refractive indices, measured reflectances, and what they give.
+"""Polished metals of mirrors: refractive indices, measured reflectance tables, reflectance by angle and wavelength.
 
 Sources of the metals' refractive indices:
 

@@ -1,4 +1,4 @@
-"""Range checks that raise `SceneError`, printable lines and nearest names for messages, faults of tables in words.
+"""Checks of ranges (`SceneError`) and of tables against models (`Fault`); printable lines and nearest names.
 
 Each message is one sentence: path, value, allowed range and advice. The first half checks numbers of the descriptions
 in `scenes` and raises `SceneError`. The second half reads TOML files that come with the package, and words pydantic's

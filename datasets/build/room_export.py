@@ -1,4 +1,4 @@
-"""Writer of catalogue and generated rooms as panorama or mesh files, on request or as tasks of a data set.
+"""Writer of catalogue and generated rooms as panorama or mesh files, on request or for a data set; damaged ones found.
 
 Both come with the table of a recipe that reads them. The robot is left out: it stands in every room by itself.
 

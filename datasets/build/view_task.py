@@ -1,4 +1,4 @@
-"""Task that renders one view: the room's light without the laser, the exact geometry of every pixel, a preview.
+"""Task that renders one view: room's light without laser, geometry of every pixel, preview; start of the renderer.
 
 A view is what the camera sees at one position of the mirror; it runs in a worker process.
 """

@@ -1,4 +1,4 @@
-"""Writer of a folder of frame files with an index (`dataset frames`); `frames.frame_source` draws the frames.
+"""Writer of a folder of frame files with an index (`dataset frames`); hash of all that a sample's frames depend on.
 
 Files that are there with the right bytes are kept. A file is known by the hash of all that it depends on: names,
 request, layers, code, and the versions of the libraries that draw and compress.

@@ -1,4 +1,4 @@
-"""Pair draws of a benchmark (`pair_draws`): sample, preset, noise seed, exposure, boxes, order; samples kept in memory.
+"""Pair draws of a benchmark (`pair_draws`): sample, preset, seed, frame counts, boxes, order; samples kept in memory.
 
 A pair draw is one draw of the noise of one sample in one preset. It is a pure function of the data set's documents.
 Its frames are those of `Sample.camera_frames`. The order is drawn, so that the number of a pair says nothing about the

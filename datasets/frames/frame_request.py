@@ -1,4 +1,4 @@
-"""Requests of frames (preset, exposure, levels, speed, crop, seed), and a data set's options.
+"""Requests of frames (preset, exposure, levels, speed, crop, seed), of a caller's options and a sample's recipe.
 
 A request is checked and frozen. The preset is one of the sensor's. `FrameOptions` are what a caller asks of a data
 set's frames; `sample_request` makes the request of a sample of them and of the recipe's `[frames]`.

@@ -1,4 +1,4 @@
-"""Checks across several keys of a recipe: names, places, strokes, and the rig as a whole.
+"""Checks across several keys of a recipe (names, places, strokes, the whole rig); warnings of legal but odd values.
 
 A recipe is checked in two stages. The first one reads the document: keys, types and ranges, which the tables check, and
 which tables go together (`table_faults`). The second one takes a recipe without such faults, and the scene that it

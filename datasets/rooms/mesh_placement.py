@@ -1,4 +1,4 @@
-"""Mesh file read by its format and placed around the robot by `MeshSettings`: unit, axes, floor, heading, free space.
+"""Mesh file read by its format and placed around the robot by `MeshSettings`: unit, axes, floor, lamps, free space.
 
 The user states the metres of a unit, the axis that points up, and the point of the floor on which the robot stands. The
 world's origin is that point. The floor below it comes to z = 0. Then the numbers are checked: a room measures 2 to

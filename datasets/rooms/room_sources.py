@@ -1,4 +1,4 @@
-"""Sources of rooms: what a room is made from, small enough for a task and a line of `rooms.jsonl`.
+"""Sources of rooms (named, generated, panorama, mesh): small records of what `room_of` builds a room from.
 
 A room of the catalogue is its name and its boards; a generated one its properties and the names of its random stream;
 a photographed room or a mesh its settings and the SHA-256 of its file, whose name is relative to a folder. `room_of`

@@ -1,7 +1,8 @@
-"""Layers as EXR files. A layer is the image of one light source in expected photo-electrons per second.
+"""EXR files, written and read, and the layers of a data set in them: room's light, laser spot, exact geometry.
 
-Three kinds of files: ambient (the room), spot (the laser spot alone) and truth (no light, but exact geometry per
-pixel). One function writes them all, and one reads them.
+A layer is the image of one light source in expected photo-electrons per second. Three kinds of files: ambient (the
+room), spot (the laser spot alone) and truth (no light, but exact geometry per pixel). One function writes them all, and
+one reads them.
 
 OpenEXR's Python module (3.5) writes wrong pixels for arrays that are not C-contiguous, reads truncated files without
 raising, and keeps header floats as float32. Therefore planes are forced to C-contiguous native float32 or half, and the

@@ -1,4 +1,4 @@
-"""Rays from the laser spot over the mirror to the lens: place on the image and light power of each.
+"""Rays from the laser spot over the mirror to the lens: place and light power on the image; Gaussians that cover it.
 
 Where an edge or a texture cuts the light, a fixed set of quasi-random rays is taken; else nodes of a quadrature.
 

@@ -1,4 +1,4 @@
-"""Light on the sensor: layers with the levels of lamps and laser, the spot's motion, and regions of the image.
+"""Light on the sensor: layers with levels of lamps, laser and other spots; the spot's motion; regions of the image.
 
 Layers have the shape (3, H, W), planes R, G, B; a region is a rectangle of whole pixels.
 """

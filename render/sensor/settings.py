@@ -1,4 +1,4 @@
-"""Settings of a sensor: one strict, frozen table per preset, from `settings_presets.toml`.
+"""Settings of a sensor (`Sensor`), checked (`SensorError`); named presets of `settings_presets.toml`, with changes.
 
 Terms of EMVA 1288. The layers are photo-electrons: the quantum efficiency comes before them (`scenes/camera.py`), and a
 photon count cannot be told from here. K = `gain_dn_per_e` x `analogue_gain` is the overall system gain in DN/e-. The
