@@ -1,7 +1,8 @@
-"""File of drawn samples that a folder keeps, written and read: the next start need not draw and trace each anew.
+"""File of drawn samples that a folder keeps, written and read; and the causes for which images do not show spots.
 
-It holds no truth and nothing that is signed: without it, or where it is damaged or of another recipe or code, samples
-are drawn anew, to the same plan. `verify`, `repair` and `merge` do not read it.
+With it the next start need not draw and trace each anew. It holds no truth and nothing that is signed: without it, or
+where it is damaged or of another recipe or code, samples are drawn anew, to the same plan. `verify`, `repair` and
+`merge` do not read it.
 """
 
 from __future__ import annotations

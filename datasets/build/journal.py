@@ -1,4 +1,4 @@
-"""Journal of a folder (`Journal`): a log of its finished and refused tasks, for resuming.
+"""Journal of a folder (`Journal`): a log of its finished and refused tasks (`Entry`, `Refusal`), for resuming.
 
 It alone decides what is finished; names and times of files do not.
 
