@@ -1,4 +1,4 @@
-"""Films of a recipe in a folder: each film is a part of it (`build.task_runner`); what is finished and whole is kept.
+"""Making of a recipe's films in a folder (`make_films`), film by film (`build.task_runner`); what is whole is kept.
 
 A killed run loses the view or film that it was at: `film_task` makes one film, view by view.
 """

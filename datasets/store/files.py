@@ -1,4 +1,4 @@
-"""Files written whole or not at all, their SHA-256, and reading of JSON lines as documents.
+"""Files written whole or not at all, and paths tried for writing before long work; SHA-256; JSON lines as documents.
 
 A file is written under a temporary name, flushed to the disk, then renamed.
 """

@@ -1,8 +1,9 @@
-"""Provenance of a data set: versions, commit, and hashes of code. Nothing here differs between two equal runs.
+"""Provenance of data sets and results: versions of program and packages, commit, hashes of code and what it imports.
 
-`code_behind` hashes a module and every module of phibench that it imports, near or far. The tables that a module keeps
-beside itself count as code: `settings_presets.toml` belongs to `settings.py`. Editing the progress bar then changes no
-key; editing the lens changes the keys of all that is seen through it.
+Nothing here differs between two equal runs. `code_behind` hashes a module and every module of phibench that it imports,
+near or far. The tables that a module keeps beside itself count as code: `settings_presets.toml` belongs to
+`settings.py`. Editing the progress bar then changes no key; editing the lens changes the keys of all that is seen
+through it.
 """
 
 from __future__ import annotations
