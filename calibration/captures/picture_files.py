@@ -19,7 +19,7 @@ from phibench.datasets.common.camera_pictures import IN_WORDS, Kind, Subsampling
 from phibench.datasets.common.input_files import InputFile
 from phibench.datasets.frames.sensor_card import SensorCard, card_of, sensor_card
 from phibench.datasets.frames.sensor_file import SensorFile
-from phibench.datasets.rooms.panorama_files import is_linear, read_light
+from phibench.datasets.rooms.panorama_files import is_linear, read_light, srgb_codes
 from phibench.estimator.interface import Image
 from phibench.estimator.spots.camera_codes import quantisation
 from phibench.estimator.spots.image_planes import ImageError, linear_planes
@@ -123,7 +123,10 @@ def read_linear(path: Path, given: SensorFile | None = None) -> NDArray[np.float
     if is_linear(path):
         return read_light(path)
     photo = read_picture(path)
-    planes = linear_planes(photo.pixels, sensor_choice(photo, given).card)
+    pixels, file = photo.pixels, InputFile(path, _REMEDY, ImageError)
+    if given is None and photo.kind in ("jpeg", "rgb"):  # a sensor file says its own curve
+        pixels = srgb_codes(file, file.read(), pixels)
+    planes = linear_planes(pixels, sensor_choice(photo, given).card)
     return np.asarray(np.maximum(np.moveaxis(planes, 0, -1), 0.0), np.float32)
 
 

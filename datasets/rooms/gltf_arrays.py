@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import base64
 import binascii
+import codecs
 import math
 import urllib.parse
 from typing import Any
@@ -47,7 +48,7 @@ class GltfDocument:
             text, self._binary = self._chunks(data)
             self.tree = file.json(text)
         else:
-            self.tree = file.json(data)
+            self.tree = file.json(data.removeprefix(codecs.BOM_UTF8))  # of editors of Windows
         version = self.table(self.tree, "asset").get("version", "2.0")
         least = self.table(self.tree, "asset").get("minVersion", "2.0")
         if not str(version).startswith("2.") or least != "2.0":

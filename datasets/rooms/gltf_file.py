@@ -50,6 +50,7 @@ _READ_EXTENSIONS = (
 _CONVERTERS = {
     "KHR_draco_mesh_compression": "`gltf-transform cp IN.glb OUT.glb` unpacks it",
     "EXT_meshopt_compression": "`gltf-transform cp IN.glb OUT.glb` unpacks it",
+    "KHR_meshopt_compression": "`gltf-transform cp IN.glb OUT.glb` unpacks it",
     "KHR_texture_basisu": "`ktx extract` of KTX-Software makes PNG of its pictures",
 }
 _LIST, _STRIP, _FAN = 4, 5, 6  # modes of primitives: TRIANGLES, TRIANGLE_STRIP, TRIANGLE_FAN

@@ -195,7 +195,7 @@ class Companions:
         digest = hashlib.sha256(data).hexdigest()
         if digest not in self._opacities:
             image = owner.picture(PICTURES, data)
-            self._opacities[digest] = _alpha(image)
+            self._opacities[digest] = opacity_of(image)
         return self._opacities[digest]
 
 
@@ -203,7 +203,8 @@ def _plain(name: str) -> str:
     return urllib.parse.unquote(name.strip()).replace("\\", "/")
 
 
-def _alpha(image: Image) -> Opacity | None:
+def opacity_of(image: Image) -> Opacity | None:
+    """Alpha of a picture, 8 bits; None where it has none."""
     if image.mode in _GREY_16 and "transparency" in image.info:  # one grey, which Pillow leaves
         return np.where(np.asarray(image) == image.info["transparency"], 0, 255).astype(np.uint8)
     has = image.mode in ("RGBA", "LA", "PA") or "transparency" in image.info

@@ -327,6 +327,11 @@ def _light(file: InputFile, companions: Companions, material: _Material, uv: Arr
     colour = tuple(min(x, BRIGHTEST) for x in material.emission)
     if material.light_picture is not None and (not colour or max(colour) > 0.0):
         return _pictured(file, companions, material, material.light_picture, colour or WHITE, uv)
+    if material.light_picture is not None and companions.picture(_file_of(companions, material.light_picture)).any():
+        raise file.fault(
+            f"states Ke 0 and map_Ke of '{printable_line(material.name, 60)}', by which programs mean dark or the "
+            "picture: write Ke 1, or take map_Ke away"
+        )
     return Paint(colour) if colour and max(colour) > 0.0 else None
 
 

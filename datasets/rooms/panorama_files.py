@@ -1,7 +1,11 @@
 """Reader of pictures with linear light: photographs, OpenEXR, Radiance HDR, and equirectangular panoramas of them.
 
-Photographs of 8 bits count as sRGB and are turned upright as their EXIF data say. EXR and HDR files hold linear values.
-All give an array of bands R, G, B in any unit, upper row first.
+Photographs of 8 bits are turned upright as their EXIF data say. They count as sRGB, unless a colour profile or a PNG's
+gamma says otherwise: then their codes are converted. EXR and HDR files hold linear values. All give an array of bands
+R, G, B in any unit, upper row first.
+
+What Photo Sphere XMP (GPano; Google, 2013) says of a panorama counts: a crop, another projection and a camera that was
+not level are refused. So are holes, whose colour nobody saw.
 
 Radiance HDR: G. Ward, in Graphics Gems II (1991); a pixel holds three mantissas and an exponent e, and means
 mantissa x 2^(e - 136), over all exposures and corrections of colour. Rows may be run-length coded, a byte plane at a
@@ -10,17 +14,21 @@ time. Crops, cube maps and other primaries than Rec. 709 are refused.
 
 from __future__ import annotations
 
+import io
 import re
+import warnings
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image, ImageCms
 
-from phibench.datasets.common.camera_pictures import IN_WORDS, read_camera_picture
+from phibench.datasets.common.camera_pictures import FORMATS, IN_WORDS, read_camera_picture
 from phibench.datasets.common.input_files import PICTURE_PIXELS, InputFile, quiet_terminal
+from phibench.datasets.rooms.mesh_parts import opacity_of
 from phibench.datasets.rooms.room_files import RoomError
-from phibench.render.sensor.srgb import srgb_decoded
+from phibench.render.sensor.srgb import srgb_decoded, srgb_encoded
 from phibench.scenes.frames import Array
 from phibench.scenes.validation import printable_line
 
@@ -30,7 +38,7 @@ Light = NDArray[np.float32]
 ASPECT = 2.0  # columns over rows of an equirectangular picture
 _ASPECT_TOLERANCE = 0.01  # a picture that was scaled has lost a row or column
 _LEAST_ROWS = 16
-_REMEDY = f"give a picture as {IN_WORDS}, OpenEXR or Radiance HDR"
+_REMEDY = f"give a picture as {IN_WORDS}, OpenEXR or Radiance HDR, of at most {PICTURE_PIXELS:.0e} pixels"
 _HDR_MAGIC = (b"#?RADIANCE", b"#?RGBE")
 _OVERSHOOT = 0.01  # of the light, below 0
 _EXR_MAGIC = b"\x76\x2f\x31\x01"
@@ -39,6 +47,15 @@ _PRIMARIES = np.array([0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290])  # R
 _OFF = 0.025  # of a coordinate: Radiance's own have green at 0.29 and white at 1/3
 _EXPOSURE = re.compile(rb"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 _ROWS = 256  # decoded at once
+_GPANO = re.compile(rb"<GPano:(\w+)>([^<]*)<|\bGPano:(\w+)\s*=\s*[\"']([^\"']*)")  # element, or attribute
+_XMP_BYTES = 1 << 16  # a JPEG's part ends there
+_SIZES = ("CroppedAreaImage", "FullPano")
+_LEVEL_DEG = 1.0  # a wall 3 m away is off by 5 cm
+_SAME_CODES = 2  # by which profiles of sRGB differ from each other
+_SRGB_GAMMA, _SAME_GAMMA, _GAMMAS = 0.45455, 0.01, (0.1, 10.0)  # gAMA of PNG
+_INTEROPERABILITY = 0xA005  # EXIF's table of the colours that a camera chose
+_STEPS = np.arange(0, 256, 15, dtype=np.uint8)
+_SOME_CODES = np.stack(np.meshgrid(_STEPS, _STEPS, _STEPS), axis=-1).reshape(1, -1, 3)
 
 
 def read_panorama(path: Path) -> Light:
@@ -47,16 +64,57 @@ def read_panorama(path: Path) -> Light:
     Raises
     ------
     RoomError
-        If the file cannot be read, or its sides are not 2 : 1 within 1 %.
+        If the file cannot be read, is a crop, tilted or of another projection, has holes, or its sides are not 2 : 1
+        within 1 %.
     """
     light = read_light(path)
     rows, columns = light.shape[:2]
+    file = InputFile(path, _REMEDY, RoomError)
+    _check_sphere(file, columns, rows)
     if rows < _LEAST_ROWS or abs(columns / rows - ASPECT) > ASPECT * _ASPECT_TOLERANCE:
         raise RoomError(
             f"{path} has {columns} x {rows} pixels: an equirectangular panorama is twice as wide as high, within 1 %, "
             f"and has {_LEAST_ROWS} rows or more; give the whole sphere, uncut"
         )
     return light
+
+
+def _check_sphere(file: InputFile, columns: int, rows: int) -> None:
+    """Refuse what XMP calls a crop, another projection or a camera that was not level."""
+    stated = _stated_sphere(file.read())
+    projection = stated.get("ProjectionType", "equirectangular")
+    if projection.lower() != "equirectangular":
+        raise file.fault(f"has the projection '{printable_line(projection, 40)}' (XMP GPano): make it equirectangular")
+    part, whole = ([_number(stated, f"{name}{side}Pixels") for side in ("Width", "Height")] for name in _SIZES)
+    is_part = any(0.0 < a < (1.0 - _ASPECT_TOLERANCE) * b for a, b in zip(part, whole, strict=True))
+    has_its_sides = abs(columns * part[1] - rows * part[0]) <= _ASPECT_TOLERANCE * rows * part[0]
+    if is_part and has_its_sides and whole != [columns, rows]:  # not one that was filled up since
+        raise file.fault(
+            f"shows {part[0]:g} x {part[1]:g} of {whole[0]:g} x {whole[1]:g} pixels (XMP GPano): give the whole sphere"
+        )
+    pitch, roll = (_number(stated, f"Pose{name}Degrees") for name in ("Pitch", "Roll"))
+    if max(abs(pitch), abs(roll)) > _LEVEL_DEG:
+        raise file.fault(
+            f"has a pitch of {pitch:g} and a roll of {roll:g} degrees (XMP GPano), which viewers apply in different "
+            f"ways: level it, or set both to 0 if it is level; up to {_LEVEL_DEG:g} degree is taken as level"
+        )
+
+
+def _stated_sphere(data: bytes) -> dict[str, str]:
+    """Properties of XMP's GPano, the first of each name."""
+    start = max(data.find(b"GPano:") - 1, 0)
+    found: dict[str, str] = {}
+    for name, text, other_name, other_text in _GPANO.findall(data, start, start + _XMP_BYTES):
+        found.setdefault((name or other_name).decode(), (text or other_text).decode("latin-1").strip())
+    return found
+
+
+def _number(stated: dict[str, str], name: str) -> float:
+    """Number of a property, 0 where it states none."""
+    try:
+        return float(stated.get(name, ""))
+    except ValueError:
+        return 0.0
 
 
 def read_light(path: Path) -> Light:
@@ -96,8 +154,63 @@ def _photograph(file: InputFile, data: bytes) -> Light:
     picture = read_camera_picture(file, data)
     if picture.kind not in ("jpeg", "rgb"):
         raise file.fault("is no photograph of 8 bits: of DN of a mosaic and of YUYV the colours are not known here")
+    opacity = opacity_of(_opened(data))
+    if opacity is not None and opacity.min() == 0:
+        raise file.fault("has wholly transparent pixels, whose colour nobody saw: fill them, or take the opacity away")
     linear = srgb_decoded(np.arange(256) / 255.0).astype(np.float32)
-    return linear[picture.pixels]
+    return linear[srgb_codes(file, data, picture.pixels)]
+
+
+def _opened(data: bytes) -> Image.Image:
+    """Picture that is decoded where its pixels are asked for; `read_camera_picture` has taken the same bytes."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of its size, which was looked at
+        return Image.open(io.BytesIO(data), formats=FORMATS)
+
+
+def srgb_codes(file: InputFile, data: bytes, codes: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Codes of a photograph, shape (H, W, 3), as those of sRGB, whatever its colour profile or its gamma says.
+
+    Raises
+    ------
+    DatasetError
+        If it has other primaries without a profile.
+    """
+    picture = _opened(data)
+    if profile := picture.info.get("icc_profile"):
+        return _of_profile(profile, codes)
+    with file.decoding("has damaged EXIF data; `exiftool -all= FILE` removes them"):
+        if picture.getexif().get_ifd(_INTEROPERABILITY).get(1) == "R03":
+            raise file.fault("has colours of Adobe RGB (EXIF), and no colour profile: convert it to sRGB")
+    if picture.format != "PNG" or "srgb" in picture.info:
+        return codes
+    if white_first := picture.info.get("chromaticity"):
+        _check_primaries(file, "cHRM", np.roll(white_first, -2))
+    gamma = picture.info.get("gamma", _SRGB_GAMMA)
+    if abs(gamma / _SRGB_GAMMA - 1.0) < _SAME_GAMMA:
+        return codes
+    if not _GAMMAS[0] < gamma < _GAMMAS[1]:
+        raise file.fault(f"has a gAMA of {gamma:g}, not {_GAMMAS[0]:g} to {_GAMMAS[1]:g}: save it as sRGB")
+    curve = srgb_encoded((np.arange(256) / 255.0) ** (1.0 / gamma))
+    return np.rint(255.0 * curve).astype(np.uint8)[codes]
+
+
+def _of_profile(profile: bytes, codes: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Codes of a colour profile as those of sRGB; a profile that no viewer could use is passed over, as they do."""
+    try:
+        source = ImageCms.ImageCmsProfile(io.BytesIO(profile))
+        mode = {"RGB ": "RGB", "GRAY": "L"}[source.profile.xcolor_space]
+        intent = ImageCms.Intent.RELATIVE_COLORIMETRIC
+        turn = ImageCms.buildTransform(source, ImageCms.createProfile("sRGB"), mode, "RGB", intent)
+    except (ImageCms.PyCMSError, OSError, KeyError):
+        return codes
+
+    def turned(pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        seen = np.ascontiguousarray(pixels if mode == "RGB" else pixels[..., 0])
+        return np.asarray(ImageCms.applyTransform(Image.fromarray(seen), turn))
+
+    some = _SOME_CODES if mode == "RGB" else np.repeat(_STEPS[None, :, None], 3, axis=2)
+    return codes if np.abs(turned(some) - some.astype(int)).max() <= _SAME_CODES else turned(codes)
 
 
 def _exr(file: InputFile) -> Light:
@@ -119,7 +232,9 @@ def _exr(file: InputFile) -> Light:
             planes = {name: np.asarray(channel.pixels) for name, channel in opened.channels().items()}
     if "R" not in planes and (coded := sorted({"RY", "BY", "X"} & set(planes))):
         raise file.fault(f"has colours as {' and '.join(['Y', *coded])}, which are not read: save red, green and blue")
-    names = ("R", "G", "B") if "R" in planes else ("Y", "Y", "Y")
+    layers = [name[:-1] for name in planes if name.endswith(".R")]  # of programs that name their passes
+    layer = layers[0] if len(layers) == 1 and not {"R", "Y"} & set(planes) else ""
+    names = tuple("YYY") if "Y" in planes and "R" not in planes else tuple(layer + band for band in "RGB")
     if not all(name in planes and planes[name].shape == (rows, columns) for name in names):
         raise file.fault("has no channels R, G and B of one size")
     return np.stack([planes[name].astype(np.float32) for name in names], axis=-1)

@@ -436,4 +436,6 @@ def _colours(file: InputFile, table: Table, kinds: dict[str, str]) -> Array | No
         if kind[0] != "f" and (values != np.floor(values)).any():
             raise file.fault("has colours that are not whole numbers, as their type says")
         columns.append(values / scale)
+    if kinds[names[0]] == "u2" and 1.0 < 65535.0 * np.max(columns) < 256.0:  # black, or codes of 8 bits
+        raise file.fault("has colours of 16 bits that end below 256: scale them to 65535, or state them as uchar")
     return np.asarray(srgb_decoded(np.stack(columns, axis=1)))

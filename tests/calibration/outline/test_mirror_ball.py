@@ -8,8 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.colour_profiles import P3, P3_TO_SRGB, edited_profile, linear
 from PIL import Image
 
+from phibench.calibration.captures.picture_files import read_linear
 from phibench.calibration.outline.mirror_ball import BallPhoto, find_ball, unwrap
 from phibench.cli.main import main
 from phibench.datasets.common.errors import DatasetError
@@ -212,3 +214,12 @@ def test_a_picture_without_a_ball_is_refused(tmp_path):
     for light in (rng.random((200, 300, 3)), np.full((200, 300, 3), 0.5), np.zeros((200, 300, 3))):
         with pytest.raises(DatasetError, match="no outline of a ball"):
             find_ball(light.astype(np.float32), BallPhoto(RADIUS, focal_px=FOCAL))
+
+
+def test_a_photograph_has_the_colours_of_its_profile(tmp_path):
+    """Display P3, as telephones write it: a red of code 200 is one of more light than sRGB's."""
+    codes = np.full((16, 16, 3), (200, 60, 60), np.uint8)
+    Image.fromarray(codes).save(tmp_path / "a.png", icc_profile=edited_profile(colorants=P3))
+    expected = np.clip(P3_TO_SRGB @ linear(codes)[0, 0], 0.0, 1.0)
+    # two roundings to 8 bits, half a code of 1 / 255 each, where the curve's slope is below 2
+    np.testing.assert_allclose(read_linear(tmp_path / "a.png")[8, 8], expected, atol=2.0 / 255.0)

@@ -209,6 +209,10 @@ def _meshopt(document: Gltf) -> None:
     document.tree["bufferViews"][0]["extensions"] = {"EXT_meshopt_compression": {}}
 
 
+def _meshopt_required(document: Gltf) -> None:
+    document.tree["extensionsRequired"] = ["KHR_meshopt_compression"]
+
+
 def _skin(document: Gltf) -> None:
     document.tree["nodes"][0]["skin"] = 0
 
@@ -249,6 +253,7 @@ def _version(document: Gltf) -> None:
         (_basisu, "KHR_texture_basisu.*`ktx extract`"),
         (_basisu_required, "KHR_texture_basisu, which is not read: `ktx extract`"),
         (_meshopt, "meshopt: `gltf-transform cp"),
+        (_meshopt_required, "KHR_meshopt_compression, which is not read: `gltf-transform cp"),
         (_skin, "a skeleton bends"),
         (_instances, "EXT_mesh_gpu_instancing"),
         (_no_places, "no texture coordinates TEXCOORD_0"),
@@ -314,3 +319,10 @@ def test_interleaved_whole_numbers_have_their_values(tmp_path: Path) -> None:
     assert area([part]) == pytest.approx(4.0)
     assert part.paint is not None
     np.testing.assert_allclose(part.paint.face_colours, [[128 / 255, 64 / 255, 32 / 255]] * 2)
+
+
+def test_a_byte_order_mark_is_no_part_of_the_document(tmp_path: Path) -> None:
+    """Of editors of Windows; glTF forbids it to writers, and readers pass over it."""
+    Gltf().read(tmp_path)
+    (tmp_path / "two.gltf").write_bytes(b"\xef\xbb\xbf" + (tmp_path / "one.gltf").read_bytes())
+    assert len(read_mesh(tmp_path / "two.gltf")) == 1

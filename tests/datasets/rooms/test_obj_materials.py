@@ -115,6 +115,27 @@ def test_colours_of_vertices_and_of_a_material(
 
 
 @pytest.mark.parametrize(
+    ("emission", "code", "light"),
+    [
+        ("", 255, 1.0),
+        ("Ke 0.5 0.5 0.5\n", 255, 0.5),
+        ("Ke 0 0 0\n", 0, None),
+        ("Ke 0 0 0\n", 255, "Ke 0 and map_Ke of 'a'"),
+    ],
+)
+def test_a_picture_of_emission_shines_or_is_told(tmp_path: Path, emission: str, code: int, light: object) -> None:
+    """Beside Ke 0 some programs mean the picture, others darkness: lamps were missing without a word."""
+    Image.fromarray(np.full((2, 2, 3), code, np.uint8)).save(tmp_path / "e.png")
+    materials = f"newmtl a\nKd 0.5 0.5 0.5\n{emission}map_Ke e.png\n"
+    if isinstance(light, str):
+        with pytest.raises(RoomError, match=light):
+            obj(tmp_path, USED, materials)
+        return
+    [part] = obj(tmp_path, USED, materials)
+    assert (None if part.light is None else part.light.colour[0]) == light
+
+
+@pytest.mark.parametrize(
     ("text", "words"),
     [
         ("# from C:\\models\\\n" + V + "f 1 2 3 4\n", "ends in a backslash"),

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import struct
+import zlib
 from pathlib import Path
 
 import cv2
 import numpy as np
 import OpenEXR
 import pytest
+from helpers.colour_profiles import P3, P3_TO_SRGB, edited_profile, linear
 from PIL import Image
 
 from phibench.datasets.rooms.panorama_files import read_light, read_panorama
@@ -224,3 +227,135 @@ def test_runs_of_the_older_code_are_no_pixels(tmp_path):
     (tmp_path / "a.hdr").write_bytes(data)
     with pytest.raises(SceneError, match="do not have the stated length"):
         read_light(tmp_path / "a.hdr")
+
+
+def test_the_one_layer_of_an_exr_is_read(tmp_path):
+    """As a renderer names it; of two layers nobody says which one is meant."""
+    planes = {f"View.Combined.{name}": plane for name, plane in equal_planes("R", "G", "B", "A").items()}
+    assert read_light(write_exr(tmp_path / "a.exr", dict(planes)))[0, 0] == pytest.approx([0.5] * 3)
+    planes |= {f"View.Gloss.{name}": plane for name, plane in equal_planes("R", "G", "B").items()}
+    with pytest.raises(SceneError, match="no channels R, G and B"):
+        read_light(write_exr(tmp_path / "b.exr", planes))
+
+
+# Colours that a photograph states.
+
+CODES = RNG.integers(0, 256, (16, 32, 3), dtype=np.uint8)
+
+
+@pytest.mark.parametrize("suffix", ["png", "jpg"])
+@pytest.mark.parametrize(
+    ("profile", "expected"),
+    [
+        (edited_profile(), linear(CODES)),
+        (edited_profile(gamma=1.0), CODES / 255.0),
+        (edited_profile(gamma=1.8), (CODES / 255.0) ** 1.8),
+        (edited_profile(colorants=P3), np.clip(linear(CODES) @ P3_TO_SRGB.T, 0.0, 1.0)),
+        (b"no profile", linear(CODES)),
+    ],
+)
+def test_a_colour_profile_counts(tmp_path, suffix, profile, expected):
+    """Every photograph counted as sRGB: linear pictures were too dark, those of a wide gamut too pale."""
+    path = tmp_path / f"a.{suffix}"
+    codes = np.repeat(np.repeat(CODES, 16, axis=0), 16, axis=1)  # whole blocks of JPEG
+    Image.fromarray(codes).save(
+        path, icc_profile=profile, **({"quality": 100, "subsampling": 0} if suffix == "jpg" else {})
+    )
+    # codes of 8 bits: half a step before and after, 0.5 / 255 times the steepest slope of the curve, 2.3, each
+    atol = 0.01 if suffix != "jpg" else 0.03
+    np.testing.assert_allclose(read_light(path)[8::16, 8::16], expected, atol=atol)
+
+
+def with_chunk(path: Path, name: bytes, data: bytes) -> Path:
+    """PNG of the codes with one more chunk after its head of 33 bytes."""
+    Image.fromarray(CODES).save(path)
+    png, whole = path.read_bytes(), name + data
+    path.write_bytes(png[:33] + struct.pack(">I", len(data)) + whole + struct.pack(">I", zlib.crc32(whole)) + png[33:])
+    return path
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "expected"),
+    [
+        (b"gAMA", struct.pack(">I", 45455), linear(CODES)),
+        (b"gAMA", struct.pack(">I", 100000), CODES / 255.0),
+        (b"gAMA", struct.pack(">I", 55556), (CODES / 255.0) ** 1.8),
+        (b"cHRM", struct.pack(">8I", 31270, 32900, 64000, 33000, 30000, 60000, 15000, 6000), linear(CODES)),
+        (b"cHRM", struct.pack(">8I", 31270, 32900, 68000, 32000, 26500, 69000, 15000, 6000), r"Rec\. 709 \(cHRM\)"),
+        (b"gAMA", struct.pack(">I", 1), "gAMA of 1e-05"),
+    ],
+)
+def test_what_a_png_says_of_its_colours_counts(tmp_path, name, data, expected):
+    path = with_chunk(tmp_path / "a.png", name, data)
+    if isinstance(expected, str):
+        with pytest.raises(SceneError, match=expected):
+            read_light(path)
+    else:
+        np.testing.assert_allclose(read_light(path), expected, atol=0.006)  # half a code of 8 bits, times 2.3
+
+
+def test_a_camera_that_chose_adobe_rgb_is_told(tmp_path):
+    """DCF 2.0: the interoperability index R03, and no profile."""
+    exif = Image.Exif()
+    exif.get_ifd(0x8769)[0xA005] = {1: "R03"}
+    Image.fromarray(CODES).save(tmp_path / "a.jpg", exif=exif)
+    with pytest.raises(SceneError, match=r"Adobe RGB \(EXIF\)"):
+        read_light(tmp_path / "a.jpg")
+
+
+@pytest.mark.parametrize(("least", "words"), [(255, ""), (1, ""), (0, "wholly transparent pixels")])
+def test_holes_have_no_colour(tmp_path, least, words):
+    """A stitched picture is white or black below the tripod, as its program likes."""
+    codes = np.dstack([CODES, np.full((16, 32), 255, np.uint8)])
+    codes[12:, :, 3] = least
+    Image.fromarray(codes).save(tmp_path / "a.png")
+    if words:
+        with pytest.raises(SceneError, match=words):
+            read_panorama(tmp_path / "a.png")
+    else:
+        np.testing.assert_allclose(read_panorama(tmp_path / "a.png"), linear(CODES), atol=1e-6)
+
+
+def xmp(form: str, **properties: object) -> bytes:
+    """XMP packet, properties as elements or attributes."""
+    if form == "elements":
+        return ("<rdf:D>" + "\n".join(f"<GPano:{k}>{v}</GPano:{k}>" for k, v in properties.items()) + "</>").encode()
+    return ("<rdf:D " + " ".join(f'GPano:{k}="{v}"' for k, v in properties.items()) + " />").encode()
+
+
+def sizes(part: tuple[int, int], whole: tuple[int, int]) -> dict[str, object]:
+    names = (
+        "CroppedAreaImageWidthPixels",
+        "CroppedAreaImageHeightPixels",
+        "FullPanoWidthPixels",
+        "FullPanoHeightPixels",
+    )
+    return dict(zip(names, (*part, *whole), strict=True))
+
+
+@pytest.mark.parametrize(("suffix", "form"), [("jpg", "elements"), ("png", "attributes"), ("tif", "attributes")])
+@pytest.mark.parametrize(
+    ("stated", "words"),
+    [
+        ({"ProjectionType": "equirectangular", **sizes((32, 16), (32, 16)), "CroppedAreaTopPixels": 0}, ""),
+        ({**sizes((8192, 4096), (8192, 4096)), "PosePitchDegrees": 0.9, "PoseRollDegrees": -0.5}, ""),  # made smaller
+        (sizes((8192, 2000), (8192, 4096)), ""),  # filled up, then made smaller
+        ({"PoseHeadingDegrees": 225.0, "InitialViewPitchDegrees": 20, "UsePanoramaViewer": True}, ""),
+        (sizes((32, 16), (64, 32)), "shows 32 x 16 of 64 x 32 pixels"),
+        (sizes((4096, 2048), (8192, 4096)), "shows 4096 x 2048 of 8192 x 4096 pixels"),
+        ({"ProjectionType": "cylindrical"}, "projection 'cylindrical'"),
+        ({"PosePitchDegrees": 17.0, "PoseRollDegrees": -121.0}, "pitch of 17 and a roll of -121 degrees"),
+    ],
+)
+def test_what_a_panorama_says_of_its_sphere_counts(tmp_path, suffix, form, stated, words):
+    """A crop with sides 2 : 1 was stretched over the whole sphere; a camera that leant made a room that leans."""
+    path, packet = tmp_path / f"a.{suffix}", xmp(form, **stated)
+    if suffix == "png":
+        with_chunk(path, b"iTXt", b"XML:com.adobe.xmp" + bytes(5) + packet)
+    else:
+        Image.fromarray(CODES).save(path, **({"xmp": packet} if suffix == "jpg" else {"tiffinfo": {700: packet}}))
+    if words:
+        with pytest.raises(SceneError, match=words):
+            read_panorama(path)
+    else:
+        assert read_panorama(path).shape == (16, 32, 3)

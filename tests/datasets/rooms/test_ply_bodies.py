@@ -70,6 +70,21 @@ def test_colours_have_the_type_that_is_stated(tmp_path: Path) -> None:
         ply(tmp_path, RGB, " 0.5 0.5 0.5")
 
 
+@pytest.mark.parametrize(("values", "is_read"), [("51400 25700 0", True), ("0 0 0", True), ("200 100 0", False)])
+def test_codes_of_8_bits_are_none_of_16(tmp_path: Path, values: str, is_read: bool) -> None:
+    """Under `ushort` they made a black room."""
+    own = RGB.replace("uchar", "ushort")
+    if not is_read:
+        with pytest.raises(RoomError, match="16 bits that end below 256"):
+            ply(tmp_path, own, f" {values}")
+        return
+    paint = ply(tmp_path, own, f" {values}").paint
+    assert paint is not None
+    assert paint.face_colours is not None
+    top = max(float(word) / 65535.0 for word in values.split())
+    assert paint.face_colours.max() == pytest.approx(((top + 0.055) / 1.055) ** 2.4 if top else 0.0)
+
+
 def test_a_comment_names_a_picture_in_any_case(tmp_path: Path) -> None:
     Image.fromarray(np.full((2, 2, 3), 9, np.uint8)).save(tmp_path / "a.png")
     for word in ("TextureFile", "texturefile", "TEXTUREFILE"):
