@@ -45,6 +45,7 @@ MOST_BYTES = 2e9  # resident, of the whole process
 RSS_BYTES = 1 if sys.platform == "darwin" else 1024  # unit of ru_maxrss
 KINDS = (
     *("recipe.toml", "settings.toml", "calibration.json", "score.json", "records.parquet", "layer.exr", "picture.png"),
+    "panorama.jpg",
     *("submission.json", "truth.json", "study.json", "frames.jsonl", "journal.txt"),
     *("lightmap.npz", "entry.lightmap", "sensitivities.parquet"),
 )

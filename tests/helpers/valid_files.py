@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 import polars as pl
 from helpers.bench_cases import cases, outcomes, truth_itself
+from helpers.colour_profiles import edited_profile
 from PIL import Image
 
 from phibench.benchmark.isolation.method_references import Reference
@@ -37,7 +38,7 @@ from phibench.benchmark.sealed.sealed_set import (
     seal_id,
 )
 from phibench.benchmark.sealed.submission import SealedPairs, outcomes_of, read_submission, submission
-from phibench.calibration.captures.picture_files import read_picture
+from phibench.calibration.captures.picture_files import read_linear, read_picture
 from phibench.calibration.rig.bundle import Bundle
 from phibench.calibration.rig.calibration_file import read_calibration, write_calibration
 from phibench.datasets.build import bake_task
@@ -47,6 +48,7 @@ from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.frames.frame_files import read_index
 from phibench.datasets.frames.sensor_card import sensor_card
 from phibench.datasets.recipe.load import load_recipe
+from phibench.datasets.rooms.panorama_files import read_panorama
 from phibench.datasets.store import schema, sensitivity_file
 from phibench.datasets.store.checksums import checksums_text
 from phibench.datasets.store.json_forms import to_json
@@ -73,6 +75,13 @@ def digest(data: bytes) -> str:
 def png(width: int = 64, height: int = 48) -> bytes:
     buffer = io.BytesIO()
     Image.fromarray(np.zeros((height, width, 3), np.uint8)).save(buffer, "PNG")
+    return buffer.getvalue()
+
+
+def panorama() -> bytes:
+    """Photograph of 2 : 1 with a colour profile and what XMP says of its sphere."""
+    buffer, stated = io.BytesIO(), b"<GPano:PosePitchDegrees>0.5</GPano:PosePitchDegrees>"
+    Image.new("RGB", (64, 32), (90, 60, 30)).save(buffer, "JPEG", icc_profile=edited_profile(gamma=1.8), xmp=stated)
     return buffer.getvalue()
 
 
@@ -172,6 +181,7 @@ def kinds(folder: Path) -> dict[str, Kind]:
         Kind("records.parquet", records, lambda path: _records(path, score)),
         Kind("layer.exr", data["layer.exr"], lambda path: read_layer(path, "ambient", ("R",), pose="h0")),
         Kind("picture.png", png(), read_picture),
+        Kind("panorama.jpg", panorama(), lambda path: (read_panorama(path), read_linear(path))),
         Kind("submission.json", compact(answers.model_dump(mode="json")), _submission, compact),
         Kind("truth.json", truth, lambda path: read_truth_file(path, digest(path.read_bytes())), compact),
         Kind("study.json", compact({**study, "files": {}, "provenance": {}}), lambda path: read_study(path.parent)),
