@@ -130,7 +130,8 @@ def walk(name: str, folder: Path, lists: bool) -> None:
     finally:
         sys.setprofile(None)
     counts = Counter(str(Path(code.co_filename).resolve().relative_to(ROOT)) for code in calls)
-    print(f"{name}: {len(counts)} files, {len(calls)} functions")
+    lines = sum((ROOT / path).read_text(encoding="utf-8").count("\n") for path in counts)
+    print(f"{name}: {len(counts)} files of {lines} lines, {len(calls)} functions")
     for path, count in counts.most_common() if lists else ():
         ran = sorted(code.co_qualname for code in calls if code.co_filename.endswith(f"/{path}"))
         print(f"    {count:4d} {path}: {', '.join(ran[:6])}")
