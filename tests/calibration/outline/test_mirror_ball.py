@@ -89,7 +89,6 @@ def test_surroundings_come_back(elevation_deg):
     assert np.abs(found.light - expected)[~found.seen].max() < 0.2  # the nearest direction: half a radian at most
 
 
-@pytest.mark.slow
 def test_distance_of_the_surroundings_matters():
     """A point 0.8 m off is seen from a place up to 50 mm beside the centre: 60 mrad."""
     light = photograph()
