@@ -22,7 +22,6 @@ from phibench.scenes.random_streams import generator
 SPOTS = 12
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("sigma_px", "flux_e", "room_e"), [(0.8, 15_000.0, 11_000.0), (0.8, 20_000.0, 11_200.0), (0.6, 200_000.0, 8000.0)]
 )
