@@ -36,7 +36,7 @@ OF_WRITERS = {
     "datasets/film/film_video.py write_frames": "the same",
     "datasets/film/film_video.py write_mp4": "the same",
     "datasets/store/layers.py _write": "writes a layer",
-    "render/sensor/processing.py decoded": "decodes what the chain has encoded in the line before",
+    "render/sensor/processing.py jpeg_image": "decodes what the chain has encoded in the line before",
     "calibration/sensor_fit/capture_folder.py _tables_of": "the same, for its tables",
     "calibration/captures/imported_set.py _stored": "copies the bytes of a picture that `read_photo` has read",
     "benchmark/export/export_make.py _finish": "copies files of a data set that is open, byte by byte",

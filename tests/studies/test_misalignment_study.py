@@ -115,7 +115,6 @@ def test_eq_4_by_hand_for_an_error_of_the_stroke() -> None:
         assert found[index] == pytest.approx(expected, abs=1e-9)
 
 
-@pytest.mark.slow
 def test_slopes_are_the_limit_of_whole_changes() -> None:
     found = slopes(RIG, PLACES)
     assert set(found) == set(PARAMETERS) - set(OF_REVOLVED)
@@ -219,7 +218,6 @@ def test_sobol_indices_of_a_sum_and_of_a_product() -> None:
     assert high[0, 4] - low[0, 4] < 0.5
 
 
-@pytest.mark.slow
 def test_calibration_takes_out_what_it_fits() -> None:
     """Radius, tilt and decentre are the calibration's own; a pitch between the images is not."""
     cost = {}

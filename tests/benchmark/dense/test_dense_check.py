@@ -186,7 +186,6 @@ def test_a_planted_fault_of_places_is_named(fault: str, truths: list[EasyTruth])
     assert words in found
 
 
-@pytest.mark.slow
 def test_right_answers_pass(truths: list[EasyTruth]) -> None:
     """Exact and coarse ones, as D and as places, with a sigma that is right."""
     rng = np.random.default_rng(2)

@@ -116,7 +116,6 @@ def test_shared_work_is_done_once_and_changes_no_answer(
     assert replace(shared, stroke_m=0.1).work.stages == {}
 
 
-@pytest.mark.slow
 def test_a_method_of_others_neither_profits_from_shared_work_nor_changes_it(
     bench_dataset: Path, tmp_path: Path
 ) -> None:
@@ -163,7 +162,6 @@ def test_a_shared_process_that_ends_is_started_anew(bench_dataset: Path) -> None
     )
 
 
-@pytest.mark.slow
 def test_a_data_set_that_becomes_unreadable_in_the_middle_keeps_the_records_so_far(
     bench_dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -146,7 +146,6 @@ def _with_frames(folder: Path, recipe: str) -> None:
     (folder / "SHA256SUMS").write_text(checksums_text(listed))
 
 
-@pytest.mark.slow
 @pytest.mark.usefixtures("inline")
 def test_parts_of_a_release_are_dense_sets(kinds_dataset: Path, tmp_path: Path) -> None:
     """The open part shows what `--use` gives. The sealed one shows the work folder's data set of the secret seed."""

@@ -333,7 +333,6 @@ def test_an_interrupted_seal_leaves_nothing(
 # Command line
 
 
-@pytest.mark.slow
 def test_the_commands_say_what_they_did(
     sealed: Sealed, method: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -268,7 +268,6 @@ def test_a_list_between_semicolons_and_a_folder_without_out_are_told(case: Case,
         assert name in refused(capsys, ["measure", str(tmp_path), *rig, *out])
 
 
-@pytest.mark.slow
 @pytest.mark.usefixtures("unaligned")
 def test_a_stroke_in_centimetres_is_told(case: Case, capsys) -> None:
     text = refused(capsys, case.arguments(case.raw, 0.01 * case.sample.row.stroke_m))

@@ -135,7 +135,6 @@ def rig_file(tmp_path):
     return file
 
 
-@pytest.mark.slow
 def test_a_rig_file_says_a_mirror_of_another_shape(rig_file, tmp_path, capsys) -> None:
     """A hyperboloid aside by 1.70 mm, within 0.03 mm; half a degree of its own tilt is in sigma."""
     rig = read_rig_file(rig_file).rig
@@ -213,7 +212,6 @@ def fitted(monkeypatch: pytest.MonkeyPatch) -> list[tuple[np.ndarray, BallCircle
     return done
 
 
-@pytest.mark.slow
 def test_a_photograph_of_an_unknown_camera_gives_the_circle(fitted, tmp_path, capsys) -> None:
     """Neither focal length nor distance: the circle in pixels. With the focal length the outline tells the distance."""
     photo = ball_photograph(np.random.default_rng([7, 3]))

@@ -124,7 +124,6 @@ def test_the_jpeg_header_comes_back(tmp_path: Path, s: Sensor) -> None:
     assert "MJPEG" in found.file.tables.not_determined["read_noise_e"]
 
 
-@pytest.mark.slow
 def test_the_lens_comes_back_from_chessboards(tmp_path: Path) -> None:
     """Eleven views: each number within five of its sigmas; and a wrong one is not."""
     write_frames(tmp_path / "chessboard", board_views((320.0, 322.0, 163.0, 118.0), 0.08, 11))

@@ -124,7 +124,6 @@ def room_of(folder: Path) -> RenderedRoom:
     return RenderedRoom(film.plan, films._set, np.array([0.0]), film.views[:1])
 
 
-@pytest.mark.slow
 def test_targets_are_found_among_lights_in_whole_frames(film_images: Path) -> None:
     """Film of an eighth of the size: two targets, a reflection and another laser, through the whole chain."""
     film = staged(room_of(film_images), ("found", 0), 25.0, 2, 16, ("reflection", "other laser"), targets=2)
