@@ -1,4 +1,4 @@
-"""For several studies: a cutout of the sensor around the spot's two images, with its light, frames and bounds.
+"""For several studies: a cutout of the sensor around a spot's two images; pairs drawn of it, their truth and bounds.
 
 Frames are drawn as if the camera had no other pixels, which saves the time of a whole frame. The corner lies on whole
 JPEG units, so that mosaic and compression are those of the whole image.

@@ -1,4 +1,4 @@
-"""Worker that loads a method or a policy and asks it (`main`); `reply_of` and sentences on failures serve others, too.
+"""Worker in a method's process: loads it from its file, limits memory, answers pairs (`reply_of`); failures in words.
 
 `isolation.supervisor` starts the worker. It tells how it is isolated, gets a reference, imports the method, gets pairs,
 and answers with JSON. Every reply repeats number and nonce of its pair. Standard output and error are the method's

@@ -1,4 +1,4 @@
-"""Status codes of array kernels, and depths with their standard deviation, interval and pull.
+"""Status codes of array kernels, their order and words; depths with standard deviation, interval and pull.
 
 A kernel never raises for one bad element: it gives NaN and the first `Status` that is not OK. A disparity is nearly
 linear in 1 / D, so that sigma of D goes as D squared: intervals and pulls are in D, or in 1 / D where sigma is large.

@@ -1,4 +1,4 @@
-"""Rooms as a robot's loop needs them: what stands in lines of sight, what it runs into, and where targets are.
+"""Rooms for the robot's loop (`Arena`): `Boxes` that block its sight or its way, and the places of targets.
 
 A room's shapes become boxes: cuboids as they are, prisms and meshes by the box around them, upright rectangles with a
 thickness of a millimetre. A target is a laser spot on the first surface that a level ray from the stroke axis meets. It

@@ -1,4 +1,4 @@
-"""Bayesian model of why the paper's published depths are off: parameters, priors, likelihood, simulation.
+"""Bayesian model of why the paper's published depths are off: explanations, priors, likelihood, simulation.
 
 The reading noise is Gaussian in the radius in the image. The inverse of an estimate is nearly linear in it, which
 `brute_force` measures. So the density of a published value is a Gaussian in 1/D times the Jacobian 1/D^2. Two errors

@@ -1,4 +1,4 @@
-"""Error of D against azimuth for one baseline: bound, scatter and bias, a test of isotropy; findings and a drawing.
+"""Error of D against azimuth for a baseline, upright or sideways: bound, scatter, bias, isotropy; tables, a drawing.
 
 A pair is a spot in the views from both ends of a baseline, with the rig that the estimator knows. The baseline is
 vertical (the rig lifted) or horizontal (the rig moved sideways).

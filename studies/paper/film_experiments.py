@@ -1,4 +1,4 @@
-"""The paper's experiments as films, with rigs that calibrate themselves: bursts at both ends, and the whole stroke.
+"""The paper's experiments as films, with rigs that calibrate themselves: bursts at both ends, whole strokes, summary.
 
 For every rig of the films, a data set of the same recipe gives the calibration (`experiment_tables.calibrate_rig`).
 Every film then gives D in two ways, each for several cameras, whose fixed pattern nobody knows:
