@@ -49,6 +49,7 @@ _EXPOSURE = re.compile(rb"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 _ROWS = 256  # decoded at once
 _GPANO = re.compile(rb"<GPano:(\w+)>([^<]*)<|\bGPano:(\w+)\s*=\s*[\"']([^\"']*)")  # element, or attribute
 _XMP_BYTES = 1 << 16  # a JPEG's part ends there
+_DARK = 0.02  # of the light beside; a black of JPEG, with some glare
 _SIZES = ("CroppedAreaImage", "FullPano")
 _LEVEL_DEG = 1.0  # a wall 3 m away is off by 5 cm
 _SAME_CODES = 2  # by which profiles of sRGB differ from each other
@@ -76,7 +77,23 @@ def read_panorama(path: Path) -> Light:
             f"{path} has {columns} x {rows} pixels: an equirectangular panorama is twice as wide as high, within 1 %, "
             f"and has {_LEAST_ROWS} rows or more; give the whole sphere, uncut"
         )
+    if _has_two_circles(light):
+        raise file.fault("shows two circles in the dark, as cameras of two fisheye lenses store them: stitch them")
     return light
+
+
+def _has_two_circles(light: Light) -> bool:
+    """Tell whether corners of both halves are dark, and the rows between are lit: at a pole all columns see one place.
+
+    Circles end at 1 from the middle of their half; the corners are beyond them, however the camera is aligned.
+    """
+    rows, columns = light.shape[:2]
+    y, x = 2.0 * (np.arange(rows) + 0.5) / rows - 1.0, (4.0 * (np.arange(columns) + 0.5) / columns) % 2.0 - 1.0
+    found = []
+    for end in (y < -0.75, y > 0.75):
+        part, distance = light[end].mean(axis=2), np.hypot(y[end][:, None], x)
+        found.append(part[distance > 1.2].mean() < _DARK * part[distance < 0.95].mean())
+    return all(found)
 
 
 def _check_sphere(file: InputFile, columns: int, rows: int) -> None:

@@ -359,3 +359,19 @@ def test_what_a_panorama_says_of_its_sphere_counts(tmp_path, suffix, form, state
             read_panorama(path)
     else:
         assert read_panorama(path).shape == (16, 32, 3)
+
+
+def test_two_fisheye_circles_are_no_panorama(tmp_path):
+    """Unstitched pictures have sides of 2 : 1, too; black poles alone are those of a crop that was filled up."""
+    y, x = np.mgrid[-1:1:128j, -1:3:256j]
+    distance, height = np.hypot(y, (x + 1.0) % 2.0 - 1.0), 90.0 * np.abs(y)
+    codes = RNG.integers(30, 256, (128, 256, 3), dtype=np.uint8)
+    noise = RNG.integers(0, 8, codes.shape, dtype=np.uint8)
+    for radius in (0.93, 1.0, 1.05):
+        Image.fromarray(np.where(distance[..., None] < radius, codes, noise)).save(tmp_path / "a.png")
+        with pytest.raises(SceneError, match="two circles"):
+            read_panorama(tmp_path / "a.png")
+    for highest_deg in range(20, 91, 5):
+        for is_dark in (height > highest_deg, (height > highest_deg) & (y > 0.0), distance < 0.7):
+            Image.fromarray(np.where(is_dark[..., None], noise, codes)).save(tmp_path / "a.png")
+            assert read_panorama(tmp_path / "a.png").shape == codes.shape
