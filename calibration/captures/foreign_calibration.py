@@ -1,12 +1,12 @@
 """Rig files that are another program's calibration, such as OpenCV's: a fault text that says what to copy, or why not.
 
 Known are OpenCV (YAML, XML, JSON), ROS (camera_info: file, message, INI), Kalibr (camchain and results), EuRoC,
-CamOdoCal, Basalt, ORB-SLAM, COLMAP, Nerfstudio, RealSense, Metashape, Bouguet's toolbox and OCamCalib. They are looked
-at as text, without a parser of their formats. Others are known by plain numbers fx, fy, cx and cy.
+CamOdoCal, Basalt, ORB-SLAM, COLMAP, Nerfstudio, RealSense, Metashape, MATLAB, Bouguet's toolbox and OCamCalib. They are
+looked at as text, without a parser of their formats. Others are known by plain numbers fx, fy, cx and cy.
 
-All of them but COLMAP, Nerfstudio and Metashape count pixels as [rig] does: 0 is the middle of the first. There the
-middle is 0.5. [rig] has a pinhole with k1, k2, p1, p2, k3 of OpenCV ("plumb_bob", "radtan"). Models of Mei, Scaramuzza
-and the like describe mirror and camera in one.
+Most count pixels as [rig] does: 0 is the middle of the first. For COLMAP, Nerfstudio and Metashape it is 0.5, for
+MATLAB 1, which names rows before columns, too. [rig] has a pinhole with k1, k2, p1, p2, k3 of OpenCV ("plumb_bob",
+"radtan"). Models of Mei, Scaramuzza and the like describe mirror and camera in one.
 """
 
 from __future__ import annotations
@@ -59,6 +59,7 @@ class _Found:
     in_one: str = ""
     cameras: int = 1
     skew: float = 0.0
+    binning: tuple[float, ...] = ()
 
 
 def foreign_calibration_fault(text: str) -> str:
@@ -125,6 +126,11 @@ def _beyond(found: _Found) -> str:
     """Say what of the file's distortion [rig] cannot hold."""
     if found.model.lower() not in _PINHOLE_ONLY:
         return f"; its distortion '{found.model}' has no keys in [rig]: calibrate with k1, k2, p1, p2, k3 ('radtan')"
+    if max(found.binning, default=1.0) > 1.0:
+        return (
+            f"; pictures are binned {' x '.join(f'{x:g}' for x in found.binning)}, and these numbers are of the whole "
+            "sensor: calibrate with binned pictures"
+        )
     lost = [name for name, x in zip(_BEYOND, found.distortion[5:8], strict=False) if x != 0.0]  # k4 to k6
     if found.skew:
         return f"; its skew of {found.skew:g} has no key in [rig]: calibrate without it"
@@ -223,8 +229,9 @@ def _matrix_file(text: str) -> _Found | None:
     focal = (matrix[0], matrix[4], matrix[2], matrix[5])
     model = _word(text, ("distortion_model",)) or ("fisheye" if "fisheye" in text.lower() else "")
     program = "ROS (camera_info)" if ros else "OpenCV" if opencv else "OpenCV or another program"
-    cameras = 1 + (_key(text, ("M2", "cameraMatrix2")) is not None)
-    return _Found(program, _size(text), focal, _values(text, _DISTORTION, 8), model, in_one, cameras, matrix[1])
+    cameras, lens = 1 + (_key(text, ("M2", "cameraMatrix2")) is not None), _values(text, _DISTORTION, 8)
+    binning = _scalars(text, (("binning_x",), ("binning_y",)))
+    return _Found(program, _size(text), focal, lens, model, in_one, cameras, matrix[1], binning)
 
 
 def _camodocal(text: str) -> _Found | None:
@@ -272,6 +279,17 @@ def _bouguet(text: str) -> _Found | None:
     return _Found("Bouguet's toolbox", size, (*row("fc", 2), *row("cc", 2)), row("kc", 5), skew=skew)
 
 
+def _matlab(text: str) -> _Found | None:
+    """MATLAB's cameraParameters or cameraIntrinsics, as jsonencode or disp writes them: first pixel 1, rows first."""
+    focal, place = (_values(text, (name,), 2) for name in ("FocalLength", "PrincipalPoint"))
+    if "RadialDistortion" not in text or len(focal) + len(place) < len(_COLMAP["PINHOLE"]):
+        return None
+    k1, k2, k3 = (*_values(text, ("RadialDistortion",), 3), 0.0, 0.0, 0.0)[:3]
+    p1, p2 = (*_values(text, ("TangentialDistortion",), 2), 0.0, 0.0)[:2]
+    skew, size = (*_values(text, ("Skew",), 1), 0.0)[0], _values(text, ("ImageSize",), 2)[::-1]
+    return _Found("MATLAB", size, (*focal, place[0] - 1.0, place[1] - 1.0), (k1, k2, p1, p2, k3), skew=skew)
+
+
 def _ros_ini(text: str) -> _Found | None:
     """INI file of ROS's camera_calibration_parsers: names and numbers in lines of their own."""
     matrix = re.search(rf"(?m)^camera matrix\s+((?:{_NUMBER}\s+){{9}})", text)
@@ -285,13 +303,18 @@ def _ros_ini(text: str) -> _Found | None:
     return _Found("ROS (INI)", whole, (fx, fy, cx, cy), coefficients, skew=skew)
 
 
-_COLMAP = {  # places of fx, fy, cx, cy, k1, k2, p1, p2 among a model's numbers
+_COLMAP = {  # places of fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6 among a model's numbers
     "SIMPLE_PINHOLE": (0, 0, 1, 2),
     "PINHOLE": (0, 1, 2, 3),
     "SIMPLE_RADIAL": (0, 0, 1, 2, 3),
     "RADIAL": (0, 0, 1, 2, 3, 4),
     "OPENCV": (0, 1, 2, 3, 4, 5, 6, 7),
+    "FULL_OPENCV": tuple(range(12)),
     "OPENCV_FISHEYE": (0, 1, 2, 3),
+    "THIN_PRISM_FISHEYE": (0, 1, 2, 3),
+    "RADIAL_FISHEYE": (0, 0, 1, 2),
+    "SIMPLE_RADIAL_FISHEYE": (0, 0, 1, 2),
+    "FOV": (0, 1, 2, 3),
 }
 
 
@@ -306,7 +329,7 @@ def _colmap(text: str) -> _Found | None:
     if max(places) >= len(numbers):
         return _Found("COLMAP")
     fx, fy, cx, cy, *lens = (numbers[place] for place in places)
-    kind = model if model.endswith("FISHEYE") else ""
+    kind = model if model.endswith(("FISHEYE", "FOV")) else ""
     return _Found(
         "COLMAP", (float(width), float(height)), (fx, fy, cx - 0.5, cy - 0.5), tuple(lens), kind, "", len(rows)
     )
@@ -347,6 +370,6 @@ def _plain_numbers(text: str) -> _Found | None:
 
 
 _PROGRAMS = (
-    _ocamcalib, _kalibr, _basalt, _camodocal, _orb_slam, _bouguet, _ros_ini, _colmap, _metashape, _plain_numbers,
-    _matrix_file,
+    _ocamcalib, _kalibr, _basalt, _camodocal, _orb_slam, _bouguet, _ros_ini, _colmap, _metashape, _matlab,
+    _plain_numbers, _matrix_file,
 )  # fmt: skip

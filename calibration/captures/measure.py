@@ -365,6 +365,8 @@ def _shifted(
 
 
 def _foreign(test: ChainTest) -> str:
+    if test.of_light:
+        return f"doubtful: {test.doubt}"
     return f"doubtful: the spots went through another chain than the file's: {test.doubt}" if test.doubt else ""
 
 

@@ -202,6 +202,7 @@ _MOST_PX = 128  # larger ones leave too little that both pictures show
 _PARTS, _FEWEST_PARTS = 5, 4  # of a picture's sides, and parts of it that must show a shift
 _CLEAR = 0.5  # correlation that a shift must have, over that of the picture with itself
 _RELIT = 0.05  # relative change of the room's light that is no drift of a lamp
+_BLACK_BESIDE = 10.0  # of codes: the room is hardly seen with the laser on
 
 
 def shift_px(one: Image, other: Image) -> tuple[float, float] | None:
@@ -249,10 +250,10 @@ def _turned_px(one: Image, other: Image) -> float:
     return float(np.quantile(ways, 0.75)) if len(ways) >= _FEWEST_PARTS else 0.0
 
 
-def relit_positions(pair: Pair) -> Iterator[tuple[str, float]]:
+def relit_positions(pair: Pair, least: float = _RELIT) -> Iterator[tuple[str, float]]:
     """Positions whose laser-off picture is brighter or darker, with its codes over those with the laser on."""
     for position in POSITIONS:
-        if (ratio := light_ratio(pair, position)) is not None and abs(ratio - 1.0) > _RELIT:
+        if (ratio := light_ratio(pair, position)) is not None and abs(ratio - 1.0) > least:
             yield position, ratio
 
 
@@ -266,8 +267,14 @@ def light_ratio(pair: Pair, position: str) -> float | None:
 
 def relit_note(photos: PairPhotos, position: str, ratio: float) -> str:
     """Sentence on light that changed between laser on and off."""
+    group: PositionPhotos = getattr(photos, position)
+    if ratio > _BLACK_BESIDE:
+        return (
+            f"{group.on[0].path} is black beside {group.off[0].path}: a difference of both, or another exposure; give "
+            "pictures as the camera took them, with one exposure"
+        )
     return (
-        f"the light changed between laser on and off: {getattr(photos, position).off[0].path} has {ratio:.2f} times "
+        f"the light changed between laser on and off: {group.off[0].path} has {ratio:.2f} times "
         "the codes of the picture with the laser on; fix exposure and white balance, and leave the lamps alone"
     )
 

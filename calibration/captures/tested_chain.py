@@ -21,6 +21,7 @@ from scipy.fft import dctn
 from scipy.ndimage import minimum_filter
 from scipy.special import log_ndtr
 
+from phibench.calibration.captures.pair_mistakes import relit_note, relit_positions
 from phibench.calibration.captures.pair_photos import PairPhotos, PositionPhotos
 from phibench.calibration.captures.picture_files import Photo
 from phibench.calibration.captures.raw_frames import MOST_LIKENESS, PATTERNS, Phase, neighbour_likeness, raw_phase
@@ -251,6 +252,7 @@ def _log_chance(z: Array, mean: Array, sigma: Array, step: Array) -> Array:
 
 _UNKNOWN_PX = 0.05  # what another interpolation than the bilinear one adds to a place, standard deviation
 _LOST_PX = 0.25  # what unknown scaling or smoothing adds
+_SEEN_RELIT = 0.02  # relative change of DN, black included, that makes neighbours alike
 _OWN_FILE = "give the camera's own file, or its frames with a sensor file"
 
 
@@ -269,6 +271,8 @@ class ChainTest:
         Sentences; empty if there is none.
     by_spots : bool
         The doubt is of the spots alone, and a beam that is torn gives it, too.
+    of_light : bool
+        The doubt is of the room's light, not of the chain.
     """
 
     photos: PairPhotos
@@ -277,6 +281,7 @@ class ChainTest:
     note: str = ""
     doubt: str = ""
     by_spots: bool = False
+    of_light: bool = False
 
 
 def chain_test(photos: PairPhotos, choice: Callable[[Photo], SensorCard], pair_of: PairOf) -> ChainTest:
@@ -368,6 +373,10 @@ def _of_raw(photos: PairPhotos, card: SensorCard, pair_of: PairOf) -> ChainTest:
     phase = told if isinstance(told, tuple) else (0, 0)
     note = _phase_note({phase: 1.0})
     if (likeness := neighbour_likeness(images)) > MOST_LIKENESS:
+        # the room is left in laser on less laser off, too, where its light changed
+        relit = next(relit_positions(pair_of(photos, card), _SEEN_RELIT), None)
+        if relit is not None:
+            return ChainTest(photos, {phase: 1.0}, _LOST_PX, note, relit_note(photos, *relit), of_light=True)
         doubt = (
             f"the noise of neighbouring pixels is alike (correlation {likeness:.2f}): the DN were smoothed, sharpened, "
             f"scaled or compressed, and sigma does not hold; {_OWN_FILE}"

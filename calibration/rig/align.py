@@ -47,6 +47,7 @@ _CONTRADICTED = 13.8  # chi^2 of two degrees of freedom: 0.1 % of true statement
 _SQUARE = 0.65  # of the outline's radius: half a square whose corners stay inside the mirror
 _RADIUS_MM, _DISTANCE_MM = 60.0, 260.0  # the paper's mirror, and the default rig's distance
 _NEAREST, _FARTHEST_MM = 1.02, 1e4  # in radii; nearer, the lens is at the mirror
+_STRETCHED = 0.04  # of a diameter over the other: a sphere 16 degrees off the axis
 _ARROW_TIMES = 20.0  # the move is a few pixels: the picture draws it larger
 
 
@@ -276,7 +277,21 @@ def circle_in_words(circle: BallCircle) -> str:
     (u, v, radius), (su, sv, sr) = circle.circle_px, circle.sigma_px
     return (
         f"outline: centre ({u:.1f} +- {su:.1f}, {v:.1f} +- {sv:.1f}) px, radius {radius:.1f} +- {sr:.1f} px, with "
-        f"edges on {100.0 * circle.edges:.0f} % of it; for a move in mm give --focal-px, --cx-px and --cy-px"
+        f"edges on {100.0 * circle.edges:.0f} % of it{_stretch_in_words(circle)}; for a move in mm give --focal-px, "
+        "--cx-px and --cy-px"
+    )
+
+
+def _stretch_in_words(circle: BallCircle) -> str:
+    """Clause on an outline that is no circle; "" where it is one."""
+    e1, e2 = circle.ellipse_px
+    longer = 2.0 * math.hypot(e1, e2) / circle.circle_px[2]
+    if longer < _STRETCHED:
+        return ""
+    angle = math.degrees(0.5 * math.atan2(e2, e1))
+    return (
+        f"; doubtful: it is an ellipse, {100.0 * longer:.0f} % longer along {angle:.0f} deg from the image's x towards "
+        "y: the picture was stretched, its pixels are not square, or the ball is far from the middle of a wide lens"
     )
 
 

@@ -28,7 +28,6 @@ from numpy.typing import NDArray
 from PIL import Image
 from pydantic import Field
 
-from phibench.calibration.sensor_fit.code_widths import code_fault
 from phibench.datasets.common.camera_pictures import read_camera_picture
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import SETTINGS_BYTES, InputFile
@@ -43,7 +42,8 @@ _SUFFIXES = (".png", ".pgm", ".tif", ".tiff", ".bmp", ".yuyv", ".jpg", ".jpeg")
 _DRIFT = 0.02  # of the mean, from the least to the largest frame mean of one level
 _DRIFT_OF_RANGE = 0.0025  # of full scale: levels near zero jitter by more than a share of themselves
 _DRIFT_SIGMAS = 8.0  # of the frames' means: their own noise is no drift
-_SHAPE = "16 pixels or more of each filter along both sides are needed"
+_CHROMA_CODES = 20.0  # by which the mean chroma of an even surface may change more than its luma
+_CONTAINER_BITS = 16  # files of 16 bits hold codes of fewer bits, too
 _FRAME_BYTES = 512 * 2**20  # 250 million pixels of 16 bits
 
 
@@ -91,6 +91,14 @@ class FrameGroup:
 
 
 @dataclass(frozen=True)
+class FrameSource:
+    """What a file says of its camera: its name in EXIF, "" for none, and the bits of a value as it is stored."""
+
+    camera: str = ""
+    bits: int = 8
+
+
+@dataclass(frozen=True)
 class Capture:
     """A folder of frames, looked through but not read.
 
@@ -116,6 +124,7 @@ class Capture:
     edges: FrameGroup | None = None
     chessboards: FrameGroup | None = None
     _count: int = field(default=0)
+    _camera: str = ""
 
     @property
     def frames(self) -> int:
@@ -130,7 +139,11 @@ class Capture:
         CaptureError
             If the file is no frame of the capture's kind and size.
         """
-        kind, image = read_frame(path, self.notes)
+        kind, image, source = read_frame(path, self.notes)
+        if (camera := source.camera) and self._camera and camera != self._camera:
+            raise CaptureError(
+                f"{path} is of {camera} and the first frame of {self._camera}: a folder holds one camera's"
+            )
         if (kind in RAW) != (self.kind in RAW) or (kind not in RAW and kind != self.kind):
             raise CaptureError(f"{path} is {kind} and the first frame {self.kind}: a folder holds one format")
         if image.shape[:2] != self.size:
@@ -226,24 +239,54 @@ def open_capture(folder: Path) -> Capture:
             f"{folder} has no frames: put them into dark/, flat/LEVEL/, exposure/SECONDS/, edge/ or chessboard/ as "
             f"{', '.join(_SUFFIXES)}"
         )
-    kind, first = read_frame(every[0].files[0], notes)
+    kind, first, source = read_frame(every[0].files[0], notes)
+    if kind in RAW:
+        flat = series["flats"][0] if series["flats"] else every[0]
+        notes = _with_bits(notes, flat.files[0], read_frame(flat.files[0], notes)[2].bits)
     count = sum(len(group.files) for group in every)
     size = (first.shape[0], first.shape[1])
-    return Capture(folder, notes, kind, size, **groups, **series, _count=count)  # type: ignore[arg-type]
+    found = Capture(folder, notes, kind, size, **groups, **series, _count=count, _camera=source.camera)  # type: ignore[arg-type]
+    if kind == "yuyv":
+        _refuse_chroma_first(found)
+    return found
 
 
-def read_frame(path: Path, notes: CaptureNotes) -> tuple[Kind, NDArray[Any]]:
-    """One frame with its kind: see `Capture.read`."""
+def _refuse_chroma_first(capture: Capture) -> None:
+    """Refuse frames whose second plane is what follows the light: their bytes are those of UYVY."""
+    groups = [group for group in (capture.dark, *capture.flats, *capture.exposures) if group is not None]
+    means = np.array([capture.read(group.files[0]).mean(axis=(0, 1)) for group in groups]).reshape(-1, 2)
+    luma_codes, chroma_codes = np.ptp(means, axis=0) if len(means) else (0.0, 0.0)
+    if chroma_codes > luma_codes + _CHROMA_CODES:
+        raise CaptureError(
+            f"{capture.folder}: from level to level the chroma changes by {chroma_codes:.0f} codes and the luma by "
+            f"{luma_codes:.0f}: the bytes are those of UYVY, chroma first; exchange the two bytes of each pixel"
+        )
+
+
+def _with_bits(notes: CaptureNotes, path: Path, stored: int) -> CaptureNotes:
+    """Notes with the bits that raw files have, where that is fewer than 16; stated ones must lie in them."""
+    if "bits" not in notes.model_fields_set:
+        return notes.model_copy(update={"bits": stored}) if stored < _CONTAINER_BITS else notes
+    if notes.bits > stored:
+        raise CaptureError(
+            f"{path} has {stored} bits a pixel, and {MANIFEST} says bits = {notes.bits}: write those of its codes"
+        )
+    return notes
+
+
+def read_frame(path: Path, notes: CaptureNotes) -> tuple[Kind, NDArray[Any], FrameSource]:
+    """One frame with its kind and source: see `Capture.read`."""
     file = InputFile(path, "give the camera's own frame", CaptureError, _FRAME_BYTES)
     if path.suffix.lower() == ".yuyv":
-        return "yuyv", _yuyv(file, notes)
+        return "yuyv", _yuyv(file, notes), FrameSource()
     picture = read_camera_picture(file)
+    source = FrameSource(picture.camera, picture.bits)
     if picture.orientation != 1:
         raise file.fault(
             f"is turned by EXIF (orientation {picture.orientation}): `exiftool -Orientation= FILE` ends that"
         )
     if picture.kind == "jpeg":
-        return "mjpeg", picture.pixels
+        return "mjpeg", picture.pixels, source
     if picture.kind == "yuyv":
         second = picture.pixels[..., 1]
         if notes.format not in (None, "yuyv"):
@@ -254,39 +297,15 @@ def read_frame(path: Path, notes: CaptureNotes) -> tuple[Kind, NDArray[Any]]:
                 f"has a second plane of {int(second.flat[0])} alone, as opacity is: save grey alone, or write "
                 f'format = "yuyv" into {MANIFEST} if it is chroma'
             )
-        return "yuyv", picture.pixels
+        return "yuyv", picture.pixels, source
     if picture.kind == "raw" or picture.mode == "L":
         values = picture.pixels if picture.kind == "raw" else picture.pixels[..., 0].astype(np.uint16)
         if notes.format in (None, *RAW):
-            return ("mono-raw" if notes.format == "mono-raw" else "bayer-raw"), values
+            return ("mono-raw" if notes.format == "mono-raw" else "bayer-raw"), values, source
         raise file.fault(f"has one plane, and {MANIFEST} says {notes.format}")
     if picture.mode in ("RGB", "RGBA", "RGBX"):
-        return "srgb8", picture.pixels
+        return "srgb8", picture.pixels, source
     raise file.fault(f"has the mode {picture.mode}: one plane (raw), two (YUYV) or R, G, B are read")
-
-
-def raw_frames(capture: Capture, group: FrameGroup) -> NDArray[Any]:
-    """Raw frames of one level, shape (n, h, w).
-
-    Raises
-    ------
-    CaptureError
-        If they are not codes of the stated bits as a converter writes them, or too small.
-    """
-    frames = capture.stack(group)
-    if fault := code_fault(frames, capture.notes.bits):
-        raise CaptureError(f"{capture.folder / group.name} {fault}")
-    if min(frames.shape[1:]) < 32:
-        raise CaptureError(f"{capture.folder / group.name}: {frames.shape[2]} x {frames.shape[1]} pixels; {_SHAPE}")
-    return frames
-
-
-def of_filters(frames: NDArray[Any], kind: Kind) -> list[tuple[str, NDArray[Any]]]:
-    """Pixels of each filter of an RGGB mosaic, or all of them."""
-    if kind == "mono-raw":
-        return [("mono", frames)]
-    names = (("R", 0, 0), ("G1", 0, 1), ("G2", 1, 0), ("B", 1, 1))
-    return [(name, frames[:, row::2, column::2]) for name, row, column in names]
 
 
 def _yuyv(file: InputFile, notes: CaptureNotes) -> NDArray[np.uint8]:

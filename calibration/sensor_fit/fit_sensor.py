@@ -356,8 +356,13 @@ def _mean_rgb(frames: Array, capture: Capture, card: SensorCard) -> tuple[float,
 def _take_jpeg(draft: _Draft, capture: Capture) -> JpegHeader | None:
     if capture.kind != "mjpeg":
         return None
-    first = next(g for g in _every_group(capture) if g.files).files[0]
-    header = read_header(InputFile(first, "give the camera's own picture", CaptureError).read(), str(first))
+    files = [path for group in _every_group(capture) for path in group.files]
+    header, *others = (_header(path) for path in files)
+    if differing := [path for path, other in zip(files[1:], others, strict=True) if other.tables != header.tables]:
+        raise CaptureError(
+            f"{differing[0]} has other quantisation tables than {files[0]}: two cameras, or a quality that changed; "
+            "give frames of one camera with one quality"
+        )
     if header.quality is not None:
         draft.take("jpeg_quality", header.quality)
     else:
@@ -366,6 +371,10 @@ def _take_jpeg(draft: _Draft, capture: Capture) -> JpegHeader | None:
     if header.restart_interval:
         draft.take("jpeg_restart_interval", header.restart_interval)
     return header
+
+
+def _header(path: Path) -> JpegHeader:
+    return read_header(InputFile(path, "give the camera's own picture", CaptureError).read(), str(path))
 
 
 def _every_group(capture: Capture) -> list[FrameGroup]:

@@ -39,6 +39,7 @@ _DARKER, _DARKER_DN = 0.005, 1.0  # of the range: dark levels move by less
 _FAINT = 0.02  # of the range: below, a level's noise over its signal says nothing
 _OTHER = 2.0  # factor of the dark variance, beyond which dark and flat frames are not of one setting
 _STRAIGHT = 0.5  # posterior share of the bent sets, below which a line is no curve
+_LINE = 4  # levels that tell a line from a curve which grows faster
 _STRONG = 0.2  # change of the response's slope that polynomials of three terms still follow
 _BY_GAIN = ("gain_dn_per_e", "dark_e_per_s", "read_noise_e", "row_noise_e", "dsnu_e", "full_well_e")
 
@@ -206,7 +207,7 @@ class _Fit(DarkTransfer):
         no_dark = self._is_cut or self.is_hidden  # the dark frames' own variance says nothing
         most_dn2 = _MOST_HIDDEN_DN**2 if self.is_hidden and not self._is_cut else np.inf
         try:
-            response = fit_response(levels, self.dark_dn2, self._range, most_dn2 if no_dark else 0.0)
+            response = fit_response(levels, self.dark_dn2, self._range, (0.0, most_dn2) if no_dark else None)
         except ValueError:
             raise self._no_growth() from None
         if response.sigma > float(response.gain[0]):
@@ -215,7 +216,7 @@ class _Fit(DarkTransfer):
                 f"{response.straight_misfit:.3g} times its variance: take all levels with one gain and one setting"
             )
         if response.is_bent and not no_dark:
-            self._refuse_other_settings(fit_response(levels, self.dark_dn2, self._range, np.inf))
+            self._refuse_other_settings(fit_response(levels, self.dark_dn2, self._range, (-np.inf, np.inf)))
         signal = np.array([float(level.signal_dn[0]) for level in levels])
         unknown = float(response.gain[0]) * self._unknown_black() * float(signal.sum() / np.sum(signal**2))
         if no_dark and response.is_bent:  # a line through levels that bend has another intercept
@@ -245,9 +246,12 @@ class _Fit(DarkTransfer):
         dark_dn2 = float(self.dark_dn2[0])
         if free.bent > _STRAIGHT or free.refused or _OTHER**-1.0 < free.dark_dn2 / max(dark_dn2, 1e-9) < _OTHER:
             return
+        if free.dark_dn2 < 0.0 and free.levels < _LINE:
+            return
         raise CaptureError(
             f"{self.folder}: the levels' noise lies on a straight line that starts at {free.dark_dn2:.3g} DN^2, and "
-            f"dark frames have {dark_dn2:.3g}: take both with one gain, and give single frames for both, not means"
+            f"dark frames have {dark_dn2:.3g}: take both with one gain and one black level, and "
+            "give single frames for both, not means"
         )
 
     def _raw_noise(self, used: list[FilterLevel]) -> None:

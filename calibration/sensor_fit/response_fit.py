@@ -157,11 +157,11 @@ class _Set:
 
 
 def fit_response(
-    levels: Sequence[NoiseOfLevel], dark_dn2: Array, range_dn: float, free_dark_dn2: float = 0.0
+    levels: Sequence[NoiseOfLevel], dark_dn2: Array, range_dn: float, free_dark_dn2: tuple[float, float] | None = None
 ) -> Response:
     """Fit levels that are not saturated; `dark_dn2`, shape (replicates,), is the dark variance before rounding.
 
-    Where dark frames say nothing of it, the levels of two names or more do, up to `free_dark_dn2`.
+    Where dark frames say nothing of it, the levels of two names or more do, within the two ends of `free_dark_dn2`.
 
     Raises
     ------
@@ -190,8 +190,8 @@ def fit_response(
         )
         weights = np.hypot(sigma, unknown)
         black_u = max(float(levels[0].mean_dn - signal[0, 0]), 1.0) / range_dn
-        if free_dark_dn2 and names > 1:
-            dark_dn2 = _intercept(signal, seen - rounding[:, None], weights, free_dark_dn2)
+        if free_dark_dn2 is not None and names > 1:
+            dark_dn2 = _intercept(signal, seen - rounding[:, None], weights, *free_dark_dn2)
         fitter = _Fitter(signal / range_dn, signal, seen - rounding[:, None], dark_dn2, weights, black_u)
         sets = [one for terms in _sets(names, len(levels)) if (one := fitter.fit(terms)) is not None]
         if not sets or sets[0].terms or sets[0].x[0, 0] <= 0.0:
@@ -205,12 +205,12 @@ def fit_response(
     return replace(fitted, dark_dn2=float(dark_dn2[0]))
 
 
-def _intercept(y: Array, v: Array, sigma: Array, most_dn2: float) -> Array:
-    """Variance at no light by the line through the levels alone, DN^2, from 0 to `most_dn2`, shape (replicates,)."""
+def _intercept(y: Array, v: Array, sigma: Array, least_dn2: float, most_dn2: float) -> Array:
+    """Variance at no light by the line through the levels alone, DN^2, between two ends, shape (replicates,)."""
     weight = sigma[:, None] ** -2.0
     y0, v0 = ((weight * x).sum(axis=0) / weight.sum() for x in (y, v))
     slope = np.sum(weight * (y - y0) * (v - v0), axis=0) / np.sum(weight * (y - y0) ** 2, axis=0)
-    return np.asarray(np.clip(v0 - slope * y0, 0.0, most_dn2))
+    return np.asarray(np.clip(v0 - slope * y0, least_dn2, most_dn2))
 
 
 def _sets(names: int, count: int) -> list[tuple[int, ...]]:

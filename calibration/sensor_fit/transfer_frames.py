@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from phibench.calibration.sensor_fit.block_sums import BlockSums, block_sums, common_noise, outliers
-from phibench.calibration.sensor_fit.capture_folder import Capture, FrameGroup, of_filters, raw_frames
-from phibench.calibration.sensor_fit.code_widths import CodeWidths
+from phibench.calibration.sensor_fit.capture_folder import Capture, CaptureError, FrameGroup, Kind
+from phibench.calibration.sensor_fit.code_widths import CodeWidths, code_fault
 from phibench.calibration.sensor_fit.dark_frames import dark_image
 from phibench.calibration.sensor_fit.noise_likeness import NoiseLikeness, noise_likeness
 from phibench.scenes.frames import Array
+
+_SHAPE = "16 pixels or more of each filter along both sides are needed"
 
 
 @dataclass(frozen=True)
@@ -62,3 +66,27 @@ class TransferFrames:
             codes = self.widths.add(pixels, float(sums.temporal_dn2[0]))
             levels.append(FilterLevel(group.name, site, sums, codes, light, group.seconds, likeness, image))
         return levels
+
+
+def raw_frames(capture: Capture, group: FrameGroup) -> NDArray[Any]:
+    """Raw frames of one level, shape (n, h, w).
+
+    Raises
+    ------
+    CaptureError
+        If they are not codes of the stated bits as a converter writes them, or too small.
+    """
+    frames = capture.stack(group)
+    if fault := code_fault(frames, capture.notes.bits):
+        raise CaptureError(f"{capture.folder / group.name} {fault}")
+    if min(frames.shape[1:]) < 32:
+        raise CaptureError(f"{capture.folder / group.name}: {frames.shape[2]} x {frames.shape[1]} pixels; {_SHAPE}")
+    return frames
+
+
+def of_filters(frames: NDArray[Any], kind: Kind) -> list[tuple[str, NDArray[Any]]]:
+    """Pixels of each filter of an RGGB mosaic, or all of them."""
+    if kind == "mono-raw":
+        return [("mono", frames)]
+    names = (("R", 0, 0), ("G1", 0, 1), ("G2", 1, 0), ("B", 1, 1))
+    return [(name, frames[:, row::2, column::2]) for name, row, column in names]

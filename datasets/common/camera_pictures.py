@@ -66,6 +66,8 @@ class CameraPicture:
         Quantisation tables of a JPEG; none otherwise.
     subsampling : str or None
         Chroma of a JPEG, such as "4:2:2".
+    bits : int
+        Of one value, as the file stores it: 8 or 16, or those of the largest value that a PGM tells.
     """
 
     pixels: NDArray[Any] = field(repr=False)
@@ -76,6 +78,7 @@ class CameraPicture:
     orientation: int = 1
     tables: tuple[NDArray[Any], ...] = field(default=(), repr=False)
     subsampling: Subsampling | None = None
+    bits: int = 8
 
 
 def read_camera_picture(file: InputFile, data: bytes | None = None) -> CameraPicture:
@@ -90,7 +93,8 @@ def read_camera_picture(file: InputFile, data: bytes | None = None) -> CameraPic
     if other := _other_format(data, file.path.suffix.lower()):
         raise file.fault(other)
     if data[:2] in PGM:
-        return CameraPicture(_sealed(pgm_values(file, data)), "raw")
+        values, top = pgm_values(file, data)
+        return CameraPicture(_sealed(values), "raw", bits=max(top.bit_length(), 8))
     picture = _opened(file, data)
     with (
         file.decoding("is a damaged picture"),
@@ -135,7 +139,7 @@ def _of_decoded(file: InputFile, picture: Image.Image) -> CameraPicture:
     orientation = _orientation(file, exif.get(_ORIENTATION, 1), kind)
     grey = picture.mode in ("L", "LA", "1") or (kind in ("jpeg", "rgb") and _is_grey(pixels))
     upright_picture = CameraPicture(
-        _sealed(upright(pixels, orientation)), kind, grey, camera, picture.mode, orientation
+        _sealed(upright(pixels, orientation)), kind, grey, camera, picture.mode, orientation, bits=8 * pixels.itemsize
     )
     return _with_tables(file, picture, upright_picture) if kind == "jpeg" else upright_picture
 
@@ -224,8 +228,8 @@ def _is_opacity(plane: NDArray[Any]) -> bool:
     return bool(np.isin(plane, (0, 255)).mean() > 0.5)
 
 
-def pgm_values(file: InputFile, data: bytes) -> NDArray[np.uint16]:
-    """DN of a PGM, binary (P5) or plain (P2); Pillow would stretch them to 16 bits.
+def pgm_values(file: InputFile, data: bytes) -> tuple[NDArray[np.uint16], int]:
+    """DN of a PGM, binary (P5) or plain (P2), and the largest that it tells; Pillow would stretch them to 16 bits.
 
     Raises
     ------
@@ -250,7 +254,7 @@ def pgm_values(file: InputFile, data: bytes) -> NDArray[np.uint16]:
         raise file.fault(f"is a PGM of another size than the {width} x {height} pixels that it tells")
     if values.min() < 0 or values.max() > top:
         raise file.fault(f"is a PGM with values beyond {top}, which it tells as the largest")
-    return values.reshape(height, width).astype(np.uint16)
+    return values.reshape(height, width).astype(np.uint16), top
 
 
 # -- formats that are not read ---------------------------------------------------------------------------------------

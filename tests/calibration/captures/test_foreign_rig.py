@@ -103,6 +103,10 @@ LINES = {
     "ORB-SLAM": '%YAML:1.0\nCamera.type: "PinHole"\nCamera.fx: 1432.5\nCamera.fy: 1431.75\nCamera.cx: 640.25\n'
     "Camera.cy: 355.5\nCamera.k1: -0.026\nCamera.k2: 1.06\nCamera.p1: 0.001\nCamera.p2: -0.002\n",
     "COLMAP": "# cameras\n1 OPENCV 1280 720 1432.5 1431.75 640.75 356.0 -0.026 1.06 0.001 -0.002\n",
+    # jsonencode of MATLAB's cameraParameters: the first pixel is 1, the size is rows and columns, K beside it
+    "MATLAB": '{"RadialDistortion": [-0.026, 1.06], "TangentialDistortion": [0.001, -0.002], "ImageSize": [720, 1280], '
+    '"FocalLength": [1432.5, 1431.75], "PrincipalPoint": [641.25, 356.5], "Skew": 0, '
+    '"K": [[1432.5, 0, 641.25], [0, 1431.75, 356.5], [0, 0, 1]]}',
     "Bouguet": "fc = [ 1432.5 ; 1431.75 ];\ncc = [ 640.25 ; 355.5 ];\nalpha_c = 0.0;\n"
     "kc = [ -0.026 ; 1.06 ; 0.001 ; -0.002 ; 0.0 ];\nnx = 1280;\nny = 720;\n",
     "ROS": "[image]\n\nwidth\n1280\n\nheight\n720\n\n[c310]\n\ncamera matrix\n1432.5 0.0 640.25\n0.0 1431.75 355.5\n"
@@ -127,6 +131,24 @@ def test_other_programs_write_what_is_copied(tmp_path: Path, program: str) -> No
     text = said(tmp_path, LINES[program])
     for words in (f"of {program}", *NUMBERS, *LENS):
         assert words in text
+    assert "width_px" not in text or all(words in text for words in SIZE)
+
+
+def test_all_models_of_colmap_are_known(tmp_path: Path) -> None:
+    full = said(tmp_path, f"1 FULL_OPENCV 1280 720 {_ONE_ROW} -0.026 1.06 0.001 -0.002 -3.4 0.5 0 0\n")
+    for words in ("of COLMAP", *SIZE, *LENS, "k3 = -3.4", "its k4 have no keys"):
+        assert words in full
+    for model in ("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE", "FOV"):
+        text = said(tmp_path, f"1 {model} 1280 720 {_ONE_ROW} 0 0 0 0 0 0 0 0\n")
+        assert f"its distortion '{model}' has no keys" in text
+
+
+def test_binned_pictures_have_other_numbers(tmp_path: Path) -> None:
+    """ROS keeps the numbers of the whole sensor in camera_info; 0 and 1 mean none."""
+    binned = {**MESSAGE, "binning_x": 2, "binning_y": 2}
+    assert "binned 2 x 2, and these numbers are of the whole sensor" in said(tmp_path, yaml.safe_dump(binned))
+    for none in (0, 1):
+        assert "binned" not in said(tmp_path, yaml.safe_dump({**binned, "binning_x": none, "binning_y": none}))
 
 
 def test_what_a_matrix_may_hide(tmp_path: Path) -> None:

@@ -239,6 +239,34 @@ def test_light_that_changed_between_on_and_off_is_told(case: Case, tmp_path: Pat
     assert "the light changed between laser on and off" in said
 
 
+@pytest.mark.usefixtures("unaligned")
+def test_light_that_changed_makes_no_other_chain(case: Case, tmp_path: Path, capsys) -> None:
+    """The room is left in laser on less laser off, and makes neighbours alike: DN were called smoothed."""
+    relit = {}
+    for name in ("down_off", "up_off"):
+        with Image.open(case.raw[name][0]) as picture:
+            darker = np.rint(64.0 + 0.8 * (np.array(picture, float) - 64.0)).astype(np.uint16)
+        relit[name] = [tmp_path / f"{name}.png"]
+        Image.fromarray(darker).save(relit[name][0])
+    main(case.arguments({**case.raw, **relit}))
+    said = "".join(capsys.readouterr())
+    assert "doubtful: the light changed between laser on and off" in said
+    assert "another chain" not in said
+
+
+@pytest.mark.usefixtures("unaligned")
+def test_a_difference_for_laser_on_is_told(case: Case, tmp_path: Path, capsys) -> None:
+    given = {}
+    for name in ("down", "up"):
+        on, off = (np.array(Image.open(case.jpg[key][0]), int) for key in (name, f"{name}_off"))
+        given[name], given[f"{name}_off"] = [tmp_path / f"{name}.png"], [tmp_path / f"{name}_off.png"]
+        Image.fromarray(np.clip(on - off, 0, 255).astype(np.uint8)).save(given[name][0])
+        Image.fromarray(off.astype(np.uint8)).save(given[f"{name}_off"][0])
+    assert re.search(
+        r"down\.png is black beside .*down_off\.png: a difference of both", refused(capsys, case.arguments(given))
+    )
+
+
 @pytest.mark.slow
 @pytest.mark.usefixtures("unaligned")
 def test_laser_off_pictures_of_the_other_position_are_told(case: Case, capsys) -> None:

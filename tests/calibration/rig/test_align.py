@@ -18,7 +18,14 @@ from phibench.calibration.captures.rig_file import read_rig_file
 from phibench.calibration.outline.ball_circle import BallCircle
 from phibench.calibration.outline.contour import aside_by_tilt_m
 from phibench.calibration.outline.first_circle import rig_circle
-from phibench.calibration.rig.align import alignment, circle_of, distance_of, nominal_centre, sharpness
+from phibench.calibration.rig.align import (
+    alignment,
+    circle_in_words,
+    circle_of,
+    distance_of,
+    nominal_centre,
+    sharpness,
+)
 from phibench.cli import main as cli
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.estimator.spots.camera_codes import linear_to_srgb
@@ -210,6 +217,15 @@ def fitted(monkeypatch: pytest.MonkeyPatch) -> list[tuple[np.ndarray, BallCircle
 
     monkeypatch.setattr("phibench.calibration.rig.align.circle_of", circle)
     return done
+
+
+@pytest.mark.parametrize(("ellipse_px", "said"), [((3.7, 0.0), "7 % longer along 0 deg"), ((0.0, 0.9), "")])
+def test_a_stretched_picture_is_told(ellipse_px: tuple[float, float], said: str) -> None:
+    """Pixels of 16:15, as in video; an ellipse of 1.6 % is that of a sphere 10 degrees off the axis."""
+    circle = BallCircle((250.0, 170.0, 113.0), ellipse_px, 0.25 * np.eye(3), 40.0, 3.0, np.zeros(360))
+    words = circle_in_words(circle)
+    assert said in words
+    assert ("doubtful: it is an ellipse" in words) == bool(said)
 
 
 def test_a_photograph_of_an_unknown_camera_gives_the_circle(fitted, tmp_path, capsys) -> None:

@@ -176,6 +176,45 @@ def averaged(places: str | tuple[str, ...]) -> Change:
     return change
 
 
+@pytest.mark.parametrize("offset_dn", [-90, 60])
+def test_dark_frames_of_another_black_level_are_refused(tmp_path: Path, offset_dn: int) -> None:
+    """Brightness was changed between dark and flat frames: below, a bend was found, and half of the gain."""
+
+    def moved(place: str, _: int, frame: Frame) -> Frame:
+        return (frame.astype(int) + offset_dn * (place == "dark")).astype(frame.dtype)
+
+    with pytest.raises(CaptureError, match="with one gain and one black level"):
+        fitted(tmp_path, CAMERA, moved)
+
+
+def test_bits_are_those_of_the_file(tmp_path: Path) -> None:
+    """8 bits a pixel were taken for 10, and a full well of four times the range for the sensor's."""
+    fitted(tmp_path, NARROW, as_taken)
+    notes = tmp_path / "capture.toml"
+    notes.write_text('format = "mono-raw"\n')
+    assert fit_sensor(tmp_path).file.numbers["adc_bits"] == 8
+    notes.write_text('format = "mono-raw"\nbits = 10\n')
+    with pytest.raises(CaptureError, match=r"has 8 bits a pixel, and capture\.toml says bits = 10"):
+        fit_sensor(tmp_path)
+    notes.write_text('format = "mono-raw"\n')
+    for path in tmp_path.rglob("*.png"):
+        with Image.open(path) as picture:
+            codes = np.array(picture).astype(">u2")
+        path.with_suffix(".pgm").write_bytes(b"P5 %d %d 4095\n" % codes.shape[::-1] + codes.tobytes())
+        path.unlink()
+    assert fit_sensor(tmp_path).file.numbers["adc_bits"] == 12
+
+
+def test_frames_of_two_cameras_are_refused(tmp_path: Path) -> None:
+    fitted(tmp_path, CAMERA, as_taken)
+    for path in tmp_path.rglob("*.png"):
+        with Image.open(path) as picture:
+            picture.save(path.with_suffix(".tif"), tiffinfo={0x0110: "A" if path.parent.name == "dark" else "B"})
+        path.unlink()
+    with pytest.raises(CaptureError, match="is of B and the first frame of A"):
+        fit_sensor(tmp_path)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("places", ["dark", "flat"])
 def test_means_beside_single_frames_are_refused(tmp_path: Path, places: str) -> None:

@@ -15,6 +15,7 @@ from helpers.sensor_captures import (
     write_frames,
     write_processed_capture,
 )
+from PIL import Image
 
 from phibench.calibration.sensor_fit.capture_folder import CaptureError
 from phibench.calibration.sensor_fit.fit_sensor import SensorFit, fit_sensor
@@ -122,6 +123,26 @@ def test_the_jpeg_header_comes_back(tmp_path: Path, s: Sensor) -> None:
     assert again.jpeg_qtables == s.jpeg_qtables
     assert s.jpeg_qtables is not None or again.jpeg_quality == s.jpeg_quality
     assert "MJPEG" in found.file.tables.not_determined["read_noise_e"]
+
+
+def test_a_quality_that_changed_is_refused(tmp_path: Path) -> None:
+    for level, quality in enumerate((76, 90)):
+        (tmp_path / f"flat/{level}").mkdir(parents=True)
+        Image.new("RGB", (64, 64), (90, 90, 90)).save(tmp_path / f"flat/{level}/0.jpg", quality=quality)
+    with pytest.raises(CaptureError, match="other quantisation tables"):
+        fit_sensor(tmp_path)
+
+
+def test_chroma_first_is_refused(tmp_path: Path) -> None:
+    """UYVY in a file of YUYV: its luma was taken for chroma, and the gain was half of the true one."""
+    frames = write_processed_capture(tmp_path, drawn_processed(1), 0, 2, 64)
+    for path in frames.rglob("*.png"):
+        with Image.open(path) as picture:
+            path.with_suffix(".yuyv").write_bytes(np.array(picture)[..., ::-1].tobytes())
+        path.unlink()
+    (tmp_path / "capture.toml").write_text("width_px = 64\nheight_px = 64\n")
+    with pytest.raises(CaptureError, match="the bytes are those of UYVY"):
+        fit_sensor(tmp_path)
 
 
 def test_the_lens_comes_back_from_chessboards(tmp_path: Path) -> None:
