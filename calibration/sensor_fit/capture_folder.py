@@ -91,8 +91,8 @@ class FrameGroup:
 
 
 @dataclass(frozen=True)
-class FrameSource:
-    """What a file says of its camera: its name in EXIF, "" for none, and the bits of a value as it is stored."""
+class FrameOrigin:
+    """Camera that a file names in EXIF, "" for none, and the bits of a value as it is stored."""
 
     camera: str = ""
     bits: int = 8
@@ -274,13 +274,13 @@ def _with_bits(notes: CaptureNotes, path: Path, stored: int) -> CaptureNotes:
     return notes
 
 
-def read_frame(path: Path, notes: CaptureNotes) -> tuple[Kind, NDArray[Any], FrameSource]:
+def read_frame(path: Path, notes: CaptureNotes) -> tuple[Kind, NDArray[Any], FrameOrigin]:
     """One frame with its kind and source: see `Capture.read`."""
     file = InputFile(path, "give the camera's own frame", CaptureError, _FRAME_BYTES)
     if path.suffix.lower() == ".yuyv":
-        return "yuyv", _yuyv(file, notes), FrameSource()
+        return "yuyv", _yuyv(file, notes), FrameOrigin()
     picture = read_camera_picture(file)
-    source = FrameSource(picture.camera, picture.bits)
+    source = FrameOrigin(picture.camera, picture.bits)
     if picture.orientation != 1:
         raise file.fault(
             f"is turned by EXIF (orientation {picture.orientation}): `exiftool -Orientation= FILE` ends that"

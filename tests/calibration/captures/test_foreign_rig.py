@@ -148,7 +148,7 @@ def test_binned_pictures_have_other_numbers(tmp_path: Path) -> None:
     binned = {**MESSAGE, "binning_x": 2, "binning_y": 2}
     assert "binned 2 x 2, and these numbers are of the whole sensor" in said(tmp_path, yaml.safe_dump(binned))
     for none in (0, 1):
-        assert "binned" not in said(tmp_path, yaml.safe_dump({**binned, "binning_x": none, "binning_y": none}))
+        assert "are binned" not in said(tmp_path, yaml.safe_dump({**binned, "binning_x": none, "binning_y": none}))
 
 
 def test_what_a_matrix_may_hide(tmp_path: Path) -> None:
