@@ -1,4 +1,6 @@
-"""Reader of data sets (`Dataset`, `Sample`): without Mitsuba or a recipe, everything comes out of the folder.
+"""Reader of data sets (`Dataset`, `Sample`): truth and layers from the folder, and camera frames drawn from them.
+
+Neither Mitsuba nor the recipe is needed.
 
 >>> import phibench
 >>> dataset = phibench.open_dataset("out/paper")  # doctest: +SKIP

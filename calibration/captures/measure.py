@@ -1,4 +1,4 @@
-"""Measurement of D from a person's own pictures: setting of files, spots, outline, rig, depth with sigma, and a test.
+"""Measurement of D from a person's own pictures: their Bayer phase and processing, spots, rig, D with sigma, doubts.
 
 The rig is that of the rig file with the corrections of a calibration file. Without one, the mirror's outline in these
 very pictures corrects it, as far as an outline can, and the covariance is that of a rig measured by a ruler. Blur and

@@ -1,8 +1,8 @@
-"""Fit of the outline of the rig's mirror, of any shape, in an image: from scratch (`find_outline`), or near a place.
+"""Outline of the rig's mirror in an image (`find_outline`): the fit for all shapes, and the model of a sphere's limb.
 
 1. Circles with edges all around are looked for in the picture (`ball_circle`), and the outline through each.
 2. From there the light across the outline is fitted, sector by sector: Gauss-Newton with robust weights. What that
-   light is, say `sphere_outline` and `rim_outline`.
+   light is, say `SphereSearch` and `rim_outline`.
 3. Sectors whose light the model does not describe (lamps, edges of the room) are left out, with their neighbours.
 4. The covariance comes from the scatter of the sectors' shifts, with the correlation of neighbours: the room and JPEG's
    blocks err over many pixels together. JPEG's effect is simulated from the frame itself (`outline_result`).

@@ -1,8 +1,8 @@
-"""Photon transfer of raw frames: gain, noise, fixed pattern, dark current and full well, each with its sigma.
+"""Photon transfer of raw frames (`fit_transfer`): gain, response curve, PRNU, full well, linearity; all with sigmas.
 
-Terms and equations are those of EMVA 1288, release 4.0. The variance from frame to frame of a level against its mean
-has the slope K. The variance from pixel to pixel of the mean frame is the fixed pattern, after what temporal noise adds
-has been taken off. Five things differ:
+Dark current and read noise are in `transfer_dark`. Terms and equations are those of EMVA 1288, release 4.0. Frame by
+frame, the variance of a level against its mean has the slope K. The variance from pixel to pixel of the mean frame is
+the fixed pattern, after what temporal noise adds has been taken off. Five things differ:
 
 * Whether the line is straight is asked, and a response that bends is fitted: see `response_fit`.
 * Rounding at a noise below half a code has its exact moments: see `block_sums`.

@@ -1,4 +1,4 @@
-"""Light on the sensor: layers with levels of lamps, laser and other spots; the spot's motion; regions of the image.
+"""Expected light of one view (`Light`), pixel rectangles (`Region`), and a moving spot under a rolling shutter.
 
 Layers have the shape (3, H, W), planes R, G, B; a region is a rectangle of whole pixels.
 """

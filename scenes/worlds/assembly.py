@@ -7,7 +7,7 @@ side than stated, so that neighbours never share a plane.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from phibench.scenes.frames import Array, Matrix, Pose, Vector, as_matrix, as_vector, rotation_facing, rotation_xyz
 from phibench.scenes.shapes import Cuboid, Mesh, Prism, Rectangle, Shape
-from phibench.scenes.worlds.materials import Surface
+from phibench.scenes.worlds.materials import MaterialSet, Rng, Surface
 
 GAP_M = 5e-4
 Span = tuple[float, float]
@@ -180,3 +180,7 @@ def footprint_of(assembly: Assembly, x: float, y: float, yaw_rad: float, z: floa
     centre = (x + c * middle[0] - s * middle[1], y + s * middle[0] + c * middle[1])
     half = (float(0.5 * (high - low)[0]), float(0.5 * (high - low)[1]))
     return Footprint(float(centre[0]), float(centre[1]), yaw_rad, half, (z + float(low[2]), z + float(high[2])))
+
+
+Piece = Callable[[Rng, MaterialSet], Assembly]
+"""Furniture and other things: functions of a random generator and the room's materials."""

@@ -13,12 +13,11 @@ import numpy as np
 
 from phibench.scenes.frames import rotation_xyz
 from phibench.scenes.worlds import graphics
-from phibench.scenes.worlds.assembly import Assembly
-from phibench.scenes.worlds.materials import MaterialSet
-from phibench.scenes.worlds.tabletop import Piece, Rng, book_row, one_of, thing
+from phibench.scenes.worlds.assembly import Assembly, Piece
+from phibench.scenes.worlds.materials import PAINTS, MaterialSet, Rng, one_of
+from phibench.scenes.worlds.tabletop import book_row, thing
 
 _FRONT = (0.0, -1.0, 0.0)
-_PAINTS = ("paint_red", "paint_blue", "paint_green", "paint_yellow", "paint_orange")
 _FRAMES = ("light_wood", "dark_wood", "red_wood", "white_lacquer", "dark_plastic", "steel")
 
 # Openings.
@@ -29,7 +28,7 @@ def door(rng: Rng, materials: MaterialSet, angle_deg: float) -> Assembly:
     made = Assembly()
     width, high = float(rng.uniform(0.8, 1.0)), float(rng.uniform(1.98, 2.1))  # standard leaves
     frame = one_of(rng, materials, _FRAMES, upright=True)
-    leaf = one_of(rng, materials, ("white_lacquer", "grey_lacquer", "light_wood", "dark_wood", *_PAINTS), upright=True)
+    leaf = one_of(rng, materials, ("white_lacquer", "grey_lacquer", "light_wood", "dark_wood", *PAINTS), upright=True)
     if angle_deg > 3.0:  # a door that is closed hides it
         dim = materials.print(graphics.corridor(rng, (80, 36)), (width, high))
         made.panel("corridor", (0.0, -0.005, high / 2.0), _FRONT, (width, high - 0.002), dim)
@@ -211,7 +210,7 @@ def wall_shelf(rng: Rng, materials: MaterialSet) -> Assembly:
 def device(rng: Rng, materials: MaterialSet) -> Assembly:
     """Fuse box, control panel or first-aid box with a duct up to the ceiling."""
     made = Assembly()
-    case = one_of(rng, materials, ("grey_lacquer", "white_lacquer", "grey_plastic", *_PAINTS))
+    case = one_of(rng, materials, ("grey_lacquer", "white_lacquer", "grey_plastic", *PAINTS))
     width, high, z = float(rng.uniform(0.15, 0.6)), float(rng.uniform(0.2, 0.8)), float(rng.uniform(1.1, 1.5))
     depth = float(rng.uniform(0.08, 0.2))
     made.box("case", (-width / 2, width / 2), (-depth, -0.003), (z, z + high), case)
@@ -284,7 +283,7 @@ def pipes(rng: Rng, materials: MaterialSet) -> Assembly:
     top = materials.properties.height_m - 0.06
     for k in range(int(rng.integers(1, 4))):
         radius = float(rng.uniform(0.012, 0.055))  # of water and of drains
-        surface = one_of(rng, materials, ("copper", "galvanised", "white_lacquer", "steel", *_PAINTS))
+        surface = one_of(rng, materials, ("copper", "galvanised", "white_lacquer", "steel", *PAINTS))
         made.post(f"pipe_{k + 1}", -0.15 + 0.15 * k, -0.08, (0.0, top), radius, surface, 10)
     made.rod("valve", (-0.15, -0.15, 1.1), (-0.15, -0.2, 1.1), 0.06, materials.surface("paint_red"), 10)
     return made
@@ -297,7 +296,7 @@ def pegboard(rng: Rng, materials: MaterialSet) -> Assembly:
     made.box("board", (-width / 2, width / 2), (-0.025, -0.003), (low, low + 0.9), materials.surface("pegboard"))
     for k in range(int(rng.integers(3, 11))):
         x, z = float(rng.uniform(-width / 2 + 0.06, width / 2 - 0.1)), float(rng.uniform(low + 0.35, low + 0.85))
-        surface = one_of(rng, materials, (*_PAINTS, "steel", "dark_plastic", "light_wood"))
+        surface = one_of(rng, materials, (*PAINTS, "steel", "dark_plastic", "light_wood"))
         near = -0.03 - 0.003 * k  # tools may cross: each hangs before the last one
         made.box(
             f"tool_{k + 1}",
@@ -328,7 +327,7 @@ def ceiling_run(rng: Rng, materials: MaterialSet, length_m: float) -> Assembly:
     """Pipe, duct or cable tray below the ceiling, along x, its back at y = 0."""
     made, top = Assembly(), materials.properties.height_m - 0.03
     half, kind = length_m / 2.0, rng.integers(3)
-    surface = one_of(rng, materials, ("galvanised", "copper", "white_lacquer", "grey_lacquer", *_PAINTS))
+    surface = one_of(rng, materials, ("galvanised", "copper", "white_lacquer", "grey_lacquer", *PAINTS))
     if kind == 0:
         for k in range(int(rng.integers(1, 4))):
             radius = float(rng.uniform(0.015, 0.05))

@@ -12,24 +12,10 @@ import numpy as np
 
 from phibench.scenes.frames import rotation_xyz
 from phibench.scenes.worlds import graphics
-from phibench.scenes.worlds.assembly import Assembly
-from phibench.scenes.worlds.materials import MaterialSet
+from phibench.scenes.worlds.assembly import Assembly, Piece
+from phibench.scenes.worlds.materials import CASES, CLOTHS, PAINTS, WOODS, MaterialSet, Rng, one_of
 from phibench.scenes.worlds.standing_objects import barrel, boxes, column, partition, plant, tripod, trolley
-from phibench.scenes.worlds.tabletop import (
-    CASES,
-    CLOTHS,
-    PAINTS,
-    WOODS,
-    Piece,
-    Rng,
-    book_row,
-    carton,
-    desk_lamp,
-    monitor,
-    one_of,
-    scatter,
-    thing,
-)
+from phibench.scenes.worlds.tabletop import book_row, carton, desk_lamp, monitor, scatter, thing
 
 # Seats.
 

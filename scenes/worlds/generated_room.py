@@ -17,14 +17,13 @@ from phibench.scenes.random_streams import Name, generator
 from phibench.scenes.room import Room, Sun
 from phibench.scenes.shapes import Bitmap, Rectangle, Shape, Uniform
 from phibench.scenes.validation import SceneError
-from phibench.scenes.worlds import fixtures, furniture, graphics, small_objects, standing_objects, tabletop
-from phibench.scenes.worlds.assembly import Assembly, AssemblyShape, Footprint, footprint_of, moved_parts
+from phibench.scenes.worlds import fixtures, floor_and_near_things, furniture, graphics, standing_objects
+from phibench.scenes.worlds.assembly import Assembly, AssemblyShape, Footprint, Piece, footprint_of, moved_parts
 from phibench.scenes.worlds.floor_plan import FREE_DISC_M, FloorPlan, Layout, Wall, floor_plan, patch_count, shell
 from phibench.scenes.worlds.graphics import radiance_bitmap
 from phibench.scenes.worlds.lamps import EFFICACY_LM_W, band_radiance, hang_lamps
-from phibench.scenes.worlds.materials import MaterialSet, Surface
+from phibench.scenes.worlds.materials import MaterialSet, Surface, one_of
 from phibench.scenes.worlds.room_properties import RoomProperties
-from phibench.scenes.worlds.tabletop import Piece
 
 MOST_LIGHTS = 12  # emitting rectangles: each is sampled by itself
 MOST_PATCHES = 3200  # faces of a room: the bake's grids and the time of a ray grow with them
@@ -143,7 +142,7 @@ class _Generator:
         rng = self.rng("skirting")
         high, surface = (
             float(rng.uniform(0.05, 0.12)),
-            tabletop.one_of(rng, self.materials, ("white_lacquer", "dark_wood", "light_wood", "grey_plastic")),
+            one_of(rng, self.materials, ("white_lacquer", "dark_wood", "light_wood", "grey_plastic")),
         )
         # from the floor to a head's height
         doors = [taken for taken in self.layout.taken if taken.z[0] < 0.05 and taken.z[1] > 1.9]
@@ -207,8 +206,8 @@ class _Generator:
         spent = 0
         for k in range(self.properties.near_objects):
             rng = self.rng("near", k)
-            kind = int(rng.integers(len(small_objects.NEAR_THINGS)))
-            made = small_objects.NEAR_THINGS[kind](rng, self.materials)
+            kind = int(rng.integers(len(floor_and_near_things.NEAR_THINGS)))
+            made = floor_and_near_things.NEAR_THINGS[kind](rng, self.materials)
             for _ in range(_TRIES if spent < _NEAR_PATCHES else 0):
                 # from just outside the free cylinder
                 angle, off = float(rng.uniform(-math.pi, math.pi)), float(rng.uniform(0.27, 1.0))
@@ -216,7 +215,7 @@ class _Generator:
                 turn = angle + math.pi / 2.0 + float(rng.normal(0.0, 0.2))  # +y towards the axis
                 place = footprint_of(made, x, y, turn)
                 if self.layout.is_free(place, 0.02, 0.0) and self.layout.leaves_the_robot(made, x, y, turn):
-                    self.layout.put(f"near_{small_objects.NEAR_THINGS[kind].__name__}", made, x, y, turn)
+                    self.layout.put(f"near_{floor_and_near_things.NEAR_THINGS[kind].__name__}", made, x, y, turn)
                     spent += patch_count(made.parts)
                     break
 
@@ -224,7 +223,7 @@ class _Generator:
         spent = 0
         for k in range(self.properties.floor_objects):
             rng = self.rng("floor", k)
-            piece = small_objects.FLOOR_THINGS[rng.integers(len(small_objects.FLOOR_THINGS))]
+            piece = floor_and_near_things.FLOOR_THINGS[rng.integers(len(floor_and_near_things.FLOOR_THINGS))]
             if spent < _FLOOR_PATCHES:
                 spent += self._free_piece(piece.__name__, piece, rng)
 

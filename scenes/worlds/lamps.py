@@ -12,8 +12,7 @@ import numpy as np
 from phibench.scenes.frames import Array
 from phibench.scenes.worlds.assembly import Assembly, Footprint, footprint_of
 from phibench.scenes.worlds.floor_plan import Layout
-from phibench.scenes.worlds.materials import MaterialSet
-from phibench.scenes.worlds.tabletop import one_of
+from phibench.scenes.worlds.materials import MaterialSet, one_of
 
 BANDS_NM = ((590.0, 680.0), (500.0, 590.0), (410.0, 500.0))
 # 683 lm/W times the mean of V(lambda) over each band; tests/scenes/worlds/test_lamps.py derives them again.

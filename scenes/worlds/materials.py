@@ -224,6 +224,15 @@ MATERIALS: Mapping[str, Material] = MappingProxyType(
 )
 
 
+WOODS = ("light_wood", "dark_wood", "red_wood", "plywood")
+PAINTS = ("paint_red", "paint_blue", "paint_green", "paint_yellow", "paint_orange")
+CLOTHS = ("cloth_grey", "cloth_blue", "cloth_red", "cloth_green", "plaid")
+CASES = ("white_lacquer", "grey_lacquer", "light_wood", "dark_wood", "red_wood")
+THINGS = (*PAINTS, "cardboard", "white_plastic", "dark_plastic", "grey_plastic", "steel", "porcelain", "paper")
+"""Names of materials that pieces of furniture choose from."""
+Rng = np.random.Generator
+
+
 @dataclass
 class MaterialSet:
     """Surfaces of one room, made when first asked for, so that shapes of one material share one bitmap.
@@ -275,6 +284,11 @@ class MaterialSet:
         texel = (size_m[0] / columns, size_m[1] / rows)
         origin = (-0.5 * size_m[0], -0.5 * size_m[1])
         return Surface(Bitmap(np.clip(values, _DARKEST, _BRIGHTEST), texel, origin), coat)
+
+
+def one_of(rng: Rng, materials: MaterialSet, names: tuple[str, ...], kinds: int = 1, upright: bool = False) -> Surface:
+    """Surface of one of some materials, in one of so many colours."""
+    return materials.surface(names[rng.integers(len(names))], int(rng.integers(kinds)), upright=upright)
 
 
 def albedo_bitmap(values: Array, texel_m: float, contrast: float) -> Bitmap:

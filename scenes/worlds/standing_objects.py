@@ -6,8 +6,8 @@ import numpy as np
 
 from phibench.scenes.worlds import graphics
 from phibench.scenes.worlds.assembly import Assembly
-from phibench.scenes.worlds.materials import MaterialSet
-from phibench.scenes.worlds.tabletop import CLOTHS, PAINTS, THINGS, Rng, carton, one_of, scatter
+from phibench.scenes.worlds.materials import CLOTHS, PAINTS, THINGS, MaterialSet, Rng, one_of
+from phibench.scenes.worlds.tabletop import carton, scatter
 
 
 def figure(rng: Rng, materials: MaterialSet) -> Assembly:

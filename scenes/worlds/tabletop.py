@@ -1,30 +1,15 @@
-"""Small things on boards and tables (books, boxes, monitors, lamps); names of materials and types that pieces share.
+"""Small things on boards and tables: books, boxes, bottles, monitors, desk lamps.
 
 Each piece is a function of a random generator and the room's materials that returns an `Assembly`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 
 from phibench.scenes.worlds import graphics
 from phibench.scenes.worlds.assembly import Assembly
-from phibench.scenes.worlds.materials import MaterialSet, Surface
-
-Rng = np.random.Generator
-Piece = Callable[[Rng, MaterialSet], Assembly]
-WOODS = ("light_wood", "dark_wood", "red_wood", "plywood")
-PAINTS = ("paint_red", "paint_blue", "paint_green", "paint_yellow", "paint_orange")
-CLOTHS = ("cloth_grey", "cloth_blue", "cloth_red", "cloth_green", "plaid")
-CASES = ("white_lacquer", "grey_lacquer", "light_wood", "dark_wood", "red_wood")
-THINGS = (*PAINTS, "cardboard", "white_plastic", "dark_plastic", "grey_plastic", "steel", "porcelain", "paper")
-
-
-def one_of(rng: Rng, materials: MaterialSet, names: tuple[str, ...], kinds: int = 1, upright: bool = False) -> Surface:
-    """Surface of one of some materials, in one of so many colours."""
-    return materials.surface(names[rng.integers(len(names))], int(rng.integers(kinds)), upright=upright)
+from phibench.scenes.worlds.materials import PAINTS, THINGS, MaterialSet, Rng, Surface, one_of
 
 
 def carton(rng: Rng, materials: MaterialSet, size_m: tuple[float, float]) -> Surface:

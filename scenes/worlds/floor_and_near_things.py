@@ -7,12 +7,11 @@ import math
 import numpy as np
 
 from phibench.scenes.worlds import furniture, graphics, standing_objects
-from phibench.scenes.worlds.assembly import Assembly
-from phibench.scenes.worlds.materials import MaterialSet
-from phibench.scenes.worlds.tabletop import Piece, Rng, one_of, thing
+from phibench.scenes.worlds.assembly import Assembly, Piece
+from phibench.scenes.worlds.materials import PAINTS, MaterialSet, Rng, one_of
+from phibench.scenes.worlds.tabletop import thing
 
 _FRONT = (0.0, -1.0, 0.0)
-_PAINTS = ("paint_red", "paint_blue", "paint_green", "paint_yellow", "paint_orange")
 _FRAMES = ("light_wood", "dark_wood", "red_wood", "white_lacquer", "dark_plastic", "steel")
 
 
@@ -36,7 +35,7 @@ def rug(rng: Rng, materials: MaterialSet) -> Assembly:
 def ball(rng: Rng, materials: MaterialSet) -> Assembly:
     """Ball as rings of a prism each."""
     made, radius = Assembly(), float(rng.uniform(0.08, 0.16))
-    surface = one_of(rng, materials, (*_PAINTS, "leather", "white_plastic"))
+    surface = one_of(rng, materials, (*PAINTS, "leather", "white_plastic"))
     for k in range(5):
         low, high = (-1.0 + 0.4 * k) * radius, (-0.6 + 0.4 * k) * radius  # five rings of a fifth of the diameter
         wide = math.sqrt(radius**2 - (0.5 * (low + high)) ** 2)  # of the ball at the ring's middle
@@ -49,7 +48,7 @@ def bucket(rng: Rng, materials: MaterialSet) -> Assembly:
     made = Assembly()
     radius, high = float(rng.uniform(0.1, 0.18)), float(rng.uniform(0.2, 0.4))
     made.post(
-        "bucket", 0.0, 0.0, (0.0, high), radius, one_of(rng, materials, (*_PAINTS, "galvanised", "dark_plastic")), 16
+        "bucket", 0.0, 0.0, (0.0, high), radius, one_of(rng, materials, (*PAINTS, "galvanised", "dark_plastic")), 16
     )
     made.post(
         "contents",
@@ -141,20 +140,20 @@ def hanging_cable(rng: Rng, materials: MaterialSet) -> Assembly:
     low = float(rng.uniform(0.5, 1.3))  # beside the mirror's way, up to its top
     colour = one_of(rng, materials, ("dark_plastic", "paint_orange", "paint_yellow", "steel"))
     made.post("cable", 0.0, 0.0, (low, top), float(rng.uniform(0.008, 0.02)), colour, 8)
-    made.post("plug", 0.0, 0.0, (low - 0.1, low), 0.035, one_of(rng, materials, (*_PAINTS, "dark_plastic")), 10)
+    made.post("plug", 0.0, 0.0, (low - 0.1, low), 0.035, one_of(rng, materials, (*PAINTS, "dark_plastic")), 10)
     return made
 
 
 def arm(rng: Rng, materials: MaterialSet) -> Assembly:
     """Post with an arm that reaches towards +y, and something at its end."""
-    made, frame = Assembly(), one_of(rng, materials, ("steel", "dark_plastic", *_PAINTS))
+    made, frame = Assembly(), one_of(rng, materials, ("steel", "dark_plastic", *PAINTS))
     # towards the stroke axis, up to the free cylinder
     high, reach = float(rng.uniform(0.5, 1.5)), float(rng.uniform(0.25, 0.5))
     made.post("foot", 0.0, 0.0, (0.0, 0.03), 0.14, frame, 14)
     made.post("post", 0.0, 0.0, (0.03, high), 0.018, frame)
     made.rod("arm", (0.0, 0.02, high - 0.04), (0.0, reach, high - 0.02), 0.014, frame)
     made.box(
-        "end", (-0.05, 0.05), (reach + 0.002, reach + 0.06), (high - 0.1, high + 0.05), one_of(rng, materials, _PAINTS)
+        "end", (-0.05, 0.05), (reach + 0.002, reach + 0.06), (high - 0.1, high + 0.05), one_of(rng, materials, PAINTS)
     )
     return made
 
