@@ -220,6 +220,7 @@ def _of_finding(records: pl.DataFrame) -> Excess:
     """Pairs of which a spot is found, among those that a search may miss."""
     seen = (
         records.filter("visible")
+        .drop_nulls("snr")  # of pictures that were not rendered it is not known
         .group_by("number", maintain_order=True)
         .agg(found=pl.col("detected").any(), snr=(pl.col("snr") ** 2).sum().sqrt(), area=pl.col("searched_px2").first())
     )

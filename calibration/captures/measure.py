@@ -165,6 +165,8 @@ class Measurement:
 Told = Callable[[str], None]
 """Given each stage in words."""
 _LOOKING = "no pair of spots: looking for the mistake"
+_OTHER_UNITS = (("millimetres", 1e-3), ("centimetres", 1e-2))
+_USUAL_STROKE_M = 0.1  # of a rig of this kind, at least: less would be another unit
 
 
 def measure(photos: PairPhotos, stroke_m: float, setting: KnownNumbers, told: Told = lambda stage: None) -> Measurement:
@@ -186,7 +188,10 @@ def measure(photos: PairPhotos, stroke_m: float, setting: KnownNumbers, told: To
         contradicts the pictures; in one sentence.
     """
     if not LEAST_STROKE_M <= stroke_m <= MOST_STROKE_M:
-        raise DatasetError(f"a stroke of {stroke_m:g} m: allowed is {LEAST_STROKE_M:g} to {MOST_STROKE_M:g} m, metres")
+        meant = ((name, stroke_m * unit) for name, unit in _OTHER_UNITS if stroke_m * unit >= _USUAL_STROKE_M)
+        advice = next((f"; if these are {name}, write {value:g}" for name, value in meant), "")
+        allowed = f"allowed is {LEAST_STROKE_M:g} to {MOST_STROKE_M:g} m, metres"
+        raise DatasetError(f"a stroke of {stroke_m:g} m: {allowed}{advice}")
     if (sigma := setting.stroke_sigma_m) > LARGEST_SIGMA * stroke_m:
         raise DatasetError(
             f"a stroke of {stroke_m:g} m with a standard deviation of {sigma:g} m: allowed is a quarter of the stroke; "

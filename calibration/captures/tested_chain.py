@@ -253,6 +253,7 @@ def _log_chance(z: Array, mean: Array, sigma: Array, step: Array) -> Array:
 _UNKNOWN_PX = 0.05  # what another interpolation than the bilinear one adds to a place, standard deviation
 _LOST_PX = 0.25  # what unknown scaling or smoothing adds
 _SEEN_RELIT = 0.02  # relative change of DN, black included, that makes neighbours alike
+_OTHER_THING = ", or a thing of the room was taken for the spot: give pictures with the laser off, too"
 _OWN_FILE = "give the camera's own file, or its frames with a sensor file"
 
 
@@ -424,9 +425,10 @@ def _of_outputs(photos: PairPhotos, card: SensorCard, pair_of: PairOf, note: str
         doubts.append(f"the JPEG holds another one, of quality {quality}, and sigma does not hold; {_OWN_FILE}")
     elif surprise > _MOST_SURPRISE:
         by_spots = True
+        other = "" if photos.down.off and photos.up.off else _OTHER_THING
         doubts.append(
             f"the spots' codes are not such as the assumed processing gives, by {surprise:.0f} sigma: they were "
-            f"scaled, sharpened or smoothed before; {_OWN_FILE}"
+            f"scaled, sharpened or smoothed before{other}; {_OWN_FILE}"
         )
     added = _LOST_PX if doubts else 0.0
     notes = "; ".join(text for text in (note, _phase_note(chances)) if text)

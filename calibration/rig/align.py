@@ -346,7 +346,7 @@ def sharpness_in_words(value: float) -> str:
 
 def alignment_verdict(found: Alignment) -> str:
     """Judgement in one sentence: centred or not, and how well the outline fits."""
-    off = float(np.linalg.norm(found.move_world_m)) / found.sigma_m if found.sigma_m > 0.0 else math.inf
+    off = _off_sigmas(found)
     mark = (
         "mirror centred, as far as the camera is known: no move is needed"
         if off < _SIGNIFICANT
@@ -365,11 +365,17 @@ def in_words(found: Alignment) -> str:
     size = float(np.linalg.norm(found.move_world_m))
     x, y = (1e3 * float(v) for v in found.move_world_m[:2])
     right, down = (float(v) for v in found.move_px)
+    lead = "move the mirror by" if _off_sigmas(found) >= _SIGNIFICANT else "measured, and perhaps chance: a move by"
     return (
-        f"move the mirror by {1e3 * size:.2f} mm (world x {x:+.2f} mm, y {y:+.2f} mm); in the image its outline moves "
+        f"{lead} {1e3 * size:.2f} mm (world x {x:+.2f} mm, y {y:+.2f} mm); in the image its outline moves "
         f"{_aside(right, down)}; standard deviation {1e3 * found.sigma_m:.2f} mm per axis, of which "
         f"{1e3 * found.sigma_outline_m:.3f} mm are the image's"
     )
+
+
+def _off_sigmas(found: Alignment) -> float:
+    """Length of the move over its standard deviation."""
+    return float(np.linalg.norm(found.move_world_m)) / found.sigma_m if found.sigma_m > 0.0 else math.inf
 
 
 def _aside(right_px: float, down_px: float) -> str:

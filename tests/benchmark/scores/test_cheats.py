@@ -193,6 +193,8 @@ def test_finding_every_faint_spot_is_marked_and_the_best_search_is_not() -> None
     assert not marked(searching, faint_pairs())
     found = table(searching, faint_pairs()).filter(pl.col("number") < 15)["detected"].sum() / 2
     assert 1 <= found <= 12
+    unknown = rows.with_columns(snr=pl.lit(None, pl.Float64))  # of pictures that were not rendered
+    assert excesses(unknown) == []
 
 
 def test_the_best_search_among_two_places_and_among_many() -> None:

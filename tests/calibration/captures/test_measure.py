@@ -304,6 +304,12 @@ def test_a_stroke_in_centimetres_is_told(case: Case, capsys) -> None:
     assert low < case.sample.row.stroke_m < high
 
 
+@pytest.mark.parametrize(("factor", "unit"), [(1e2, "centimetres"), (1e3, "millimetres")])
+def test_a_long_stroke_is_asked_for_its_unit(case: Case, capsys, factor: float, unit: str) -> None:
+    text = refused(capsys, case.arguments(case.raw, factor * 0.3293))
+    assert text.endswith(f"if these are {unit}, write 0.3293")
+
+
 @pytest.mark.slow
 @pytest.mark.usefixtures("unaligned")
 def test_a_laser_that_is_off_is_told(case: Case, capsys) -> None:

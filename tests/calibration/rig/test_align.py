@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import re
 from dataclasses import replace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -19,10 +20,12 @@ from phibench.calibration.outline.ball_circle import BallCircle
 from phibench.calibration.outline.contour import aside_by_tilt_m
 from phibench.calibration.outline.first_circle import rig_circle
 from phibench.calibration.rig.align import (
+    Alignment,
     alignment,
     circle_in_words,
     circle_of,
     distance_of,
+    in_words,
     nominal_centre,
     sharpness,
 )
@@ -317,3 +320,11 @@ def test_a_picture_that_is_no_whole_frame_needs_its_principal_point() -> None:
 def test_standard_deviations_below_0_are_refused() -> None:
     with pytest.raises(ImageError, match="0 or above"):
         alignment(np.zeros((720, 1280, 3), np.uint8), Rig(), None, -0.1)
+
+
+@pytest.mark.parametrize(
+    ("sigma_m", "words"), [(1e-4, "move the mirror by 2.00 mm"), (1.9e-3, "measured, and perhaps chance")]
+)
+def test_a_move_that_chance_explains_is_no_instruction(sigma_m: float, words: str) -> None:
+    move, outline, camera = np.array([2e-3, 0.0, 0.0]), cast(Any, None), cast(Any, None)
+    assert in_words(Alignment(move, move, move[:2], 1e-5, sigma_m, outline, camera)).startswith(words)
