@@ -203,8 +203,10 @@ def _finds(document: ScoreDocument) -> bool:
 
 
 def _pairs_in_words(document: ScoreDocument) -> str:
-    presets = ", ".join(document.pair_set.get("presets", ()))
-    return " ".join(filter(None, (f"{document.pairs} pairs", presets)))
+    """Say how many pairs there were, such as "5 pairs mjpeg, 4 with search boxes"."""
+    presets, boxes = ", ".join(document.pair_set.get("presets", ())), document.pair_set.get("hinted")
+    pairs = " ".join(filter(None, (f"{document.pairs} pair{'s' * (document.pairs != 1)}", presets)))
+    return f"{pairs}, {boxes} with search boxes" if boxes else pairs
 
 
 def frames_line(document: ScoreDocument) -> str:
