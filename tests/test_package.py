@@ -170,7 +170,7 @@ def test_every_result_is_shown_by_a_short_table(tiny_dataset: Path) -> None:
         assert len(lines) <= 25, type(result)
         assert max(map(len, lines)) <= (260 if result is answer else 120), type(result)
         assert result._repr_html_() == f"<pre>{html.escape(repr(result))}</pre>"
-    assert "red_centroid: 1 pairs mono-raw" in repr(results[-1])
+    assert "red_centroid: 1 pair mono-raw" in repr(results[-1])
     assert "rms error" in repr(results[-1])
     assert repr(results[6 - 1]).splitlines()[1] == f"  position  ({spots[0].uv_px[0]:.6g}, {spots[0].uv_px[1]:.6g}) px"
 
