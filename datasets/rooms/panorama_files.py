@@ -89,11 +89,11 @@ def _has_two_circles(light: Light) -> bool:
     """
     rows, columns = light.shape[:2]
     y, x = 2.0 * (np.arange(rows) + 0.5) / rows - 1.0, (4.0 * (np.arange(columns) + 0.5) / columns) % 2.0 - 1.0
-    found = []
+    dark_ends = []
     for end in (y < -0.75, y > 0.75):
         part, distance = light[end].mean(axis=2), np.hypot(y[end][:, None], x)
-        found.append(part[distance > 1.2].mean() < _DARK * part[distance < 0.95].mean())
-    return all(found)
+        dark_ends.append(part[distance > 1.2].mean() < _DARK * part[distance < 0.95].mean())
+    return all(dark_ends)
 
 
 def _check_sphere(file: InputFile, columns: int, rows: int) -> None:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import io
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ from helpers.camera_files import NAMES, write_pictures
 from PIL import Image
 from scipy.ndimage import gaussian_filter
 
+from phibench.calibration.captures import tested_chain
 from phibench.calibration.captures.imported_set import ImportedSet, import_pairs, open_imported
 from phibench.calibration.captures.measure import Measurement, measure, read_setting
 from phibench.calibration.captures.pair_photos import PairPhotos, PositionPhotos
@@ -228,3 +231,15 @@ def test_an_imported_set_has_the_chain_that_its_pictures_show(case: Case, tmp_pa
     assert found.pair(found.rows[0]).down.shape == (180, 320, 3)
     with pytest.raises(DatasetError, match=r"begins with GRBG: .* cut 1 columns and 0 rows"):
         imported("bayer-raw", TURNS[1, 0], "dn")
+
+
+@pytest.mark.parametrize(
+    ("off", "words"), [((), "the laser off, too"), ((object(),), "smoothed before; give the camera")]
+)
+def test_a_light_that_is_no_spot_asks_for_pictures_with_the_laser_off(
+    off: tuple[object, ...], words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Codes 16 sigma off are another thing of the room or another chain; with laser-off pictures, the chain alone."""
+    monkeypatch.setattr(tested_chain, "phase_weights", lambda _: ({(0, 0): 1.0}, 16.0))
+    photos, card = SimpleNamespace(down=SimpleNamespace(off=off), up=SimpleNamespace(off=off)), sensor_card("srgb8")
+    assert words in tested_chain._of_outputs(cast(Any, photos), card, lambda *_: cast(Any, None)).doubt
