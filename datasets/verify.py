@@ -1,4 +1,4 @@
-"""Verification of a data set: every file is opened, every truth is computed again from the parameters.
+"""Verification of a data set: file hashes, truth computed again, layers; and manifest, rigs, rooms against the recipe.
 
 `plan_faults` compares manifest, rigs and poses with the plan of the recipe. `verify` does this, checks all hashes, and
 compares spots, certificates, noise budgets, layers and light map with what the parameters give.

@@ -1,4 +1,4 @@
-"""Form errors of a mirror (`Form`): harmonics added to a radius, derivatives of the surface, and its seen contour.
+"""Form errors of a mirror (`Form`): harmonics added to a radius, derivatives of the surface, its occluding contour.
 
 The form error adds low-order harmonics to the sphere's radius. The surface is r(n) = R + sum of c_k h_k(n), with
 n = (x, y, z) a unit direction in the sphere's own frame (`T_camera_sphere`). `Rig.perturbed` lays its axes along the

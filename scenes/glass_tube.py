@@ -1,4 +1,4 @@
-"""Wall of a glass tube: rays from inside, and points outside as they appear from inside, in closed form.
+"""Refraction by the wall of a glass tube, in closed form: rays going out, apparent points, area growth, transmittance.
 
 The wall lies between two cylinders about one axis, with air on both sides. A ray keeps two numbers at a cylinder about
 that axis: the direction cosine along it, q, times the refractive index, and the moment L = axis . (P x d), times the

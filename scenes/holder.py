@@ -1,4 +1,4 @@
-"""Holder of the mirror: what carries it above the camera, between two plates or on a post from above.
+"""Holder of the mirror above the camera (rods, post or glass tube): sizes, checks against mirror and lens, and shapes.
 
 It has a file of its own because three sides need the same thing: the rig checks its sizes, rooms take its shapes, and
 recipes draw it. It belongs to the rig and moves with it. Its axis is the line from the lens centre to the sphere's
@@ -10,6 +10,7 @@ in its holder.
 * Post: a post from above ends at the top of a ball, or on the back of a mirror of revolution, in the plane of its rim.
   Nothing that is wholly behind a convex mirror is ever seen in it. The post therefore hangs from an arm, and a column
   beside the mirror carries that from the plate below the camera.
+* Tube: a glass tube around mirror and lens, between the same plates as the rods (`scenes.glass_tube`).
 
 **Nothing of it stands between lens and mirror.** Mirror and lens lie in a cylinder around the axis, as wide as the
 mirror reaches (`check`: or as the lens opening), and so does every line between their points, since a cylinder is

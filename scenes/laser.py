@@ -1,4 +1,4 @@
-"""The laser spot: place, size, power, profile, beam; the beam's diameter against the distance."""
+"""Laser spot: place, size, power, profile, beam, radiance and irradiance; diameter of a beam against the distance."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Misalignment of a real rig: table of deviations with unit, size, effect; and the rig's motion between two images.
+"""Misalignment of a rig: deviations with unit and range, applied to its nominal parts; its motion between two images.
 
 `Misalignment` holds one number for every `RigParameter` of `PARAMETERS`; all are 0 by default. Recipes, calibrations,
 sensitivities and studies use these names. `Motion` is what moves the whole rig between the two images of a pair.

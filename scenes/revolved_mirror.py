@@ -1,4 +1,4 @@
-"""Mirror of revolution (`RevolvedMirror`): profile, metal, roughness, form error; check that the camera can see it.
+"""Mirror of revolution (`RevolvedMirror`): profile, metal, form error, outline and mesh; check that the camera sees it.
 
 In the mirror's frame the vertex is the origin, and z is the axis, away from the camera (`revolved_profile`).
 """

@@ -1,4 +1,4 @@
-"""Convex profile of a mirror of revolution around its axis, cut at its rim, and its form error.
+"""Convex profile of a mirror of revolution: conic with even polynomial terms, its rim, form error, occluding contour.
 
 In the mirror's frame the vertex is the origin, and z is the axis, away from the camera. With s = x^2 + y^2 the surface
 is z = sag(s) for sqrt(s) <= rim radius,

@@ -1,4 +1,4 @@
-"""Room, sun, boards and robot: all but the mirror; boards that a carriage cuts; named rooms and rigs of recipes.
+"""Room with sun and robot; target boards and whether a rig hits them; the lab; named rooms and rigs of recipes.
 
 The robot is the ESCALADE360 as simple solids. The paper gives its overall dimensions, which the solids have, and tracks
 with flippers after the PackBot; the split into body, tracks and flippers is ours. So are the mast that lifts the sensor

@@ -1,4 +1,4 @@
-"""Checks of ranges (`SceneError`) and of tables against models (`Fault`); printable lines and nearest names.
+"""Range checks of numbers (`SceneError`), pydantic's errors of TOML tables in words (`Fault`), and nearest known names.
 
 Each message is one sentence: path, value, allowed range and advice. The first half checks numbers of the descriptions
 in `scenes` and raises `SceneError`. The second half reads TOML files that come with the package, and words pydantic's

@@ -1,4 +1,4 @@
-"""Training of `learned_crop`, the network of crops about spots, by PyTorch; helpers that `frame_training` shares.
+"""Training of `learned_crop`, the network for crops around spots, by PyTorch; its covariance scale; shared helpers.
 
     python -m tools.crop_training out/bench-dev --out learned_crop.onnx --seed 0
     python -m tools.crop_training out/bench-dev --out my_crop.onnx --crops 8000 --passes 8   # a first try

@@ -1,4 +1,4 @@
-"""Training of `learned_detect`, the network of whole frames, by PyTorch.
+"""Training of `learned_detect`, the network for whole frames, by PyTorch; its peak thresholds and covariance scale.
 
     python -m tools.frame_training out/bench-dev --out learned_detect.onnx --seed 0
 

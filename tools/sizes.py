@@ -1,4 +1,4 @@
-"""Lines of the library by district: code, docstrings, blank lines, imports and comments: `python -m tools.sizes`."""
+"""Line counts of the library by top folder: code, docstrings, blanks, imports, comments: `python -m tools.sizes`."""
 
 from __future__ import annotations
 

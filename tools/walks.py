@@ -1,4 +1,4 @@
-"""Walks through the library: which of its files and functions run on three ways, counted while they run.
+"""Walks: count of files and functions that run from recipe to frame, from pairs to score, and from pictures to D.
 
     python -m tools.walks FOLDER [--list]
 

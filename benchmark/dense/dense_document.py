@@ -1,4 +1,4 @@
-"""Models of the score document of a dense method, the JSON of one run whose records lie beside it, and its maker."""
+"""JSON score document of a dense method: its models, its maker, and strata of records by stroke, room and preset."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Dense pairs of films: camera frames at both ends of each stroke, and frames of the moving carriage between them.
+"""Dense pairs of films and their truth: frames at rest at both ends of each stroke, frames of the moving carriage.
 
 All frames are drawn with the laser off (`Film.frame`), with the film's exposure, rolling shutter and motion blur, and
 noise of their own. Heights are what the robot is told: the nominal stroke, the encoder at the frames' times, and the

@@ -1,4 +1,4 @@
-"""Dense pairs of a data set as a method sees them, and the exact truth of their pixels, checked by their geometry.
+"""Dense pairs of a data set, laser off, as a method sees them; exact truth of each pixel, its geometric check, texture.
 
 The images are the laser-off frames of the spot pairs: the same exposures, the same draws of the noise, byte for byte.
 Samples that differ in the spot alone show the same two views; one of them is taken.

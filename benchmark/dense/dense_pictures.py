@@ -1,4 +1,4 @@
-"""Pictures of a dense answer: panoramas of the image, of D, of the error and of the causes; and the room from above.
+"""Pictures of a method's dense answer: panoramas of image, D, error and causes; the room from above with free space.
 
 The panoramas are unrolled as those of the methods, pixel by pixel without mixing: a column is an azimuth, a row an
 elevation. From above, what a robot may drive on ends at the nearest point that stands between its wheels and its top.

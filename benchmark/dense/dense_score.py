@@ -1,4 +1,4 @@
-"""Dense methods run, each in its own process, and scored; their scores saved, read again and compared.
+"""Dense methods run and scored, each in its own process; interrupted runs resumed; scores saved, read and compared.
 
 Each pair is drawn once, shown to every method and compared with its truth. Processes, limits and isolation are those
 of spots (`isolation.runner`).

@@ -1,4 +1,4 @@
-"""Tables of dense scores: methods side by side, strata of one, and differences of two."""
+"""Tables of dense scores: methods side by side, strata and metrics of one, differences of two; failures in words."""
 
 from __future__ import annotations
 

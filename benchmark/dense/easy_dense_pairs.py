@@ -1,4 +1,4 @@
-"""Easy dense pairs, made in NumPy without rendering: a box of a room with patterned walls and a cabinet, an exact rig.
+"""Easy dense pairs and their truth, made in NumPy, not rendered: a box room, patterned walls, a cabinet, an exact rig.
 
 They serve to try a dense method, not to rank it. Nothing is dark, glossy or without pattern, and there are no shadows.
 The estimator's geometry makes both images and their truth: the ray of a pixel, and its first meeting with the box.

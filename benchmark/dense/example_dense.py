@@ -1,4 +1,4 @@
-"""A dense method for phibench; try it with `phibench dense check my_depth.py:depth`.
+"""Example of a dense method, a sweep over 1 / D; try it with `phibench dense check my_depth.py:depth`.
 
 It gets a DensePair, two images of a room in a mirror with the laser off, and returns a DenseAnswer: D of every pixel of
 the down image, NaN for "do not know". This one tries 64 distances for every fourth pixel and keeps the one whose place

@@ -1,7 +1,6 @@
-"""Card and Croissant description that lie beside an export.
+"""Card (README with YAML header) and Croissant description (JSON-LD) of an export, with the meaning of its columns.
 
-The card is a README with a YAML header, as dataset hosts read it. Neither holds a date: the same export gives the same
-bytes.
+Dataset hosts read the card's header. Neither file holds a date: the same export gives the same bytes.
 """
 
 from __future__ import annotations

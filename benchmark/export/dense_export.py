@@ -1,7 +1,7 @@
-"""Export of dense pairs for other tools, as pictures and 32-bit planes (`dense_set` is for ours); reader of its index.
+"""Export of dense pairs for other tools: pictures, truth as 32-bit OpenEXR planes, and an index by which a run resumes.
 
 Each pair has three files, NAME-down, NAME-up and NAME-truth.exr, and a line in `dense.jsonl`. Planes have the shape
-(H, W), float32, NaN where there is nothing. A pair that is there and whole is kept: a run that ended early goes on.
+(H, W), float32, NaN where there is nothing. A pair that is there and whole is kept. phibench reads `dense_set`.
 """
 
 from __future__ import annotations

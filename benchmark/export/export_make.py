@@ -1,4 +1,4 @@
-"""Export of a data set's pairs in formats of other tools, with index, card, licence and hashes; and its check.
+"""Export of a data set's pairs for other tools or as frames sets, in shards with index, card, hashes; and its check.
 
 Each shard is a part of the folder (`datasets.build.task_runner`), so that a run that ended early goes on where it was.
 """

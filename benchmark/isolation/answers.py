@@ -1,4 +1,4 @@
-"""Answers of a method as JSON: encoded in the method's process; checked in its parent, as the outcome of a pair.
+"""Answers of a method, spots or dense planes, as JSON: encoded in its process, checked in its parent as an outcome.
 
 A method may return anything. Encoding keeps what JSON can hold; the check gives one plain sentence if it is no answer.
 """

@@ -1,4 +1,4 @@
-"""Easy pairs of images (down, up), made in NumPy without rendering: bright spots on a smooth room, an aligned rig.
+"""Easy pairs (down, up) and their truth, made in NumPy, not rendered: spots in a smooth room, a simulated noisy camera.
 
 They serve to try a method, not to rank it. There is no lamp, no stripe and no shadow, and the nominal rig is exact.
 

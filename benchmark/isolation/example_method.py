@@ -1,4 +1,4 @@
-"""A method for phibench; try it with `phibench method check my_phi.py:extract`.
+"""Example of a method, the centroid of the laser's light; try it with `phibench method check my_phi.py:extract`.
 
 It gets a Pair, two images of one laser spot in a mirror, and returns an Answer. This one takes the light that the laser
 adds, the most spot-like place inside the mirror, and its centroid. Make it better.

@@ -1,4 +1,4 @@
-"""Isolation of a method's process (`isolate`): what it may reach (`Access`), and what the system enforces of that.
+"""Isolation of a method's process (`isolate`) on Linux: files it may read (`Access`), by Landlock, seccomp and mounts.
 
 The process reads an `Access` from its standard input and gives up all other rights for good, before it imports the
 worker. No thread and no code of the method may come before: Landlock limits the thread that asks for it and what that

@@ -1,4 +1,4 @@
-"""Packages that a method's process has loaded, and files that it opens in the folders that it may read.
+"""Packages that a method's process has loaded, versions and hashes; files that it opens in folders that it may read.
 
 The process tells the names of its modules. Versions are looked up outside it, in the metadata of the same environment,
 and an installed package has the hash of its files. Opened files are weights, tables and modules of computed names.

@@ -1,4 +1,4 @@
-"""Methods by reference, looked up and hashed but not run; tasks that they are written for; example methods to write.
+"""Look-up of methods by file, built-in name or entry point, hashed but not run; their tasks and example files.
 
 A reference is ``my_phi.py:extract`` (a file and a function in it), the name of a built-in method, or the name under
 which an installed package registers a method (entry-point group ``phibench.methods``). It is resolved without running

@@ -1,4 +1,4 @@
-"""Printed output of a method's process: its end is kept; place of a stack; advice on what isolation denied."""
+"""Printed output of a method's process: its end kept; source line of a stack; advice on files that are denied."""
 
 from __future__ import annotations
 

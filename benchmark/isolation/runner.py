@@ -1,4 +1,4 @@
-"""Runner of methods over a set of pairs: in processes of their own, or a function here; packages and files they used.
+"""Runner of methods on a set of pairs, in their own processes or a function in this one; packages and files they used.
 
 What a method does to its process costs the pair at hand, and the run goes on. The truth stays in this process: a
 method's process gets the fields of `Pair` and nothing else. Where the system can do it, the process reads neither the

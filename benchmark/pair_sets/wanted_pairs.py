@@ -1,4 +1,4 @@
-"""Pairs to be scored, as options (`PairChoice`) choose them from a data set, frames or pictures; calibrated ones."""
+"""Pairs to be scored, chosen by options (`PairChoice`) from a data set, frames or pictures; with a calibrated rig."""
 
 from __future__ import annotations
 

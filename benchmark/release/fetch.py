@@ -1,4 +1,4 @@
-"""Fetching of a released data set from a folder or an HTTP server: verified, resumable, all or nothing.
+"""Fetching of a released data set from a folder or HTTP server: archives verified, unpacked; resumable, all or nothing.
 
 `release_source` brings each archive, whose SHA-256 `MANIFEST.json` holds. Archives are unpacked beside the final
 folder, in OUT.part, after a look at all their headers. When all files have the hashes of the data set's own list, the

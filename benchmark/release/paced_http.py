@@ -1,4 +1,4 @@
-"""HTTP answers within bounds of time and bytes, whatever the server does.
+"""HTTP downloads within bounds of time and bytes, whatever the server does; redirects followed, gzip unpacked.
 
 `requests` bounds the wait for one piece of an answer, not the number of pieces: a byte a minute, headers without end,
 and `100 Continue` again and again hold it for ever. Here the socket itself is watched. Until the body begins, through

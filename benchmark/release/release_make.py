@@ -1,4 +1,4 @@
-"""Release of the benchmark: data sets made from the frozen recipes, as archives with a list of their hashes.
+"""Release of the benchmark: data sets of frozen recipes, made or reused, as archives with hashes; forecast of its cost.
 
 Two folders are kept apart. `out` is public: archives, `MANIFEST.json`, `SHA256SUMS`, card, licence and Croissant.
 `work` is not: it holds the data sets as they are rendered, that of the sealed part with its truth.

@@ -1,4 +1,4 @@
-"""Frozen benchmark: its version, the parts that are released, and the documents of a release.
+"""Frozen benchmark: its version, the released parts with hashes of their recipes, and the models of `MANIFEST.json`.
 
 The recipes of a version never change. `SHA256` over the values of each, comments aside, is written down here, and a
 recipe with another one is refused. docs/release.md has the rules and the changelog of the versions.

@@ -1,4 +1,4 @@
-"""Sources of a release's files, a folder or an HTTP address; archives fetched in part (`Partial`).
+"""Sources of a release's files, a folder or an HTTP address; archive downloads that go on after a break (`Partial`).
 
 `pooch` tries again, and compares each archive with its SHA-256 in `MANIFEST.json`. The bytes come in bounds of time and
 size (`paced_http`), and go on within an archive if the server gives ranges of bytes (RFC 9110, section 14).

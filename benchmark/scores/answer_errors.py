@@ -1,4 +1,4 @@
-"""Rules of a score (`Rules`), and the arithmetic of its records: errors in px and phi, pulls, squares for ranks.
+"""Rules of a score (`Rules`); errors of answers in px and phi, pulls, squares for ranks; a cache of array functions.
 
 Definitions, used by all metrics:
 

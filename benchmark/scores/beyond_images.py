@@ -1,4 +1,4 @@
-"""Tests whether the answers of a score know more than the images tell.
+"""Tests whether a score's answers are better than the images allow: by errors, exact answers, and faint spots found.
 
 V is the least covariance of a position that any method on the images can have (`least_px2`). Errors of such a method
 scatter by V or more, so that e^T V^-1 e is stochastically larger than chi^2. Four kinds of tests follow.

@@ -1,4 +1,4 @@
-"""Comparison of two scores of the same pairs: paired differences with intervals and tests; their tables; notes.
+"""Comparison of two scores of the same pairs: paired differences with intervals and tests; tables; notes on mismatches.
 
 Errors are compared over the images (or pairs) that both methods found. A method that skips the hard ones gains nothing
 from it. Rates, and figures that count missed spots, are compared over all visible spots.

@@ -1,4 +1,4 @@
-"""Fit of a spot that is told where to look (`fit_at_truth`): whether an image allows what a method did not do.
+"""Fit of a spot that is told where to look (`fit_at_truth`): whether an image allows a position that a method missed.
 
 The built-in fit of the image's kind searches a small box about the true place. Where it comes as near to the truth as
 the bound says, the light was there, and neither saturation, noise, compression nor an edge is why another method has

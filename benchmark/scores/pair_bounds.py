@@ -1,4 +1,4 @@
-"""Bounds of pairs that answers are held against: joint ones of both images, and the smallest that are possible."""
+"""Bounds of pairs: joint covariances of both images, smallest possible ones, and squared errors over these."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Columns of the records, and the numbers of the three tracks that are computed from them.
+"""Columns of a score's records (meaning, type), and numbers of the tracks localise, find and depth computed from them.
 
 `localise`: every visible spot whose bound is below 1 px, in a box of 64 px with the spot anywhere in its middle half.
 What ranks is the geometric mean over spots of error over bound: a ratio counts as 0.1 at least, an error as 3 px at

@@ -1,4 +1,4 @@
-"""Files of scores, written and read: a document as JSON, its records beside it as Parquet under the same stem."""
+"""Files of scores, written and read: JSON document, Parquet records beside it; records of runs that broke off."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tables of scores for a terminal, CSV, Markdown, LaTeX, JSON; shared cells; sentences on frames, light and failures.
+"""Tables of scores for a terminal, CSV, Markdown, LaTeX, JSON; numbers as text; sentences on frames, light, failures.
 
 Units are those of `Metric.shown`: mrad for phi, per cent for rates and relative errors. CSV and JSON hold the numbers
 of the files instead: SI, in full.

@@ -1,4 +1,4 @@
-"""Strata of a score: parts of the records by depth, signal, place and more, with metrics; ranges of numbers of frames.
+"""Strata of a score by depth, signal, place and more, with metrics; median and range of exposure, gain, light shift.
 
 A stratum takes images; its metrics of pairs take pairs. By signal an image counts with its own electrons, a pair with
 those of its fainter spot; by azimuth a pair counts with its "down" image. Signal to noise ("sigmas"), Bayer phase and

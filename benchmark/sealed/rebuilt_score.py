@@ -1,4 +1,4 @@
-"""A score made again: built out of its records, or by its method, whose hashes, packages and files are checked.
+"""A score made again, from its records or by its method, and compared; the method's hashes, packages and files checked.
 
 Answers come out of the records, truth and images out of the data set. The scorer's own functions do it, so that nothing
 is believed but the answers, the seconds and words about failures. Without the method only the form of what is said of

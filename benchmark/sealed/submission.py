@@ -1,4 +1,4 @@
-"""Answers to a sealed set (`submit`), and their join with the truth (`unseal`).
+"""Sealed set read as pairs; a method's answers to it (`submit`), checked and joined with the truth (`unseal`).
 
 A submission says what a method answered on a sealed set and which method it was; it holds no images and no truth.
 The command `submission check` is another thing: it checks a score file of an open set, by `score_check`.

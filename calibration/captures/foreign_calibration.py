@@ -1,4 +1,4 @@
-"""Rig files that are another program's calibration, such as OpenCV's: a fault text that says what to copy, or why not.
+"""Calibration files of other programs (OpenCV, ROS, COLMAP) given as a rig file: recognised; an error tells what to do.
 
 Known are OpenCV (YAML, XML, JSON), ROS (camera_info: file, message, INI), Kalibr (camchain and results), EuRoC,
 CamOdoCal, Basalt, ORB-SLAM, COLMAP, Nerfstudio, RealSense, Metashape, MATLAB, Bouguet's toolbox and OCamCalib. They are

@@ -1,4 +1,4 @@
-"""Calibration from real pictures: outlines of an imported set, and its spots at the distances of a tape."""
+"""Calibration of a rig from imported real pictures: outlines, vertical edges, and spots at distances of a tape."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Imported set, made from a folder of real pairs and opened: a data set that scores take like a rendered one.
+"""Data set of real image pairs (`ImportedSet`): imported from a folder, opened; its pairs with measured D for scoring.
 
 imported.json   rig, sensor, laser, and whether the sensor was assumed
 pairs.jsonl     per pair: sample, frame, files, stroke, and the D of a tape with its standard deviation

@@ -1,4 +1,4 @@
-"""Picture files of a real camera read: pixels, linear light, what a file tells, its sensor; mixed cameras refused.
+"""Reader of a real camera's pictures: pixels, EXIF, JPEG tables, linear light, sensor preset; mixed cameras refused.
 
 Formats are those of `camera_pictures`, and headerless raw (`.raw`). That holds nothing but DN, row by row: 8 bits, or
 16 bits with the low byte first, whose size comes from the rig file and whose bits from the sensor file. No colour is

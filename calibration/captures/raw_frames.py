@@ -1,4 +1,4 @@
-"""Tests of a pair's raw pixels: where the mosaic begins, by its spots, and whether noise is that of single pixels.
+"""Tests of a pair's raw frames: Bayer phase from the laser spots, and correlation of noise between neighbouring pixels.
 
 A phase (du, dv) puts red where u + du and v + dv are even: 1 for 0 in a sensor that is read out mirrored.
 

@@ -1,4 +1,4 @@
-"""Reader of the rig file, a small TOML file of what a person has measured of a rig; refuses foreign calibrations.
+"""Reader of the rig file, a TOML file of measured numbers; errors explain wrong keys, wrong units and other files.
 
 A rig file has the tables `[rig]`, `[rig.holder]` and `[laser]` of a recipe, with the same keys, so that they can be
 pasted. `[rig]` takes one key more, `fov_deg`, for a camera whose data sheet names no focal length. What is left out is

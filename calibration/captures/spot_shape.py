@@ -1,4 +1,4 @@
-"""Width and colour of a rig's spots, from its own pictures: the lens's blur and the filters at the laser's line.
+"""Lens blur and colour response fitted to laser spots; their part in a spot's covariance; how unlike a spot a light is.
 
 Nobody measures either with a ruler, and a fit of the position takes both as known. Where they are wrong, bright spots
 are off by some of their sigmas: a blur of 0.70 instead of 0.85 px made the rms of D 1.7 times as large, and the pull

@@ -1,4 +1,4 @@
-"""Chain behind a picture's pixels, tried on the pictures: phase of the mosaic, interpolation, and an earlier JPEG.
+"""Tests of how a pair's pixels were processed: Bayer phase, bilinear demosaicing, an earlier JPEG; result `ChainTest`.
 
 A kind of file says little of what a camera did. Three questions are put to the pixels.
 

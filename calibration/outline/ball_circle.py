@@ -1,4 +1,4 @@
-"""Outline of a mirror ball in a photograph of any room: circles by votes, then an edge all around, or a limb beside.
+"""Outline of a mirror ball in any photograph: circles by Hough votes, robust fit to edges, or to light across the limb.
 
 1. Edge elements of a small picture vote for the centres along their gradients, for every radius. The radii are
    compared by the votes over those of all places.

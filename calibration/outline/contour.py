@@ -1,4 +1,4 @@
-"""Occluding contour of a mirror of revolution in the image: its change with place and tilt, a place from its points.
+"""Occluding contour of a mirror of revolution in the image: derivatives by position and tilt; position from its points.
 
 r(t) is the contour's distance from a fixed place in the image, in the direction t from u towards v. Five numbers say
 where the mirror is: x, y, z of its vertex in the camera frame, and e1, e2 of an ellipse r(t) + e1 cos 2t + e2 sin 2t.

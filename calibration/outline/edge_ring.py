@@ -1,4 +1,4 @@
-"""Edges and limbs across a circle in a picture, by turn and by distance from it; closed curves that follow them.
+"""Edge and limb strength around a circle in a picture (`EdgeRing`, `LimbRing`), and the contrast of curves there.
 
 The light is taken as logarithm and colour differences, so that a step counts the same in the dark and in the bright.
 What is sought is a curve r(t) = r0 + dr + du cos t + dv sin t + e1 cos 2t + e2 sin 2t: a circle that may move, and the

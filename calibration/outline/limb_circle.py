@@ -1,4 +1,4 @@
-"""Circle of a ball by the fall of the light across its limb, beside the circle by edges.
+"""Circle of a ball, fitted to how the light falls across its limb in sectors; starts from a circle found by edges.
 
 A wall that goes on in the mirror leaves no edge at the limb: reflectance rises to 1 there. The light falls smoothly
 inside, and an edge detector takes the place of the steepest fall, pixels inside the limb. Here the light of each sector

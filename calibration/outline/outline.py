@@ -1,4 +1,4 @@
-"""Outline of the rig's mirror in an image (`find_outline`): the fit for all shapes, and the model of a sphere's limb.
+"""Search and fit of the mirror's outline in an image (`find_outline`), for all shapes; classes for a sphere's outline.
 
 1. Circles with edges all around are looked for in the picture (`ball_circle`), and the outline through each.
 2. From there the light across the outline is fitted, sector by sector: Gauss-Newton with robust weights. What that

@@ -1,4 +1,4 @@
-"""Least squares of the outline: pixels around it, sectors, and one Gauss-Newton step.
+"""Gauss-Newton step of an outline fit: pixels near it, distances from a sphere's limb, least squares and covariance.
 
 s is the sphere centre in the camera frame, a0 = asin(R / |s|) the angle of the limb from it. d is the distance of a
 pixel from the limb, across it, outwards positive, pixels. `step_from` is the entry: it gives the step of s and blur

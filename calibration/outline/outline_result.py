@@ -1,4 +1,4 @@
-"""Outlines found in an image (`Outline`), measured poses, their means, a moved mirror; base and checks of fits."""
+"""Result of an outline fit (`Outline`), means of several, test for a moved mirror; base class and checks of fits."""
 
 from __future__ import annotations
 

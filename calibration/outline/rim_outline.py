@@ -1,4 +1,4 @@
-"""Outline of a mirror of revolution: search of its contour in an image, and a step of the fit of its vertex and tilt.
+"""Contour of a mirror of revolution in an image: search, light across it, and a step of the fit of vertex and ellipse.
 
 At a rim the light steps: inside it is the room, reflected at the rim's angle, outside it is the room behind the mirror,
 or its holder. Both are free in each sector, with a slope across and along, and so is the blur. The step S(d) is the

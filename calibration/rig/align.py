@@ -1,4 +1,4 @@
-"""Alignment of the paper: rig of a command's numbers, move that centres the mirror, sharpness; pictures, sentences.
+"""Alignment of mirror and lens: rig from command options, move that centres the mirror, sharpness; pictures, sentences.
 
 The mirror is aligned when its centre lies on the vertical through the lens. The outline gives the centre. The nominal
 tilt and principal point of the camera give the vertical; their errors usually dominate. The paper's check, that all

@@ -1,4 +1,4 @@
-"""Bundle fit of a rig: least squares over priors, outline, vertical, known spots; outline and vertical of a true rig.
+"""Bundle adjustment of a rig to priors, outline, vertical and spots; and outline and vertical that a true rig shows.
 
 The unknowns are the parameters of `rig_parameters.PARAMETERS`, as deviations from the nominal rig, and the world point
 of every calibration spot. The data:

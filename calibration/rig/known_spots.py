@@ -1,4 +1,4 @@
-"""Laser spots at known places, for calibration: as found in both images, and their places as a `Ruler` tells them.
+"""Laser spots at known places, for calibration: pixels in both images, and places measured by a simulated `Ruler`.
 
 Pixels are found by a built-in method; distance, height and azimuth are as if a person had measured them.
 A "measured" place is the truth plus an error drawn from the sample's own stream. The stated sigma is the real one.

@@ -1,4 +1,4 @@
-"""Vertical of the world in the camera frame, from upright edges in the mirror; edges that agree on one shift.
+"""World vertical in the camera frame: upright edges found in the unwrapped mirror image, robust fit of their tilt.
 
 1. Edges. The image is unwrapped about the middle of the outline: columns are azimuth, half a pixel at the middle
    radius, rows radius, one pixel. A vertical edge of the room is an upright line there. Canny's edges and a

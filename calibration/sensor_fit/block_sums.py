@@ -1,4 +1,4 @@
-"""Sums over blocks of one filter's pixels, outliers, jackknife, common noise of rows and frames, and rounding.
+"""Statistics of raw frames: mean and noise by blocks with a jackknife, hot pixels, row and frame noise, rounding.
 
 Rounding at a noise below half a code adds neither 1/12 DN^2 nor nothing. Its exact moments are taken: the mean, the
 temporal and the spatial variance of a rounded Gaussian whose place between two codes has the spread of the DSNU.

@@ -1,11 +1,11 @@
-"""Widths of the converter's codes by how often each comes; faults of changed codes: bytes, bits, signs, text.
+"""Code widths of the converter (DNL) from histograms; faults of altered codes: bytes, bit shifts, signs, drawn text.
 
 The values of a level have a smooth distribution where its noise is about a code or more: that of the pixels' means,
 widened by the noise. A code that comes w times as often as its neighbours let expect is w codes wide. Wide codes add
 (w^2 - 1) / 12 DN^2 to the variance and move the mean by up to half of what they are too wide. Both go into sigma: a
 table after the converter, a digital gain and a converter's own steps look alike.
 
-The second half names what programs make of codes between the converter and the file: bytes, bits, signs, and text.
+The faults are those that programs make between the converter and the file.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Dark frames as one image (`DarkImage`) and its pattern; light and curves in them that pass for noise and black level.
+"""Dark frames as mean and variance images (`DarkImage`); tests for stray light in them, by pattern and by shot noise.
 
 Light shows itself three ways. The pixels' responsivity (PRNU) is in it: the dark pattern is then like that of lit
 frames. Its shot noise grows with it over the picture, with the slope K. And where a curve, a cut or a program bends

@@ -1,4 +1,4 @@
-"""Noise of processed flat frames, by covariances between frames with a jackknife; the tone curve fitted and applied.
+"""Noise of processed flat frames: covariances of neighbouring pixels with a jackknife; tone curve, fitted and applied.
 
 Planes are those of the frames, Y', Cb, Cr of "yuyv", whose chroma has half of the columns, or R, G, B. Besides each
 plane's own covariances there are those of the first plane (of R, G, B: of green) with the two others.

@@ -1,4 +1,4 @@
-"""Test whether frames are raw: likeness of noise from pixel to pixel and frame to frame, and steps of a JPEG.
+"""Test whether frames are raw: noise correlation between pixels and between frames, row flicker, steps of a JPEG.
 
 Frames that were demosaiced, smoothed, shrunk, sharpened or compressed have less noise, or more, than the sensor gave,
 and so have frames that a camera averages over time. A photon transfer of them has a wrong gain, and its line fits. What

@@ -1,4 +1,4 @@
-"""Numbers of processed cameras from the noise of flat frames, by least squares on the autocovariances of Y', Cb, Cr.
+"""Gain, read noise, white balance, sharpening, denoising of processed frames, fitted to covariances of Y', Cb, Cr.
 
 * Shot noise grows with the level: electrons of white. Read noise does not.
 * Neighbours are alike by demosaicing, unsharp mask and denoising.

@@ -1,4 +1,4 @@
-"""Gain and response of a raw sensor from the noise of its levels, and whether a straight line is enough.
+"""Gain and response curve of a raw sensor from the noise of its levels; linearity against stated light (EMVA 1288).
 
 A response y(x) bends what a straight sensor would have given, x = K e. A level with the signal y above black then has
 the variance from frame to frame

@@ -1,4 +1,4 @@
-"""Dark frames of a photon transfer: black level, its growth, read noise, pattern, and faults that they show."""
+"""Dark frames of a photon transfer: black level, dark current, read and row noise, DSNU; stray light and cut codes."""
 
 from __future__ import annotations
 

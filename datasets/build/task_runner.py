@@ -1,4 +1,4 @@
-"""Tasks of a folder, run in workers or here in order of their needs (`bring_all`); what the journal proves is kept.
+"""Runner of a folder's tasks in order of their needs (`bring_all`): keeps finished ones, retries those of dead workers.
 
 `journal.txt` proves which parts are whole: a line for each, with its key (a hash of all that it depends on) and the
 SHA-256 of its files. `run_tasks` makes the parts that are not. So a run that was killed goes on, more is added, and

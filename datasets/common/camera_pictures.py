@@ -1,4 +1,4 @@
-"""Pictures of cameras: one reader with one list of formats, for every command that takes one.
+"""Reader of camera pictures: JPEG with its tables, PNG, TIFF, BMP, PPM, PGM, turned upright; other formats are refused.
 
 * JPEG: colour or grey, with its quantisation tables and the subsampling of its chroma. One of R, G, B without chroma
   is colour like any other. Of a multi-picture file of a telephone the first one is taken; others are its previews.

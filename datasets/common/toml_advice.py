@@ -1,4 +1,4 @@
-"""Advice on a line that is no TOML: habits of other languages, of sheets of numbers and of word processors.
+"""Advice on a line that is not valid TOML: habits of other languages, of spreadsheets and of word processors.
 
 The parser says where it stopped, and only that line is looked at.
 """

@@ -1,4 +1,4 @@
-"""Expected electrons around one spot, as the sensor's pixels collect them: the input of limits and fits.
+"""Expected electrons of each pixel around one spot, and their derivatives by its place: the input of limits and fits.
 
 Integer (u, v) are pixel centres; a region's origin is the image pixel of its first column and row.
 """

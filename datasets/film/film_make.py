@@ -1,6 +1,6 @@
-"""Making of a recipe's films in a folder (`make_films`), film by film (`build.task_runner`); what is whole is kept.
+"""Films of a recipe made in a folder (`make_films`), a task each, keyed by a hash of its inputs; finished ones kept.
 
-A killed run loses the view or film that it was at: `film_task` makes one film, view by view.
+`build.task_runner` runs the tasks. A killed run loses the view that it was at: `film_task` makes a film view by view.
 """
 
 from __future__ import annotations

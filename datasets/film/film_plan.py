@@ -1,4 +1,4 @@
-"""Plan of the films of a recipe: one for every pair, with the motions of `[film]`. NumPy only; nothing is rendered."""
+"""Plan of a recipe's films, one for each pair: moving scene by `[film]`, image region to render, count of key views."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Room of a film: light maps along the robot's way, key views, and the proof by views that were left out.
+"""Room in a film: light maps along the robot's way, rendered key views, test of interpolated views by rendered ones.
 
 Key views are kept one by one, named by their place: a killed run, and one with twice as many, find those that are
 there. The number of key views of a part of the poses is doubled until a view that was left out agrees with the

@@ -1,4 +1,4 @@
-"""Task of one film: key views of the room, the spot in every frame, the truth of each, and the document about it.
+"""Task that makes one film: key views of the room, images of spot and other lights in each frame, truth, `done.json`.
 
 Key views have lines in a journal of the film's own folder (`film_room`): a killed task goes on after the last of them.
 """

@@ -1,4 +1,4 @@
-"""Distractors: lights that a method may take for the spot, drawn per sample.
+"""Distractors, lights that a method may take for the laser spot: random places, images and truth for each sample.
 
 They are flat Lambertian discs at the laser's wavelength, with an exact place in both images, as the spot has. A
 sample's distractors are a pure function of the recipe, the sample's names and its row of the manifest. They are

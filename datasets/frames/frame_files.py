@@ -1,4 +1,4 @@
-"""Writer of one frame (PNG, JPEG or EXR) and its preview; writer and reader of the index of a folder of frames.
+"""Writer of a frame (PNG, JPEG, EXR) and its preview; index of a folder of frames; each folder is for one request.
 
 A frame is written as PNG, as the chain's JPEG, or as EXR; a frame that a viewer shows dark gets a preview for
 people. The index has one row per file: its SHA-256, every number that it depends on, and the truth of its image. It is

@@ -1,4 +1,4 @@
-"""Requests of frames (preset, exposure, levels, speed, crop, seed), of a caller's options and a sample's recipe.
+"""Requests for frames (preset, exposure, levels, speed, crop, seed) from a caller's options and a recipe's `[frames]`.
 
 A request is checked and frozen. The preset is one of the sensor's. `FrameOptions` are what a caller asks of a data
 set's frames; `sample_request` makes the request of a sample of them and of the recipe's `[frames]`.

@@ -1,4 +1,4 @@
-"""Draws of a plan: rooms and their files, rigs of a recipe with `[rigs]`, and samples that were drawn before."""
+"""Random draws of a plan: rooms and their files, rigs of `[rigs]`, and samples rebuilt from draws of an earlier run."""
 
 from __future__ import annotations
 

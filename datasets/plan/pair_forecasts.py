@@ -1,4 +1,4 @@
-"""Forecast of how both images of a planned pair show its spot, by chief rays, without rendering; and a table of it."""
+"""Forecast of the spot in both images of planned pairs, by chief rays; its table; advice if a mirror's rim hides it."""
 
 from __future__ import annotations
 

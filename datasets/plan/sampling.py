@@ -1,6 +1,6 @@
-"""Random rigs, spots and strokes of a recipe, drawn again where the geometry is impossible.
+"""Random rigs, spots and strokes of `[random]`, by Sobol or independent points, drawn again where impossible.
 
-They come from `[random]`; `draws` draws the misalignments of `[rigs]` likewise.
+`draws` draws the misalignments of `[rigs]` likewise.
 
 The number of sample i for parameter p, in [0, 1), is a function of (data set, seed, sequence, p, i) and of nothing
 else. It depends neither on how many samples there are nor on which other parameters are drawn. The distributions turn

@@ -1,4 +1,4 @@
-"""Table `[film]` of a recipe: the pairs of a recipe as films of the stroke, and what moves in them."""
+"""Tables of `[film]` in a recipe: frame times, carriage, encoder, laser code, vibration, other lights, robot drive."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Reading of recipes, by file or by shipped name: TOML text, its faults in two stages, the text with other numbers.
+"""Reading of recipes, by file or shipped name: TOML text, all its faults, the text with another seed or sample count.
 
 All faults of the tables come in one go; where there are none, all faults of the scene do (`checks`).
 

@@ -1,4 +1,4 @@
-"""Arrays of a glTF file: chunks of a .glb, buffers, views, accessors with strides, sparse entries and whole numbers.
+"""Document of a glTF file (`GltfDocument`): checked JSON values, chunks of a .glb, buffers, and arrays of accessors.
 
 glTF 2.0, sections 3.6 and 4 (Khronos Group, 2021; ISO/IEC 12113:2022). Every number of the document is looked at before
 it is used: the file is a stranger's.

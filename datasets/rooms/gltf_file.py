@@ -1,4 +1,4 @@
-"""Reader of glTF files (.glb, .gltf): nodes, meshes and materials of the scene that the file shows.
+"""Reader of glTF files (.glb, .gltf): triangles of the shown nodes, with their colours, textures, opacity and emission.
 
 glTF 2.0 (Khronos Group, 2021; ISO/IEC 12113:2022). Lists, strips and fans of triangles are read; points and lines have
 no surface. Base colours, emission and their pictures are read, each by its own coordinates. Metal, gloss and relief are

@@ -1,4 +1,4 @@
-"""Lights of a mesh room: rectangles that shine evenly as lamps, and the lit pieces of what a picture lets shine.
+"""Lights of a mesh room: evenly shining rectangles as lamps; triangles with emission textures cut into lit and dark.
 
 A panel of a double-sided material shines to both sides. OBJ has no sides. Where one side of such a panel is closed by
 a ceiling or a housing, the lamp shines to the other one.

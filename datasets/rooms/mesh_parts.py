@@ -1,4 +1,4 @@
-"""Parts of a mesh file: triangles with one material, its colours and pictures, and what readers of all formats share.
+"""Parts of a mesh file (triangles of one material); files and pictures that it names; triangle opacity; limits, checks.
 
 Colours are linear. Texture coordinates have (0, 0) at a picture's lower left corner and (1, 1) at its upper right one;
 beyond them the picture repeats.

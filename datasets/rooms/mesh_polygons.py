@@ -1,4 +1,4 @@
-"""Triangles of polygons: fans of convex ones, ears of concave ones.
+"""Triangulation of polygons: fans for convex ones, ear clipping within a work limit for concave ones; a test for quads.
 
 Corners lie in a plane, or nearly. The triangles have the polygon's corners and its sense.
 """

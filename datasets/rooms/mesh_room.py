@@ -1,4 +1,4 @@
-"""Room of a mesh file: textures as bitmaps, emitting materials as lamps or as surfaces that shine, one mesh per part.
+"""Room of a mesh file: a mesh for each part, textures averaged to small bitmaps, emission as lamps or shining surfaces.
 
 Albedo is the file's base colour, linear, cut to the largest one. Metals, gloss and transparency are not kept: a window
 pane is an opaque surface of its colour. The laser's albedo is that of band R.

@@ -1,4 +1,4 @@
-"""Reader of pictures with linear light: photographs, OpenEXR, Radiance HDR, and equirectangular panoramas of them.
+"""Reader of pictures as linear light: photographs with colour profiles, OpenEXR, Radiance HDR; checks of panoramas.
 
 Photographs of 8 bits are turned upright as their EXIF data say. They count as sRGB, unless a colour profile or a PNG's
 gamma says otherwise: then their codes are converted. EXR and HDR files hold linear values. All give an array of bands

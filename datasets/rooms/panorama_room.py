@@ -1,4 +1,4 @@
-"""Room of a panorama: an equirectangular photograph as radiance on stated geometry, a box or a mesh.
+"""Room of a panorama, and its settings: an equirectangular picture as radiance on the faces of a box or a mesh.
 
 The picture was taken at a stated point. Its middle column looks along the heading, its left and right edges behind; its
 columns run to the right, as seen from inside. Its upper edge is the zenith. Row i of H has the elevation

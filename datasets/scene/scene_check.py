@@ -1,4 +1,4 @@
-"""Check of samples by Mitsuba's own path tracer (`check_sample`): their exported scenes beside the stored layers.
+"""Check of samples by Mitsuba's path tracer (`check_sample`): ambient light, mirror outline and spot against ours.
 
 Nothing of phibench's optics, light maps or Dr.Jit kernels takes part: the XML holds standard plugins alone. Compared
 are

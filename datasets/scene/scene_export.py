@@ -1,4 +1,4 @@
-"""Export of a sample: Mitsuba scenes that an unmodified Mitsuba opens, and glTF files for Blender and other programs.
+"""Export of a sample: XML scenes for an unmodified Mitsuba, glTF for Blender, our images as radiance, and a README.
 
 One folder holds both stroke positions, each with all its light, the room's alone and the laser spot alone. Beside them
 lie our own layers as radiance in the same pixels, and a README that says what a scene does not carry.

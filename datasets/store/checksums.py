@@ -1,4 +1,4 @@
-"""SHA256SUMS of a data set, written last and read first: files checked by it; and folders held while they are filled.
+"""SHA256SUMS of a data set, written last: files that it lists, their checks; and folders locked while a run fills them.
 
 A folder that has the file is complete. Names are relative to the folder, with forward slashes.
 """

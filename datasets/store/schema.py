@@ -1,4 +1,4 @@
-"""Schema of a data set's files: base class `Document`, models of metadata, file names, files that tell the truth.
+"""Schema of a data set's files: base class `Document`, models of metadata, file names, and which files hold the truth.
 
 FORMAT.md describes them; a test compares. A certificate records that two independent computations agree: closed form
 and ray tracer, on position and flux of a spot.

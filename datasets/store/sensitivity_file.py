@@ -1,4 +1,4 @@
-"""Sensitivities of a data set, sensitivities.parquet: made after its documents, and bound to them by their hash."""
+"""File sensitivities.parquet (dD/d(parameter) by sample), written and read: tied to its data set by hash, checked."""
 
 from __future__ import annotations
 

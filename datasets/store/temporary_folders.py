@@ -1,4 +1,4 @@
-"""Temporary files and folders with an owner, removed when it is gone; output folders, removed if work in them fails.
+"""Temporary files and folders, removed when their owner process is gone; output folders, removed if work in them fails.
 
 The owner holds a lock (`flock`) on the folder or file itself. It vanishes with the process, whatever ended it: no
 process number and no clock is asked, and nothing is written into the folder. Where locks do not work, nothing is

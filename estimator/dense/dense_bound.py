@@ -1,4 +1,4 @@
-"""Bound of dense matching: least sigma of D of a pixel by gradient, noise and window; motion of texture with 1 / D.
+"""Lower bound of the error of each pixel's depth D in dense matching; motion of the image's texture with 1 / D.
 
 A window's pixels share one 1 / D, q. Where q changes, the down image is as if its texture moved by e = M^-1 t: t is the
 motion of the up image's place with q, M its derivative by the down pixel, both of the exact projection. The texture

@@ -1,4 +1,4 @@
-"""Interface of a dense method: two images with the laser off in, a depth for every pixel of the lower one out.
+"""Interface of a dense method: images with the laser off in, depth or match of each down pixel out; checks of answers.
 
 >>> import numpy as np
 >>> from phibench.estimator.dense.dense_interface import DenseAnswer, DensePair

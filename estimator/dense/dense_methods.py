@@ -1,4 +1,4 @@
-"""Built-in dense methods, by name. To add one, add an entry to `_ALL`."""
+"""Table of the built-in methods for dense depth, by name. To add one, add an entry to `_ALL`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Built-in method `dense_learned`: a small network corrects the sweep's answer and claims its error.
+"""Built-in method `dense_learned`: a small network corrects the depths of `dense_sweep` and predicts their errors.
 
 The network sees, at each grid point, what `dense_sweep` has reckoned: the cost curves around its answer before and
 after aggregation, the fit's sigma and its way from the minimum, the fit at eight points around, place and stroke. Two

@@ -1,4 +1,4 @@
-"""Built-in methods `dense_sweep`, `dense_stroke`: sweep over 1 / D by exact geometry, fit of planes; hidden points.
+"""Built-in methods `dense_sweep`, `dense_stroke`: sweep over 1 / D, semi-global costs, plane fits; hidden points.
 
 1. Cost: for each 1 / D the up image is fetched at the place where each grid point of the down panorama would be seen.
    The map is exact, so that it holds for misaligned rigs and needs no epipolar lines (R. T. Collins, CVPR 1996).

@@ -1,4 +1,4 @@
-"""Dense pair unrolled: both images as panoramas on one grid (pixel maps, luma codes); matches back to pixels and D."""
+"""Both images of a dense pair as panoramas, by interpolated pixel maps; matches between them turned into depth D."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Epipolar line of a down pixel: image in the up frame of the point at 1 / D on its ray; range along a ray at a D.
+"""Epipolar line of a down pixel: its place in the up image at 1 / D, with derivatives; length of a ray to distance D.
 
 The down pixel's ray is X(t) = P + t r. t follows from |X_h - S_h| = D, h the horizontal part and S the sphere centre at
 the down position. `up_image` gives the pixel of X in the up image, with derivatives.

@@ -1,4 +1,4 @@
-"""Depth by weighted least squares from two spots' pixels, with a test; answers of both combined; their joint bound.
+"""Depth from two spots by weighted least squares with rig errors; both positions combined on the epipolar line; bound.
 
 Ray k (1 down, 2 up): X = P_k + t_k r_k, world frame. Pixels and rig parameters together, z, have a covariance C. The
 two rays of the true z meet: the gap e(z), the signed length of their common perpendicular, is 0. The least-squares

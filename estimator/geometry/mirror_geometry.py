@@ -1,4 +1,4 @@
-"""Geometry of the mirror's kinds, for estimators: what rays, images, phi, eq. (4) and sensitivities ask of a shape.
+"""Kinds of mirror (sphere, with form error, of revolution) for estimators: ray hits, normals, derivatives, eq. (4).
 
 `geometry_of` alone tests the type of a mirror. Points P are relative to the mirror's origin, a sphere's centre or a
 vertex; `pose` is the mirror's in the camera, where rays begin at 0. Arrays take leading axes, and a ray that misses

@@ -1,4 +1,4 @@
-"""Panorama: a view unrolled into azimuth (columns) and elevation (rows); its grid and pixels; the view as a picture.
+"""Panorama of a view, azimuth by elevation: grid, its image pixels by model or by truth layer, and the view's picture.
 
 A sphere has no single viewpoint: every ray leaves it from another place. So a grid point stands for a direction (a
 scene far away, exactly one pixel), or for a point at a stated distance from the sphere centre. Elevation is spaced

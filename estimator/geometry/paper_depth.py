@@ -1,4 +1,4 @@
-"""Depth of the paper from two angles, its approximation, its predicted errors, and its published results.
+"""Depth from two angles by the paper's equations, sphere or mirror of revolution; predicted errors; published results.
 
 "Depth estimation for mobile robot using single omnidirectional camera system", sections 3 and 4. Symbols are the
 paper's: phi_1 (down) and phi_2 (up), h stroke, R mirror radius, D depth, lambda, epsilon; see docs/paper.md. Leading

@@ -1,4 +1,4 @@
-"""Camera rays reflected at a mirror of any shape, with derivatives, and points of the room imaged in it.
+"""Camera rays reflected at any mirror, through a glass tube as well, with derivatives; pixels that show a room point.
 
 Estimators assume a perfect surface. The form error serves the true rig, whose errors `sensitivities` predicts.
 

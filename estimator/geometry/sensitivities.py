@@ -1,4 +1,4 @@
-"""Derivatives dD/dp by misalignments of the true rig (`PARAMETERS`), of an estimate of D made with the nominal rig.
+"""Derivatives of the estimated depth D, the true D and the spot's pixel by each misalignment of the true rig.
 
 An estimate depends on the true rig through the pixels alone: dD/dp = dD/d(u1, v1, u2, v2) . d(u1, v1, u2, v2)/dp. The
 first factor is the estimator's own gradient at the nominal rig. The second follows from the reflected ray through the

@@ -1,4 +1,4 @@
-"""Networks in ONNX files: read, checked, run by onnxruntime, written; a position from a crop, and peaks of heat.
+"""Networks in ONNX files: read, checked, run by onnxruntime, written; a spot's position from a crop; heat map peaks.
 
 One thread: the same bytes every time.
 

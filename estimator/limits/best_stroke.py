@@ -1,4 +1,4 @@
-"""Stroke with the smallest predicted error of D, and its limits; the bound by a spot's electrons for rig and sensor.
+"""Stroke with the smallest predicted error of depth D, and what limits it; position bound by a spot's electrons.
 
 For a camera at infinity the rays to a spot at (D, z) leave the mirror at theta_k with tan(theta_k) = D / (z_k - z),
 z_k the mirror's height at the down and the up position, so that an error s of both theta gives

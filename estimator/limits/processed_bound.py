@@ -1,4 +1,4 @@
-"""Bound of a spot's position in processed images, and in raw or processed ones with laser off; table by electrons.
+"""Bound of a spot's position in processed images, or from frames with laser on and off; its table by spot electrons.
 
 "srgb8": the information of each pixel's own code (`pixel_statistics`); interpolated colours are left out. "yuyv" and
 "mjpeg", and "srgb8" whose codes sharpening, denoising or a colour matrix mix: J^T C^-1 J of the mean and covariance of

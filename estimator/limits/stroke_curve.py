@@ -1,4 +1,4 @@
-"""Predicted error of D against the stroke h, its parts, and what is in the way; distance of pixels from the outline.
+"""Predicted error of depth D against the stroke h, higher orders included, and the causes that rule a stroke out.
 
 Beyond first order, rigs are drawn in pairs of opposite deviations. The error of D of a rig that deviates by p is
 e(p) = g p + p H p / 2 + third order + ... Of the pair p, -p, half the sum of both errors is the even part, to which the

@@ -1,7 +1,7 @@
-"""Difference of one data set rendered by two variants of Mitsuba, in units of the sensor's sigma of phi.
+"""Comparison of one data set rendered by two Mitsuba variants: truth, shift of phi in units of its bound, and times.
 
-Truth is NumPy's and must be the same to the bit. Of
-the layers the difference dm of the expected electrons moves the best estimate of a spot by
+Truth is NumPy's and must be the same to the bit. The difference dm of the layers' expected electrons moves the best
+estimate of a spot by
 
     d theta = F^-1 sum over pixels of (dm/d theta) I dm,
 

@@ -1,4 +1,4 @@
-"""Faults of a method's answers on easy pairs: rules of convention, each tried on the truth, and named in plain words.
+"""Faults of a method's positions, covariances, phi and D on easy pairs: wrong axes, units or conventions, in words.
 
 A mistake of convention moves every answer by a rule. Of the rules that predict the answers the nearest is named.
 Positions have the shape (n, 2, 2): pair, (down, up), (u, v), pixels; NaN where there is none.

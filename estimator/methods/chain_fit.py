@@ -1,4 +1,4 @@
-"""Built-in method `chain_fit`: both spots through the camera's processing; a spot's outputs and likelihood."""
+"""Built-in method `chain_fit`: each spot fitted in a processed image through the camera's own chain; its likelihood."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Built-in method `raw_maximum_likelihood`: each spot by itself on raw pixels; those pixels with their law.
+"""Built-in method `raw_maximum_likelihood`: each spot fitted by itself on raw pixels; pixels with noise for other fits.
 
 `raw_maximum_likelihood` takes as known the card's noise (PRNU and DSNU count as noise), the rig's detector for the
 filters' response at the laser line, and the oblique blur that the rig predicts at the pixel (`spot_blur`), with the

@@ -1,7 +1,7 @@
-"""Built-in methods that find the spot, by name (`KNOWN`; `METHODS` if installed), with the simple and learned ones.
+"""All built-in methods that find the spot, by name; code of the simple, the learned and other packages' ones.
 
-To add a method, add one entry to `_ALL`. The first part has those without a noise model: extractors of `simple_spots`,
-which work on the picture as a viewer shows it, `detect`, and extractors of other packages, rows to compare with; each
+To add a method, add one entry to `_ALL`. `KNOWN` holds all of them, `METHODS` those that are installed. Extractors of
+`simple_spots` work on the picture as a viewer shows it. They and those of other packages are rows to compare with; each
 package is imported when its method runs.
 """
 

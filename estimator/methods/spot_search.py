@@ -1,4 +1,4 @@
-"""Search for a spot by the built-in methods: shared work, boxes, regions, peaks; its distance, choice of an answer.
+"""Parts shared by built-in methods: kept results, boxes, search regions, peaks, spot distance, test of a fit's place.
 
 A fit begins at a detection and may walk off along noise, to a lamp's edge or to another light. Its covariance is that
 of the place where it ended, and says nothing of this: `at_detection` and `joint_or_separate` test how far it

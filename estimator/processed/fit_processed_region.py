@@ -1,4 +1,4 @@
-"""Fit of a spot in one region of a processed image, JPEG or not: window of outputs, and the fit that suits them.
+"""Fit of a spot in one region of a processed image: window of codes or JPEG coefficients, and the room behind it.
 
 A window is 2 x 2 JPEG units of a decoded region, or 12 x 12 pixels of another, with the spot nearest to its middle.
 """

@@ -1,4 +1,4 @@
-"""Posterior of a spot from rounded outputs of one or several frames: each lies in one step of the quantiser.
+"""Posterior of a spot from rounded outputs of one or several frames, by expectation propagation; truncated Gaussians.
 
 Steps of JPEG are often larger than the noise. Then a coefficient near the edge of its step seems to say much about the
 spot, and one far from the edges nothing, both only if the spot is where it is thought to be: a quasi-score has many
@@ -9,7 +9,7 @@ roots. The intervals themselves say the same for every hypothesis. With Gaussian
 the posterior of theta is a Gaussian cut by planes in y. Expectation propagation finds its mean and covariance (T. P.
 Minka, UAI 2001; boxes: J. P. Cunningham, P. Hennig, S. Lacoste-Julien, arXiv:1111.6832): each interval is replaced by
 a Gaussian that gives y_i the same mean and variance. m is linear about the posterior's mean, found again some times. Of
-several frames y is their mean before the quantiser (`interval_moments`).
+several frames y is their mean before the quantiser (`QuantiserSteps`).
 """
 
 from __future__ import annotations

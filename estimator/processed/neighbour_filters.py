@@ -1,4 +1,4 @@
-"""Sharpening and denoising of planes of codes: as matrices, and, where edges are spared, as means over their noise.
+"""Sharpening and denoising of colour planes as matrices; edge-preserving denoising as mean and slope under noise.
 
 Denoising that spares edges changes Y' of pixel i by share x the sum of b_j f(Y'_j - Y'_i) over the pixels j of a
 binomial blur with the weights b; f(d) = d exp(-d^2 / 2 T^2). With a Gaussian d of mean m and variance v,

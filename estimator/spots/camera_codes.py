@@ -1,4 +1,4 @@
-"""Codes of processed images on the estimator's side: tone curves, Y'CbCr 4:2:2, JPEG coefficients, rounding.
+"""Codes of processed images for the estimator: tone curves, Y'CbCr 4:2:2, JPEG coefficients, statistics of a quantiser.
 
 * A tone curve takes linear light, full scale 1, to encoded R, G, B: sRGB (IEC 61966-2-1), Rec. 709 (ITU-R BT.709), or
   a measured table whose points straight lines join. `card.transfer_function` says which.

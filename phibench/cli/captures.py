@@ -1,4 +1,4 @@
-"""Commands `phibench measure`, `import` and `sensor fit`: a person's own pictures, sets of them, and their camera."""
+"""Commands `phibench measure`, `import`, `sensor fit`: D from own pictures, data sets of them, their camera fitted."""
 
 from __future__ import annotations
 

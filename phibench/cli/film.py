@@ -1,4 +1,4 @@
-"""Commands `phibench film ...`: films of the stroke made, checked, shown, measured and written as videos."""
+"""Commands `phibench film ...`: make, check and show films of the stroke, measure D, track targets, write videos."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Options that many commands share, limits and promises on methods among them, and values that the Tab key completes.
+"""Options that commands share, with limits and declarations of methods; converters, and values for tab completion.
 
 `--method` is repeated, `--sample` names one sample by its number or id, `--samples` is a count, `--out` is the file or
 folder to write. Wherever a method runs, `Limits` are its options.

@@ -1,4 +1,4 @@
-"""Commands `export`, `release`, `fetch`, `seal`, `submission`: sets for others, answers to sealed ones, checks."""
+"""Commands `export`, `release`, `fetch`, `seal`, `submission`: publish data sets, answer sealed ones, check scores."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Commands `phibench room`, which makes panoramas and meshes for recipes, and `phibench scene`, to export samples."""
+"""Commands `phibench room`: panoramas of mirror-ball photos or rooms, meshes; `phibench scene`: samples for Mitsuba."""
 
 from __future__ import annotations
 

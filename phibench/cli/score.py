@@ -1,4 +1,4 @@
-"""Commands `phibench score`, `bench`, `compare`, `report` and `results`: methods on the pairs of a data set."""
+"""Commands `score`, `bench`, `compare`, `report`, `results`: methods scored on pairs, compared, and shown as pages."""
 
 from __future__ import annotations
 

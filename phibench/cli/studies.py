@@ -1,4 +1,4 @@
-"""Commands `phibench paper`, `stroke` and `study ...`: the paper's tables and experiments, strokes, studies."""
+"""Commands `phibench paper`, `stroke`, `study ...`: the paper's tables and experiments, the best stroke, studies."""
 
 from __future__ import annotations
 

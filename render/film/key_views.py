@@ -1,4 +1,4 @@
-"""Key views of a film: parts of its poses (`PoseParts`), the room's image between few rendered views, its error.
+"""Key views of a film: its motion in parts (`PoseParts`), the room's image interpolated between views, and its error.
 
 Views are smooth in the pose: where the image moves by less than its blur between two keys, a pixel's light is a smooth
 function of the pose. It is interpolated by the cubic through the four keys around (`key_weights`). Weights are linear

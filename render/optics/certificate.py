@@ -1,4 +1,4 @@
-"""Certificate of a spot in one view: agreement of two independent solutions and of the spot layer.
+"""Certificate of a spot in one view: its chief ray and its spot layer compared with an independent ray tracer.
 
 The world-side solution (`truth.spot_truth`, `spot_samples`) goes from the spot to the lens: Alhazen's problem and
 Coddington's equations, or Fermat's path and its second derivatives where the mirror has a form error. The camera-side

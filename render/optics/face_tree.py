@@ -1,8 +1,8 @@
-"""Tree of plane faces for rays in float64, in NumPy: rays go down all together, level by level.
+"""Bounding volume hierarchy of plane faces (parallelograms, triangles) in NumPy: first hits of many rays, in float64.
 
 Rays that run side by side meet few faces: these are tried by all of them. Where they meet many, the largest faces are
 tried by all rays. The others stand in a tree of boxes, split at the median of the longest side, eight children to a
-node; what moves down are pairs (ray, node). There is no loop over rays or faces.
+node; all rays go down together, level by level, as pairs (ray, node). There is no loop over rays or faces.
 
 **No ray slips through an edge.** A ray meets the plane of a face at t = (h - n.o) / (n.d). With coordinates up to 30 m
 and about 30 roundings the numerator errs by e <= 30 * 30 m * 1.1e-16 = 1e-13 m, and the place on the face by

@@ -1,4 +1,4 @@
-"""Camera-side ray tracer in float64: pixel to mirror and away, through a glass tube; `room_tracer` goes on to the room.
+"""Ray tracer from pixels in float64: lens, reflection at a sphere or mirror of revolution with form error, glass tube.
 
 It shares no mathematics with the world-side solution (`reflection_point`), so that the two can certify each other. A
 form error enters by the values of the mirror's radius or height alone: neither its tensors nor its derivatives are
@@ -6,7 +6,7 @@ used. The harmonics are written out as in `scenes/mirror.py`. The ray's place is
 q = |P|^2 - r(P / |P|)^2, which for a sphere is a parabola in the distance along the ray. The normal follows from
 differences of surface points.
 
-Rays are origins and unit directions, shape (N, 3), world frame, metres.
+Rays are origins and unit directions, shape (N, 3), world frame, metres. `room_tracer` follows them into the room.
 """
 
 from __future__ import annotations

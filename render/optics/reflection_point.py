@@ -1,4 +1,4 @@
-"""Reflection points: the place on the mirror where light from a world point goes to the lens, and the bundle's spread.
+"""Reflection point on the mirror between a world point and the lens, also through a glass tube; spread of the bundle.
 
 **Perfect sphere: Alhazen's problem.** In the plane of the two points and the sphere centre one angle gamma is unknown.
 With c and p the distances of the points from the centre, beta the angle between them, and l_c and l_p the two path

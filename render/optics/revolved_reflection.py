@@ -1,4 +1,4 @@
-"""Reflection points on a mirror of revolution by Fermat's path, from a start in the right basin; roots in a bracket.
+"""Reflection points on a mirror of revolution by Fermat's principle: starts, Newton's method, and bracketed roots.
 
 With a and b two points outside the mirror, F(P) = |a P| + |P b| is a convex function of P. The mirror with all that is
 behind it, K = {z >= sag(x^2 + y^2)}, is a convex body. Where the straight line from a to b misses K, the least F on K

@@ -1,4 +1,4 @@
-"""Spot layer: the laser spot's expected electrons per second in a window of pixels, derivative images, centre of light.
+"""Spot layer: the laser spot's image in electrons per second, derivatives and centre; light paths over a rough mirror.
 
 The light on the film comes as a cloud of weighted points: from `spot_samples` for a smooth mirror, from here for a
 rough one (Beckmann distribution, Smith shadowing). For each pair (spot point, aperture point) film positions are drawn

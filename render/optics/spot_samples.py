@@ -1,4 +1,4 @@
-"""Rays from the laser spot over the mirror to the lens: place and light power on the image; Gaussians that cover it.
+"""Laser spot's light on the film by quadrature over spot and aperture: positions, powers; Gaussians that cover them.
 
 Where an edge or a texture cuts the light, a fixed set of quasi-random rays is taken; else nodes of a quadrature.
 

@@ -1,4 +1,4 @@
-"""Image of a spot by rays from the film through aperture and mirror to the wall, and the film position of each ray.
+"""Image of a spot by rays from the film to the lit surface: centroid, power; film position of a ray to a given point.
 
 The camera's side of a certificate. Newton's method finds the film position that meets a given wall point; power is
 radiance times etendue. A rough mirror reflects each ray at a facet with a drawn slope.

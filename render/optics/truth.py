@@ -1,9 +1,9 @@
-"""Exact truth in float64, of one spot and every pixel centre: chief ray over the mirror, the three phi, distance D.
+"""Exact truth of one spot and every pixel: chief ray over the mirror, the three phi, distance D; the spot's visibility.
 
 `spot_truth` solves for the chief ray of a spot in closed form, or by Fermat's path. `truth_layer` traces the chief ray
 of every pixel centre: exact and unfiltered. Both give the three angles that the paper calls phi, and the azimuth
 (docs/paper.md). All angles are measured against the world's vertical, in radians; points are world coordinates in
-metres. NaN marks what does not exist.
+metres. NaN marks what does not exist. All is float64.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Scene of standard Mitsuba plugins as a tree, and that tree as a dictionary for `mi.load_dict`.
+"""Tree of standard Mitsuba plugins, with PLY and PFM bytes of meshes and images; its dictionary for `mi.load_dict`.
 
 The tree is plain Python: it is written as XML (`datasets.scene.scene_export`) without Mitsuba, whose own writer
 distorts boxes. Both forms come from one tree and load as the same scene.

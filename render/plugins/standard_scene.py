@@ -1,4 +1,6 @@
-"""Scene of one view in standard Mitsuba plugins, and its camera: all light, the room's alone, or the spot alone.
+"""Scene of one view in standard Mitsuba plugins, with the laser spot as area emitters and the camera as a thin lens.
+
+The light is all of it, the room's alone, or the spot's alone.
 
 Units are millimetres, with the sphere centre at the origin: in metres with the origin on the floor Mitsuba's ray offset
 moves the spot by 0.01 px. Colours are three bands, one for each colour filter of the detector, in Mitsuba's rgb mode.

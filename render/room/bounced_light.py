@@ -1,4 +1,4 @@
-"""Bounced light on a room's texels: from all surfaces and, by aimed rays, bright ones; how many rays a texel gets.
+"""Indirect light on a room's texels: rays over the hemisphere and at bright texels, rays per texel, grid resampling.
 
 Every texel sends rays over the hemisphere, cosine-weighted, and looks up what the faces send out. For the bounces the
 rays are traced once, over a coarse grid: what they meet stays the same, and only the irradiance changes. Two halves of

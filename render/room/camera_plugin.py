@@ -1,4 +1,4 @@
-"""Mitsuba sensor plugin of the camera: thin lens, focus, distortion, blur, electrons; and the scene's millimetres.
+"""Mitsuba sensor plugin of the camera: thin lens, focus, Brown distortion and its inverse, blur, weight in electrons.
 
 Mitsuba's film coordinate is u + 0.5: its pixel centres are half integers. The scene is in millimetres, with the origin
 at the sphere centre. The weight of a ray is its etendue times electrons per joule: an image of radiance in W/(m^2 sr)

@@ -1,4 +1,4 @@
-"""Pixels of a window of the film, whole or cut into cells; the camera's blur of them; maxima and means of neighbours.
+"""Pixels of an image window, some cut into cells: arrays, blurred means and variances, and neighbourhood filters.
 
 A pixel's mean and variance are weighted sums over all pixels and cells within the blur (`subpixel_grid`). Sums run over
 bands of rows, which stay in the processor's cache.

@@ -1,4 +1,4 @@
-"""Refraction by a glass tube around mirror and lens (Dr.Jit, float64): rays turned and lifted on their way out.
+"""Refraction of rays that leave a glass tube around mirror and lens, and its transmittance (Dr.Jit, float64).
 
 They come from the mirror or from the lens; the closed forms are those of `scenes.glass_tube`. What the tube's faces
 mirror back to the inside is left out.

@@ -1,4 +1,4 @@
-"""Light map of a room: irradiance of every texel from lamps, the sun and all bounces, smoothed. Baked once for a room.
+"""Light map of a room, baked once: irradiance of every texel from lamps, sun and all bounces, and its smoothing.
 
 First what comes from lamps and the sun (`lamp_light`), then the bounces over a coarse grid (`bounced_light`). Last a
 gather over the fine grid from the full map, in two independent halves; `smoothed_mean` keeps what both agree on.

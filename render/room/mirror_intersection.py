@@ -1,4 +1,4 @@
-"""Mirror in Dr.Jit: first points and normals on rays, float64, in the scene's coordinates; and its reflectance.
+"""Intersection of rays with the mirror in Dr.Jit: points, normals; the closed body that shades its holder; reflectance.
 
 The scene's coordinates are millimetres, world axes, and the sphere centre or the vertex of a mirror of revolution at
 the origin. Numbers of a mirror are opaque: one kernel serves all mirrors of a kind. Rays come from outside; those that

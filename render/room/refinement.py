@@ -1,4 +1,4 @@
-"""Adaptive sampling of the film: which pixels are cut into cells, and how many samples each cell gets.
+"""Adaptive sampling of the film: which pixels are cut into cells, samples of each cell, and cells that lamps cover.
 
 1. Each pixel gets one sample that decides and counts for nothing (a scout). Where the contrast of the scouts around is
    low, one sample a of the whole pixel does. Other pixels are cut into cells, each with two samples a and b.

@@ -1,4 +1,4 @@
-"""Shading kernel (Dr.Jit): electrons that film positions of one view get from a room, seen directly or mirrored.
+"""Shading kernel (Dr.Jit): electrons that film positions get from a room, directly or over a smooth or rough mirror.
 
 The ray from the film to the mirror and its reflection are float64 (`mirror_intersection`). The mirror is convex and
 stands in no table of faces, so that a reflected ray needs no lift. Only where something may stand between lens and

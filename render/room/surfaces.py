@@ -1,4 +1,4 @@
-"""Room in Mitsuba: one mesh of all faces, tables of what a face that is hit sends out, and arrays that suit Dr.Jit.
+"""Room in Mitsuba: one mesh of all faces, and tables of the radiance that they send by texture, irradiance and coat.
 
 All triangles are one mesh: Embree answers a query five times as fast as with a shape for every face. What a kernel
 needs of a face lies in one row of 32 numbers, read in groups of four. The albedo is looked up exactly, at the point of

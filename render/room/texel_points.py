@@ -1,4 +1,4 @@
-"""Texels of a room as Dr.Jit arrays, for kernels that gather light: points, points of their rays, covered texels.
+"""Texels of a room as Dr.Jit arrays: their points, starts and Sobol nets of their rays, and which are covered.
 
 Sixteen neighbours share a Sobol net of n points, shifted within its n cells for each of them. So rays of neighbours
 with the same number are nearly parallel, which Embree traces twice as fast. Together they fill the cells: what is

@@ -1,9 +1,9 @@
-"""Stages of the sensor from light to electrons to DN, and the named noise streams that they draw from. NumPy only.
+"""Sensor stages from light to DN (mosaic, shot noise, PRNU, DSNU, read noise, gain), and their named noise streams.
 
 Order: mosaic, exposure, vignetting, PRNU, shot noise, full well, DSNU and read noise, gain, black level, rounding,
 clipping. Shot noise is that of light and dark current together: a sum of Poisson numbers is a Poisson number.
 
-Planes R, G, B have the shape (3, h, w); a pixel's electrons and DN have the shape (h, w).
+Planes R, G, B have the shape (3, h, w); a pixel's electrons and DN have the shape (h, w). NumPy only.
 """
 
 from __future__ import annotations

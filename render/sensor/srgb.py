@@ -1,6 +1,6 @@
-"""Curve of sRGB, the simulator's only one: between linear values and what 8-bit pictures hold.
+"""Transfer function of sRGB (IEC 61966-2-1), both ways: linear values to encoded ones, and back.
 
-A file of its own, so that rooms of photographs and meshes depend on it and not on the sensor.
+It is the simulator's only one, in a file of its own: rooms of photographs and meshes depend on it, not on the sensor.
 """
 
 from __future__ import annotations

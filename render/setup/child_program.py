@@ -1,4 +1,4 @@
-"""Run of a program of the package in a process of its own, which may abort or hang: its fault in a line (`fault_of`).
+"""Runs a module of the package in a child process, which may abort or hang; says its fault in one line (`fault_of`).
 
 Only the standard library is used here.
 """

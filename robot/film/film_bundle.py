@@ -1,4 +1,4 @@
-"""Joint fit of a film, one point and the carriage's offset in every frame; frames that agree, and the expected sigma.
+"""Joint fit of one point and the carriage's offset in every frame of a film; outlier frames, and the expected sigma.
 
 Unknowns are the point X and the offset p_k of each frame. Data are the positions (u, v)_k with the covariance of all
 frames, pattern included, and the encoder's readings e_k = p_k + noise. An offset moves the point in the rig's frame by

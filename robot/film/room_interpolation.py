@@ -1,4 +1,4 @@
-"""Room behind a spot in each frame of a film, interpolated (kriging) between the frames with the laser off.
+"""Kriging of the room behind a spot between a film's laser-off frames, and its test by leaving each frame out.
 
 In the pose of a frame each pixel sees of the room what it sees in frames with the laser off of nearly the same pose.
 Kriging interpolates between them (`room_weights`): a pixel's room is a constant plus a Gaussian process of the place of

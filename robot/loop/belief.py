@@ -1,4 +1,4 @@
-"""Belief over the place of a target, as seen from the robot: an unscented Kalman filter of `filterpy`.
+"""Belief over a target's place seen from the robot: prior, motion model, and an unscented Kalman filter of `filterpy`.
 
 State, in the rig's frame made level: the azimuth a, the rise k = (z - z0) / D and the inverse distance q = 1 / D, z0
 the height of the sphere centre at the down position; then the slip and the skid factor of the tracks, and the velocity

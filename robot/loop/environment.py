@@ -1,4 +1,4 @@
-"""Environments `phibench/ApproachTarget-v0` and `-Flat-v0` for `gymnasium`: `Simulator` with spaces, reward, seeds.
+"""Environments `phibench/ApproachTarget-v0` and `-Flat-v0` for `gymnasium`: spaces, reward, seeds, a view from above.
 
     import phibench.robot.loop.environment  # its import makes them known
     env = gymnasium.make("phibench/ApproachTarget-v0")

@@ -1,4 +1,4 @@
-"""Drive of the robot in a film: arcs, turns of the flippers, readings of its tracks, and the rig's pose at any state.
+"""Drive of the robot in a film: arcs and flipper turns in time, encoder readings of its tracks, and the rig's pose.
 
 A leg starts and ends at rest, on a level floor. A leg that drives is an arc of the base of a given length and turn; the
 faster track follows the trapezoidal speed of `carriage.Leg`. A leg may turn the flippers instead. At any time the state

@@ -1,4 +1,4 @@
-"""Vehicle ESCALADE360: motion by its two tracks, odometry, obstacles, and the sensor's pose by flippers and ground.
+"""Vehicle ESCALADE360: parameters, motion and odometry of its two tracks, obstacles, and the sensor's pose on it.
 
 Frames: `base` has its origin midway between the contacts of both tracks, at their underside, x ahead, y left, z up.
 `rig` is the frame in which a `Rig` is written: its origin lies `sensor_x_m` ahead, below the stroke axis.

@@ -1,4 +1,4 @@
-"""Generated rooms: a room follows from its properties and the names of a random stream.
+"""Generator of a room from its properties and a named random stream: doors, windows, furniture, objects, lamps, sun.
 
 Each subject (openings, furniture, things near the robot, things on the floor, walls, ceiling, lamps) has streams of its
 own, and comes after those that it must keep clear of. A change of the lamps therefore changes no furniture, and a

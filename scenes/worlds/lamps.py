@@ -1,4 +1,4 @@
-"""Lamps: ceiling panels, tubes, pendants and uplights, and the radiance that a colour temperature means.
+"""Lamps (ceiling panels, tubes, pendants, uplights), their places in a room, and band radiances by colour temperature.
 
 Each band of the camera stands for an interval of wavelengths: R 590 to 680 nm, G 500 to 590 nm, B 410 to 500 nm. Light
 of a colour temperature T has the band radiances of a black body at T, integrated over these intervals. Luminances use

@@ -1,4 +1,4 @@
-"""Study `baseline`: the paper's 25 experiments simulated: errors by sense of phi, misaligned rigs, law of eq. (7).
+"""Study `baseline`: the paper's 25 experiments simulated: senses of phi, misaligned rigs, eq. (7); findings, drawings.
 
 The settings and the run come first, then the findings, the small tables of the report, and the drawings: Figures 9 to
 11 and Table 4 of the paper with our estimates, and the laws of eq. (7).

@@ -1,4 +1,4 @@
-"""Study `cause`: why the paper's published depths are off: explanations compared by their Bayesian evidence.
+"""Study `cause`: explanations of the paper's depth errors compared by Bayesian evidence; findings and drawings.
 
 The run comes first, then the findings from its tables, the small tables of the report, and the drawings: predicted
 errors, evidence of each explanation, posterior of noise and tilt. Log evidences are natural logarithms; a finding gives

@@ -1,4 +1,4 @@
-"""Rendered pairs: the bound of D by stroke over the texture of a room, and the near space that methods get right.
+"""Rendered pairs: bound of D by stroke over a room's texture; near space and free floor that methods get right.
 
 The bound takes the down image's texture, exposure and noise, and any stroke: only the up image changes with that. So
 one rendered room tells of all strokes. It is asked in the middle of each cell of 3 x 3 pixels, whose motion stands for

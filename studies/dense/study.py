@@ -1,4 +1,4 @@
-"""Study `dense`: error of D over all pixels of a pair, by stroke, mirror, wrong rig and method, beside the bound."""
+"""Study `dense`: error and bound of D over all pixels of a pair, by stroke, mirror, wrong rig and method; a drawing."""
 
 from __future__ import annotations
 

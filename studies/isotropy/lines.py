@@ -1,4 +1,4 @@
-"""Epipolar lines (Figure 1 of the paper), and the azimuths that two sensors side by side hide from each other.
+"""Epipolar lines (Figure 1 of the paper); azimuths that two sensors side by side hide; findings, a table, a drawing.
 
 An epipolar line holds the pixels of the up image that show the points on the ray of one down pixel. A spot counts as
 seen only if both sensors see it. Sensor A at the first place loses the spots behind sensor B at the second, and the

@@ -1,4 +1,4 @@
-"""Study `isotropy`: error of D against azimuth for upright and sideways baselines; lines and edges in panoramas.
+"""Study `isotropy`: error of D against azimuth, baseline upright or sideways; lines and edges in panoramas; findings.
 
 The horizontal baseline is the competitor that the paper names: the same sensor moved sideways by the same length, or
 two of them. D counts from the vertical through the first position, in both cases. Epipolar lines and upright edges of

@@ -1,4 +1,4 @@
-"""Study `loop`: a robot that drives up to its target: time, strokes, success, and what spoils them.
+"""Study `loop`: a robot that drives up to its target: time, strokes, success, what spoils them; statistics, a drawing.
 
 A condition changes one thing of a base: the paper's process, plain rooms, three other lights, raw pixels, 1 mW. All
 conditions have the same episodes by name: rooms, targets and lights are the same, and so are the deviates of the noise

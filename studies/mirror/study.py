@@ -1,4 +1,4 @@
-"""Study `mirror`: mirrors of several shapes compared: field of view, resolution, bound of D, cost of misalignment.
+"""Study `mirror`: mirrors of several shapes: field of view, resolution, bound of D, cost of misalignment; a drawing.
 
 The drawing comes last: resolution, bound of D, measured places, and cost of deviations.
 """

@@ -1,4 +1,4 @@
-"""Study `misalignment`: error of D that each misalignment of the rig makes, predicted and rendered.
+"""Study `misalignment`: error of D that each misalignment of the rig makes, predicted and rendered; drawings.
 
 Tolerances, a ranking, the effect of a calibration, and interactions follow from the same closed forms.
 """

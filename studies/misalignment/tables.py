@@ -1,7 +1,7 @@
-"""Tables, tolerances, ranking and findings of the study `misalignment`.
+"""Tables of the study `misalignment`: change of D by each parameter, its tolerance and its rank; findings from them.
 
 Main table: a row per parameter, value, spot and estimator. Tolerance table: the value of each parameter that costs a
-given part of D. Findings and the small tables of the report are made from both.
+given part of D. Findings are made from both.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Study `noise`: errors of position, phi and D against exposure, laser power, noise, blur and JPEG, beside the bound.
+"""Study `noise`: errors of position, phi and D by exposure, power, noise, blur and JPEG, beside the bound; drawings.
 
 One factor at a time about base cases; all methods that take the preset, on the same draws, with the bound. The run
 comes first, then the drawings: error against each factor, and which factor matters most.

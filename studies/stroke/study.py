@@ -1,4 +1,4 @@
-"""Study `stroke`: the stroke of least error of D for each distance, what limits it, and a check on drawn frames.
+"""Study `stroke`: stroke of least error of D for each distance, what limits it, and a check on drawn frames; drawings.
 
 The drawings come last: the best stroke by distance, error by stroke, measured beside predicted.
 """
