@@ -348,12 +348,11 @@ def _spot_residuals(rig: Rig, values: Array, spots: Sequence[KnownSpot], points:
     strokes = stroke_of(np.array([spot.stroke_m for spot in spots]), values)
     # the rig up by h is the point down by h
     up_points = points - strokes[:, None] * np.array(rig.stroke_axis_world)
-    view, seen = rig.at(0.0), []
-    for where, name in ((points, "down"), (up_points, "up")):
-        seen_px = np.array([getattr(spot, f"uv_{name}_px") for spot in spots], float)
-        covariance = np.array([getattr(spot, f"covariance_{name}_px2") for spot in spots], float)
-        off = (mirror_pixels(view, where, seen_px) - seen_px)[..., None]
-        seen.append(np.linalg.solve(np.linalg.cholesky(covariance), off).ravel())
+    view, places = rig.at(0.0), np.concatenate([points, up_points])
+    seen_px = np.array([s.uv_down_px for s in spots] + [s.uv_up_px for s in spots], float)
+    covariance = np.array([s.covariance_down_px2 for s in spots] + [s.covariance_up_px2 for s in spots], float)
+    off = (mirror_pixels(view, places, seen_px) - seen_px)[..., None]
+    seen = np.linalg.solve(np.linalg.cholesky(covariance), off).ravel()
     flat = points[:, :2] - view.sphere_centre_m[:2]
     turn = np.arctan2(flat[:, 1], flat[:, 0]) - [spot.azimuth_rad for spot in spots]
     known = np.stack(
@@ -366,7 +365,7 @@ def _spot_residuals(rig: Rig, values: Array, spots: Sequence[KnownSpot], points:
         axis=-1,
     )
     sigma = _place_sigmas(spots)
-    return np.concatenate([*seen, (known / sigma)[np.isfinite(sigma)]])
+    return np.concatenate([seen, (known / sigma)[np.isfinite(sigma)]])
 
 
 def _place_sigmas(spots: Sequence[KnownSpot]) -> Array:
