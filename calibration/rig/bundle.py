@@ -224,19 +224,23 @@ class _Problem:
 
     def jacobian(self, x: Array) -> Array:
         """Forward differences of `residuals`. A point moves its own spot's rows alone: so all points move at once."""
-        f, n = self.residuals(x), self.free.size
+        f, n, count = self.residuals(x), self.free.size, len(self.spots)
         step = x + _FORWARD * np.where(x >= 0.0, 1.0, -1.0) * np.maximum(1.0, np.abs(x)) - x
-        J, spots = np.zeros((f.size, x.size)), np.arange(len(self.spots))
-
-        def change(columns: NDArray[np.intp]) -> Array:
-            return self.residuals(x + np.where(np.isin(np.arange(x.size), columns), step, 0.0)) - f
-
+        J = np.zeros((f.size, x.size))
         for i in range(n):
-            J[:, i] = change(np.array([i])) / step[i]
-        own = _spot_of_rows(self.spots)
-        for columns in (n + 3 * spots + axis for axis in range(3 if self.spots else 0)):
-            rows = change(columns)[-own.size :, None] / step[columns]
-            J[-own.size :, columns] = np.where(own[:, None] == spots, rows, 0.0)
+            moved = x.copy()
+            moved[i] += step[i]
+            J[:, i] = (self.residuals(moved) - f) / step[i]
+        if count:
+            # every spot three times, moved along one axis after the other
+            values, points, steps = self.values(x), x[n:].reshape(-1, 3), step[n:].reshape(-1, 3)
+            every = np.concatenate([points + steps * axis for axis in np.eye(3)])
+            moved = _spot_residuals(changed_rig(self.nominal, values), values, self.spots * 3, every)
+            own, of_row = _spot_of_rows(self.spots), _spot_of_rows(self.spots * 3)
+            rows = f.size - own.size + np.arange(own.size)
+            for axis in range(3):
+                change = moved[of_row // count == axis] - f[rows]
+                J[rows, n + 3 * own + axis] = change / steps[own, axis]
         return J
 
 
