@@ -60,7 +60,8 @@ CURVES = np.stack(
     [np.ones(TURNS), np.cos(TURN_RAD), np.sin(TURN_RAD), np.cos(2.0 * TURN_RAD), np.sin(2.0 * TURN_RAD)], axis=1
 )
 """Derivatives of r(t) by (dr, du, dv, e1, e2), shape (TURNS, 5)."""
-for _table in (TURN_RAD, CURVES):
+_EVERY_TURN = np.arange(TURNS)
+for _table in (TURN_RAD, CURVES, _EVERY_TURN):
     _table.setflags(write=False)
 
 
@@ -142,11 +143,12 @@ class EdgeRing:
 
     def along(self, table: Array, distance_px: Array) -> Array:
         """Values of a table (TURNS, distances) on a curve, shape (TURNS,); 0 beyond the reach."""
+        count = len(self.distances_px)
         x = (distance_px - self.distances_px[0]) / self.step_px
-        i = np.clip(x.astype(np.intp), 0, len(self.distances_px) - 2)
-        fraction, rows = x - i, np.arange(TURNS)
-        value = table[rows, i] * (1.0 - fraction) + table[rows, i + 1] * fraction
-        return np.asarray(np.where((x < 0.0) | (x > len(self.distances_px) - 1), 0.0, value))
+        i = np.minimum(np.maximum(x.astype(np.intp), 0), count - 2)
+        fraction, values, place = x - i, table.reshape(-1), i + count * _EVERY_TURN
+        value = values[place] * (1.0 - fraction) + values[place + 1] * fraction
+        return np.asarray(np.where((x < 0.0) | (x > count - 1), 0.0, value))
 
     def contrast(self, curve: Array) -> float:
         """By how many standard errors a curve's mean strength exceeds that of curves beside it.

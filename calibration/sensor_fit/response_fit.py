@@ -230,8 +230,8 @@ class _Fitter:
         self.u, self.signal, self.seen, self.dark, self.sigma = u, signal, variance, dark, sigma
         self.black_u = black_u
 
-    def variance(self, terms: tuple[int, ...], x: Array, k: int) -> Array:
-        """v(y) of replicate k, shape (levels,)."""
+    def variance(self, terms: tuple[int, ...], x: Array, k: int | slice) -> Array:
+        """v(y) of replicate k, shape (levels,), or of some, shape (levels, replicates)."""
         u = self.u[:, k]
         if terms == _POWER:
             linear = self.signal[:, k] * _power_over_line(u / self.black_u, x[1])
@@ -239,14 +239,18 @@ class _Fitter:
             linear = self.signal[:, k] * (1.0 + sum(x[1 + i] * u**p for i, p in enumerate(terms)))
         return np.asarray((x[0] * linear + self.dark[k]) / self._slope(terms, x, k) ** 2)
 
-    def _slope(self, terms: tuple[int, ...], x: Array, k: int) -> Array:
+    def _slope(self, terms: tuple[int, ...], x: Array, k: int | slice) -> Array:
         u = self.u[:, k]
         if terms == _POWER:
             return np.asarray((1.0 + u / self.black_u) ** x[1])
         return np.asarray(np.ones_like(u) + sum((p + 1) * x[1 + i] * u**p for i, p in enumerate(terms)))
 
-    def _residuals(self, terms: tuple[int, ...], x: Array, k: int) -> Array:
-        return np.asarray((self.variance(terms, x, k) - self.seen[:, k]) / self.sigma)
+    def _residuals(self, terms: tuple[int, ...], x: Array) -> Array:
+        """Of all replicates, shape (levels, replicates)."""
+        return np.asarray((self.variance(terms, x, slice(None)) - self.seen) / self.sigma[:, None])
+
+    def _of_whole(self, x: Array, terms: tuple[int, ...]) -> Array:
+        return np.asarray((self.variance(terms, x, 0) - self.seen[:, 0]) / self.sigma)
 
     def fit(self, terms: tuple[int, ...]) -> _Set | None:
         """Least squares of the whole; the replicates follow by the derivative. None where there is no such response."""
@@ -255,12 +259,11 @@ class _Fitter:
         straight = float(np.sum(weight * y * excess) / np.sum(weight * y * y))
         start = np.array([straight, *(0.0 for _ in terms)])
         scale = np.array([max(abs(straight), 1e-9), *(0.1 for _ in terms)])
-        done = least_squares(lambda x: self._residuals(terms, x, 0), start, x_scale=scale)
+        done = least_squares(self._of_whole, start, x_scale=scale, args=(terms,))
         if (terms and done.x[0] <= 0.0) or float(self._slope(terms, done.x, 0).min()) < _STEEPEST:
             return None
         change = np.linalg.pinv(done.jac)
-        columns = range(self.seen.shape[1])
-        shifts = np.stack([self._residuals(terms, done.x, k) - done.fun for k in columns])
+        shifts = (self._residuals(terms, done.x) - done.fun[:, None]).T
         x = done.x - shifts @ change.T
         if terms == _POWER:
             x = self._as_polynomial(x)

@@ -29,7 +29,7 @@ def flat_frames(
 def write_frames(folder: Path, images: Sequence[NDArray[Any]]) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     for k, image in enumerate(images):
-        Image.fromarray(image).save(folder / f"{k:03d}.png")
+        Image.fromarray(image).save(folder / f"{k:03d}.png", compress_level=0)  # noise: packing takes seconds
 
 
 def write_raw_capture(

@@ -61,7 +61,7 @@ def write_stack(folder: Path, images: list[NDArray[Any]]) -> list[str]:
     folder.mkdir(parents=True)
     names = [f"{k:03d}.png" for k in range(len(images))]
     for name, image in zip(names, images, strict=True):
-        Image.fromarray(image).save(folder / name)
+        Image.fromarray(image).save(folder / name, compress_level=0)  # noise, read once: packing takes seconds
     return names
 
 

@@ -56,6 +56,7 @@ def unaligned(monkeypatch: pytest.MonkeyPatch) -> None:
         raise ImageError("not looked for")
 
     monkeypatch.setattr("phibench.calibration.captures.measure.find_outline", nothing)
+    monkeypatch.setattr("phibench.calibration.captures.measure.other_size_note", lambda *_: "")
 
 
 def refused(capsys: pytest.CaptureFixture[str], arguments: list[str]) -> str:

@@ -81,6 +81,7 @@ def unaligned(monkeypatch: pytest.MonkeyPatch) -> None:
         raise ImageError("not looked for")
 
     monkeypatch.setattr("phibench.calibration.captures.measure.find_outline", nothing)
+    monkeypatch.setattr("phibench.calibration.captures.measure.other_size_note", lambda *_: "")
 
 
 def test_interpolation_tells_each_phase_and_what_was_scaled(case: Case) -> None:
