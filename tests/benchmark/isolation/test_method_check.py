@@ -414,11 +414,12 @@ def test_check_exits_with_1_and_says_what_is_wrong(tmp_path: Path, capsys) -> No
 
 def test_check_shows_what_the_method_prints(tmp_path: Path, capsys) -> None:
     reference = method_file(tmp_path, "print('number', pair.number)\nreturn 5", header=HEADER)
-    assert cli.main(["method", "check", reference]) == 1
+    raw = ("--preset", "mono-raw")  # pairs that tests above have made
+    assert cli.main(["method", "check", reference, *raw]) == 1
     out = capsys.readouterr().out
     assert "--show-output shows it" in out
     assert "number 3" not in out
-    assert cli.main(["method", "check", reference, "--show-output"]) == 1
+    assert cli.main(["method", "check", reference, *raw, "--show-output"]) == 1
     shown = capsys.readouterr()
     assert "printed for pair 3:\n    number 3\n" in shown.out
     assert "easy pairs: 10/10" in shown.err
