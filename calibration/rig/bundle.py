@@ -224,19 +224,23 @@ class _Problem:
 
     def jacobian(self, x: Array) -> Array:
         """Forward differences of `residuals`. A point moves its own spot's rows alone: so all points move at once."""
-        f, n = self.residuals(x), self.free.size
+        f, n, count = self.residuals(x), self.free.size, len(self.spots)
         step = x + _FORWARD * np.where(x >= 0.0, 1.0, -1.0) * np.maximum(1.0, np.abs(x)) - x
-        J, spots = np.zeros((f.size, x.size)), np.arange(len(self.spots))
-
-        def change(columns: NDArray[np.intp]) -> Array:
-            return self.residuals(x + np.where(np.isin(np.arange(x.size), columns), step, 0.0)) - f
-
+        J = np.zeros((f.size, x.size))
         for i in range(n):
-            J[:, i] = change(np.array([i])) / step[i]
-        own = _spot_of_rows(self.spots)
-        for columns in (n + 3 * spots + axis for axis in range(3 if self.spots else 0)):
-            rows = change(columns)[-own.size :, None] / step[columns]
-            J[-own.size :, columns] = np.where(own[:, None] == spots, rows, 0.0)
+            moved = x.copy()
+            moved[i] += step[i]
+            J[:, i] = (self.residuals(moved) - f) / step[i]
+        if count:
+            # every spot three times, moved along one axis after the other
+            values, points, steps = self.values(x), x[n:].reshape(-1, 3), step[n:].reshape(-1, 3)
+            every = np.concatenate([points + steps * axis for axis in np.eye(3)])
+            moved = _spot_residuals(changed_rig(self.nominal, values), values, self.spots * 3, every)
+            own, of_row = _spot_of_rows(self.spots), _spot_of_rows(self.spots * 3)
+            rows = f.size - own.size + np.arange(own.size)
+            for axis in range(3):
+                change = moved[of_row // count == axis] - f[rows]
+                J[rows, n + 3 * own + axis] = change / steps[own, axis]
         return J
 
 
@@ -348,12 +352,11 @@ def _spot_residuals(rig: Rig, values: Array, spots: Sequence[KnownSpot], points:
     strokes = stroke_of(np.array([spot.stroke_m for spot in spots]), values)
     # the rig up by h is the point down by h
     up_points = points - strokes[:, None] * np.array(rig.stroke_axis_world)
-    view, seen = rig.at(0.0), []
-    for where, name in ((points, "down"), (up_points, "up")):
-        seen_px = np.array([getattr(spot, f"uv_{name}_px") for spot in spots], float)
-        covariance = np.array([getattr(spot, f"covariance_{name}_px2") for spot in spots], float)
-        off = (mirror_pixels(view, where, seen_px) - seen_px)[..., None]
-        seen.append(np.linalg.solve(np.linalg.cholesky(covariance), off).ravel())
+    view, places = rig.at(0.0), np.concatenate([points, up_points])
+    seen_px = np.array([s.uv_down_px for s in spots] + [s.uv_up_px for s in spots], float)
+    covariance = np.array([s.covariance_down_px2 for s in spots] + [s.covariance_up_px2 for s in spots], float)
+    off = (mirror_pixels(view, places, seen_px) - seen_px)[..., None]
+    seen = np.linalg.solve(np.linalg.cholesky(covariance), off).ravel()
     flat = points[:, :2] - view.sphere_centre_m[:2]
     turn = np.arctan2(flat[:, 1], flat[:, 0]) - [spot.azimuth_rad for spot in spots]
     known = np.stack(
@@ -366,7 +369,7 @@ def _spot_residuals(rig: Rig, values: Array, spots: Sequence[KnownSpot], points:
         axis=-1,
     )
     sigma = _place_sigmas(spots)
-    return np.concatenate([*seen, (known / sigma)[np.isfinite(sigma)]])
+    return np.concatenate([seen, (known / sigma)[np.isfinite(sigma)]])
 
 
 def _place_sigmas(spots: Sequence[KnownSpot]) -> Array:

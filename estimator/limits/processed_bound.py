@@ -367,8 +367,8 @@ def _readings(model: ChainModel, mean_e: Array) -> _Readings:
     """Outputs for means of the raw pixels, shape (r,)."""
     cut = cut_pixels(mean_e, raw_variance_e2(model, mean_e), model.card.saturation_e)
     at = codes(model, cut.mean_e)
-    factor = noise_factor(model, at, cut.variance_e2, model.transform)
-    rest = excess_variance(model, at, model.transform) + model.rounding
+    factor = noise_factor(model, at, cut.variance_e2, model.transform, model.parts)
+    rest = excess_variance(model, at, model.transform, model.parts) + model.rounding
     return _Readings(at, cut.slope, factor, rest, at.mean @ model.transform + model.shift)
 
 
@@ -390,7 +390,7 @@ def _off_frames_of_window(
     noise = (on.factor * output.slope).T @ (on.factor * output.slope)
     np.fill_diagonal(noise, output.variance)
     extra_e2 = raw_variance_e2(model, mean_e - spot) / frames.off + (card.prnu * spot) ** 2
-    E = noise_factor(model, on.at, on.slope**2 * extra_e2, model.transform) * output.slope
+    E = noise_factor(model, on.at, on.slope**2 * extra_e2, model.transform, model.parts) * output.slope
     room = off.rest / frames.off + (_hidden(off, model.step, frames.off) if steps else 0.0)
     C = noise / frames.on + E.T @ E + np.diag(output.slope**2 * room)
     J = (code_slopes(model, on.at, D * on.slope) @ model.transform) * output.slope

@@ -16,8 +16,9 @@ The outputs are what is then quantised: codes in steps of 1, or coefficients in 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -97,6 +98,81 @@ class ChainModel:
     step: Array
     shift: Array
     rounding: Array
+
+    @cached_property
+    def by_pixel(self) -> ByPixel:
+        """The linear way, pixel by pixel."""
+        return ByPixel.of(self.linear)
+
+    @cached_property
+    def parts(self) -> list[Part]:
+        """All outputs block by block."""
+        return parts_of(self, self.transform, self.block)
+
+    @cached_property
+    def supports(self) -> tuple[Support, ...]:
+        """What each block's outputs depend on, in the order of their numbers; none where all are one block."""
+        if not self.block.any():
+            return ()
+        first = (int(np.argmax(self.block == number)) for number in range(int(self.block.max()) + 1))
+        return tuple(self.by_pixel.support(np.flatnonzero(self.transform[:, column])) for column in first)
+
+
+@dataclass(frozen=True)
+class ByPixel:
+    """The transpose of `ChainModel.linear`, shape (r, 3 p), in its compressed rows; `pixels` is each element's row."""
+
+    values: Array
+    pixels: NDArray[np.int64]
+    codes: NDArray[np.int64]
+    ends: NDArray[np.int64]
+    count: int
+
+    @classmethod
+    def of(cls, linear: sparse.csr_array) -> ByPixel:
+        """Transpose of a matrix."""
+        turned = sparse.csr_array(linear.T)
+        turned.sort_indices()
+        pixels = np.repeat(np.arange(turned.shape[0]), np.diff(turned.indptr))
+        return cls(turned.data, pixels, turned.indices, turned.indptr, turned.shape[1])
+
+    def spread(self, regression: Array, sigma_e: Array) -> Array:
+        """Elements of the way from noise of variance 1 of the raw pixels to the codes."""
+        return np.asarray(regression[self.codes] * self.values * sigma_e[self.pixels])
+
+    def support(self, codes: NDArray[np.int64]) -> Support:
+        """Part that leads to some codes."""
+        number = np.full(max(self.count, int(codes.max()) + 1), -1)  # changes of Y' have no elements
+        number[codes] = np.arange(len(codes))
+        elements = np.flatnonzero(number[self.codes] >= 0)
+        pixels, counts = np.unique(self.pixels[elements], return_counts=True)
+        return Support(codes, pixels, elements, number[self.codes[elements]], np.concatenate([[0], np.cumsum(counts)]))
+
+
+@dataclass(frozen=True)
+class Support:
+    """Codes and raw pixels of one block; `elements` of `ByPixel`, as compressed rows of these pixels and codes."""
+
+    codes: NDArray[np.int64]
+    pixels: NDArray[np.int64]
+    elements: NDArray[np.int64]
+    columns: NDArray[np.int64]
+    ends: NDArray[np.int64]
+
+    def matrix(self, spread: Array) -> sparse.csr_array:
+        """Matrix from the block's codes to its pixels, of `ByPixel.spread`."""
+        shape = len(self.pixels), len(self.codes)
+        return sparse.csr_array((spread[self.elements], self.columns, self.ends), shape=shape)
+
+
+@dataclass(frozen=True)
+class Part:
+    """Outputs of one block: its number, codes, columns among the outputs, and the transform between them."""
+
+    number: int
+    codes: NDArray[np.int64]
+    columns: NDArray[np.int64]
+    matrix: Array
 
 
 @dataclass(frozen=True)
@@ -255,7 +331,22 @@ def code_slopes(model: ChainModel, at: Codes, derivatives: Array) -> Array:
     return np.concatenate([slopes, np.stack(each)], axis=-1)
 
 
-def noise_factor(model: ChainModel, at: Codes, variance_e2: Array, transform: Array) -> Array:
+def parts_of(model: ChainModel, transform: Array, block: NDArray[np.int64]) -> list[Part]:
+    """Outputs of a model, or some of them, block by block; `transform` holds zeros beside the parts."""
+    if not model.supports:
+        codes = np.flatnonzero(transform.any(axis=1))
+        columns = np.arange(transform.shape[1])
+        return [Part(0, codes, columns, np.ascontiguousarray(transform[codes]))] if len(columns) else []
+    parts = []
+    for number in np.unique(block):
+        columns, codes = np.flatnonzero(block == number), model.supports[number].codes
+        parts.append(Part(int(number), codes, columns, np.ascontiguousarray(transform[np.ix_(codes, columns)])))
+    return parts
+
+
+def noise_factor(
+    model: ChainModel, at: Codes, variance_e2: Array, transform: Array, parts: Sequence[Part] | None = None
+) -> Array:
     """Matrix F, shape (r, n), of which F^T F is the coefficients' covariance from the raw pixels' noise; one window.
 
     Parameters
@@ -263,16 +354,30 @@ def noise_factor(model: ChainModel, at: Codes, variance_e2: Array, transform: Ar
     at : Codes, of one window
     variance_e2 : shape (r,)
     transform : shape (3 p + q, n), of those coefficients
+    parts : the same block by block, if known
     """
-    spread = _spread(model, at.regression, np.sqrt(variance_e2))
     # F = (slopes x sigma)^T x transform: C = F^T F needs no covariance of the raw pixels
-    return np.asarray(sparse.csr_array(spread.T) @ _of_codes(model, at, transform))
+    way, sigma_e = model.by_pixel, np.sqrt(variance_e2)
+    spread = way.spread(at.regression, sigma_e)
+    if parts is None or not model.supports or model.sparing is not None:
+        matrix = sparse.csr_array((spread, way.codes, way.ends), shape=(len(sigma_e), way.count))
+        return np.asarray(matrix @ _of_codes(model, at, transform))
+    F = np.zeros((len(sigma_e), transform.shape[1]))
+    for part in parts:
+        support = model.supports[part.number]
+        F[np.ix_(support.pixels, part.columns)] = support.matrix(spread) @ part.matrix
+    return F
 
 
-def excess_variance(model: ChainModel, at: Codes, transform: Array) -> Array:
+def excess_variance(model: ChainModel, at: Codes, transform: Array, parts: Sequence[Part] | None = None) -> Array:
     """Variance of outputs, shape (n,), by what the regression of the codes leaves; one window; as `noise_factor`."""
-    T = _of_codes(model, at, transform)
-    return np.asarray(np.einsum("p,pn,pn->n", at.excess, T, T))
+    if parts is None or model.sparing is not None:
+        T = _of_codes(model, at, transform)
+        return np.asarray(np.einsum("p,pn,pn->n", at.excess, T, T))
+    variance = np.zeros(transform.shape[1])
+    for part in parts:
+        variance[part.columns] = np.einsum("p,pn,pn->n", at.excess[part.codes], part.matrix, part.matrix)
+    return variance
 
 
 def _spread(model: ChainModel, regression: Array, sigma_e: Array) -> sparse.csr_array:

@@ -144,8 +144,10 @@ def _room(
         return room_variance(each[0], step), 0.0
     mean_e = np.maximum(background_e.ravel(), 0.0)
     at = codes(chain, mean_e)
-    F, E = (noise_factor(chain, at, x, chain.transform) for x in (raw_variance_e2(chain, mean_e), extra_e2))
-    spread = np.einsum("rn,rn->n", F, F) + excess_variance(chain, at, chain.transform) + chain.rounding
+    F, E = (
+        noise_factor(chain, at, x, chain.transform, chain.parts) for x in (raw_variance_e2(chain, mean_e), extra_e2)
+    )
+    spread = np.einsum("rn,rn->n", F, F) + excess_variance(chain, at, chain.transform, chain.parts) + chain.rounding
     room = room_variance(each.mean(axis=0), step, hidden_share(np.sqrt(spread) / step, len(each)))
     known = np.einsum("rn,rn->n", E, E)
     coarse = np.flatnonzero((spread < step**2) & (room > _HIDDEN * step**2))

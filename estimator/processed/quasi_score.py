@@ -22,10 +22,12 @@ from scipy.linalg import solve_triangular
 
 from phibench.estimator.processed.chain_model import (
     ChainModel,
+    Part,
     code_slopes,
     codes,
     excess_variance,
     noise_factor,
+    parts_of,
     raw_variance_e2,
 )
 from phibench.estimator.spots.camera_codes import quantised_output, step_correlation
@@ -48,6 +50,7 @@ _REST = 1e-2  # and at which it has come to rest, if it ends for its number of s
 class Rows:
     """Some of a model's coefficients, with what belongs to them; `index` into all, shape (l,)."""
 
+    model: ChainModel
     index: NDArray[np.int64]
     transform: Array
     block: NDArray[np.int64]
@@ -59,31 +62,23 @@ class Rows:
     def all(cls, model: ChainModel) -> Rows:
         """All coefficients of a model."""
         names = ("transform", "block", "step", "shift", "rounding")
-        return cls(np.arange(len(model.step)), *(getattr(model, name) for name in names))
+        return cls(model, np.arange(len(model.step)), *(getattr(model, name) for name in names))
 
     def part(self, index: NDArray[np.int64]) -> Rows:
         """Take some of them."""
-        return Rows(*(np.take(getattr(self, f.name), index, axis=-1) for f in fields(self)))
+        return Rows(self.model, *(np.take(getattr(self, f.name), index, axis=-1) for f in fields(self)[1:]))
 
     @cached_property
-    def _parts(self) -> list[tuple[NDArray[np.int64], NDArray[np.int64], Array]]:
-        """Codes and outputs of each block, and the part of the transform between them, which holds its non-zeros."""
-        parts = []
-        for number in np.unique(self.block):
-            columns = np.flatnonzero(self.block == number)
-            rows = np.flatnonzero((self.transform[:, columns[:1]] if self._many else self.transform).any(axis=1))
-            parts.append((rows, columns, np.ascontiguousarray(self.transform[np.ix_(rows, columns)])))
-        return parts
-
-    @property
-    def _many(self) -> bool:
-        return bool(len(self.block) and self.block.max() > 0)
+    def parts(self) -> list[Part]:
+        """The same block by block."""
+        whole = self.transform is self.model.transform
+        return self.model.parts if whole else parts_of(self.model, self.transform, self.block)
 
     def of_codes(self, values: Array) -> Array:
         """Outputs, shape (..., l), of codes, shape (..., 3 p + q): `values @ transform`, block by block."""
         result = np.empty((*values.shape[:-1], len(self.block)))
-        for rows, columns, matrix in self._parts:
-            result[..., columns] = values[..., rows] @ matrix
+        for part in self.parts:
+            result[..., part.columns] = values[..., part.codes] @ part.matrix
         return result
 
 
@@ -202,9 +197,9 @@ class CoefficientWindow:
         raw, _ = self._raw(theta[None])
         at = codes(model, raw.mean_e).one(0)
         extra = raw.slope[0] ** 2 * (self.extra_e2 + self._pattern_e2(theta))
-        F = noise_factor(model, at, raw.variance_e2[0] + extra, rows.transform)
+        F = noise_factor(model, at, raw.variance_e2[0] + extra, rows.transform, rows.parts)
         room, offset = (np.broadcast_to(x, len(model.step))[rows.index] for x in (self.room, self.offset))
-        rest = excess_variance(model, at, rows.transform) + rows.rounding + room
+        rest = excess_variance(model, at, rows.transform, rows.parts) + rows.rounding + room
         # diagonal of F^T F, and what is white beside it
         sigma = np.sqrt(np.einsum("rn,rn->n", F, F) + rest)
         output = quantised_output(at.mean @ rows.transform + rows.shift + offset, sigma, rows.step)
@@ -222,7 +217,7 @@ class CoefficientWindow:
         if self.frames > 1:
             if model.noise.prnu > 0.0:
                 extra = extra + raw.slope[0] ** 2 * (model.noise.prnu * np.maximum(raw.mean_e[0], 0.0)) ** 2
-            E = noise_factor(model, at, extra, rows.transform)
+            E = noise_factor(model, at, extra, rows.transform, rows.parts)
             alike = shared_covariance(E, room, sigma, slope, rows.step)
             # mean of n frames: own errors fall by n, shared ones stay
             C = C / self.frames + (1.0 - 1.0 / self.frames) * alike
@@ -247,12 +242,13 @@ class CoefficientWindow:
         # the fixed pattern is the same in every frame; the rest is drawn anew
         pattern = raw.slope[0] ** 2 * (model.noise.prnu * np.maximum(raw.mean_e[0], 0.0)) ** 2
         changing = np.maximum(raw.variance_e2[0] - pattern, 0.0)
-        white = excess_variance(model, at.one(0), model.transform) + model.rounding
-        F = noise_factor(model, at.one(0), shared + pattern + changing / self.frames, model.transform)
+        white = excess_variance(model, at.one(0), model.transform, model.parts) + model.rounding
+        variance_e2 = shared + pattern + changing / self.frames
+        F = noise_factor(model, at.one(0), variance_e2, model.transform, model.parts)
         mean = at.one(0).mean @ model.transform + model.shift + self.offset
         spread = white
         if self.frames > 1:
-            changes = noise_factor(model, at.one(0), changing, model.transform)
+            changes = noise_factor(model, at.one(0), changing, model.transform, model.parts)
             spread = np.einsum("rn,rn->n", changes, changes) + white
         slopes = (code_slopes(model, at, derivatives) @ model.transform)[0]
         return Inputs(mean, slopes, F, white / self.frames + self.room, spread)

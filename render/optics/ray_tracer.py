@@ -27,7 +27,8 @@ from phibench.scenes.revolved_mirror import RevolvedMirror
 from phibench.scenes.revolved_profile import FormedProfile, Profile
 from phibench.scenes.rig import View
 
-Radius = Callable[[Array], Array]
+Function = Callable[[Array], Array]
+Added = Callable[[Array, Array, Array], Array]
 
 
 # Rays from the camera, reflected once at the mirror.
@@ -184,12 +185,13 @@ def meet(origins_m: Array, directions: Array, radius_m: float, form: Form) -> tu
     approach = -np.einsum("ni,ni->n", origins_m, directions)
     foot = origins_m + approach[:, None] * directions  # nearest point to the centre
     foot2 = np.einsum("ni,ni->n", foot, foot)
+    foot_xyz, way_xyz = np.ascontiguousarray(foot.T), np.ascontiguousarray(directions.T)
 
     def q(x: Array) -> Array:
         """Excess of the ray over the surface at a distance x from the foot, in squares of metres."""
         rho2 = foot2 + x * x
         with np.errstate(invalid="ignore"):
-            return rho2 - (radius_m + added((foot + x[:, None] * directions) / np.sqrt(rho2)[:, None])) ** 2
+            return rho2 - (radius_m + added(*((foot_xyz + x * way_xyz) / np.sqrt(rho2)))) ** 2
 
     # certainly hits, and q is no parabola near the sphere's centre
     central = foot2 < 0.25 * radius_m**2
@@ -200,17 +202,17 @@ def meet(origins_m: Array, directions: Array, radius_m: float, form: Form) -> tu
     return points, _normals(points, radius_m, added), approach + x
 
 
-def _added(form: Form) -> Radius:
-    """Deviation of the radius in unit directions, shape (N, 3) -> (N,)."""
+def _added(form: Form) -> Added:
+    """Deviation of the radius in unit directions x, y, z, each of shape (N,): rows that lie together are faster."""
     terms = [(peak, _HARMONICS[name]) for name, peak in asdict(form).items() if peak]
 
-    def added(n: Array) -> Array:
-        return np.asarray(sum(peak * harmonic(*n.T) for peak, harmonic in terms))
+    def added(x: Array, y: Array, z: Array) -> Array:
+        return np.asarray(sum(peak * harmonic(x, y, z) for peak, harmonic in terms))
 
     return added
 
 
-def _lowest(q: Radius, radius_m: float, count: int) -> Array:
+def _lowest(q: Function, radius_m: float, count: int) -> Array:
     """Minimiser of a function that is nearly a parabola x^2 + c, shape (N,)."""
     lowest = np.zeros(count)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -222,13 +224,13 @@ def _lowest(q: Radius, radius_m: float, count: int) -> Array:
     return lowest
 
 
-def _first_zero(q: Radius, lowest: Array, reach: Array) -> Array:
+def _first_zero(q: Function, lowest: Array, reach: Array) -> Array:
     """Zero of q about `reach` before its lowest place, shape (N,); NaN where `reach` is."""
     with np.errstate(invalid="ignore", divide="ignore"):
         return _secants(q, lowest - reach, lowest - 0.999 * reach, _SECANTS, _SETTLED)
 
 
-def _secants(f: Radius, old: Array, new: Array, most: int, rest: float) -> Array:
+def _secants(f: Function, old: Array, new: Array, most: int, rest: float) -> Array:
     """Zeros by secants from two places each, shape (N,), until no step is above `rest`, `most` of them at most."""
     f_old, f_new = f(old), f(new)
     for _ in range(most):
@@ -241,7 +243,7 @@ def _secants(f: Radius, old: Array, new: Array, most: int, rest: float) -> Array
     return new
 
 
-def _normals(points_m: Array, radius_m: float, added: Radius) -> Array:
+def _normals(points_m: Array, radius_m: float, added: Added) -> Array:
     """Outward unit normals, shape (N, 3), at surface points: the cross product of two tangents."""
     n = points_m / np.linalg.norm(points_m, axis=-1, keepdims=True)
     # the axis that lies farthest from the normal: no small cross product
@@ -249,22 +251,24 @@ def _normals(points_m: Array, radius_m: float, added: Radius) -> Array:
     first = np.cross(n, helper)
     first /= np.linalg.norm(first, axis=-1, keepdims=True)
     second = np.cross(n, first)
-    radius = (radius_m + added(n))[:, None]
-    tangents = [radius * e + _slope(added, n, e)[:, None] * n for e in (first, second)]
+    n_xyz = np.ascontiguousarray(n.T)
+    radius = (radius_m + added(*n_xyz))[:, None]
+    slopes = [_slope(added, n_xyz, np.ascontiguousarray(e.T)) for e in (first, second)]
+    tangents = [radius * e + slope[:, None] * n for e, slope in zip((first, second), slopes, strict=True)]
     normals = np.cross(*tangents)
     return np.asarray(normals / np.linalg.norm(normals, axis=-1, keepdims=True))
 
 
-def _slope(added: Radius, n: Array, e: Array) -> Array:
-    """Derivative of the radius, metres per radian, from n towards e at right angles to it."""
+def _slope(added: Added, n: Array, e: Array) -> Array:
+    """Derivative of the radius, metres per radian, from n (3, N) towards e at right angles to it."""
     # five points: (8 (f1 - f-1) - (f2 - f-2)) / 12 h
     near, far = (_difference(added, n, e, angle) for angle in (_STENCIL_RAD, 2.0 * _STENCIL_RAD))
     return (8.0 * near - far) / (12.0 * _STENCIL_RAD)
 
 
-def _difference(added: Radius, n: Array, e: Array, angle: float) -> Array:
+def _difference(added: Added, n: Array, e: Array, angle: float) -> Array:
     c, s = math.cos(angle), math.sin(angle)
-    return added(c * n + s * e) - added(c * n - s * e)
+    return added(*(c * n + s * e)) - added(*(c * n - s * e))
 
 
 # Mirror of revolution.

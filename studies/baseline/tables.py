@@ -28,6 +28,7 @@ from phibench.estimator.geometry.sensitivities import PARAMETERS
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.estimator.interface import Spot
 from phibench.estimator.methods.registry import METHODS
+from phibench.estimator.methods.spot_search import SharedPair
 from phibench.scenes.frames import Array
 from phibench.scenes.mirror import OF_REVOLVED
 from phibench.scenes.misalignment import PARAMETERS as MISALIGNMENT
@@ -274,7 +275,7 @@ def _found(folder: Path, preset: str, draws: dict[str, int], sample_id: str) -> 
     pairs = DatasetPairs(dataset, tuple(replace(pair_draw, number=i) for i, pair_draw in enumerate(chosen)))
     spots: dict[str, list[Array]] = {name: [] for name in draws}
     for number in range(len(pairs)):
-        pair = pairs.pair(number)
+        pair = SharedPair.of(pairs.pair(number))
         for name, count in draws.items():
             if number < count:
                 answer = METHODS[name](pair)
