@@ -5,8 +5,8 @@ pairs.jsonl       per pair: files, what a user knows, and the truth with its bou
 frames/           images: PNG of 8 or 16 bits, or the camera's JPEG
 SHA256SUMS        of everything above
 
-Its pairs are those of `Dataset.pairs` in one preset, with the same numbers and bytes. Nothing is drawn anew: no other
-exposure, boxes or sensor. `phibench export --to frames` writes one.
+Its pairs are those of `ScoredDataset.pairs` in one preset, with the same numbers and bytes. Nothing is drawn anew: no
+other exposure, boxes or sensor. `phibench export --to frames` writes one.
 """
 
 from __future__ import annotations
