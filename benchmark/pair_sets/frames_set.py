@@ -85,7 +85,7 @@ def truth_text(truths: Sequence[PairTruth], salt: str, public_sha256: str) -> st
     return json.dumps(document, sort_keys=True, separators=(",", ":"), allow_nan=False) + "\n"
 
 
-def read_truth_file(path: Path, sha256: str) -> list[PairTruth]:
+def read_truth_file(path: Path, expected_sha256: str) -> list[PairTruth]:
     """Truths of a file whose bytes must have a hash.
 
     Raises
@@ -96,10 +96,10 @@ def read_truth_file(path: Path, sha256: str) -> list[PairTruth]:
     file = InputFile(path, "give the truth's file")
     data = file.read()
     digest = hashlib.sha256(data).hexdigest()
-    if digest != sha256:
+    if digest != expected_sha256:
         raise DatasetError(
             f"{path} is not the truth that was sealed: its SHA-256 begins with {digest[:12]}, the seal says "
-            f"{sha256[:12]}; give the file that `phibench seal make` wrote for this set"
+            f"{expected_sha256[:12]}; give the file that `phibench seal make` wrote for this set"
         )
     truths = []
     for place, row in enumerate(file.document(SealedTruth, data).truths):
