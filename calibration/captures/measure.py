@@ -41,10 +41,11 @@ from phibench.calibration.captures.pair_photos import (
     PositionPhotos,
     frames_note,
     pair_of_photos,
+    require_fitting,
 )
-from phibench.calibration.captures.picture_files import Photo, SensorChoice, require_colour, sensor_choice
+from phibench.calibration.captures.picture_files import Photo, SensorChoice, sensor_choice
 from phibench.calibration.captures.raw_frames import PATTERNS
-from phibench.calibration.captures.rig_file import MeasuredRig, read_rig_file, require_camera_size
+from phibench.calibration.captures.rig_file import MeasuredRig, read_rig_file
 from phibench.calibration.captures.spot_shape import (
     OUTLINE_SIGMA_PX,
     PRIOR_SIGMA,
@@ -197,20 +198,23 @@ def measure(photos: PairPhotos, stroke_m: float, setting: KnownNumbers, told: To
             f"a stroke of {stroke_m:g} m with a standard deviation of {sigma:g} m: allowed is a quarter of the stroke; "
             f"{sigma:g} mm are {1e-3 * sigma:g} m"
         )
-    for photo in photos.all:
-        require_colour(photo)
-        require_camera_size(setting.known.rig, photo.size_px, str(photo.path))
-        sensor_choice(photo, setting.sensor)
+    require_fitting(photos, setting.known.rig, setting.sensor)
     require_alike(photos.pictures_to_compare, setting.known.rig)
     told("trying what the files stand for")
-    test = chain_test(
+    test = chain_of(photos, stroke_m, setting)
+    if photos.down.on[0].kind == "raw" and (corner := next(iter(test.phases))) != (0, 0):
+        inner, cut = _without(corner, photos, setting)
+        return _shifted(measure(inner, stroke_m, cut, told), corner, photos, setting, test.note)
+    return _measured(test, stroke_m, setting, told)
+
+
+def chain_of(photos: PairPhotos, stroke_m: float, setting: KnownNumbers) -> ChainTest:
+    """Chain of a pair's pictures, tried: see `chain_test`."""
+    return chain_test(
         photos,
         lambda photo: sensor_choice(photo, setting.sensor).card,
         lambda group, card: pair_of_photos(group, stroke_m, setting.known, card),
     )
-    if photos.down.on[0].kind == "raw" and (corner := next(iter(test.phases))) != (0, 0):
-        return _shifted(measure(*_without(corner, photos, stroke_m, setting), told), corner, photos, setting, test.note)
-    return _measured(test, stroke_m, setting, told)
 
 
 def _measured(test: ChainTest, stroke_m: float, setting: KnownNumbers, told: Told) -> Measurement:
@@ -327,9 +331,7 @@ def _mixed(parts: Sequence[tuple[SeenSpot, float]], added_px: float) -> SeenSpot
     return SeenSpot(mean, within + between + added_px**2 * np.eye(2), parts[0][0].unlike)
 
 
-def _without(
-    corner: tuple[int, int], photos: PairPhotos, stroke_m: float, setting: KnownNumbers
-) -> tuple[PairPhotos, float, KnownNumbers]:
+def _without(corner: tuple[int, int], photos: PairPhotos, setting: KnownNumbers) -> tuple[PairPhotos, KnownNumbers]:
     """Pictures of DN and setting without the first columns and rows, so that red comes first."""
     du, dv = corner
 
@@ -340,7 +342,7 @@ def _without(
     known = replace(setting.known, rig=_rig_at(setting.known.rig, -du, -dv))
     held = setting.calibration
     held = None if held is None else replace(held, rig=_rig_at(held.rig, -du, -dv))
-    return PairPhotos(down, up), stroke_m, replace(setting, known=known, calibration=held)
+    return PairPhotos(down, up), replace(setting, known=known, calibration=held)
 
 
 def _cut(pixels: Image, du: int, dv: int) -> Image:
@@ -406,13 +408,8 @@ def _corrected(setting: KnownNumbers, outlines: Sequence[Outline], why: str) -> 
         return held.rig, held.covariance, held.values, *calibration_note(held, outlines)
     if not outlines:
         values, covariance = np.zeros(len(PARAMETERS)), np.diag(prior_sigmas() ** 2)
-        return (
-            nominal,
-            covariance,
-            values,
-            f"rig: as in the rig file, with the errors of a ruler; no outline: {why}",
-            "",
-        )
+        note = f"rig: as in the rig file, with the errors of a ruler; no outline: {why}"
+        return nominal, covariance, values, note, ""
     outline = outlines_as_one(outlines)
     bundle = calibrate(nominal, outline)
     kind = ", by its edge alone" if any(outline.by_edge for outline in outlines) else ""
