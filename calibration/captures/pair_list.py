@@ -23,9 +23,8 @@ from phibench.calibration.captures.pair_photos import (
     LEAST_STROKE_M,
     MOST_STROKE_M,
     PairPhotos,
-    PositionPhotos,
+    read_photos,
 )
-from phibench.calibration.captures.picture_files import read_photo
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import FILE_NAME, MIB, InputFile
 from phibench.datasets.common.shown_text import csv_text
@@ -151,15 +150,10 @@ def photos_of(folder: Path, row: ListedPair, setting: KnownNumbers) -> PairPhoto
     Raises
     ------
     DatasetError
-        As `read_photo` and `PairPhotos`.
+        As `read_photos`.
     """
-    groups = {
-        key: tuple(read_photo(folder / name, setting.known.rig, setting.sensor) for name in names)
-        for key, names in row.files.items()
-    }
-    return PairPhotos(
-        PositionPhotos(groups["down"], groups["down_off"]), PositionPhotos(groups["up"], groups["up_off"])
-    )
+    files = {key: [folder / name for name in names] for key, names in row.files.items()}
+    return read_photos(files, setting.known.rig, setting.sensor)
 
 
 # -- results ---------------------------------------------------------------------------------------------------------
