@@ -22,7 +22,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from phibench.calibration.captures.measure import KnownNumbers, chain_of, read_setting
+from phibench.calibration.captures.measure import MeasureSetting, chain_of, read_setting
 from phibench.calibration.captures.pair_list import ListedPair, photos_of, read_pair_list
 from phibench.calibration.captures.pair_photos import require_fitting
 from phibench.calibration.captures.picture_files import Photo, SensorChoice, sensor_choice
@@ -121,7 +121,7 @@ def _there(path: Path) -> Path | None:
     return path if path.is_file() else None
 
 
-def _import(folder: Path, listed: Sequence[ListedPair], setting: KnownNumbers, work: Path, out: Path) -> Imported:
+def _import(folder: Path, listed: Sequence[ListedPair], setting: MeasureSetting, work: Path, out: Path) -> Imported:
     rows: list[ImportedRow] = []
     first: Photo | None = None
     test: ChainTest | None = None
@@ -174,7 +174,7 @@ def _import(folder: Path, listed: Sequence[ListedPair], setting: KnownNumbers, w
     return Imported(out, len(rows), sum(row.depth_m is not None for row in rows), chosen.note)
 
 
-def _chosen(test: ChainTest, setting: KnownNumbers) -> SensorChoice:
+def _chosen(test: ChainTest, setting: MeasureSetting) -> SensorChoice:
     """Sensor of a set, with what the pictures say of its chain.
 
     Raises

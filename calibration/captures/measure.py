@@ -79,8 +79,8 @@ from phibench.scenes.rig import POSITIONS, Rig
 
 
 @dataclass(frozen=True)
-class KnownNumbers:
-    """Numbers that are known beside the pictures.
+class MeasureSetting:
+    """Setting of a measurement: what is known beside the pictures.
 
     Attributes
     ----------
@@ -99,8 +99,8 @@ class KnownNumbers:
 
 def read_setting(
     rig: Path, calibration: Path | None = None, sensor: Path | None = None, stroke_sigma_m: float = 0.0
-) -> KnownNumbers:
-    """Setting of files.
+) -> MeasureSetting:
+    """Known numbers, read from their files.
 
     Raises
     ------
@@ -111,7 +111,7 @@ def read_setting(
     held = None if calibration is None else read_calibration(calibration, known.rig)
     if not 0.0 <= stroke_sigma_m <= MOST_STROKE_M:
         raise DatasetError(f"the stroke's standard deviation is {stroke_sigma_m:g} m: must be 0 or above")
-    return KnownNumbers(known, held, None if sensor is None else read_sensor_file(sensor), stroke_sigma_m)
+    return MeasureSetting(known, held, None if sensor is None else read_sensor_file(sensor), stroke_sigma_m)
 
 
 @dataclass(frozen=True)
@@ -170,7 +170,9 @@ _OTHER_UNITS = (("millimetres", 1e-3), ("centimetres", 1e-2))
 _USUAL_STROKE_M = 0.1  # of a rig of this kind, at least: less would be another unit
 
 
-def measure(photos: PairPhotos, stroke_m: float, setting: KnownNumbers, told: Told = lambda stage: None) -> Measurement:
+def measure(
+    photos: PairPhotos, stroke_m: float, setting: MeasureSetting, told: Told = lambda stage: None
+) -> Measurement:
     """Measure D.
 
     Parameters
@@ -178,7 +180,7 @@ def measure(photos: PairPhotos, stroke_m: float, setting: KnownNumbers, told: To
     photos : PairPhotos
     stroke_m : float
         As the person read it.
-    setting : KnownNumbers
+    setting : MeasureSetting
     told : callable
         Given each stage in words, before it begins: all together take some seconds.
 
@@ -208,7 +210,7 @@ def measure(photos: PairPhotos, stroke_m: float, setting: KnownNumbers, told: To
     return _measured(test, stroke_m, setting, told)
 
 
-def chain_of(photos: PairPhotos, stroke_m: float, setting: KnownNumbers) -> ChainTest:
+def chain_of(photos: PairPhotos, stroke_m: float, setting: MeasureSetting) -> ChainTest:
     """Chain of a pair's pictures, tried: see `chain_test`."""
     return chain_test(
         photos,
@@ -217,7 +219,7 @@ def chain_of(photos: PairPhotos, stroke_m: float, setting: KnownNumbers) -> Chai
     )
 
 
-def _measured(test: ChainTest, stroke_m: float, setting: KnownNumbers, told: Told) -> Measurement:
+def _measured(test: ChainTest, stroke_m: float, setting: MeasureSetting, told: Told) -> Measurement:
     """Measurement with the phases of a test, which are in sigma where they are several."""
     photos, chosen = test.photos, sensor_choice(test.photos.down.on[0], setting.sensor)
     parts: list[tuple[_Fitted, float]] = []
@@ -289,7 +291,7 @@ class _Fitted:
 def _fitted(
     photos: PairPhotos,
     stroke_m: float,
-    setting: KnownNumbers,
+    setting: MeasureSetting,
     card: SensorCard,
     told: Told,
     limb: _Limb | None = None,
@@ -331,7 +333,7 @@ def _mixed(parts: Sequence[tuple[SeenSpot, float]], added_px: float) -> SeenSpot
     return SeenSpot(mean, within + between + added_px**2 * np.eye(2), parts[0][0].unlike)
 
 
-def _without(corner: tuple[int, int], photos: PairPhotos, setting: KnownNumbers) -> tuple[PairPhotos, KnownNumbers]:
+def _without(corner: tuple[int, int], photos: PairPhotos, setting: MeasureSetting) -> tuple[PairPhotos, MeasureSetting]:
     """Pictures of DN and setting without the first columns and rows, so that red comes first."""
     du, dv = corner
 
@@ -361,7 +363,7 @@ def _rig_at(rig: Rig, du: int, dv: int) -> Rig:
 
 
 def _shifted(
-    found: Measurement, corner: tuple[int, int], photos: PairPhotos, setting: KnownNumbers, note: str
+    found: Measurement, corner: tuple[int, int], photos: PairPhotos, setting: MeasureSetting, note: str
 ) -> Measurement:
     """Measurement of cut pictures in the pixels of the whole ones."""
     down, up = (replace(spot, uv_px=spot.uv_px + np.array(corner)) for spot in (found.down, found.up))
@@ -400,7 +402,7 @@ def _picture(pair: Pair, position: str) -> Image:
     return pair.images[name] if pair.card.output == "raw" else pair.stack(name)[0]
 
 
-def _corrected(setting: KnownNumbers, outlines: Sequence[Outline], why: str) -> tuple[Rig, Array, Array, str, str]:
+def _corrected(setting: MeasureSetting, outlines: Sequence[Outline], why: str) -> tuple[Rig, Array, Array, str, str]:
     """Corrected rig, covariance and values of `PARAMETERS`, a sentence, and a doubt."""
     nominal = setting.known.rig
     if setting.calibration is not None:
@@ -432,7 +434,9 @@ def seen_images(pair: Pair) -> dict[str, SpotPicture]:
     return spot_pictures(pair, *(Spot(None if spot is None else spot.uv_px) for spot in (detection.down, detection.up)))
 
 
-def _shape(setting: KnownNumbers, pair: Pair, images: dict[str, SpotPicture], outlines: Sequence[Outline]) -> SpotShape:
+def _shape(
+    setting: MeasureSetting, pair: Pair, images: dict[str, SpotPicture], outlines: Sequence[Outline]
+) -> SpotShape:
     """Blur and filters: of the calibration's spots, or of these, about what outline and rig file say."""
     held = setting.calibration
     if held is not None and (document := held.made_from.get(SHAPE)) is not None:
@@ -454,7 +458,7 @@ def widened_by_shape(spot: SeenSpot, image: SpotPicture | None, shape: SpotShape
     return replace(spot, covariance_px2=spot.covariance_px2 + added, unlike=unlike)
 
 
-def _shape_note(shape: SpotShape, setting: KnownNumbers) -> str:
+def _shape_note(shape: SpotShape, setting: MeasureSetting) -> str:
     (blur, green, blue), (blur_sigma, *_) = shape.values, shape.sigmas
     held = setting.calibration is not None and SHAPE in setting.calibration.made_from
     source = "of the calibration" if held else "of these spots" if shape.images else "of the rig file"

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-from phibench.calibration.captures.measure import KnownNumbers, Measurement, measure
+from phibench.calibration.captures.measure import Measurement, MeasureSetting, measure
 from phibench.calibration.captures.pair_photos import (
     LARGEST_SIGMA,
     LEAST_STROKE_M,
@@ -144,7 +144,7 @@ def _number(key: str, text: str, fault: Callable[[str], DatasetError]) -> float:
     return value
 
 
-def photos_of(folder: Path, row: ListedPair, setting: KnownNumbers) -> PairPhotos:
+def photos_of(folder: Path, row: ListedPair, setting: MeasureSetting) -> PairPhotos:
     """Pictures of a row.
 
     Raises
@@ -191,14 +191,14 @@ class PairOutcome:
 
 
 def measured_pairs(
-    folder: Path, setting: KnownNumbers, told: Callable[[PairOutcome], None] = lambda _: None
+    folder: Path, setting: MeasureSetting, told: Callable[[PairOutcome], None] = lambda _: None
 ) -> list[PairOutcome]:
     """Measure all pairs of a folder; a pair that cannot be measured ends no run.
 
     Parameters
     ----------
     folder : Path
-    setting : KnownNumbers
+    setting : MeasureSetting
         The stroke's standard deviation of a row goes before its own.
     told : callable
         Given each result.

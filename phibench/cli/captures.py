@@ -11,7 +11,7 @@ from cyclopts import App, Parameter
 from phibench.cli.options import SENSOR, Metres, SensorFile
 
 if TYPE_CHECKING:
-    from phibench.calibration.captures.measure import KnownNumbers
+    from phibench.calibration.captures.measure import MeasureSetting
 
 Pictures = Annotated[tuple[Path, ...], Parameter(consume_multiple=True, negative="", show_default=False)]
 
@@ -85,7 +85,7 @@ def measure(
     return _measure_pair(pair, setting, out)
 
 
-def _measure_pair(pair: PairPictures, setting: KnownNumbers, out: Path | None) -> int:
+def _measure_pair(pair: PairPictures, setting: MeasureSetting, out: Path | None) -> int:
     from phibench.calibration.captures.measure import measure as measured
     from phibench.calibration.captures.measure_picture import write_measure_picture
     from phibench.calibration.captures.pair_photos import read_photos
@@ -110,7 +110,7 @@ def _measure_pair(pair: PairPictures, setting: KnownNumbers, out: Path | None) -
     return 0
 
 
-def _measure_folder(directory: Path, setting: KnownNumbers, out: Path | None) -> int:
+def _measure_folder(directory: Path, setting: MeasureSetting, out: Path | None) -> int:
     """Exit code 1 if a pair could not be measured, or contradicts itself or the tape."""
     from phibench.calibration.captures.pair_list import PairOutcome, measured_pairs, write_results
     from phibench.datasets.common.errors import DatasetError
