@@ -35,8 +35,6 @@ from phibench.calibration.captures.measurement_doubts import (
 from phibench.calibration.captures.pair_mistakes import exchanged_colours_error, missing_spot_error, no_distance_error
 from phibench.calibration.captures.pair_photos import (
     LARGEST_SIGMA,
-    LEAST_STROKE_M,
-    MOST_STROKE_M,
     PairPhotos,
     PositionPhotos,
     frames_note,
@@ -65,6 +63,7 @@ from phibench.calibration.rig.calibration_file import Calibration, read_calibrat
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.datasets.frames.sensor_file import SensorFile, read_sensor_file
+from phibench.datasets.recipe.tables import MAX_STROKE_M, MIN_STROKE_M
 from phibench.estimator.geometry.least_squares_depth import GeneralDepth, depth_general
 from phibench.estimator.geometry.rig_parameters import PARAMETERS, prior_sigmas, stroke_of
 from phibench.estimator.geometry.status import Status, describe
@@ -109,7 +108,7 @@ def read_setting(
     """
     known = read_rig_file(rig)
     held = None if calibration is None else read_calibration(calibration, known.rig)
-    if not 0.0 <= stroke_sigma_m <= MOST_STROKE_M:
+    if not 0.0 <= stroke_sigma_m <= MAX_STROKE_M:
         raise DatasetError(f"the stroke's standard deviation is {stroke_sigma_m:g} m: must be 0 or above")
     return MeasureSetting(known, held, None if sensor is None else read_sensor_file(sensor), stroke_sigma_m)
 
@@ -190,10 +189,10 @@ def measure(
         If a picture does not fit to the rig or the sensor, no spot is found, the positions are swapped, or the stroke
         contradicts the pictures; in one sentence.
     """
-    if not LEAST_STROKE_M <= stroke_m <= MOST_STROKE_M:
+    if not MIN_STROKE_M <= stroke_m <= MAX_STROKE_M:
         meant = ((name, stroke_m * unit) for name, unit in _OTHER_UNITS if stroke_m * unit >= _USUAL_STROKE_M)
         advice = next((f"; if these are {name}, write {value:g}" for name, value in meant), "")
-        allowed = f"allowed is {LEAST_STROKE_M:g} to {MOST_STROKE_M:g} m, metres"
+        allowed = f"allowed is {MIN_STROKE_M:g} to {MAX_STROKE_M:g} m, metres"
         raise DatasetError(f"a stroke of {stroke_m:g} m: {allowed}{advice}")
     if (sigma := setting.stroke_sigma_m) > LARGEST_SIGMA * stroke_m:
         raise DatasetError(

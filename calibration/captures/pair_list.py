@@ -18,16 +18,11 @@ from functools import partial
 from pathlib import Path
 
 from phibench.calibration.captures.measure import Measurement, MeasureSetting, measure
-from phibench.calibration.captures.pair_photos import (
-    LARGEST_SIGMA,
-    LEAST_STROKE_M,
-    MOST_STROKE_M,
-    PairPhotos,
-    read_photos,
-)
+from phibench.calibration.captures.pair_photos import LARGEST_SIGMA, PairPhotos, read_photos
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import FILE_NAME, MIB, InputFile
 from phibench.datasets.common.shown_text import csv_text
+from phibench.datasets.recipe.tables import MAX_STROKE_M, MIN_STROKE_M
 from phibench.datasets.store.files import write_text
 from phibench.datasets.store.schema import TruthFile
 from phibench.scenes.validation import nearest, printable_line
@@ -35,7 +30,7 @@ from phibench.scenes.validation import nearest, printable_line
 PAIRS = TruthFile.MEASURED.value
 _FILES = ("down", "up", "down_off", "up_off")
 _NUMBERS = {
-    "stroke_m": (LEAST_STROKE_M, MOST_STROKE_M),
+    "stroke_m": (MIN_STROKE_M, MAX_STROKE_M),
     "stroke_sigma_m": (0.0, 1.0),
     "depth_m": (0.05, 100.0),
     "depth_sigma_m": (1e-6, 10.0),

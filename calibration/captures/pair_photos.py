@@ -20,7 +20,6 @@ from phibench.datasets.frames.sensor_file import SensorFile
 from phibench.estimator.interface import Pair
 from phibench.scenes.rig import POSITIONS, Rig
 
-LEAST_STROKE_M, MOST_STROKE_M = 1e-3, 10.0  # those of a recipe
 LARGEST_SIGMA = 0.25  # of a length that somebody measured; a larger one is of another unit
 
 
