@@ -32,6 +32,7 @@ from phibench.datasets.common.camera_pictures import read_camera_picture
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import SETTINGS_BYTES, InputFile
 from phibench.datasets.store.schema import Document
+from phibench.estimator.spots.simple_spots import LUMA
 from phibench.scenes.frames import Array
 from phibench.scenes.validation import printable_line, structural_faults
 
@@ -365,7 +366,7 @@ def luma(image: NDArray[Any], kind: Kind) -> Array:
     """Y' of a processed frame, shape (h, w), BT.601, on 0 to 255 (that of YUYV as it is)."""
     if kind == "yuyv":
         return image[..., 0].astype(float)
-    return np.asarray(image.astype(float) @ np.array([0.299, 0.587, 0.114]))  # BT.601
+    return np.asarray(image.astype(float) @ np.array(LUMA))
 
 
 # -- header of a JPEG file --------------------------------------------------------------------------------------------

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from phibench.render.sensor.light import Light, Region, SpotImage, moved_spot
+from phibench.render.sensor.light import Light, Region, SpotImage
 from phibench.render.sensor.settings import Sensor, SensorError
 from phibench.scenes.camera import Camera
 from phibench.scenes.frames import Array
@@ -174,26 +174,18 @@ def expected_electrons(light: Light, sensor: Sensor, camera: Camera, region: Reg
     electrons = sampled_planes(part, sensor, phase).astype(float) * (seconds * light.lamp_level)
     if light.spot is not None:
         factor = seconds * light.laser_level * flicker
-        _add_spot(electrons, light.spot, factor, light.velocity_px_per_s, light, sensor, region)
+        _add_spot(electrons, light.spot, factor, sensor, region)
     for other in light.others:
         factor = seconds * (light.laser_level if other.follows_laser else 1.0)
-        _add_spot(electrons, other.image, factor, (0.0, 0.0), light, sensor, region)
+        _add_spot(electrons, other.image, factor, sensor, region)
     return electrons * vignetting(sensor.vignetting_exponent, camera, region)
 
 
-def _add_spot(
-    electrons: Array,
-    spot: SpotImage,
-    factor: float,
-    velocity_px_per_s: tuple[float, float],
-    light: Light,
-    sensor: Sensor,
-    region: Region,
-) -> None:
+def _add_spot(electrons: Array, spot: SpotImage, factor: float, sensor: Sensor, region: Region) -> None:
     """Add `factor` times a spot to what `expected_electrons` has of the ambient light, in place."""
     if factor == 0.0:
         return
-    u0, v0, planes = moved_spot(spot, velocity_px_per_s, sensor.exposure_s, sensor.readout_s, light.size[0])
+    u0, v0, planes = spot.u0_px, spot.v0_px, spot.electrons_per_s
     window = Region(u0, v0, u0 + planes.shape[2], v0 + planes.shape[1])
     common = Region(
         max(window.u0_px, region.u0_px),

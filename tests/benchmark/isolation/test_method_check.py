@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from helpers.sandbox_pairs import HEADER, method_file
 
-from phibench.benchmark.isolation.answers import AnswerError, answer_text, checked_answer
+from phibench.benchmark.isolation.answers import AnswerError, answer_document, checked_answer
 from phibench.benchmark.isolation.easy_pairs import EasyPairs
 from phibench.benchmark.isolation.method_check import PAIRS, MethodCheck, check_method, check_of_outcomes
 from phibench.benchmark.isolation.run_limits import MethodError, RunLimits
@@ -70,7 +70,7 @@ def tried(method: Method, pairs: list[Pair], of: EasyPairs = SET) -> MethodCheck
     done = []
     for pair in pairs:
         try:
-            done.append(Outcome(pair.number, checked_answer(answer_text(method(pair))), 0.01))
+            done.append(Outcome(pair.number, checked_answer(answer_document(method(pair))), 0.01))
         except AnswerError as error:
             done.append(Outcome(pair.number, None, 0.01, "invalid", str(error)))
         except AttributeError as error:
