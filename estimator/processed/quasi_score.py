@@ -22,7 +22,6 @@ from scipy.linalg import solve_triangular
 
 from phibench.estimator.processed.chain_model import (
     ChainModel,
-    Part,
     code_slopes,
     codes,
     excess_variance,
@@ -30,6 +29,7 @@ from phibench.estimator.processed.chain_model import (
     parts_of,
     raw_variance_e2,
 )
+from phibench.estimator.processed.output_blocks import Part
 from phibench.estimator.spots.camera_codes import quantised_output, step_correlation
 from phibench.estimator.spots.gaussian_spot import SpotPixels, limited_step, scoring_step
 from phibench.estimator.spots.pixel_statistics import CutPixels, cut_pixels

@@ -31,7 +31,7 @@ CELLS = [
 NAMES = [f"{s.name}-{d:g}-{h:g}-{e:g}" for s, d, h, e in CELLS]
 
 
-@pytest.mark.parametrize("cell", CELLS[:2], ids=NAMES[:2])
+@pytest.mark.parametrize("cell", [pytest.param(CELLS[0], marks=pytest.mark.slow), CELLS[1]], ids=NAMES[:2])
 def test_accuracy_of_the_joint_fit_in_short(cell: tuple[Sensor, float, float, float]) -> None:
     """480 draws: a standard deviation of 3 %."""
     checked(*cell, 12)

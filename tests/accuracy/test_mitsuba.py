@@ -148,16 +148,21 @@ def test_accuracy_spot_layer_against_brute_force_path_tracing(mi: ModuleType) ->
     [
         ("defocused", {"focus_m": 0.46, "blur_px": 0.3}),
         ("rough", {"alpha": 0.004, "blur_px": 0.3}),
-        ("off axis", {"T_camera_sphere": Pose("camera", "sphere", (0.01, -0.008, 0.30)), "blur_px": 0.3}),
+        pytest.param(
+            *("off axis", {"T_camera_sphere": Pose("camera", "sphere", (0.01, -0.008, 0.30)), "blur_px": 0.3}),
+            marks=pytest.mark.slow,
+        ),
     ],
 )
 def test_accuracy_spot_layer_against_path_tracing_short(mi: ModuleType, name: str, changes: dict[str, Any]) -> None:
     """The same with fewer paths for the other optics: flux and shares within 5 sigma + 0.3 % (false alarm 6e-7).
 
-    2.5e7 paths: sigma is at most 0.55 %, so that 3 % are always seen; 0.3 % are for the slow test above.
+    1.7e7 paths on 9 x 9 pixels, which hold all of the light but 1e-4: sigma is at most 0.55 %, so that 3 % are always
+    seen; 0.3 % are for the slow test above.
     """
     spot = LaserSpot((1.9, 0.7, 0.5), (-1.9, -0.7, 0.0), 20e-3, profile="uniform")
-    figures = compare(mi, _red_laser_rig(**changes), spot, 5, 2.5e7)
+    figures = compare(mi, _red_laser_rig(**changes), spot, 4, 1.67e7)
+    assert figures["inside"] > 0.9998
     assert figures["flux_error"] < 5.5e-3
     assert abs(figures["flux"]) <= 5.0 * figures["flux_error"] + 3e-3
     assert figures["share"] <= 2.5 * figures["flux_error"] + 2e-3

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pytest
 from helpers.chain_scenes import COLLECTED, ROOM
@@ -24,20 +26,26 @@ PLACES = {"down": np.array([430.3, 300.2]), "up": np.array([470.6, 320.8])}
 
 def pair_of(preset: str, off: bool, stripes: bool = False, collected_e: float = 5000.0) -> Pair:
     """Spots over a room of 100 e-, flat or with vertical stripes of 100 and 400 e-."""
-    s = sensor(preset)
+    images = {position: frame(preset, position, stripes, collected_e) for position in PLACES}
+    if off:
+        images |= {f"{position}_off": frame(preset, position, stripes, None) for position in PLACES}
+    boxes = {f"box_{p}": Box(int(uv[0]) - 12, int(uv[1]) - 9, 21, 21) for p, uv in PLACES.items()}
+    return Pair(number=0, rig=RIG, stroke_m=0.5, card=card_of(sensor(preset)), **images, **boxes)
+
+
+@cache
+def frame(preset: str, position: str, stripes: bool, collected_e: float | None) -> np.ndarray:
+    """Whole frame with the spot, or with the laser off; read only."""
+    s, uv = sensor(preset), PLACES[position]
     room = np.full((720, 1280), 100.0 / s.exposure_s)
     if stripes:
         room[:, np.arange(1280) // 5 % 2 == 0] *= 4.0
-    images = {}
-    for position, uv in PLACES.items():
-        spot = spot_at(*uv, spot_blur(RIG, uv).sigma_px, collected_e / COLLECTED / s.exposure_s)
-        light = Light(ROOM[:, None, None] * room, spot)
-        images[position] = Chain(s).frame(light, NoiseStream(("method", position, stripes)))
-        if off:
-            dark = NoiseStream(("method", position, "off", stripes))
-            images[f"{position}_off"] = Chain(s).frame(light.laser_off(), dark)
-    boxes = {f"box_{p}": Box(int(uv[0]) - 12, int(uv[1]) - 9, 21, 21) for p, uv in PLACES.items()}
-    return Pair(number=0, rig=RIG, stroke_m=0.5, card=card_of(s), **images, **boxes)
+    names = ("method", position, stripes) if collected_e else ("method", position, "off", stripes)
+    spot = spot_at(*uv, spot_blur(RIG, uv).sigma_px, (collected_e or 1.0) / COLLECTED / s.exposure_s)
+    light = Light(ROOM[:, None, None] * room, spot)
+    image = Chain(s).frame(light if collected_e else light.laser_off(), NoiseStream(names))
+    image.flags.writeable = False
+    return image
 
 
 @pytest.mark.parametrize("off", [False, True])

@@ -348,6 +348,10 @@ def test_joint_fit_answers_a_depth_with_its_sigma(s: Sensor, off: bool) -> None:
     assert answer.sigma_depth_m is not None
     assert abs(answer.depth_m - 2.0) < 5.0 * answer.sigma_depth_m
     assert answer.sigma_depth_m < 0.2
+
+
+@pytest.mark.parametrize("s", [BAYER, MONO, SRGB, MJPEG], ids=lambda s: s.name)
+def test_joint_fit_of_a_spot_in_one_image_answers_no_depth(s: Sensor) -> None:
     one = joint_fit(Scene(s, (12_000.0, 0.0), tiles=0.0).pair(off=True))
     assert one.depth_m is None
     assert one.down.uv_px is not None

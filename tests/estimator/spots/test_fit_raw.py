@@ -91,7 +91,7 @@ def _named(value: object) -> str:
 @pytest.mark.parametrize(
     ("s", "sigma_px", "collected_e", "background_e"),
     [
-        (MONO, 0.7, 2000.0, 100.0),
+        pytest.param(MONO, 0.7, 2000.0, 100.0, marks=pytest.mark.slow),
         (BAYER, 0.7, 2000.0, 100.0),
         pytest.param(BAYER, 0.7, 500.0, 0.0, marks=pytest.mark.slow),
         # at 0.7 px the brightest red pixels would be full
