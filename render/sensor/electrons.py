@@ -96,7 +96,8 @@ def _by_tiles(stream: NoiseStream, region: Region, draw: Draw) -> Array:
         for u in range(0, width, TILE_PX):
             # word 0 counts the tile's own draws
             counter = (0, (region.v0_px + v) // TILE_PX, (region.u0_px + u) // TILE_PX, 0)
-            bits.state = {**fresh, "state": {"counter": counter, "key": key}}
+            state: Any = {**fresh, "state": {"counter": counter, "key": key}}
+            bits.state = state
             part = slice(v, v + TILE_PX), slice(u, u + TILE_PX)
             result[part] = draw(generator, part)
     return result
