@@ -359,6 +359,11 @@ def _seconds(level: Path) -> float:
         raise CaptureError(
             f"{printable_line(str(level))}: the folder's name must be its exposure time, seconds, such as 0.0100"
         )
+    if level.name.isdigit():  # milliseconds as often as seconds: a factor of 1000 that nothing else would tell
+        raise CaptureError(
+            f"{printable_line(str(level))}: {level.name} of which unit? Name it {int(level.name)}.0 for seconds, "
+            f"{float(level.name) / 1000:g} for milliseconds"
+        )
     return float(level.name)
 
 
