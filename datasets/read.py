@@ -27,7 +27,7 @@ from phibench.datasets.common.shown_text import ShortForm
 from phibench.datasets.frames.distractors import Distractor, distractors
 from phibench.datasets.frames.frame_request import FrameOptions, FrameRequest, sample_request
 from phibench.datasets.frames.frame_source import Frames, FrameSource
-from phibench.datasets.recipe.recipe_scene import spot_albedo
+from phibench.datasets.recipe.recipe_scene import beam_of, spot_albedo
 from phibench.datasets.recipe.tables import Recipe
 from phibench.datasets.store.checksums import check_documents
 from phibench.datasets.store.layers import SpotWindow, read_ambient, read_ambient_variance, read_spot, read_truth
@@ -124,10 +124,7 @@ class Dataset(ShortForm):
     @property
     def beam(self) -> Beam:
         """Diameter of the laser's spots by the recipe; single targets may differ."""
-        laser = self.recipe.laser
-        if laser.diameter_m is not None:
-            return Beam(laser.diameter_m, 0.0)
-        return Beam(laser.diameter_base_m, laser.diameter_growth_m_per_m)
+        return beam_of(self.recipe.laser)
 
     def __len__(self) -> int:
         return len(self.rows)

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from phibench.calibration.captures.measure import KnownNumbers, PairPhotos, PositionPhotos, measure
+from phibench.calibration.captures.measure import MeasureSetting, PairPhotos, PositionPhotos, measure
 from phibench.calibration.captures.measure_picture import draw_measurement
 from phibench.calibration.captures.picture_files import read_photo
 from phibench.calibration.captures.rig_file import MeasuredRig
@@ -37,7 +37,7 @@ def main() -> None:
             path.write_bytes(png_bytes(frame.image) if frame.jpeg is None else frame.jpeg)
             photos.append(read_photo(path, default_rig()))
         down, up = (PositionPhotos((photos[k],), (photos[k + 2],)) for k in (0, 1))
-        setting = KnownNumbers(MeasuredRig(default_rig(), None))
+        setting = MeasureSetting(MeasuredRig(default_rig(), None))
         found = measure(PairPhotos(down, up), sample.row.nominal_stroke_m, setting)
     picture = draw_measurement(replace(found, notes=found.notes[-1:]), f"true D = {sample.row.depth_m:.3f} m")
     height = round(picture.height * _WIDTH / picture.width)

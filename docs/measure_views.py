@@ -42,7 +42,7 @@ from phibench.datasets.plan.draws import draw_rooms
 from phibench.datasets.plan.plan import make_plan
 from phibench.datasets.recipe.load import load_recipe, parse_recipe, recipe_text
 from phibench.datasets.rooms.room_sources import room_of
-from phibench.datasets.store.layers import TRUTH_PLANES
+from phibench.datasets.store.layers import STORED_TRUTH_PLANES
 from phibench.datasets.store.schema import ROOM_FILES, view_file
 from phibench.render.optics.room_tracer import room_geometry
 from phibench.render.optics.truth import truth_layer
@@ -152,7 +152,7 @@ def measure_noise(what: str, quality: str | None, seeds: int) -> None:
     levels, variances = (
         np.array(a) for a in zip(*((v.electrons_per_s, v.variance_per_s2) for v in drawn), strict=True)
     )
-    truth = truth_layer(view, room_geometry(room, view), surfaces.first_patch, TRUTH_PLANES)
+    truth = truth_layer(view, room_geometry(room, view), surfaces.first_patch, STORED_TRUTH_PLANES)
     mean = levels.mean(axis=0)
     counts = np.isfinite(truth["path_m"]) & ~is_full(mean)
     scatter = levels.var(axis=0, ddof=1)

@@ -99,13 +99,13 @@ class SharedFolder:
 
     def __init__(self, factory: pytest.TempPathFactory) -> None:
         base = factory.getbasetemp()
-        self._folder = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+        self.folder = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
 
     def made(self, name: str, make: Callable[[Path], object]) -> Path:
         """Folder `name`, filled by `make`, which gets a path that is not there yet; without Mitsuba a skip."""
         if find_spec("mitsuba") is None:  # imported it must not be before its LLVM is chosen
             pytest.skip("nothing renders here: Mitsuba is not installed")
-        out = self._folder / f"shared-{name}"
+        out = self.folder / f"shared-{name}"
         with FileLock(out.with_suffix(".lock")):
             if not out.exists():
                 make(out.with_suffix(".part"))
@@ -160,6 +160,8 @@ def filmed(shared: SharedFolder, name: str, changes: dict[str, str], alone: bool
     from helpers.remembered_spots import SPOTS
 
     from phibench.datasets.film.film_make import make_films
+
+    SPOTS.folder = shared.folder / "spots-of-films"
 
     def make(out: Path) -> None:
         recipe, text = out.with_suffix(".toml"), (ROOT / "tests" / "films.toml").read_text(encoding="utf-8")

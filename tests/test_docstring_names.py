@@ -9,7 +9,7 @@ from functools import cache
 from pathlib import Path
 
 import pytest
-from helpers.districts import DISTRICTS, tree
+from helpers.districts import DISTRICTS, statements, tree
 from helpers.docstring_entries import annotations, entries
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -119,8 +119,9 @@ def wrong_types(module: ast.Module) -> Iterator[tuple[str, bool]]:
     Excepted are `NO_TYPES`. An alias counts as what it stands for. Where there is no annotation, or `Any`, a class of
     the library or a name of the module is enough.
     """
-    bound = classes().union(*(defined(node) for node in ast.walk(module) if isinstance(node, ast.stmt)))
-    for node in (node for node in ast.walk(module) if isinstance(node, ast.ClassDef | ast.FunctionDef)):
+    inside = list(statements(module))
+    bound = classes().union(*(defined(node) for node in inside if isinstance(node, ast.stmt)))
+    for node in (node for node in inside if isinstance(node, ast.ClassDef | ast.FunctionDef)):
         types = annotations(node)
         for section, head, _ in entries(ast.get_docstring(node) or ""):
             names, _, text = head.partition(" : ")

@@ -177,7 +177,7 @@ def _drawn_pairs(dataset: Dataset, shard: Shard) -> list[DrawnPair]:
 
 
 def _scored_pairs(dataset: Dataset, shard: Shard) -> tuple[list[DrawnPair], list[dict[str, Any]]]:
-    """Pairs as they are scored, with the lines of a frames set: the frames of `Dataset.pairs`."""
+    """Pairs as they are scored, with the lines of a frames set: the frames of `ScoredDataset.pairs`."""
     request, pairs, lines = shard.request, [], []
     taken = scored_pairs(dataset, request)
     for sample_id, draw in shard.pairs:

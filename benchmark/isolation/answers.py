@@ -24,7 +24,7 @@ _DEEPEST = 4  # lists in each other: a covariance has two
 _LARGEST_INTEGER = 10**300  # a float holds it; a longer one does not fit into any number of an answer
 
 
-def answer_text(value: object) -> dict[str, Any]:
+def answer_document(value: object) -> dict[str, Any]:
     """Document of an answer; {"wrong": sentence} of anything else."""
     if not isinstance(value, Answer):
         return {"wrong": f"the method returned {value_description(value)}: an Answer(down, up) is needed"}
@@ -113,7 +113,7 @@ class AnswerError(ValueError):
 
 
 def checked_answer(document: dict[str, Any]) -> Answer:
-    """Answer of a document of `answer_text`.
+    """Answer of a document of `answer_document`.
 
     Where a status is not "ok" whatever position comes with it is dropped. The document may be forged: any JSON ends in
     an answer or in an `AnswerError` of one line.
@@ -268,7 +268,7 @@ def most_bytes(shape: tuple[int, int]) -> int:
     return 3 * 8 * math.prod(shape) * 4 // 3 + (1 << 16)
 
 
-def dense_answer_text(value: object) -> dict[str, Any]:
+def dense_answer_document(value: object) -> dict[str, Any]:
     """Document of a dense answer; {"wrong": sentence} of anything else."""
     if not isinstance(value, DenseAnswer):
         return {"wrong": f"the method returned {value_description(value)}: a DenseAnswer(depth_m=...) is needed"}
@@ -282,7 +282,7 @@ def _encoded(plane: Any) -> dict[str, Any]:
 
 
 def checked_dense_answer(document: dict[str, Any], shape: tuple[int, int]) -> DenseAnswer:
-    """Answer of a document of `dense_answer_text`, for an image of this shape; the document may be forged.
+    """Answer of a document of `dense_answer_document`, for an image of this shape; the document may be forged.
 
     Raises
     ------

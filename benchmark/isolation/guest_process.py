@@ -91,7 +91,7 @@ class MethodProcess:
     """A method that is kept warm between pairs, and started anew after a failure; or several built-in ones.
 
     Built-in methods may have one process together. They get a pair once and share what they begin with
-    (`locate.SharedWork`). A method of another's has its process alone: nothing that it does reaches others.
+    (`spot_search.SharedWork`). A method of another's has its process alone: nothing that it does reaches others.
 
     Parameters
     ----------
@@ -385,9 +385,7 @@ class GuestProcess:
         with contextlib.suppress(subprocess.TimeoutExpired):  # it still runs
             self._process.wait(_STACK_SECONDS)
         code = self._process.poll()
-        if code is None:
-            return "the process broke its connection to the runner"
-        if code == HUNG_UP:
+        if code in (None, HUNG_UP):
             return "the process broke its connection to the runner"
         if code >= 0:
             return f"the process left with exit code {code}, without an answer"

@@ -132,7 +132,7 @@ DENSE = MethodTask(
 GROUP = SPOTS.group
 
 
-def resolve(reference: str, seat: MethodTask = SPOTS) -> Reference:
+def resolve(reference: str, task: MethodTask = SPOTS) -> Reference:
     """Find a method.
 
     Raises
@@ -141,44 +141,44 @@ def resolve(reference: str, seat: MethodTask = SPOTS) -> Reference:
         If the file or its function is missing, the file is not Python, the name is unknown, or two methods share it.
     """
     if reference.endswith(".py") or ".py:" in reference:
-        return _of_file(reference, seat)
+        return _of_file(reference, task)
     # a second of imports that a method in a file does not need
-    known = importlib.import_module(seat.registry).KNOWN
-    points = [point for point in installed_methods(seat) if point.name == reference]
+    known = importlib.import_module(task.registry).KNOWN
+    points = [point for point in installed_methods(task) if point.name == reference]
     if reference in known:
         if points:
             raise MethodError(f"method '{reference}' is built in, and {_owner(points[0])} registers another")
-        return _built_in(known[reference], seat)
+        return _built_in(known[reference], task)
     if len(points) > 1:
         raise MethodError(f"method '{reference}' is registered by {' and by '.join(map(_owner, points))}: remove one")
     if not points:
-        raise MethodError(_unknown(reference, list(known), seat))
+        raise MethodError(_unknown(reference, list(known), task))
     hashed = package_sha256(points[0].dist, points[0].module)
     return Reference(reference, "package", points[0].value, sha256=hashed, version=_owner(points[0]))
 
 
-def installed_methods(seat: MethodTask = SPOTS) -> tuple[EntryPoint, ...]:
+def installed_methods(task: MethodTask = SPOTS) -> tuple[EntryPoint, ...]:
     """Entry points of installed packages, by name; none of them is imported."""
-    return tuple(sorted(entry_points(group=seat.group), key=lambda point: point.name))
+    return tuple(sorted(entry_points(group=task.group), key=lambda point: point.name))
 
 
-def _built_in(method: Any, seat: MethodTask) -> Reference:
+def _built_in(method: Any, task: MethodTask) -> Reference:
     if not method.installed:
         raise MethodError(f"method '{method.name}' {method.needs}")
-    sees: Literal["image", "pair"] = "image" if seat is SPOTS and not method.joint else "pair"
-    return Reference(method.name, "built-in", seat.registry, sha256=code_behind(seat.registry), sees=sees)
+    sees: Literal["image", "pair"] = "image" if task is SPOTS and not method.joint else "pair"
+    return Reference(method.name, "built-in", task.registry, sha256=code_behind(task.registry), sees=sees)
 
 
-def _of_file(reference: str, seat: MethodTask) -> Reference:
+def _of_file(reference: str, task: MethodTask) -> Reference:
     text, colon, function = reference.rpartition(":")
     if not colon or not function.isidentifier():
         file = Path(text if colon else reference).name
-        raise MethodError(f"method '{reference}': say which function is meant, such as {file}:{seat.function}")
+        raise MethodError(f"method '{reference}': say which function is meant, such as {file}:{task.function}")
     path = Path(text).absolute()
     if not path.is_file():
         if path.is_dir():
             raise MethodError(f"method '{reference}': {path} is a folder; name the file with the function in it")
-        advice = f"`{seat.command} new {text}` writes an example"
+        advice = f"`{task.command} new {text}` writes an example"
         raise MethodError(f"method '{reference}': the file {path} is not there; {advice}")
     if path.name != printable_line(path.name):
         raise MethodError(f"method '{printable_line(path.name)}': give the file a name of at most 200 printable signs")
@@ -275,15 +275,15 @@ def _owner(point: EntryPoint) -> str:
     return "an unknown package" if point.dist is None else f"{point.dist.name} {point.dist.version}"
 
 
-def _unknown(name: str, built_in: list[str], seat: MethodTask) -> str:
-    known = [*built_in, *(point.name for point in installed_methods(seat))]
+def _unknown(name: str, built_in: list[str], task: MethodTask) -> str:
+    known = [*built_in, *(point.name for point in installed_methods(task))]
     guess = close_names(name, known)
-    advice = f"did you mean '{guess[0]}'?" if guess else f"`{seat.command} list` lists what there is."
-    own = f"{seat.file}:{seat.function}"
+    advice = f"did you mean '{guess[0]}'?" if guess else f"`{task.command} list` lists what there is."
+    own = f"{task.file}:{task.function}"
     return f"no method '{name}': {advice} A method of your own is given as file and function, {own}"
 
 
-def write_example(path: Path, seat: MethodTask = SPOTS) -> Path:
+def write_example(path: Path, task: MethodTask = SPOTS) -> Path:
     """Write the example method to a file that is not there yet.
 
     Raises
@@ -292,8 +292,8 @@ def write_example(path: Path, seat: MethodTask = SPOTS) -> Path:
         If the name does not end in .py, or there is something of that name.
     """
     if path.suffix != ".py":
-        raise MethodError(f"{path}: the file of a method must end in .py, such as {seat.file}")
+        raise MethodError(f"{path}: the file of a method must end in .py, such as {task.file}")
     if path.exists():
         raise MethodError(f"{path} is there already and is not overwritten: give another name or remove it")
-    example = Path(__file__).parent / seat.example
-    return write_text(path, example.read_text(encoding="utf-8").replace(seat.file, path.name))
+    example = Path(__file__).parent / task.example
+    return write_text(path, example.read_text(encoding="utf-8").replace(task.file, path.name))

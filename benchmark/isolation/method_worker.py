@@ -31,7 +31,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-from phibench.benchmark.isolation.answers import answer_text, dense_answer_text, to_bytes
+from phibench.benchmark.isolation.answers import answer_document, dense_answer_document, to_bytes
 from phibench.benchmark.isolation.method_provenance import loaded_names
 from phibench.benchmark.isolation.method_references import Reference
 from phibench.benchmark.isolation.pair_transport import Connection, ReceivedPair, SharedPages, TransportError, unpack
@@ -299,8 +299,10 @@ def _reply(method: Method, received: ReceivedPair, limits: RunLimits, limit_byte
         with memory_limit(limit_bytes):
             return method(pair)
 
-    work, text = getattr(pair, "work", None), answer_encoder(pair)
-    reply = reply_of(ask, file, BaseException, limits, text) if work is None else _reply_with_stages(ask, work, limits)
+    work, encode = getattr(pair, "work", None), answer_encoder(pair)
+    reply = (
+        reply_of(ask, file, BaseException, limits, encode) if work is None else _reply_with_stages(ask, work, limits)
+    )
     for stream in (sys.stdout, sys.stderr):  # what belongs to this pair must be in the pipe before the reply
         with suppress(Exception):  # the method has closed or replaced it
             stream.flush()
@@ -319,7 +321,7 @@ def _reply_with_stages(ask: Callable[[], Any], work: SharedWork, limits: RunLimi
 
 def answer_encoder(pair: object) -> Callable[[object], dict[str, Any]]:
     """Encoder of the answers that a kind of pair asks for."""
-    return dense_answer_text if isinstance(pair, DensePair) else answer_text
+    return dense_answer_document if isinstance(pair, DensePair) else answer_document
 
 
 def reply_of(
@@ -327,7 +329,7 @@ def reply_of(
     file: str = "",
     caught: type[BaseException] = Exception,
     limits: RunLimits | None = None,
-    text: Callable[[object], dict[str, Any]] = answer_text,
+    encode: Callable[[object], dict[str, Any]] = answer_document,
 ) -> dict[str, Any]:
     """Answer or failure of one pair, with its time, as a document.
 
@@ -337,11 +339,11 @@ def reply_of(
     file : file of the method, whose line an error names
     caught : what counts as the method's error; anything else passes
     limits : under which the method runs; None if there are none
-    text : encodes the answer
+    encode : gives the document of an answer
     """
     start = time.perf_counter()
     try:
-        reply: dict[str, Any] = {"failure": "", "answer": text(ask())}
+        reply: dict[str, Any] = {"failure": "", "answer": encode(ask())}
     except caught as error:
         reply = _of_exception(error, file, limits)
     return {**reply, "seconds": time.perf_counter() - start}

@@ -320,7 +320,7 @@ def outcomes_here(method: Callable[[Any], Any]) -> Callable[[ShownPairs, Sequenc
     require_method(method, function_name(method))
 
     def one(pair: AnyPair) -> tuple[Outcome]:
-        reply = reply_of(lambda: method(pair), text=answer_encoder(pair))
+        reply = reply_of(lambda: method(pair), encode=answer_encoder(pair))
         return (outcome_of(pair, reply, reply["seconds"]),)
 
     return lambda pairs, numbers: (one(pairs.pair(number)) for number in numbers)

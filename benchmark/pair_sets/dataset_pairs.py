@@ -52,7 +52,7 @@ TASK_VERSION = 6
 
 Track = Literal["localise", "find", "depth"]
 TRACKS: tuple[Track, ...] = get_args(Track)
-BOX_PX, BOX_MARGIN_PX = 64, 16
+LOCALISE_BOX_PX, LOCALISE_MARGIN_PX = 64, 16
 """Side of the boxes of `localise`, and how far the spot's centre is from their edges at least."""
 
 _OF_THE_SPOT = 0.01  # of its brightest pixel: dimmer pixels are not the spot's
@@ -111,11 +111,12 @@ class DatasetPairs(DrawnPairs, ShortForm):
     def of_track(self, track: Track) -> DatasetPairs:
         """The same pairs as a track shows them: in boxes of its own, or as whole frames."""
         boxes: dict[str, Any] = {}
+        size = LOCALISE_BOX_PX, LOCALISE_MARGIN_PX
         if track == "localise":
             samples = {draw.sample_id: self.dataset[draw.sample_id] for draw in self.pair_draws}
-            boxes = {name: search_boxes(sample, BOX_PX, BOX_MARGIN_PX) for name, sample in samples.items()}
+            boxes = {name: search_boxes(sample, *size) for name, sample in samples.items()}
         draws = tuple(replace(draw, boxes=boxes.get(draw.sample_id)) for draw in self.pair_draws)
-        return DatasetPairs(self.dataset, draws, BOX_PX if boxes else None, self._sensor, self._count_frames, track)
+        return DatasetPairs(self.dataset, draws, size[0] if boxes else None, self._sensor, self._count_frames, track)
 
     def truth(self, number: int) -> PairTruth:
         """The exact answer, with the bounds of the image and of the raw pixels behind it."""

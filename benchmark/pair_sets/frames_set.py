@@ -5,8 +5,8 @@ pairs.jsonl       per pair: files, what a user knows, and the truth with its bou
 frames/           images: PNG of 8 or 16 bits, or the camera's JPEG
 SHA256SUMS        of everything above
 
-Its pairs are those of `Dataset.pairs` in one preset, with the same numbers and bytes. Nothing is drawn anew: no other
-exposure, boxes or sensor. `phibench export --to frames` writes one.
+Its pairs are those of `ScoredDataset.pairs` in one preset, with the same numbers and bytes. Nothing is drawn anew: no
+other exposure, boxes or sensor. `phibench export --to frames` writes one.
 """
 
 from __future__ import annotations
@@ -22,7 +22,13 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from phibench.benchmark.pair_sets.dataset_pairs import BOX_MARGIN_PX, BOX_PX, TASK_VERSION, DatasetPairs, Track
+from phibench.benchmark.pair_sets.dataset_pairs import (
+    LOCALISE_BOX_PX,
+    LOCALISE_MARGIN_PX,
+    TASK_VERSION,
+    DatasetPairs,
+    Track,
+)
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import SETTINGS_BYTES, InputFile, Name
 from phibench.datasets.common.shown_text import ShortForm
@@ -85,7 +91,7 @@ def truth_text(truths: Sequence[PairTruth], salt: str, public_sha256: str) -> st
     return json.dumps(document, sort_keys=True, separators=(",", ":"), allow_nan=False) + "\n"
 
 
-def read_truth_file(path: Path, sha256: str) -> list[PairTruth]:
+def read_truth_file(path: Path, expected_sha256: str) -> list[PairTruth]:
     """Truths of a file whose bytes must have a hash.
 
     Raises
@@ -96,10 +102,10 @@ def read_truth_file(path: Path, sha256: str) -> list[PairTruth]:
     file = InputFile(path, "give the truth's file")
     data = file.read()
     digest = hashlib.sha256(data).hexdigest()
-    if digest != sha256:
+    if digest != expected_sha256:
         raise DatasetError(
             f"{path} is not the truth that was sealed: its SHA-256 begins with {digest[:12]}, the seal says "
-            f"{sha256[:12]}; give the file that `phibench seal make` wrote for this set"
+            f"{expected_sha256[:12]}; give the file that `phibench seal make` wrote for this set"
         )
     truths = []
     for place, row in enumerate(file.document(SealedTruth, data).truths):
@@ -250,7 +256,7 @@ class FramesSet(ShortForm):
             size = camera.width_px, camera.height_px
             has_place = all(-0.5 <= x <= n - 0.5 for x, n in zip(spot.axis_px, size, strict=True))
             light = spot.uv_px if has_place else None
-            regions.append(search_box(names, position, light, camera, BOX_PX, BOX_MARGIN_PX))
+            regions.append(search_box(names, position, light, camera, LOCALISE_BOX_PX, LOCALISE_MARGIN_PX))
         down, up = (Box(r.u0_px, r.v0_px, r.u1_px - r.u0_px, r.v1_px - r.v0_px) for r in regions)
         return down, up
 
@@ -272,7 +278,7 @@ class FramesSet(ShortForm):
         except DatasetError as error:
             raise DatasetError(f"{self.folder / PAIRS} line {place + 1}: {error}; download the set again") from error
         localised = self._track == "localise"
-        box_px2 = float(BOX_PX**2) if localised else read.box_px2
+        box_px2 = float(LOCALISE_BOX_PX**2) if localised else read.box_px2
         return replace(read, number=number, hinted=localised or (read.hinted and self._hints), box_px2=box_px2)
 
     def number_of(self, sample_id: str, draw: int = 0, preset: str | None = None) -> int:
@@ -334,7 +340,7 @@ class FramesSet(ShortForm):
             "samples": len({row.sample_id for row in rows}),
             "presets": [self.preset],
             "hinted": len(rows) if self._track == "localise" else sum(row.hinted for row in rows) if self._hints else 0,
-            "boxes_px": BOX_PX if self._track == "localise" else None,
+            "boxes_px": LOCALISE_BOX_PX if self._track == "localise" else None,
             "track": self._track,
             "seed": self.info.seed,
             "recipe_sha256": self.info.recipe_sha256,

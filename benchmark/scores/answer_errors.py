@@ -3,7 +3,7 @@
 Definitions, used by all metrics:
 
 found
-    The spot is visible and a position is given within `match_px` of the chief ray's (u, v).
+    The spot is visible and a position is given within `match_px` of the centre of the light.
 missed
     The spot is visible and not found.
 false detection
@@ -276,6 +276,3 @@ def in_ray_units(rig: Rig, uv_px: Array, conventions: Sequence[str]) -> Array:
             # along its own gradient a change of this phi is so much of a change of phi_ray
             factor[chosen] = np.sum(g * ray, axis=-1) / np.sum(g * g, axis=-1)
     return factor
-
-
-# -- bounds of pairs ---------------------------------------------------------------------------------------------------

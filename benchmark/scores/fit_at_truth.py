@@ -15,6 +15,7 @@ import numpy as np
 from phibench.estimator.interface import Answer, Box, Image, Pair
 from phibench.estimator.methods.chain_fit import chain_fit
 from phibench.estimator.methods.raw_likelihood import raw_likelihood
+from phibench.estimator.methods.spot_search import square_around
 from phibench.estimator.pair_set import ImageTruth, PairTruth
 from phibench.estimator.spots.image_planes import PROCESSED
 
@@ -64,7 +65,4 @@ def reaches_bound(answer: Answer | None, position: str, spot: ImageTruth, match_
 def _box_about(spot: ImageTruth, image: Image) -> Box | None:
     if not (spot.visible and np.isfinite(spot.uv_px).all()):
         return None
-    height, width = image.shape[:2]
-    u0, v0 = (round(x) - _BOX_PX // 2 for x in spot.uv_px)
-    left, top = max(min(u0, width - _BOX_PX), 0), max(min(v0, height - _BOX_PX), 0)
-    return Box(left, top, min(_BOX_PX, width - left), min(_BOX_PX, height - top))
+    return square_around(spot.uv_px, image.shape, _BOX_PX)

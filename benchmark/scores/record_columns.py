@@ -153,6 +153,7 @@ THRESHOLDS = (0.005, 0.01, 0.02, 0.05, 0.10, 0.20)
 """Relative errors of D that count as right, of the average recall."""
 LONGEST_INTERVAL = 20.0
 _ALPHA = 0.05
+_AT_ONCE = 32  # spots whose 4096 nodes are taken together: 1 MB, which stays in a processor's cache
 
 
 def track_columns(records: pl.DataFrame) -> pl.DataFrame:
@@ -193,8 +194,17 @@ def perfect_log(covariance_px2: Array, bound_px2: Array, radii: int = 256, angle
     rho2 = -2.0 * np.log1p(-(np.arange(radii) + 0.5) / radii)
     theta = (np.arange(angles) + 0.5) * (0.5 * np.pi / angles)
     along = variances[:, :1] * np.cos(theta) ** 2 + variances[:, 1:] * np.sin(theta) ** 2
-    square = np.minimum(along[..., None] * rho2, MATCH_PX**2) / bound_px2[known, None, None]
-    result[known] = 0.5 * np.log(np.maximum(square, LEAST_RATIO**2)).mean(axis=(1, 2))
+    bounds, means = bound_px2[known, None, None], np.empty(len(along))
+    for start in range(0, len(along), _AT_ONCE):
+        part = slice(start, start + _AT_ONCE)
+        square = along[part, :, None] * rho2
+        np.minimum(square, MATCH_PX**2, out=square)
+        square /= bounds[part]
+        np.maximum(square, LEAST_RATIO**2, out=square)
+        np.log(square, out=square)
+        square *= 0.5
+        means[part] = square.mean(axis=(1, 2))
+    result[known] = means
     return result
 
 

@@ -19,7 +19,7 @@ import polars as pl
 from rich.console import Console
 
 from phibench.benchmark.isolation.run_limits import RunLimits
-from phibench.benchmark.pair_sets.dataset_pairs import BOX_PX, TASK_VERSION, TRACKS
+from phibench.benchmark.pair_sets.dataset_pairs import LOCALISE_BOX_PX, TASK_VERSION, TRACKS
 from phibench.benchmark.pair_sets.wanted_pairs import PairChoice, wanted_pairs
 from phibench.benchmark.scores.answer_errors import Rules, usable_covariance, whitened_errors
 from phibench.benchmark.scores.record_columns import COLUMN_TYPES
@@ -150,8 +150,9 @@ def _of_document(document: ScoreDocument) -> Iterator[str]:
     track = pair_set.get("track")
     if track not in ("", None, *TRACKS):
         yield f"pair_set.track is {track!r}: there are {', '.join(TRACKS)}; score again"
+    own = ("boxes_px", "localise", LOCALISE_BOX_PX)
     for name in ("boxes_px", "frames", "sensor_sha256"):
-        if pair_set.get(name) is not None and (name, track, pair_set[name]) != ("boxes_px", "localise", BOX_PX):
+        if pair_set.get(name) is not None and (name, track, pair_set[name]) != own:
             yield f"pair_set.{name} is {pair_set[name]}: results are of the data set's own pairs, score without it"
     if document.seed != 0:
         yield f"seed is {document.seed}: intervals of results are of the bootstrap seed 0"

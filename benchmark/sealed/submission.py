@@ -372,7 +372,7 @@ def _outcome(line: AnswerLine) -> Outcome:
 
 
 def _plain(line: Document) -> dict[str, Any]:
-    """Fields as `answer_check` takes them: JSON's lists."""
+    """Fields as `checked_answer` takes them: JSON's lists."""
     fields: dict[str, Any] = json.loads(line.model_dump_json())
     return fields
 

@@ -22,13 +22,12 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from phibench.calibration.captures.measure import KnownNumbers, read_setting
+from phibench.calibration.captures.measure import MeasureSetting, chain_of, read_setting
 from phibench.calibration.captures.pair_list import ListedPair, photos_of, read_pair_list
-from phibench.calibration.captures.pair_photos import PairPhotos, pair_of_photos
-from phibench.calibration.captures.picture_files import Photo, SensorChoice, require_colour, sensor_choice
+from phibench.calibration.captures.pair_photos import require_fitting
+from phibench.calibration.captures.picture_files import Photo, SensorChoice, sensor_choice
 from phibench.calibration.captures.raw_frames import PATTERNS
-from phibench.calibration.captures.rig_file import require_camera_size
-from phibench.calibration.captures.tested_chain import ChainTest, chain_test
+from phibench.calibration.captures.tested_chain import ChainTest
 from phibench.datasets.common.camera_pictures import read_camera_picture
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import SETTINGS_BYTES, FileName, InputFile, Name, path_below
@@ -122,18 +121,16 @@ def _there(path: Path) -> Path | None:
     return path if path.is_file() else None
 
 
-def _import(folder: Path, listed: Sequence[ListedPair], setting: KnownNumbers, work: Path, out: Path) -> Imported:
+def _import(folder: Path, listed: Sequence[ListedPair], setting: MeasureSetting, work: Path, out: Path) -> Imported:
     rows: list[ImportedRow] = []
     first: Photo | None = None
     test: ChainTest | None = None
     for row in listed:
         photos = photos_of(folder, row, setting)
         first = first or photos.down.on[0]
-        test = test or _test_of(photos, row, setting)
+        test = test or chain_of(photos, row.stroke_m, setting)  # of a set: that of its first pair
+        require_fitting(photos, setting.known.rig, setting.sensor)
         for photo in photos.all:
-            require_colour(photo)
-            require_camera_size(setting.known.rig, photo.size_px, str(photo.path))
-            sensor_choice(photo, setting.sensor)
             _require_like(first, photo)
         groups = {"down": photos.down.on, "up": photos.up.on, "down_off": photos.down.off, "up_off": photos.up.off}
         for draw in range(len(photos.down.on)):
@@ -177,16 +174,7 @@ def _import(folder: Path, listed: Sequence[ListedPair], setting: KnownNumbers, w
     return Imported(out, len(rows), sum(row.depth_m is not None for row in rows), chosen.note)
 
 
-def _test_of(photos: PairPhotos, row: ListedPair, setting: KnownNumbers) -> ChainTest:
-    """Chain of a set, by its first pair."""
-    return chain_test(
-        photos,
-        lambda photo: sensor_choice(photo, setting.sensor).card,
-        lambda group, card: pair_of_photos(group, row.stroke_m, setting.known, card),
-    )
-
-
-def _chosen(test: ChainTest, setting: KnownNumbers) -> SensorChoice:
+def _chosen(test: ChainTest, setting: MeasureSetting) -> SensorChoice:
     """Sensor of a set, with what the pictures say of its chain.
 
     Raises

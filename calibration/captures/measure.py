@@ -35,16 +35,15 @@ from phibench.calibration.captures.measurement_doubts import (
 from phibench.calibration.captures.pair_mistakes import exchanged_colours_error, missing_spot_error, no_distance_error
 from phibench.calibration.captures.pair_photos import (
     LARGEST_SIGMA,
-    LEAST_STROKE_M,
-    MOST_STROKE_M,
     PairPhotos,
     PositionPhotos,
     frames_note,
     pair_of_photos,
+    require_fitting,
 )
-from phibench.calibration.captures.picture_files import Photo, SensorChoice, require_colour, sensor_choice
+from phibench.calibration.captures.picture_files import Photo, SensorChoice, sensor_choice
 from phibench.calibration.captures.raw_frames import PATTERNS
-from phibench.calibration.captures.rig_file import MeasuredRig, read_rig_file, require_camera_size
+from phibench.calibration.captures.rig_file import MeasuredRig, read_rig_file
 from phibench.calibration.captures.spot_shape import (
     OUTLINE_SIGMA_PX,
     PRIOR_SIGMA,
@@ -64,6 +63,7 @@ from phibench.calibration.rig.calibration_file import Calibration, read_calibrat
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.datasets.frames.sensor_file import SensorFile, read_sensor_file
+from phibench.datasets.recipe.tables import MAX_STROKE_M, MIN_STROKE_M
 from phibench.estimator.geometry.least_squares_depth import GeneralDepth, depth_general
 from phibench.estimator.geometry.rig_parameters import PARAMETERS, prior_sigmas, stroke_of
 from phibench.estimator.geometry.status import Status, describe
@@ -78,8 +78,8 @@ from phibench.scenes.rig import POSITIONS, Rig
 
 
 @dataclass(frozen=True)
-class KnownNumbers:
-    """Numbers that are known beside the pictures.
+class MeasureSetting:
+    """Setting of a measurement: what is known beside the pictures.
 
     Attributes
     ----------
@@ -98,8 +98,8 @@ class KnownNumbers:
 
 def read_setting(
     rig: Path, calibration: Path | None = None, sensor: Path | None = None, stroke_sigma_m: float = 0.0
-) -> KnownNumbers:
-    """Setting of files.
+) -> MeasureSetting:
+    """Known numbers, read from their files.
 
     Raises
     ------
@@ -108,9 +108,9 @@ def read_setting(
     """
     known = read_rig_file(rig)
     held = None if calibration is None else read_calibration(calibration, known.rig)
-    if not 0.0 <= stroke_sigma_m <= MOST_STROKE_M:
+    if not 0.0 <= stroke_sigma_m <= MAX_STROKE_M:
         raise DatasetError(f"the stroke's standard deviation is {stroke_sigma_m:g} m: must be 0 or above")
-    return KnownNumbers(known, held, None if sensor is None else read_sensor_file(sensor), stroke_sigma_m)
+    return MeasureSetting(known, held, None if sensor is None else read_sensor_file(sensor), stroke_sigma_m)
 
 
 @dataclass(frozen=True)
@@ -169,7 +169,9 @@ _OTHER_UNITS = (("millimetres", 1e-3), ("centimetres", 1e-2))
 _USUAL_STROKE_M = 0.1  # of a rig of this kind, at least: less would be another unit
 
 
-def measure(photos: PairPhotos, stroke_m: float, setting: KnownNumbers, told: Told = lambda stage: None) -> Measurement:
+def measure(
+    photos: PairPhotos, stroke_m: float, setting: MeasureSetting, told: Told = lambda stage: None
+) -> Measurement:
     """Measure D.
 
     Parameters
@@ -177,7 +179,7 @@ def measure(photos: PairPhotos, stroke_m: float, setting: KnownNumbers, told: To
     photos : PairPhotos
     stroke_m : float
         As the person read it.
-    setting : KnownNumbers
+    setting : MeasureSetting
     told : callable
         Given each stage in words, before it begins: all together take some seconds.
 
@@ -187,33 +189,36 @@ def measure(photos: PairPhotos, stroke_m: float, setting: KnownNumbers, told: To
         If a picture does not fit to the rig or the sensor, no spot is found, the positions are swapped, or the stroke
         contradicts the pictures; in one sentence.
     """
-    if not LEAST_STROKE_M <= stroke_m <= MOST_STROKE_M:
+    if not MIN_STROKE_M <= stroke_m <= MAX_STROKE_M:
         meant = ((name, stroke_m * unit) for name, unit in _OTHER_UNITS if stroke_m * unit >= _USUAL_STROKE_M)
         advice = next((f"; if these are {name}, write {value:g}" for name, value in meant), "")
-        allowed = f"allowed is {LEAST_STROKE_M:g} to {MOST_STROKE_M:g} m, metres"
+        allowed = f"allowed is {MIN_STROKE_M:g} to {MAX_STROKE_M:g} m, metres"
         raise DatasetError(f"a stroke of {stroke_m:g} m: {allowed}{advice}")
     if (sigma := setting.stroke_sigma_m) > LARGEST_SIGMA * stroke_m:
         raise DatasetError(
             f"a stroke of {stroke_m:g} m with a standard deviation of {sigma:g} m: allowed is a quarter of the stroke; "
             f"{sigma:g} mm are {1e-3 * sigma:g} m"
         )
-    for photo in photos.all:
-        require_colour(photo)
-        require_camera_size(setting.known.rig, photo.size_px, str(photo.path))
-        sensor_choice(photo, setting.sensor)
+    require_fitting(photos, setting.known.rig, setting.sensor)
     require_alike(photos.pictures_to_compare, setting.known.rig)
     told("trying what the files stand for")
-    test = chain_test(
+    test = chain_of(photos, stroke_m, setting)
+    if photos.down.on[0].kind == "raw" and (corner := next(iter(test.phases))) != (0, 0):
+        inner, cut = _without(corner, photos, setting)
+        return _shifted(measure(inner, stroke_m, cut, told), corner, photos, setting, test.note)
+    return _measured(test, stroke_m, setting, told)
+
+
+def chain_of(photos: PairPhotos, stroke_m: float, setting: MeasureSetting) -> ChainTest:
+    """Chain of a pair's pictures, tried: see `chain_test`."""
+    return chain_test(
         photos,
         lambda photo: sensor_choice(photo, setting.sensor).card,
         lambda group, card: pair_of_photos(group, stroke_m, setting.known, card),
     )
-    if photos.down.on[0].kind == "raw" and (corner := next(iter(test.phases))) != (0, 0):
-        return _shifted(measure(*_without(corner, photos, stroke_m, setting), told), corner, photos, setting, test.note)
-    return _measured(test, stroke_m, setting, told)
 
 
-def _measured(test: ChainTest, stroke_m: float, setting: KnownNumbers, told: Told) -> Measurement:
+def _measured(test: ChainTest, stroke_m: float, setting: MeasureSetting, told: Told) -> Measurement:
     """Measurement with the phases of a test, which are in sigma where they are several."""
     photos, chosen = test.photos, sensor_choice(test.photos.down.on[0], setting.sensor)
     parts: list[tuple[_Fitted, float]] = []
@@ -285,7 +290,7 @@ class _Fitted:
 def _fitted(
     photos: PairPhotos,
     stroke_m: float,
-    setting: KnownNumbers,
+    setting: MeasureSetting,
     card: SensorCard,
     told: Told,
     limb: _Limb | None = None,
@@ -327,9 +332,7 @@ def _mixed(parts: Sequence[tuple[SeenSpot, float]], added_px: float) -> SeenSpot
     return SeenSpot(mean, within + between + added_px**2 * np.eye(2), parts[0][0].unlike)
 
 
-def _without(
-    corner: tuple[int, int], photos: PairPhotos, stroke_m: float, setting: KnownNumbers
-) -> tuple[PairPhotos, float, KnownNumbers]:
+def _without(corner: tuple[int, int], photos: PairPhotos, setting: MeasureSetting) -> tuple[PairPhotos, MeasureSetting]:
     """Pictures of DN and setting without the first columns and rows, so that red comes first."""
     du, dv = corner
 
@@ -340,7 +343,7 @@ def _without(
     known = replace(setting.known, rig=_rig_at(setting.known.rig, -du, -dv))
     held = setting.calibration
     held = None if held is None else replace(held, rig=_rig_at(held.rig, -du, -dv))
-    return PairPhotos(down, up), stroke_m, replace(setting, known=known, calibration=held)
+    return PairPhotos(down, up), replace(setting, known=known, calibration=held)
 
 
 def _cut(pixels: Image, du: int, dv: int) -> Image:
@@ -359,7 +362,7 @@ def _rig_at(rig: Rig, du: int, dv: int) -> Rig:
 
 
 def _shifted(
-    found: Measurement, corner: tuple[int, int], photos: PairPhotos, setting: KnownNumbers, note: str
+    found: Measurement, corner: tuple[int, int], photos: PairPhotos, setting: MeasureSetting, note: str
 ) -> Measurement:
     """Measurement of cut pictures in the pixels of the whole ones."""
     down, up = (replace(spot, uv_px=spot.uv_px + np.array(corner)) for spot in (found.down, found.up))
@@ -398,7 +401,7 @@ def _picture(pair: Pair, position: str) -> Image:
     return pair.images[name] if pair.card.output == "raw" else pair.stack(name)[0]
 
 
-def _corrected(setting: KnownNumbers, outlines: Sequence[Outline], why: str) -> tuple[Rig, Array, Array, str, str]:
+def _corrected(setting: MeasureSetting, outlines: Sequence[Outline], why: str) -> tuple[Rig, Array, Array, str, str]:
     """Corrected rig, covariance and values of `PARAMETERS`, a sentence, and a doubt."""
     nominal = setting.known.rig
     if setting.calibration is not None:
@@ -406,13 +409,8 @@ def _corrected(setting: KnownNumbers, outlines: Sequence[Outline], why: str) -> 
         return held.rig, held.covariance, held.values, *calibration_note(held, outlines)
     if not outlines:
         values, covariance = np.zeros(len(PARAMETERS)), np.diag(prior_sigmas() ** 2)
-        return (
-            nominal,
-            covariance,
-            values,
-            f"rig: as in the rig file, with the errors of a ruler; no outline: {why}",
-            "",
-        )
+        note = f"rig: as in the rig file, with the errors of a ruler; no outline: {why}"
+        return nominal, covariance, values, note, ""
     outline = outlines_as_one(outlines)
     bundle = calibrate(nominal, outline)
     kind = ", by its edge alone" if any(outline.by_edge for outline in outlines) else ""
@@ -435,7 +433,9 @@ def seen_images(pair: Pair) -> dict[str, SpotPicture]:
     return spot_pictures(pair, *(Spot(None if spot is None else spot.uv_px) for spot in (detection.down, detection.up)))
 
 
-def _shape(setting: KnownNumbers, pair: Pair, images: dict[str, SpotPicture], outlines: Sequence[Outline]) -> SpotShape:
+def _shape(
+    setting: MeasureSetting, pair: Pair, images: dict[str, SpotPicture], outlines: Sequence[Outline]
+) -> SpotShape:
     """Blur and filters: of the calibration's spots, or of these, about what outline and rig file say."""
     held = setting.calibration
     if held is not None and (document := held.made_from.get(SHAPE)) is not None:
@@ -457,7 +457,7 @@ def widened_by_shape(spot: SeenSpot, image: SpotPicture | None, shape: SpotShape
     return replace(spot, covariance_px2=spot.covariance_px2 + added, unlike=unlike)
 
 
-def _shape_note(shape: SpotShape, setting: KnownNumbers) -> str:
+def _shape_note(shape: SpotShape, setting: MeasureSetting) -> str:
     (blur, green, blue), (blur_sigma, *_) = shape.values, shape.sigmas
     held = setting.calibration is not None and SHAPE in setting.calibration.made_from
     source = "of the calibration" if held else "of these spots" if shape.images else "of the rig file"

@@ -17,18 +17,12 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-from phibench.calibration.captures.measure import KnownNumbers, Measurement, measure
-from phibench.calibration.captures.pair_photos import (
-    LARGEST_SIGMA,
-    LEAST_STROKE_M,
-    MOST_STROKE_M,
-    PairPhotos,
-    PositionPhotos,
-)
-from phibench.calibration.captures.picture_files import read_photo
+from phibench.calibration.captures.measure import Measurement, MeasureSetting, measure
+from phibench.calibration.captures.pair_photos import LARGEST_SIGMA, PairPhotos, read_photos
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import FILE_NAME, MIB, InputFile
 from phibench.datasets.common.shown_text import csv_text
+from phibench.datasets.recipe.tables import MAX_STROKE_M, MIN_STROKE_M
 from phibench.datasets.store.files import write_text
 from phibench.datasets.store.schema import TruthFile
 from phibench.scenes.validation import nearest, printable_line
@@ -36,7 +30,7 @@ from phibench.scenes.validation import nearest, printable_line
 PAIRS = TruthFile.MEASURED.value
 _FILES = ("down", "up", "down_off", "up_off")
 _NUMBERS = {
-    "stroke_m": (LEAST_STROKE_M, MOST_STROKE_M),
+    "stroke_m": (MIN_STROKE_M, MAX_STROKE_M),
     "stroke_sigma_m": (0.0, 1.0),
     "depth_m": (0.05, 100.0),
     "depth_sigma_m": (1e-6, 10.0),
@@ -145,21 +139,16 @@ def _number(key: str, text: str, fault: Callable[[str], DatasetError]) -> float:
     return value
 
 
-def photos_of(folder: Path, row: ListedPair, setting: KnownNumbers) -> PairPhotos:
+def photos_of(folder: Path, row: ListedPair, setting: MeasureSetting) -> PairPhotos:
     """Pictures of a row.
 
     Raises
     ------
     DatasetError
-        As `read_photo` and `PairPhotos`.
+        As `read_photos`.
     """
-    groups = {
-        key: tuple(read_photo(folder / name, setting.known.rig, setting.sensor) for name in names)
-        for key, names in row.files.items()
-    }
-    return PairPhotos(
-        PositionPhotos(groups["down"], groups["down_off"]), PositionPhotos(groups["up"], groups["up_off"])
-    )
+    files = {key: [folder / name for name in names] for key, names in row.files.items()}
+    return read_photos(files, setting.known.rig, setting.sensor)
 
 
 # -- results ---------------------------------------------------------------------------------------------------------
@@ -197,14 +186,14 @@ class PairOutcome:
 
 
 def measured_pairs(
-    folder: Path, setting: KnownNumbers, told: Callable[[PairOutcome], None] = lambda _: None
+    folder: Path, setting: MeasureSetting, told: Callable[[PairOutcome], None] = lambda _: None
 ) -> list[PairOutcome]:
     """Measure all pairs of a folder; a pair that cannot be measured ends no run.
 
     Parameters
     ----------
     folder : Path
-    setting : KnownNumbers
+    setting : MeasureSetting
         The stroke's standard deviation of a row goes before its own.
     told : callable
         Given each result.

@@ -18,8 +18,9 @@ import numpy as np
 from scipy import fft
 from scipy.ndimage import gaussian_filter
 
-from phibench.calibration.captures.pair_photos import LEAST_STROKE_M, MOST_STROKE_M, PairPhotos, PositionPhotos
+from phibench.calibration.captures.pair_photos import PairPhotos, PositionPhotos
 from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.recipe.tables import MAX_STROKE_M, MIN_STROKE_M
 from phibench.estimator.geometry.reflection import reflect
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.estimator.interface import Answer, Image, Pair
@@ -168,7 +169,7 @@ def _offs_exchanged(pair: Pair) -> bool:
 def _strokes_faults(pair: Pair) -> Iterator[DatasetError]:
     """Errors of a stroke with which both spots are no point of a room, but are with another."""
     for stroke in (factor * pair.stroke_m for factor in _FACTORS):
-        if not LEAST_STROKE_M <= stroke <= MOST_STROKE_M:
+        if not MIN_STROKE_M <= stroke <= MAX_STROKE_M:
             continue
         detection = detect(replace(pair, stroke_m=stroke))
         if detection.down is None or detection.up is None or not _both(detection):

@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
-from phibench.calibration.captures.picture_files import Photo, require_one_camera
-from phibench.calibration.captures.rig_file import MeasuredRig
+from phibench.calibration.captures.picture_files import (
+    Photo,
+    read_photo,
+    require_colour,
+    require_one_camera,
+    sensor_choice,
+)
+from phibench.calibration.captures.rig_file import MeasuredRig, require_camera_size
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.frames.sensor_card import SensorCard
+from phibench.datasets.frames.sensor_file import SensorFile
 from phibench.estimator.interface import Pair
-from phibench.scenes.rig import POSITIONS
+from phibench.scenes.rig import POSITIONS, Rig
 
-LEAST_STROKE_M, MOST_STROKE_M = 1e-3, 10.0  # those of a recipe
 LARGEST_SIGMA = 0.25  # of a length that somebody measured; a larger one is of another unit
 
 
@@ -59,6 +67,32 @@ class PairPhotos:
         groups = [(*position.on, *position.off) for position in (self.down, self.up)]
         within = [(group[0], other) for group in groups for other in group[1:]]
         return (*within, (self.down.on[0], self.up.on[0]))
+
+
+def read_photos(files: Mapping[str, Sequence[Path]], rig: Rig, sensor: SensorFile | None) -> PairPhotos:
+    """Pictures of the files of "down", "up", "down_off" and "up_off".
+
+    Raises
+    ------
+    DatasetError
+        As `read_photo` and `PairPhotos`.
+    """
+    groups = {name: tuple(read_photo(path, rig, sensor) for path in paths) for name, paths in files.items()}
+    return PairPhotos(*(PositionPhotos(groups[name], groups[f"{name}_off"]) for name in POSITIONS))
+
+
+def require_fitting(photos: PairPhotos, rig: Rig, sensor: SensorFile | None) -> None:
+    """Refuse pictures that do not fit to the rig's camera or to the sensor.
+
+    Raises
+    ------
+    DatasetError
+        As `require_colour`, `require_camera_size` and `sensor_choice`.
+    """
+    for photo in photos.all:
+        require_colour(photo)
+        require_camera_size(rig, photo.size_px, str(photo.path))
+        sensor_choice(photo, sensor)
 
 
 def pair_of_photos(photos: PairPhotos, stroke_m: float, known: MeasuredRig, card: SensorCard) -> Pair:

@@ -22,7 +22,7 @@ from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import SETTINGS_BYTES, InputFile
 from phibench.datasets.recipe.distributions import Table
 from phibench.datasets.recipe.mirror_tables import HolderTable, MirrorTable
-from phibench.datasets.recipe.recipe_scene import build_rig, idle_holder_faults
+from phibench.datasets.recipe.recipe_scene import beam_of, build_rig, idle_holder_faults
 from phibench.datasets.recipe.tables import LaserTable, RigTable
 from phibench.scenes.laser import Beam
 from phibench.scenes.rig import Rig
@@ -94,7 +94,7 @@ def read_rig_file(path: Path) -> MeasuredRig:
         rig = build_rig(_with_focal_length(table))
     except SceneError as error:
         raise file.fault(f"describes no rig: {error}") from error
-    return MeasuredRig(rig, None if document.laser is None else _beam(document.laser))
+    return MeasuredRig(rig, None if document.laser is None else beam_of(document.laser))
 
 
 def _other_file(raw: dict[str, Any]) -> str:
@@ -293,12 +293,6 @@ def _with_focal_length(table: MeasuredRigTable) -> RigTable:
         return table
     width = RIGS[table.preset]().camera.width_px if table.width_px is None else table.width_px
     return table.model_copy(update={"fx_px": 0.5 * width / math.tan(math.radians(0.5 * table.fov_deg))})
-
-
-def _beam(laser: LaserTable) -> Beam:
-    if laser.diameter_m is not None:
-        return Beam(laser.diameter_m, 0.0)
-    return Beam(laser.diameter_base_m, laser.diameter_growth_m_per_m)
 
 
 def require_camera_size(rig: Rig, size_px: tuple[int, int], name: str) -> None:

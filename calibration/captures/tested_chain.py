@@ -36,6 +36,7 @@ from phibench.estimator.spots.camera_codes import light_of, quantisation, tone_o
 from phibench.estimator.spots.detect import detect
 from phibench.estimator.spots.fit_raw import SpotData
 from phibench.estimator.spots.image_planes import ImageError, through_jpeg
+from phibench.estimator.spots.simple_spots import LUMA
 from phibench.scenes.frames import Array
 
 PairOf = Callable[[PairPhotos, SensorCard], Pair]
@@ -155,14 +156,13 @@ def _changed_codes(pixels: Image, quality: int, sampling: Subsampling) -> float:
 def comb_quality(pixels: Image) -> int | None:
     """Quality of libjpeg on whose steps the luma's coefficients lie best, of the coarsest that will do and its like."""
     h, w = (size // 8 * 8 for size in pixels.shape[:2])
-    luma = pixels[:h, :w].astype(float) @ np.array([0.299, 0.587, 0.114])  # JPEG's Y (BT.601)
+    luma = pixels[:h, :w].astype(float) @ np.array(LUMA)  # JPEG's Y
     blocks = luma.reshape(h // 8, 8, w // 8, 8).swapaxes(1, 2).reshape(-1, 8, 8)
     # a code that is cut has no coefficients of a JPEG
     lit = blocks[(blocks.min(axis=(1, 2)) > 8.0) & (blocks.max(axis=(1, 2)) < 247.0)]
     if len(lit) < 16:
         return None
-    detail = lit.var(axis=(1, 2))
-    c = dctn(lit[np.argsort(detail)[-_BLOCKS:]], axes=(1, 2), norm="ortho").reshape(-1, 64)[:, 1:]
+    c = dctn(lit[np.argsort(lit.var(axis=(1, 2)))[-_BLOCKS:]], axes=(1, 2), norm="ortho").reshape(-1, 64)[:, 1:]
     rests: dict[int, float] = {}
     for quality in range(10, 100):
         step = quantisation(quality)[0].ravel()[1:]

@@ -26,11 +26,11 @@ from scipy import fft, ndimage
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.estimator.spots.camera_codes import light_of, rgb_picture
 from phibench.estimator.spots.image_planes import ImageError
+from phibench.estimator.spots.simple_spots import LUMA
 from phibench.scenes.camera import Camera
 from phibench.scenes.frames import Array, BoolArray
 from phibench.scenes.rig import Rig
 
-JPEG_LUMA = (0.299, 0.587, 0.114)  # JPEG's (ITU-R BT.601): errors of its coarse chroma cancel in this sum
 _CLIPPED = 250  # of 255: JPEG moves clipped pixels by some codes
 _NEAR_FULL = 0.97  # of saturation: with noise a pixel above it may be cut
 
@@ -152,7 +152,7 @@ def _raw(image: NDArray[Any], card: SensorCard) -> tuple[Plane, ...]:
 
 def _luma(image: NDArray[Any], card: SensorCard) -> Plane:
     """Luma of the linear, white-balanced planes. It is a filter's own light only where the colour matrix is one."""
-    weights = np.array(JPEG_LUMA)
+    weights = np.array(LUMA)  # JPEG's: errors of its coarse chroma cancel in this sum
     clipped: BoolArray = np.maximum(np.maximum(image[..., 0], image[..., 1]), image[..., 2]) >= _CLIPPED
     clipped = ndimage.binary_dilation(clipped, iterations=2) if clipped.any() else clipped
     if image.dtype == np.uint8:  # 256 codes have 256 values: the tone curve of twelve megapixels would take seconds
@@ -165,7 +165,7 @@ def _luma(image: NDArray[Any], card: SensorCard) -> Plane:
         linear = light_of(np.asarray(image, float) / 255.0, card)
         values, level = linear @ weights, np.median(linear.reshape(-1, 3), axis=0) * weights
     # shares of the filters in the luma of this picture; three equal ones would be as good, the room is nearly grey
-    share = level / level.sum() if level.sum() > 0.0 else np.array(JPEG_LUMA)
+    share = level / level.sum() if level.sum() > 0.0 else weights
     du, dv = card.mosaic_phase
     taps = [_merged(_luma_taps(2 * ((k // 2 + dv) % 2) + (k + du) % 2, share, card)) for k in range(4)]
     return Plane(values, ~clipped, (taps[0], taps[1], taps[2], taps[3]))

@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from phibench.calibration.outline.limb_image import JPEG_LUMA
 from phibench.calibration.outline.outline_least_squares import OutlinePixels, Step
 from phibench.calibration.outline.outline_result import JPEG_DRAWS
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.estimator.spots.camera_codes import light_of, mcu_px, tone_of
 from phibench.estimator.spots.image_planes import full_scale_e, through_jpeg
+from phibench.estimator.spots.simple_spots import LUMA
 from phibench.scenes.frames import Array
 from phibench.scenes.random_streams import generator
 
@@ -89,7 +89,7 @@ class JpegSimulation:
         codes = np.rint(255.0 * tone_of(light, self.card)).astype(np.uint8)
         image = through_jpeg(_packed(codes, units.rows), self.card)
         decoded = light_of(image.reshape(-1, 3)[units.place] / 255.0, self.card)
-        return np.asarray(decoded @ np.array(JPEG_LUMA) / self.pixels.ray[:, 2] ** 4)
+        return np.asarray(decoded @ np.array(LUMA) / self.pixels.ray[:, 2] ** 4)
 
 
 def _noise(linear: Array, units: Units, card: SensorCard, rng: np.random.Generator) -> Array:

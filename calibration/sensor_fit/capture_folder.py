@@ -32,6 +32,7 @@ from phibench.datasets.common.camera_pictures import read_camera_picture
 from phibench.datasets.common.errors import DatasetError
 from phibench.datasets.common.input_files import SETTINGS_BYTES, InputFile
 from phibench.datasets.store.schema import Document
+from phibench.estimator.spots.simple_spots import LUMA
 from phibench.scenes.frames import Array
 from phibench.scenes.validation import printable_line, structural_faults
 
@@ -358,6 +359,11 @@ def _seconds(level: Path) -> float:
         raise CaptureError(
             f"{printable_line(str(level))}: the folder's name must be its exposure time, seconds, such as 0.0100"
         )
+    if level.name.isdigit():  # milliseconds as often as seconds: a factor of 1000 that nothing else would tell
+        raise CaptureError(
+            f"{printable_line(str(level))}: {level.name} of which unit? Name it {int(level.name)}.0 for seconds, "
+            f"{float(level.name) / 1000:g} for milliseconds"
+        )
     return float(level.name)
 
 
@@ -365,7 +371,7 @@ def luma(image: NDArray[Any], kind: Kind) -> Array:
     """Y' of a processed frame, shape (h, w), BT.601, on 0 to 255 (that of YUYV as it is)."""
     if kind == "yuyv":
         return image[..., 0].astype(float)
-    return np.asarray(image.astype(float) @ np.array([0.299, 0.587, 0.114]))  # BT.601
+    return np.asarray(image.astype(float) @ np.array(LUMA))
 
 
 # -- header of a JPEG file --------------------------------------------------------------------------------------------

@@ -23,6 +23,7 @@ from scipy.optimize import least_squares
 from scipy.special import ndtr
 
 from phibench.calibration.sensor_fit.noise_levels import Curve, decoded_by, encoded_by
+from phibench.estimator.spots.simple_spots import LUMA
 from phibench.scenes.frames import Array
 
 _WINDOW = 24  # pixels: an edge with both its plateaus
@@ -195,7 +196,6 @@ _HERE: Offsets = [(0, 0, 1.0)]
 _BY_PLACE = ((_HERE, _CROSS, _CORNERS), (_BESIDE, _HERE, _ABOVE), (_ABOVE, _HERE, _BESIDE), (_CORNERS, _CROSS, _HERE))
 """Where bilinear interpolation takes R, G and B from, by place of the mosaic."""
 _MEAN = (_TENT, [*((i, j, 0.5 * w) for i, j, w in _CROSS), (0, 0, 0.5)], _TENT)
-_LUMA = (0.299, 0.587, 0.114)
 
 
 @dataclass(frozen=True)
@@ -222,7 +222,7 @@ class EdgeModel:
 
         def luma(planes: tuple[Offsets, Offsets, Offsets]) -> Array:
             total = np.zeros_like(fine)
-            for weight, offsets in zip(_LUMA, planes, strict=True):
+            for weight, offsets in zip(LUMA, planes, strict=True):
                 share = sum(w * shares[i, j] for i, j, w in offsets)
                 total += weight * encoded_by(self.curve, dark + (bright - dark) * share, self.points)
             return total

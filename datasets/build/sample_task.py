@@ -23,7 +23,7 @@ from phibench.render.optics.room_tracer import room_geometry
 from phibench.render.optics.truth import SpotTruth, spot_truth
 from phibench.render.room.noise_budget import BUDGETS, NoiseBudget, noise_budget
 from phibench.scenes.laser import LaserSpot
-from phibench.scenes.rig import POSITIONS, Rig, Stroke, View
+from phibench.scenes.rig import POSITIONS, Rig, View
 
 
 def finish_sample(out: Path, pair: PairPlan, rig: Rig, source: RoomSource, spot: LaserSpot, quality: str) -> TaskResult:
@@ -36,7 +36,7 @@ def finish_sample(out: Path, pair: PairPlan, rig: Rig, source: RoomSource, spot:
     """
     sides, rows, room = [], {}, room_of(source, out / schema.ROOM_FILES)
     for position in POSITIONS:
-        view = rig.at(Stroke(pair.stroke_m).offset_m(position))
+        view = rig.at(pair.offset_m(position))
         truth = spot_truth(view, spot, room_geometry(room, view))
         ambient = out / schema.view_file(pair.pose_id(position), "ambient")
         (planes, variance), window = read_ambient_pair(ambient), _window(out, pair, position)

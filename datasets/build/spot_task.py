@@ -22,7 +22,7 @@ from phibench.render.optics.spot_layer import SpotLayer, spot_layer, spot_light
 from phibench.render.optics.truth import SpotTruth, depth_m, spot_truth
 from phibench.scenes.frames import Array
 from phibench.scenes.laser import LaserSpot
-from phibench.scenes.rig import POSITIONS, Rig, Stroke, View
+from phibench.scenes.rig import POSITIONS, Rig, View
 from phibench.scenes.room import Room
 
 _LOG2_MORE_PAIRS = (19, 21)  # four and sixteen times those of a spot that an edge cuts
@@ -69,7 +69,7 @@ def make_spot(out: Path, dataset: str, rig: Rig, source: RoomSource, spot: Laser
     RefusedSampleError
         If a certificate is out of tolerance, with its numbers.
     """
-    views = {position: rig.at(Stroke(pair.stroke_m).offset_m(position)) for position in POSITIONS}
+    views = {position: rig.at(pair.offset_m(position)) for position in POSITIONS}
     room = room_of(source, out / schema.ROOM_FILES)
     answers = {position: answer_spot(view, spot, room) for position, view in views.items()}
     if fault := certificate_fault(answers):

@@ -16,7 +16,7 @@ from phibench.datasets.recipe.tables import AmbientTable
 from phibench.datasets.rooms.room_files import RoomError
 from phibench.datasets.rooms.room_sources import RoomSource, room_of
 from phibench.datasets.store import schema
-from phibench.datasets.store.layers import TRUTH_PLANES, write_ambient, write_truth
+from phibench.datasets.store.layers import STORED_TRUTH_PLANES, write_ambient, write_truth
 from phibench.datasets.store.pictures import display_exposure_s, save_png, to_srgb
 from phibench.scenes.rig import Rig
 
@@ -54,7 +54,7 @@ def render_view(
     planes = layer.electrons_per_s
     if room.lit and not planes.any():
         raise RoomError(f"room {pose.room}: no light reaches the camera; move its lamps inside, facing the room")
-    truth = truth_layer(view, room_geometry(room, view), surfaces.first_patch, TRUTH_PLANES)
+    truth = truth_layer(view, room_geometry(room, view), surfaces.first_patch, STORED_TRUTH_PLANES)
     header_ambient = {**header, **ambient.model_dump(), "seed": pose.seed}
     write_ambient(out / schema.view_file(pose.pose_id, "ambient"), planes, layer.variance_per_s2, header_ambient)
     write_truth(out / schema.view_file(pose.pose_id, "truth"), truth, header)

@@ -90,9 +90,13 @@ class PairPlan:
     tries: int = 0
     room: str = ONLY_ROOM
 
+    def offset_m(self, position: str) -> float:
+        """Carriage offset at a stroke position, "down" or "up", of the true stroke."""
+        return Stroke(self.stroke_m).offset_m(position)
+
     def pose_id(self, position: str) -> str:
-        """Id of the pose at a stroke position, "down" or "up"."""
-        return pose_of(self.rig, Stroke(self.stroke_m).offset_m(position), self.room)
+        """Id of the pose at a stroke position."""
+        return pose_of(self.rig, self.offset_m(position), self.room)
 
 
 @dataclass(frozen=True)
@@ -166,7 +170,7 @@ class Plan:
 
     def view(self, pair: PairPlan, position: str) -> View:
         """View of a pair at a stroke position."""
-        return self.rigs[pair.rig].at(Stroke(pair.stroke_m).offset_m(position))
+        return self.rigs[pair.rig].at(pair.offset_m(position))
 
 
 def make_plan(
@@ -318,7 +322,7 @@ _Place = tuple[str, float, str]
 
 def _places(pairs: Sequence[PairPlan]) -> list[_Place]:
     """Rig, offset and room of every view of every pair."""
-    return [(pair.rig, Stroke(pair.stroke_m).offset_m(position), pair.room) for pair in pairs for position in POSITIONS]
+    return [(pair.rig, pair.offset_m(position), pair.room) for pair in pairs for position in POSITIONS]
 
 
 def _poses(recipe: Recipe, places: Iterable[_Place]) -> tuple[PosePlan, ...]:

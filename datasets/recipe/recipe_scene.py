@@ -24,7 +24,7 @@ from phibench.render.optics.faces import face_table
 from phibench.scenes.camera import Camera
 from phibench.scenes.frames import Array, Pose, Vector, as_matrix, as_vector, rotation_xyz
 from phibench.scenes.holder import LENGTHS, Holder, fitted_holder
-from phibench.scenes.laser import LaserSpot
+from phibench.scenes.laser import Beam, LaserSpot
 from phibench.scenes.metals import ReflectanceTable
 from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.revolved_mirror import RevolvedMirror
@@ -271,14 +271,15 @@ def build_room(table: RoomTable, targets: Iterable[TargetTable]) -> Room:
 def build_spot(laser: LaserTable, target: TargetTable) -> LaserSpot:
     """Laser spot at the centre of a target board."""
     board = build_target(target)
-    diameter_m = grown_diameter_m(laser, target.depth_m) if target.diameter_m is None else target.diameter_m
+    diameter_m = beam_of(laser).diameter_m(target.depth_m) if target.diameter_m is None else target.diameter_m
     return make_spot(laser, board.position_world_m, board.normal_world, diameter_m)
 
 
-def grown_diameter_m(laser: LaserTable, depth_m: float) -> float:
-    """Diameter of a spot at a distance from the axis, unless its target says otherwise."""
-    growing = laser.diameter_base_m + laser.diameter_growth_m_per_m * depth_m
-    return growing if laser.diameter_m is None else laser.diameter_m
+def beam_of(laser: LaserTable) -> Beam:
+    """Diameter of the laser's spots by their distance from the axis; a target may say otherwise."""
+    if laser.diameter_m is not None:
+        return Beam(laser.diameter_m, 0.0)
+    return Beam(laser.diameter_base_m, laser.diameter_growth_m_per_m)
 
 
 def make_spot(

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from phibench.datasets.recipe.recipe_scene import build_spot, grown_diameter_m, make_spot
+from phibench.datasets.recipe.recipe_scene import beam_of, build_spot, make_spot
 from phibench.datasets.recipe.tables import OWN_ALBEDO, LaserTable, TargetTable
 from phibench.render.optics.beam_deposit import BEAM_REACH_M
 from phibench.render.optics.faces import FaceTable
@@ -106,7 +106,7 @@ def _at(laser: LaserTable, geometry: RoomGeometry, rays: _Rays, hits: RoomHits, 
         normal = -normal
     if math.hypot(*point[:2]) < _LEAST_DISTANCE_M:
         return f"the ray meets {name} nearer than {_LEAST_DISTANCE_M:g} m to the axis"
-    diameter = grown_diameter_m(laser, float(hits.distance_m[i]))
+    diameter = beam_of(laser).diameter_m(float(hits.distance_m[i]))
     beam = as_vector(direction) if laser.albedo == OWN_ALBEDO else None
     return name, make_spot(laser, as_vector(point), as_vector(normal), diameter, beam)
 

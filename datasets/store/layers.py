@@ -204,7 +204,7 @@ def _check_shapes(arrays: dict[str, NDArray[Any]]) -> None:
 
 # Layers: their planes, and what their headers say.
 
-TRUTH_PLANES = ("x_m", "y_m", "z_m", "depth_m", "path_m", "object_id")
+STORED_TRUTH_PLANES = ("x_m", "y_m", "z_m", "depth_m", "path_m", "object_id")
 """Planes of a file; the angles at the mirror follow from the rig and the pixel, and `read_truth` computes them."""
 AMBIENT_PLANES = (*FILTERS, *(f"sd.{name}" for name in FILTERS))
 _SD_BITS = 4  # of a standard deviation's fraction: 3 %, which is less than is known of it
@@ -305,8 +305,8 @@ def _scaled(path: Path, file: ExrFile, prefix: str) -> NDArray[np.float32]:
 
 
 def write_truth(path: Path, planes: Mapping[str, Array], header: Mapping[str, Any]) -> Path:
-    """Write a truth layer: the planes `TRUTH_PLANES`."""
-    return write_exr(path, {name: planes[name] for name in TRUTH_PLANES}, {"kind": "truth", **header})
+    """Write a truth layer: the planes `STORED_TRUTH_PLANES`."""
+    return write_exr(path, {name: planes[name] for name in STORED_TRUTH_PLANES}, {"kind": "truth", **header})
 
 
 def read_truth(path: Path, view: View, **owner: str) -> dict[str, NDArray[Any]]:
@@ -314,8 +314,8 @@ def read_truth(path: Path, view: View, **owner: str) -> dict[str, NDArray[Any]]:
 
     The planes are `truth.TRUTH_PLANES`. Angles are computed in double, also where an older file holds them.
     """
-    file = read_layer(path, "truth", TRUTH_PLANES, **owner)
-    planes: dict[str, NDArray[Any]] = {name: file.planes[name].astype(float) for name in TRUTH_PLANES[:-1]}
+    file = read_layer(path, "truth", STORED_TRUTH_PLANES, **owner)
+    planes: dict[str, NDArray[Any]] = {name: file.planes[name].astype(float) for name in STORED_TRUTH_PLANES[:-1]}
     ids = file.planes["object_id"].astype(np.int32)
     camera = view.rig.camera
     if ids.shape != (camera.height_px, camera.width_px):

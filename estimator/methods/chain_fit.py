@@ -17,14 +17,15 @@ from phibench.estimator.methods.likelihood_maps import SpotLikelihood, claimed_p
 from phibench.estimator.methods.spot_search import (
     at_detection,
     box_around,
+    box_at,
     measured_twice,
     once,
     pair_blur,
     pair_detection,
     seen_depth_m,
+    square_around,
     trusted_hints,
 )
-from phibench.estimator.methods.spot_search import box_at as box_at
 from phibench.estimator.processed.fit_processed_images import (
     code_data,
     codes_are_independent,
@@ -50,7 +51,7 @@ from phibench.estimator.spots.raw_pixels import (
 )
 from phibench.scenes.frames import Array
 
-_HALF_PX = 8
+_SIDE_PX = 17  # of the square whose codes are fitted
 _AROUND_PX = 21  # of the box whose units a likelihood is made of
 _FLAT_CHI2 = 1.5  # below it one level per filter describes the room
 _MOST_CHI2 = 30.0  # beyond it the light around the spot is not what the model says
@@ -142,7 +143,7 @@ def _srgb(
     pair: Pair, position: str, start: Array, blur: SpotBlur, model: SpotModel, near: tuple[float, float] | None
 ) -> SpotFit:
     """Fit a square of 17 x 17 pixels about the start."""
-    card, square = pair.card, _square(start, pair.images[position])
+    card, square = pair.card, square_around(start, pair.images[position].shape, _SIDE_PX)
     origin = np.array([[square.u0_px, square.v0_px]])
     on, dark = _parts(pair, position, square)
     own = codes_are_independent(card) and on.shape[1] == 1
@@ -151,7 +152,7 @@ def _srgb(
         flat = fit_srgb(on, origin, card, blur, model, near_px=near)
         if flat.chi2[0] < _FLAT_CHI2:
             return flat
-        known = outside_spot(start[None], origin, (2 * _HALF_PX + 1, 2 * _HALF_PX + 1))
+        known = outside_spot(start[None], origin, on.shape[2:4])
         background = _background(on, known, origin, card, own)
     else:
         background = _background(dark, None, origin, card, own)
@@ -190,7 +191,7 @@ def _answer(fit: SpotFit, likelihood: Callable[[Spot], SpotLikelihood | None]) -
     worse = fit.covariance_px2[0] * max(1.0, float(fit.chi2[0]))
     c = claimed_px2(fit.uv_px[0], worse, lambda: likelihood(Spot((u, v))))
     own = fit.misfit_px2[0]  # of pixels that are fitted one by one; a light of another shape misfits on few of them
-    if c is not None and fit.chi2[0] > 1.0 + MISFIT_SIGMAS * math.sqrt(2.0) / (2 * _HALF_PX + 1):
+    if c is not None and fit.chi2[0] > 1.0 + MISFIT_SIGMAS * math.sqrt(2.0) / _SIDE_PX:
         c = max(c, np.where(np.isfinite(own), own, 0.0), key=np.trace)
     return Spot((u, v), None if c is None else ((float(c[0, 0]), float(c[0, 1])), (float(c[1, 0]), float(c[1, 1]))))
 
@@ -210,9 +211,10 @@ def spot_outputs(
     Codes where those of a single frame are independent (`codes_are_independent`); else a window, a start and the
     window's corner.
     """
-    card, image = pair.card, pair.images[position]
+    card, shape = pair.card, pair.images[position].shape
     own = codes_are_independent(card) and pair.count(position) == 1
-    region = _square(uv, image) if own else _region(box_at((uv[0], uv[1]), image.shape, _AROUND_PX), card, image.shape)
+    box = square_around(uv, shape, _SIDE_PX) if own else box_at((uv[0], uv[1]), shape, _AROUND_PX)
+    region = box if own else _region(box, card, shape)
     origin, (on, dark) = np.array([[region.u0_px, region.v0_px]]), _parts(pair, position, region)
     if dark is None:
         background = _background(on, outside_spot(uv[None], origin, on.shape[2:4]), origin, card, own)
@@ -223,15 +225,4 @@ def spot_outputs(
         behind = replace(model, background_e=background.mean_e)
         extra_e2 = float(np.median(background.variance_e2))
         return code_data(on[:, 0], origin, card, blur, behind, extra_e2=extra_e2)
-    size = (image.shape[1], image.shape[0])
-    return spot_window(on, origin, uv, card, blur, model, background, size)
-
-
-def _square(uv: Array, image: NDArray[Any]) -> Box:
-    """Square of 17 x 17 pixels about a place, inside the image."""
-    side = 2 * _HALF_PX + 1
-    u0, v0 = (
-        int(np.clip(np.rint(centre) - _HALF_PX, 0, size - side))
-        for centre, size in zip(uv, (image.shape[1], image.shape[0]), strict=True)
-    )
-    return Box(u0, v0, side, side)
+    return spot_window(on, origin, uv, card, blur, model, background, (shape[1], shape[0]))

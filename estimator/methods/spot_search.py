@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, TypeVar
 
@@ -156,14 +156,15 @@ def trusted_hints(pair: Pair, found: PairDetection) -> tuple[Box | None, Box | N
 
 def box_around(found: Detection | None, image: Image) -> Box | None:
     """Square of 21 pixels around a detection, moved inside the image where it would leave it."""
-    if found is None:
-        return None
-    height, width = image.shape[:2]
-    side = (min(_DETECTED_SIDE_PX, width), min(_DETECTED_SIDE_PX, height))
-    u0, v0 = (
-        min(max(round(x) - s // 2, 0), size - s) for x, s, size in zip(found.uv_px, side, (width, height), strict=True)
-    )
-    return Box(u0, v0, side[0], side[1])
+    return None if found is None else square_around(found.uv_px, image.shape, _DETECTED_SIDE_PX)
+
+
+def square_around(uv_px: Iterable[float], shape: tuple[int, ...], side_px: int) -> Box:
+    """Square about the nearest pixel of a place, moved inside an image of the shape (H, W, ...); at most the image."""
+    size = shape[1], shape[0]
+    side = min(side_px, size[0]), min(side_px, size[1])
+    u0, v0 = (min(max(round(x) - s // 2, 0), n - s) for x, s, n in zip(uv_px, side, size, strict=True))
+    return Box(u0, v0, *side)
 
 
 def box_at(uv_px: tuple[float, float], shape: tuple[int, ...], side_px: int = SIDE_PX) -> Box:

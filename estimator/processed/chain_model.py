@@ -112,7 +112,7 @@ class ChainModel:
 
     @cached_property
     def supports(self) -> tuple[Support, ...]:
-        """What each block's outputs depend on, in the order of their numbers; none where all are one block."""
+        """Support of each block's outputs, in the order of the blocks' numbers; none where all are one block."""
         if not self.block.any():
             return ()
         first = (int(np.argmax(self.block == number)) for number in range(int(self.block.max()) + 1))

@@ -11,7 +11,7 @@ from cyclopts import App, Parameter
 from phibench.cli.options import SENSOR, Metres, SensorFile
 
 if TYPE_CHECKING:
-    from phibench.calibration.captures.measure import KnownNumbers
+    from phibench.calibration.captures.measure import MeasureSetting
 
 Pictures = Annotated[tuple[Path, ...], Parameter(consume_multiple=True, negative="", show_default=False)]
 
@@ -85,17 +85,15 @@ def measure(
     return _measure_pair(pair, setting, out)
 
 
-def _measure_pair(pair: PairPictures, setting: KnownNumbers, out: Path | None) -> int:
+def _measure_pair(pair: PairPictures, setting: MeasureSetting, out: Path | None) -> int:
     from phibench.calibration.captures.measure import measure as measured
     from phibench.calibration.captures.measure_picture import write_measure_picture
-    from phibench.calibration.captures.pair_photos import PairPhotos, PositionPhotos
-    from phibench.calibration.captures.picture_files import read_photo
+    from phibench.calibration.captures.pair_photos import read_photos
     from phibench.datasets.common.progress import progress_console, stages
 
-    files = (pair.down, pair.up, pair.down_off, pair.up_off)
+    files = {"down": pair.down, "up": pair.up, "down_off": pair.down_off, "up_off": pair.up_off}
     with stages(progress_console(), "measure") as told:
-        groups = [tuple(read_photo(path, setting.known.rig, setting.sensor) for path in paths) for paths in files]
-        photos = PairPhotos(PositionPhotos(groups[0], groups[2]), PositionPhotos(groups[1], groups[3]))
+        photos = read_photos(files, setting.known.rig, setting.sensor)
         measurement = measured(photos, pair.stroke_m or 0.0, setting, told)
     print(f"D = {measurement.depth_m:.4f} m, sigma {measurement.sigma_m:.4f} m")
     spot_m, rig_m = float(measurement.depth.sigma_spot_m), float(measurement.depth.sigma_calibration_m)
@@ -112,7 +110,7 @@ def _measure_pair(pair: PairPictures, setting: KnownNumbers, out: Path | None) -
     return 0
 
 
-def _measure_folder(directory: Path, setting: KnownNumbers, out: Path | None) -> int:
+def _measure_folder(directory: Path, setting: MeasureSetting, out: Path | None) -> int:
     """Exit code 1 if a pair could not be measured, or contradicts itself or the tape."""
     from phibench.calibration.captures.pair_list import PairOutcome, measured_pairs, write_results
     from phibench.datasets.common.errors import DatasetError

@@ -114,7 +114,7 @@ def make(
     processes: ProcessOptions = _PROCESSES,
     wanted: RecipeOptions = _WHOLE_RECIPE,
     dry_run: bool = False,
-    variant: Variant = None,
+    variant: Variant = None,  # its converter sets PHIBENCH_VARIANT
 ) -> int:
     """Render a data set; what is finished already is kept. Sensitivities of D come last, sensitivities.parquet.
 

@@ -20,7 +20,7 @@ def make(
     out: OutFolder,
     workers: Workers = None,
     dry_run: bool = False,
-    variant: Variant = None,
+    variant: Variant = None,  # its converter sets PHIBENCH_VARIANT
 ) -> int:
     """Make the films of a recipe with [film]; what is finished already is kept.
 

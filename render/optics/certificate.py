@@ -136,6 +136,3 @@ def pixel_centroid(layer: SpotLayer) -> Array:
     with np.errstate(invalid="ignore"):
         total = image.sum()
         return np.array([(image * u).sum() / total + layer.u0_px, (image * v).sum() / total + layer.v0_px])
-
-
-# Spots of a beam.

@@ -96,7 +96,7 @@ class SpotTruth:
     u_px, v_px : float
         Image of the spot centre through the lens centre.
     phi_ray_rad, phi_normal_rad, phi_incidence_rad, azimuth_rad : float
-        See `angles`.
+        See `MirrorAngles`.
     reflection_point_world_m, camera_centre_world_m, sphere_centre_world_m : 3 floats
     cause : str
         "none", "no_reflection", "mirror_edge", "faces_away", "outside_image" or "occluded:<object>".

@@ -86,7 +86,7 @@ def render_ambient(
     Parameters
     ----------
     light, settings
-        Of `bake.bake` for this room.
+        Of `light_map.bake` for this room.
     cells_per_pixel : int
         Cells per pixel side where the image has detail; the first pass takes two samples a cell.
     seed : int

@@ -43,7 +43,7 @@ def mirror_intersection(mi: ModuleType, view: View) -> Meeting:
     if isinstance(mirror, RevolvedMirror):
         return _Revolved(mi, view, mirror.surface).meet
     if mirror.form is not None:
-        return lambda origin, direction: meet_form(mi, view, origin, direction)
+        return _FormedBall(mi, view).meet
     return _ball(mi, mirror.radius_m)
 
 
@@ -84,7 +84,7 @@ class _Revolved:
         def number(value: float) -> Any:
             return dr.opaque(mi.Float64, float(value))
 
-        self._vector, self._axes = mi.Vector3d, view.T_world_sphere.R
+        self._vector, self._axes = mi.Vector3d, _numbers(mi, view.T_world_sphere.R)
         self._radius, self._bend = number(MM_PER_M * profile.vertex_radius_m), number(1.0 + profile.conic)
         self._rim2 = number((MM_PER_M * profile.rim_radius_m) ** 2)
         terms = profile.even_terms if not profile.is_quadric else ()
@@ -99,7 +99,7 @@ class _Revolved:
         import drjit as dr
 
         V, axes = self._vector, self._axes
-        o, d = (_turned(V, axes.T, vector) for vector in (origin, direction))
+        o, d = (_turned(V, _transposed(axes), vector) for vector in (origin, direction))
         approach = -dr.dot(o, d)
         foot = o + approach * d
         if self._is_plain:
@@ -210,71 +210,84 @@ _LEAST_STEPS = 3
 _STEPS = 5
 
 
-def meet_form(mi: ModuleType, view: View, origin: Any, direction: Any) -> tuple[Any, Any, Any]:
-    """First point of a mirror with a form error, its outward normal, and whether there is one.
+class _FormedBall:
+    """A form's numbers in millimetres. Each is one variable: a kernel would load again what is made again."""
 
-    All are float64, in the scene's coordinates: mm, world axes, the sphere centre at the origin. The ray comes from
-    outside.
-    """
+    def __init__(self, mi: ModuleType, view: View) -> None:
+        import drjit as dr
+
+        form = view.rig.sphere.form
+        assert form is not None
+        Q, T = form.tensors
+        self._vector, self._axes = mi.Vector3d, _numbers(mi, view.T_world_sphere.R)
+        self._radius = dr.opaque(mi.Float64, MM_PER_M * view.rig.sphere.radius_m)
+        self._Q, self._T = _numbers(mi, MM_PER_M * Q), [_numbers(mi, MM_PER_M * part) for part in T]
+
+    def meet(self, origin: Any, direction: Any) -> tuple[Any, Any, Any]:
+        """First points, normals, and whether there are any; see `mirror_intersection`."""
+        import drjit as dr
+
+        V, axes, radius = self._vector, self._axes, self._radius
+        o, d = (_turned(V, _transposed(axes), vector) for vector in (origin, direction))
+        d = dr.normalize(d)
+        foot = o - dr.dot(o, d) * d
+        foot2 = dr.dot(foot, foot)
+        central = foot2 < 0.25 * radius * radius  # certainly hits, and q is no parabola near the sphere's centre
+        x = type(radius)(0.0)
+        for _ in range(_LEAST_STEPS):  # q'' is 2 but for the form
+            _, slope = self._q(foot, foot2, d, x)
+            x = dr.select(central, 0.0, x - 0.5 * slope)
+        q, _ = self._q(foot, foot2, d, x)
+        q = dr.select(central, foot2 - radius * radius, q)
+        found = q < 0.0
+        x = x - dr.sqrt(dr.maximum(-q, 0.0))
+        for _ in range(_STEPS):
+            q, slope = self._q(foot, foot2, d, x)
+            x = dr.select(found, x - q / slope, x)
+        P = foot + x * d
+        rho = dr.norm(P)
+        n = P / rho
+        _, gradient = self._added(n)
+        normal = dr.normalize(n - gradient / rho)
+        return _turned(V, axes, P), _turned(V, axes, normal), found
+
+    def _q(self, foot: Any, foot2: Any, d: Any, x: Any) -> tuple[Any, Any]:
+        """q and its derivative by the distance x from the foot."""
+        import drjit as dr
+
+        rho2 = foot2 + x * x
+        rho = dr.sqrt(rho2)
+        added, gradient = self._added((foot + x * d) / rho)
+        r = self._radius + added
+        return rho2 - r * r, 2.0 * x - 2.0 * r * dr.dot(gradient, d) / rho
+
+    def _added(self, n: Any) -> tuple[Any, Any]:
+        """Deviation of the radius in a unit direction, and its derivative along the unit sphere."""
+        import drjit as dr
+
+        V = self._vector
+        q = _turned(V, self._Q, n)
+        t = V(*(dr.dot(n, _turned(V, part, n)) for part in self._T))
+        along_q, along_t = dr.dot(q, n), dr.dot(t, n)
+        return along_q + along_t, 2.0 * q + 3.0 * t - (2.0 * along_q + 3.0 * along_t) * n
+
+
+Rows = list[list[Any]]
+
+
+def _numbers(mi: ModuleType, matrix: Array) -> Rows:
+    """Rows of a matrix of float64."""
     import drjit as dr
 
-    V, axes = mi.Vector3d, view.T_world_sphere.R
-    form = view.rig.sphere.form
-    assert form is not None
-    tensors = [MM_PER_M * tensor for tensor in form.tensors]
-    radius = dr.opaque(mi.Float64, MM_PER_M * view.rig.sphere.radius_m)
-    o, d = (_turned(V, axes.T, vector) for vector in (origin, direction))
-    d = dr.normalize(d)
-    foot = o - dr.dot(o, d) * d
-    foot2 = dr.dot(foot, foot)
-    central = foot2 < 0.25 * radius * radius  # certainly hits, and q is no parabola near the sphere's centre
-    x = mi.Float64(0.0)
-    for _ in range(_LEAST_STEPS):  # q'' is 2 but for the form
-        _, slope = _q(V, foot, foot2, d, x, radius, tensors)
-        x = dr.select(central, 0.0, x - 0.5 * slope)
-    q, _ = _q(V, foot, foot2, d, x, radius, tensors)
-    q = dr.select(central, foot2 - radius * radius, q)
-    found = q < 0.0
-    x = x - dr.sqrt(dr.maximum(-q, 0.0))
-    for _ in range(_STEPS):
-        q, slope = _q(V, foot, foot2, d, x, radius, tensors)
-        x = dr.select(found, x - q / slope, x)
-    P = foot + x * d
-    rho = dr.norm(P)
-    n = P / rho
-    _, gradient = _added(V, n, tensors)
-    normal = dr.normalize(n - gradient / rho)
-    return _turned(V, axes, P), _turned(V, axes, normal), found
+    return [[dr.opaque(mi.Float64, float(value)) for value in row] for row in matrix]
 
 
-def _q(V: Any, foot: Any, foot2: Any, d: Any, x: Any, radius: Any, tensors: list[Array]) -> tuple[Any, Any]:
-    """q and its derivative by the distance x from the foot."""
-    import drjit as dr
-
-    rho2 = foot2 + x * x
-    rho = dr.sqrt(rho2)
-    added, gradient = _added(V, (foot + x * d) / rho, tensors)
-    r = radius + added
-    return rho2 - r * r, 2.0 * x - 2.0 * r * dr.dot(gradient, d) / rho
+def _transposed(rows: Rows) -> Rows:
+    return [list(column) for column in zip(*rows, strict=True)]
 
 
-def _added(V: Any, n: Any, tensors: list[Array]) -> tuple[Any, Any]:
-    """Deviation of the radius in a unit direction, and its derivative along the unit sphere."""
-    import drjit as dr
-
-    Q, T = tensors
-    q = _turned(V, Q, n)
-    t = V(*(dr.dot(n, _turned(V, T[i], n)) for i in range(3)))
-    along_q, along_t = dr.dot(q, n), dr.dot(t, n)
-    return along_q + along_t, 2.0 * q + 3.0 * t - (2.0 * along_q + 3.0 * along_t) * n
-
-
-def _turned(V: Any, matrix: Array, vector: Any) -> Any:
+def _turned(V: Any, rows: Rows, vector: Any) -> Any:
     """Matrix times vector."""
-    import drjit as dr
-
-    number = type(vector.x)
-    rows = [[dr.opaque(number, float(value)) for value in row] for row in matrix]  # one kernel for all forms
     return V(*(row[0] * vector.x + row[1] * vector.y + row[2] * vector.z for row in rows))
 
 

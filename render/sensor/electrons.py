@@ -8,7 +8,6 @@ Planes R, G, B have the shape (3, h, w); a pixel's electrons and DN have the sha
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
@@ -17,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from phibench.render.sensor.light import Light, Region, SpotImage, moved_spot
+from phibench.render.sensor.light import Light, Region, SpotImage
 from phibench.render.sensor.settings import Sensor, SensorError
 from phibench.scenes.camera import Camera
 from phibench.scenes.frames import Array
@@ -88,36 +87,22 @@ def row_normal(stream: NoiseStream, region: Region) -> Array:
 
 def _by_tiles(stream: NoiseStream, region: Region, draw: Draw) -> Array:
     """Put together what `draw` gives for each tile of `region`."""
-    bits, generator, fresh = _philox()
-    key = philox_key(*stream.names).tolist()
+    bits = np.random.Philox(key=philox_key(*stream.names))
+    generator = np.random.Generator(bits)
+    state: Any = bits.state
+    # plain integers: numpy reads them three times as fast as its own arrays' elements
+    state["state"] = {name: words.tolist() for name, words in state["state"].items()}
+    state["buffer"] = state["buffer"].tolist()
     result = np.empty(region.shape)
     height, width = region.shape
     for v in range(0, height, TILE_PX):
         for u in range(0, width, TILE_PX):
             # word 0 counts the tile's own draws
-            counter = (0, (region.v0_px + v) // TILE_PX, (region.u0_px + u) // TILE_PX, 0)
-            state: Any = {**fresh, "state": {"counter": counter, "key": key}}
+            state["state"]["counter"] = (0, (region.v0_px + v) // TILE_PX, (region.u0_px + u) // TILE_PX, 0)
             bits.state = state
             part = slice(v, v + TILE_PX), slice(u, u + TILE_PX)
             result[part] = draw(generator, part)
     return result
-
-
-_OF_THREAD = threading.local()
-
-
-def _philox() -> tuple[np.random.Philox, np.random.Generator, dict[str, Any]]:
-    """A thread's generator, which takes its whole state anew for each tile, and that state without key and counter.
-
-    To make one takes NumPy longer than to draw a tile.
-    """
-    if not hasattr(_OF_THREAD, "philox"):
-        bits = np.random.Philox(key=0)
-        state: Any = bits.state
-        # plain integers: numpy reads them three times as fast as its own arrays' elements
-        _OF_THREAD.philox = bits, np.random.Generator(bits), {**state, "buffer": state["buffer"].tolist()}
-    made: tuple[np.random.Philox, np.random.Generator, dict[str, Any]] = _OF_THREAD.philox
-    return made
 
 
 def mosaic(planes: Array, phase: tuple[int, int] = (0, 0)) -> Array:
@@ -175,26 +160,18 @@ def expected_electrons(light: Light, sensor: Sensor, camera: Camera, region: Reg
     electrons = sampled_planes(part, sensor, phase).astype(float) * (seconds * light.lamp_level)
     if light.spot is not None:
         factor = seconds * light.laser_level * flicker
-        _add_spot(electrons, light.spot, factor, light.velocity_px_per_s, light, sensor, region)
+        _add_spot(electrons, light.spot, factor, sensor, region)
     for other in light.others:
         factor = seconds * (light.laser_level if other.follows_laser else 1.0)
-        _add_spot(electrons, other.image, factor, (0.0, 0.0), light, sensor, region)
+        _add_spot(electrons, other.image, factor, sensor, region)
     return electrons * vignetting(sensor.vignetting_exponent, camera, region)
 
 
-def _add_spot(
-    electrons: Array,
-    spot: SpotImage,
-    factor: float,
-    velocity_px_per_s: tuple[float, float],
-    light: Light,
-    sensor: Sensor,
-    region: Region,
-) -> None:
+def _add_spot(electrons: Array, spot: SpotImage, factor: float, sensor: Sensor, region: Region) -> None:
     """Add `factor` times a spot to what `expected_electrons` has of the ambient light, in place."""
     if factor == 0.0:
         return
-    u0, v0, planes = moved_spot(spot, velocity_px_per_s, sensor.exposure_s, sensor.readout_s, light.size[0])
+    u0, v0, planes = spot.u0_px, spot.v0_px, spot.electrons_per_s
     window = Region(u0, v0, u0 + planes.shape[2], v0 + planes.shape[1])
     common = Region(
         max(window.u0_px, region.u0_px),

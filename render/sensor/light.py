@@ -69,21 +69,19 @@ class Light:
     ----------
     ambient_electrons_per_s : array, shape (3, H, W)
     spot : spot layer or None
+        As this frame sees it: one that moves is given as `moved_spot` draws it out.
     lamp_level, laser_level : float
         Factors of the ambient and of the spot layer; `laser_level` 0 is laser off.
-    velocity_px_per_s : 2 floats
-        Velocity (u, v) of the spot's image; see `moved_spot`. The room is taken to stand still.
     f_number : float
         Lens stop at which the layers were rendered.
     others : tuple of OtherSpot
-        Added to the spot. Neither `velocity_px_per_s` nor the spot's speckle flicker is theirs.
+        Added to the spot. The spot's speckle flicker is not theirs.
     """
 
     ambient_electrons_per_s: NDArray[Any] = field(repr=False)
     spot: SpotImage | None = field(default=None, repr=False)
     lamp_level: float = 1.0
     laser_level: float = 1.0
-    velocity_px_per_s: tuple[float, float] = (0.0, 0.0)
     f_number: float = 2.4
     others: tuple[OtherSpot, ...] = ()
 
@@ -95,8 +93,6 @@ class Light:
             )
         for name in ("lamp_level", "laser_level"):
             _not_negative(name, getattr(self, name))
-        if not all(map(math.isfinite, self.velocity_px_per_s)):
-            raise SensorError(f"Light.velocity_px_per_s = {self.velocity_px_per_s}: must be two finite numbers")
         if not 0.5 <= self.f_number <= 256.0:
             raise SensorError(f"Light.f_number = {self.f_number:g}: allowed range is 0.5 to 256")
 
@@ -277,7 +273,7 @@ def _margin_px(velocity_px_per_s: tuple[float, float], exposure_s: float, readou
     reach = math.hypot(*velocity_px_per_s) * 0.5 * (exposure_s + readout_s)
     if reach > _MAX_MOTION_PX:
         raise SensorError(
-            f"Light.velocity_px_per_s = {velocity_px_per_s}: the spot moves by {reach:.0f} px in half a frame, "
+            f"the spot's velocity is {velocity_px_per_s} px/s: it moves by {reach:.0f} px in half a frame, "
             f"{_MAX_MOTION_PX} are allowed; move the carriage more slowly"
         )
     return math.ceil(reach) + 2

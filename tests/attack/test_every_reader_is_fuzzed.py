@@ -5,7 +5,9 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
+from types import CodeType, FrameType
 
 import pytest
 from attack.test_fuzz_readers import FEW, MANY, fuzz_a_file, outcome, read_dataset
@@ -46,23 +48,26 @@ OF_WRITERS = {
 @contextmanager
 def watched(seen: set[str]) -> Iterator[None]:
     """Names of our functions that are entered meanwhile, as `readers` has them."""
-    places: dict[str, str] = {}
+    entered: set[CodeType] = set()
 
-    def enter(frame: object, event: str, _: object) -> None:
-        code = frame.f_code  # type: ignore[attr-defined]
-        if event == "call":
-            name = code.co_filename
-            if name not in places:
-                path = Path(name).resolve()
-                places[name] = path.relative_to(ROOT).as_posix() if path.is_relative_to(ROOT) else ""
-            seen.add(f"{places[name]} {code.co_name}")
+    def enter(frame: FrameType, event: str, _: object) -> None:
+        entered.add(frame.f_code)
 
-    before = sys.getprofile()
-    sys.setprofile(enter)
+    before = sys.gettrace()
+    sys.settrace(enter)  # a profile function would be called for each function in C as well
     try:
         yield
     finally:
-        sys.setprofile(before)
+        sys.settrace(before)
+    for code in entered:
+        path = _resolved(code.co_filename)
+        if path.is_relative_to(ROOT):
+            seen.add(f"{path.relative_to(ROOT).as_posix()} {code.co_name}")
+
+
+@cache
+def _resolved(name: str) -> Path:
+    return Path(name).resolve()
 
 
 @pytest.fixture(scope="module")

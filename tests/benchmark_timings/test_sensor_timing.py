@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import replace
 
 import pytest
-from helpers.sensor_light import room
+from helpers.sensor_light import moving, room
 
 from phibench.datasets.frames.frame_request import FrameRequest
 from phibench.datasets.frames.frame_source import FrameSource, PositionLight
-from phibench.datasets.store.layers import SpotWindow
 from phibench.render.sensor.camera_chain import Chain
 from phibench.render.sensor.electrons import NoiseStream, _pattern
-from phibench.render.sensor.light import Region, moved_spot
+from phibench.render.sensor.light import Region
 from phibench.render.sensor.settings import sensor
 
 LIGHT = room((720, 1280))
@@ -57,9 +55,7 @@ def test_benchmark_region_of_a_new_camera(benchmark) -> None:
 def source(region: Region, preset: str = "mjpeg", velocity: tuple[float, float] = (0.0, 0.0), **changes) -> FrameSource:
     """Source of a pair whose layers are read already."""
     s = sensor(preset, **changes)
-    u0, v0, planes = moved_spot(LIGHT.spot, velocity, s.exposure_s, s.readout_s, LIGHT.size[0])
-    light = replace(LIGHT, spot=SpotWindow(u0, v0, planes, 0.0 * planes, 0.0 * planes))
-    side = PositionLight(Chain(s), light, region)
+    side = PositionLight(Chain(s), moving(LIGHT, velocity, s), region)
     return FrameSource(FrameRequest(preset, overrides=changes), ("benchmark", 0, "s"), {"down": side, "up": side})
 
 

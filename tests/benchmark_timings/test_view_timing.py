@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from helpers.oracles import TARGETS
 
-from phibench.datasets.store.layers import TRUTH_PLANES, write_ambient, write_truth
+from phibench.datasets.store.layers import STORED_TRUTH_PLANES, write_ambient, write_truth
 from phibench.datasets.store.pictures import display_exposure_s, save_png, to_srgb
 from phibench.render.optics.room_tracer import room_geometry
 from phibench.render.optics.truth import truth_layer
@@ -32,7 +32,7 @@ def parts(light: LightMap, seed: int, folder: Path) -> dict[str, float]:
     surfaces = view_surfaces(VIEW, ROOM)
     layer = render_ambient(VIEW, ROOM, light, SETTINGS, 2, seed, surfaces=surfaces)
     times.append(time.process_time())
-    truth = truth_layer(VIEW, room_geometry(ROOM, VIEW), surfaces.first_patch, TRUTH_PLANES)
+    truth = truth_layer(VIEW, room_geometry(ROOM, VIEW), surfaces.first_patch, STORED_TRUTH_PLANES)
     times.append(time.process_time())
     write_ambient(folder / "ambient.exr", layer.electrons_per_s, layer.variance_per_s2, {})
     write_truth(folder / "truth.exr", truth, {})

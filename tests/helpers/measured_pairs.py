@@ -29,7 +29,7 @@ from helpers.sensor_captures import write_raw_capture
 from phibench.calibration.captures import measure as command
 from phibench.calibration.captures.imported_calibration import calibrate_imported
 from phibench.calibration.captures.imported_set import import_pairs
-from phibench.calibration.captures.measure import KnownNumbers, measure, read_setting
+from phibench.calibration.captures.measure import MeasureSetting, measure, read_setting
 from phibench.calibration.captures.pair_list import photos_of, read_pair_list
 from phibench.calibration.rig.from_dataset import CalibrationSources
 from phibench.calibration.sensor_fit.fit_sensor import fit_sensor
@@ -131,7 +131,7 @@ def known(dataset: Dataset, sample: Sample, preset: str, draw: int, frames: int)
 
 
 def measured(
-    dataset: Dataset, preset: str, folder: Path, name: str, setting: KnownNumbers, frames: int
+    dataset: Dataset, preset: str, folder: Path, name: str, setting: MeasureSetting, frames: int
 ) -> Iterator[Row]:
     """Results of the command for a folder's pairs; those that it refuses are printed."""
     by_id = {sample.row.sample_id: sample for sample in dataset}

@@ -50,7 +50,7 @@ def write_raw_capture(
         write_frames(folder / "flat" / f"{i:02d}", images)
     for seconds, count in (dark_seconds or {}).items():
         images = flat_frames(s.replace(exposure_s=seconds), (0.0, 0.0, 0.0), count, f"slow{seconds}", seed)
-        write_frames(folder / "dark-exposure" / f"{seconds:g}", images)
+        write_frames(folder / "dark-exposure" / f"{seconds:.3f}", images)
     notes = f"exposure_s = {s.exposure_s}\nanalogue_gain = {s.analogue_gain}\nbits = {s.adc_bits}\n"
     (folder / "capture.toml").write_text(f'{notes}format = "{s.mosaic}-raw"\n')
     return folder

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
+from phibench.datasets.store.layers import SpotWindow
 from phibench.render.optics.spot_layer import SpotLayer, splat
 from phibench.render.optics.spot_samples import FilmCloud
-from phibench.render.sensor.light import Light
+from phibench.render.sensor.light import Light, moved_spot
 from phibench.render.sensor.processing import _ALPHA, _BETA, colour_corrected, white_balanced
 from phibench.render.sensor.settings import Sensor
 from phibench.render.sensor.srgb import srgb_decoded
@@ -25,6 +28,13 @@ def room(size: tuple[int, int], seed: int = 7) -> Light:
     """Textured room of (height, width) with a spot right of the middle; some pixels saturate at 1/60 s."""
     rates = np.random.default_rng(seed).uniform(0.0, 8e5, (3, *size)).astype(np.float32)
     return Light(rates, spot_at(0.6 * size[1] + 0.3, 0.5 * size[0] - 0.2))
+
+
+def moving(light: Light, velocity_px_per_s: tuple[float, float], sensor: Sensor) -> Light:
+    """The same view with its spot as the sensor's rolling shutter sees it."""
+    assert light.spot is not None
+    u0, v0, planes = moved_spot(light.spot, velocity_px_per_s, sensor.exposure_s, sensor.readout_s, light.size[0])
+    return replace(light, spot=SpotWindow(u0, v0, planes, 0.0 * planes, 0.0 * planes))
 
 
 def tone_decoded(encoded: Array, sensor: Sensor) -> Array:

@@ -214,7 +214,7 @@ def test_rays_from_values_against_newtons_method() -> None:
 @pytest.mark.skipif(find_spec("mitsuba") is None, reason="needs Mitsuba")
 def test_rays_inside_a_kernel_against_those_in_float64() -> None:
     """The ambient layer's rays start 200 to 300 mm off, in float64: some ulp of 6e-14 mm, over cos i >= 0.05."""
-    from phibench.render.room.mirror_intersection import meet_form
+    from phibench.render.room.mirror_intersection import mirror_intersection
     from phibench.render.setup.variant import activate
 
     mi, rng = activate(), np.random.default_rng(6)
@@ -224,7 +224,7 @@ def test_rays_inside_a_kernel_against_those_in_float64() -> None:
     expected = reflect(view, origins, ways)
     origins = 1e3 * (origins - view.sphere_centre_m)
     ray = mi.Point3d(*origins.T), mi.Vector3d(*ways.T)
-    points, normals, found = (np.array(x).T for x in meet_form(mi, view, *ray))
+    points, normals, found = (np.array(x).T for x in mirror_intersection(mi, view)(*ray))
     sure = expected.cos_incidence > 0.05
     assert sure.sum() > 5000
     assert found[sure].all()

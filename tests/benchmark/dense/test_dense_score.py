@@ -28,7 +28,7 @@ from phibench.benchmark.dense.dense_score import (
     score_dense,
 )
 from phibench.benchmark.dense.dense_tables import dense_board, dense_metrics_table, dense_strata_table
-from phibench.benchmark.isolation.answers import AnswerError, checked_dense_answer, dense_answer_text, most_bytes
+from phibench.benchmark.isolation.answers import AnswerError, checked_dense_answer, dense_answer_document, most_bytes
 from phibench.benchmark.isolation.method_references import DENSE, resolve
 from phibench.benchmark.isolation.run_limits import MethodError, RunLimits
 from phibench.benchmark.scored_dataset import open_dataset
@@ -244,7 +244,7 @@ def test_a_mirror_without_an_epipolar_curve_is_refused() -> None:
 
 # What a hostile process may send.
 
-GOOD: dict[str, Any] = dense_answer_text(DenseAnswer(np.ones((2, 3)), sigma_depth_m=np.ones((2, 3), np.float32)))
+GOOD: dict[str, Any] = dense_answer_document(DenseAnswer(np.ones((2, 3)), sigma_depth_m=np.ones((2, 3), np.float32)))
 
 
 def test_planes_come_back_with_their_types() -> None:
@@ -252,7 +252,7 @@ def test_planes_come_back_with_their_types() -> None:
     assert answer.depth_m is not None
     assert answer.sigma_depth_m is not None
     assert (answer.depth_m.dtype, answer.sigma_depth_m.dtype) == (np.float64, np.float32)
-    assert len(json.dumps(dense_answer_text(DenseAnswer(np.ones((50, 60)))))) < most_bytes((50, 60))
+    assert len(json.dumps(dense_answer_document(DenseAnswer(np.ones((50, 60)))))) < most_bytes((50, 60))
 
 
 def forged(**fields: Any) -> dict[str, Any]:

@@ -8,13 +8,13 @@ import math
 import numpy as np
 import pytest
 
-from phibench.benchmark.isolation.answers import AnswerError, answer_text, checked_answer
+from phibench.benchmark.isolation.answers import AnswerError, answer_document, checked_answer
 from phibench.estimator.interface import Answer, Spot
 
 
 def through(answer: object) -> Answer:
     """An answer on its way to the parent."""
-    return checked_answer(json.loads(json.dumps(answer_text(answer))))
+    return checked_answer(json.loads(json.dumps(answer_document(answer))))
 
 
 MISSING = Spot.missing("x")

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from helpers.sandbox_pairs import HEADER, method_file
 
-from phibench.benchmark.isolation.answers import AnswerError, answer_text, checked_answer
+from phibench.benchmark.isolation.answers import AnswerError, answer_document, checked_answer
 from phibench.benchmark.isolation.easy_pairs import EasyPairs
 from phibench.benchmark.isolation.method_check import PAIRS, MethodCheck, check_method, check_of_outcomes
 from phibench.benchmark.isolation.run_limits import MethodError, RunLimits
@@ -70,7 +70,7 @@ def tried(method: Method, pairs: list[Pair], of: EasyPairs = SET) -> MethodCheck
     done = []
     for pair in pairs:
         try:
-            done.append(Outcome(pair.number, checked_answer(answer_text(method(pair))), 0.01))
+            done.append(Outcome(pair.number, checked_answer(answer_document(method(pair))), 0.01))
         except AnswerError as error:
             done.append(Outcome(pair.number, None, 0.01, "invalid", str(error)))
         except AttributeError as error:
@@ -414,11 +414,12 @@ def test_check_exits_with_1_and_says_what_is_wrong(tmp_path: Path, capsys) -> No
 
 def test_check_shows_what_the_method_prints(tmp_path: Path, capsys) -> None:
     reference = method_file(tmp_path, "print('number', pair.number)\nreturn 5", header=HEADER)
-    assert cli.main(["method", "check", reference]) == 1
+    raw = ("--preset", "mono-raw")  # pairs that tests above have made
+    assert cli.main(["method", "check", reference, *raw]) == 1
     out = capsys.readouterr().out
     assert "--show-output shows it" in out
     assert "number 3" not in out
-    assert cli.main(["method", "check", reference, "--show-output"]) == 1
+    assert cli.main(["method", "check", reference, *raw, "--show-output"]) == 1
     shown = capsys.readouterr()
     assert "printed for pair 3:\n    number 3\n" in shown.out
     assert "easy pairs: 10/10" in shown.err

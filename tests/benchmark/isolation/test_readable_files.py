@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from helpers.districts import DISTRICTS, tree
+from helpers.districts import DISTRICTS, statements, tree
 from helpers.landlock import FilePairs, landlock, needs_landlock, own_mounts
 from helpers.listeners import as_nobody
 from helpers.sandbox_pairs import GOOD, HEADER, SmallPairs, method_file
@@ -217,7 +217,7 @@ def test_every_file_that_is_written_is_on_the_list_or_open() -> None:
     for file in sorted(path for folder in DISTRICTS for path in (ROOT / folder).rglob("*.py")):
         if "studies" in file.parts:
             continue
-        for node in ast.walk(tree(file)):
+        for node in statements(tree(file)):
             if isinstance(node, ast.Assign | ast.AnnAssign) and node.value is not None:
                 for one in ast.walk(node.value):
                     if isinstance(one, ast.Constant) and isinstance(one.value, str) and NAMES.fullmatch(one.value):

@@ -18,8 +18,8 @@ from helpers.bench_samples import hidden, with_tables
 from PIL import Image
 
 from phibench.benchmark.pair_sets.dataset_pairs import (
-    BOX_MARGIN_PX,
-    BOX_PX,
+    LOCALISE_BOX_PX,
+    LOCALISE_MARGIN_PX,
     DatasetPairs,
     SpotInImage,
     dataset_pairs,
@@ -385,11 +385,14 @@ def test_tracks_show_boxes_of_their_own_or_whole_frames(bench_dataset: Path, tmp
     for pair, truth in localised:
         for box, spot in ((pair.box_down, truth.down), (pair.box_up, truth.up)):
             assert box is not None
-            assert (box.width_px, box.height_px) == (BOX_PX, BOX_PX)
+            assert (box.width_px, box.height_px) == (LOCALISE_BOX_PX, LOCALISE_BOX_PX)
             if truth.hinted and spot.visible:
                 # between pixel edges; near the image's edge the box has no room
                 u, v = spot.uv_px[0] - box.u0_px + 0.5, spot.uv_px[1] - box.v0_px + 0.5
-                inside += BOX_MARGIN_PX <= u <= BOX_PX - BOX_MARGIN_PX and BOX_MARGIN_PX <= v <= BOX_PX - BOX_MARGIN_PX
+                inside += (
+                    LOCALISE_MARGIN_PX <= u <= LOCALISE_BOX_PX - LOCALISE_MARGIN_PX
+                    and LOCALISE_MARGIN_PX <= v <= LOCALISE_BOX_PX - LOCALISE_MARGIN_PX
+                )
     assert inside >= len(localised)
     assert tracks_of(localised.document()) == ("localise",)
     for track in ("find", "depth"):

@@ -10,7 +10,7 @@ import pytest
 import scipy
 from helpers.bench_cases import Cases, cases, change, outcomes, records, sampler, shifted, truth_itself
 
-from phibench.benchmark.pair_sets.dataset_pairs import BOX_PX, tracks_of
+from phibench.benchmark.pair_sets.dataset_pairs import LOCALISE_BOX_PX, tracks_of
 from phibench.benchmark.scores.answer_errors import MATCH_PX, Rules
 from phibench.benchmark.scores.metrics import metric_estimates, prepared_records
 from phibench.benchmark.scores.record_columns import LEAST_RATIO, THRESHOLDS, perfect_log
@@ -164,11 +164,11 @@ def test_an_interval_of_the_methods_own_goes_before_its_sigma() -> None:
 @pytest.mark.parametrize(
     ("document", "tracks"),
     [
-        ({"boxes_px": BOX_PX, "hinted": 12, "track": "localise"}, ("localise",)),
+        ({"boxes_px": LOCALISE_BOX_PX, "hinted": 12, "track": "localise"}, ("localise",)),
         ({"boxes_px": None, "hinted": 0, "track": "depth"}, ("find", "depth")),
         ({"boxes_px": None, "hinted": 0}, ("find", "depth")),
         ({"boxes_px": None, "hinted": 3}, ()),
-        ({"boxes_px": BOX_PX, "hinted": 12}, ()),
+        ({"boxes_px": LOCALISE_BOX_PX, "hinted": 12}, ()),
         ({}, ()),
     ],
 )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -223,10 +224,15 @@ def _unknown_note(folder: Path) -> None:
     (folder / "capture.toml").write_text("exposure = 0.1\n")
 
 
-def _bad_seconds(folder: Path) -> None:
-    (folder / "flat/00").rename(folder / "x")
-    (folder / "exposure").mkdir()
-    (folder / "x").rename(folder / "exposure/short")
+def _exposed(name: str) -> Callable[[Path], None]:
+    """One level of flat frames is said to have an exposure time."""
+
+    def harm(folder: Path) -> None:
+        (folder / "flat/00").rename(folder / "x")
+        (folder / "exposure").mkdir()
+        (folder / "x").rename(folder / "exposure" / name)
+
+    return harm
 
 
 @pytest.mark.parametrize(
@@ -246,7 +252,8 @@ def _bad_seconds(folder: Path) -> None:
         (_cmyk, "CMYK"),
         (_damage, "not a picture"),
         (_unknown_note, "exposure: unknown key; did you mean 'exposure_s'"),
-        (_bad_seconds, "exposure time"),
+        (_exposed("short"), "exposure time"),
+        (_exposed("20"), "Name it 20.0 for seconds, 0.02 for milliseconds"),
     ],
 )
 def test_a_folder_that_will_not_do_is_refused_in_one_sentence(good: Path, harm, reason: str) -> None:

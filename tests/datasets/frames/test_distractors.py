@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from helpers.bench_samples import hidden, many, with_tables
 from helpers.oracles import true_pixel
-from helpers.sensor_light import room, spot_at
+from helpers.sensor_light import moving, room, spot_at
 
 from phibench.datasets.exposures.expected_electrons import expected_of_light
 from phibench.datasets.exposures.pair_draws import CachedSample, pair_draws
@@ -84,7 +84,7 @@ def test_what_lies_under_the_spot_holds_every_other_light() -> None:
 @pytest.mark.parametrize("velocity", [(0.0, 0.0), (140.0, -90.0)])
 @pytest.mark.parametrize("preset", ["ideal", "mono-raw", "bayer-raw", "srgb8", "mjpeg"])
 def test_a_region_is_the_whole_frame_there(preset: str, velocity: tuple[float, float]) -> None:
-    view, chain = replace(light(), velocity_px_per_s=velocity), Chain(sensor(preset), 3, CAMERA)
+    view, chain = moving(light(), velocity, sensor(preset)), Chain(sensor(preset), 3, CAMERA)
     whole = chain.frame(view, STREAM)
     without = chain.frame(replace(view, others=()), STREAM)
     assert not np.array_equal(whole, without)

@@ -16,7 +16,7 @@ from phibench.datasets.rooms.room_sources import room_of
 from phibench.render.optics.room_tracer import room_geometry
 from phibench.render.optics.spot_layer import spot_layer
 from phibench.render.optics.truth import spot_truth
-from phibench.scenes.rig import POSITIONS, Stroke
+from phibench.scenes.rig import POSITIONS
 
 SHARE = 0.25
 
@@ -46,7 +46,7 @@ def seen(plan: Plan, pair: PairPlan) -> list[tuple[str, float]]:
     """Cause and light of both images."""
     spot, room, found = plan.spots[pair.spot], room_of(plan.rooms[pair.room]), []
     for position in POSITIONS:
-        view = plan.rigs[pair.rig].at(Stroke(pair.stroke_m).offset_m(position))
+        view = plan.rigs[pair.rig].at(pair.offset_m(position))
         geometry = room_geometry(room, view)
         light = float(spot_layer(view, spot, geometry).total_electrons_per_s.sum())
         found.append((spot_truth(view, spot, geometry).cause, light))

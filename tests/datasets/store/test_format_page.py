@@ -105,7 +105,7 @@ def test_files() -> None:
 
 def test_planes() -> None:
     said = [name for row in table_with("plane", "unit", "meaning") for name in names(row[0])]
-    assert tuple(said) == layers.TRUTH_PLANES
+    assert tuple(said) == layers.STORED_TRUTH_PLANES
     assert {*said, *truth.ANGLES} == set(truth.TRUTH_PLANES)
     spots = [name for row in table_with("planes", "unit", "meaning") for name in names(row[0])]
     assert tuple(spots) == layers.SPOT_PLANES

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.sensor_light import room
+from helpers.sensor_light import moving, room
 
 from phibench.render.sensor.camera_chain import Chain
 from phibench.render.sensor.electrons import NoiseStream
@@ -61,7 +60,7 @@ def mismatches(chain: Chain, size: tuple[int, int], velocity: tuple[float, float
     """For each region whether it differs from the whole frame."""
     if chain.sensor.output == "yuyv":
         size = size[0], size[1] // 2 * 2  # it has pairs of columns
-    light = replace(room(size), velocity_px_per_s=velocity)
+    light = moving(room(size), velocity, chain.sensor)
     whole = chain.frame(light, STREAM)
     assert whole.std() > 0
     return [
