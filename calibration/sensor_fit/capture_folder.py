@@ -43,6 +43,7 @@ _SUFFIXES = (".png", ".pgm", ".tif", ".tiff", ".bmp", ".yuyv", ".jpg", ".jpeg")
 _DRIFT = 0.02  # of the mean, from the least to the largest frame mean of one level
 _DRIFT_OF_RANGE = 0.0025  # of full scale: levels near zero jitter by more than a share of themselves
 _DRIFT_SIGMAS = 8.0  # of the frames' means: their own noise is no drift
+_UNIT = "{0} of which unit? Write {0}.0 for seconds, {1:g} for milliseconds"  # a whole time may be either
 _CHROMA_CODES = 20.0  # by which the mean chroma of an even surface may change more than its luma
 _CONTAINER_BITS = 16  # files of 16 bits hold codes of fewer bits, too
 _FRAME_BYTES = 512 * 2**20  # 250 million pixels of 16 bits
@@ -335,6 +336,8 @@ def read_notes(path: Path) -> CaptureNotes:
     tables = file.toml()
     if faults := structural_faults(CaptureNotes, tables):
         raise file.fault(f"is damaged: {'; '.join(map(str, faults))}")
+    if isinstance(time := tables.get("exposure_s"), int):
+        raise file.fault(f"has exposure_s = {_UNIT.format(time, time / 1000)}")
     return CaptureNotes.model_validate(tables)
 
 
@@ -359,11 +362,8 @@ def _seconds(level: Path) -> float:
         raise CaptureError(
             f"{printable_line(str(level))}: the folder's name must be its exposure time, seconds, such as 0.0100"
         )
-    if level.name.isdigit():  # milliseconds as often as seconds: a factor of 1000 that nothing else would tell
-        raise CaptureError(
-            f"{printable_line(str(level))}: {level.name} of which unit? Name it {int(level.name)}.0 for seconds, "
-            f"{float(level.name) / 1000:g} for milliseconds"
-        )
+    if level.name.isdigit():
+        raise CaptureError(f"{printable_line(str(level))}: {_UNIT.format(int(level.name), int(level.name) / 1000)}")
     return float(level.name)
 
 

@@ -224,6 +224,10 @@ def _unknown_note(folder: Path) -> None:
     (folder / "capture.toml").write_text("exposure = 0.1\n")
 
 
+def _whole_time(folder: Path) -> None:
+    (folder / "capture.toml").write_text("exposure_s = 33\n")
+
+
 def _exposed(name: str) -> Callable[[Path], None]:
     """One level of flat frames is said to have an exposure time."""
 
@@ -252,8 +256,9 @@ def _exposed(name: str) -> Callable[[Path], None]:
         (_cmyk, "CMYK"),
         (_damage, "not a picture"),
         (_unknown_note, "exposure: unknown key; did you mean 'exposure_s'"),
+        (_whole_time, "Write 33.0 for seconds, 0.033 for milliseconds"),
         (_exposed("short"), "exposure time"),
-        (_exposed("20"), "Name it 20.0 for seconds, 0.02 for milliseconds"),
+        (_exposed("20"), "Write 20.0 for seconds, 0.02 for milliseconds"),
     ],
 )
 def test_a_folder_that_will_not_do_is_refused_in_one_sentence(good: Path, harm, reason: str) -> None:
