@@ -140,19 +140,23 @@ def test_files_may_lie_in_another_folder(
     assert {path: path.stat().st_mtime_ns for path in copy.rglob("*") if path in before} == before
 
 
-def test_the_forecast_of_a_bake_is_the_mean_over_kinds(recipe: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Four rooms, of which two are generated: the first of them stands for both."""
+def test_the_forecast_of_a_bake_is_the_mean_over_rooms(recipe: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of four rooms two are generated and differ; of many of a kind some, evenly chosen, stand for all."""
     monkeypatch.setattr("phibench.datasets.build.forecast.is_cached", lambda *_: False)
     plan = make_plan(load_recipe(recipe), recipe_files(recipe))
-    plan = replace(plan, rooms={**plan.rooms, "room000001": plan.rooms["room000000"]})
+    drawn = plan.rooms["room000000"]
+    other = replace(drawn, stream=(*drawn.stream, "another"))
+    many = {f"room{k:06}": (drawn, other)[k % 2] for k in range(12)}
+    rooms = {**plan.rooms, "room000001": other, **many}
     tasks = [task for task in plan_tasks(make_plan(plan.recipe, plan.files), {}).values() if task.kind == "bake"]
 
     def seconds(*names: str) -> float:
-        return forecast(replace(plan, rooms={name: plan.rooms[name] for name in names}), tasks).seconds["bake"]
+        return forecast(replace(plan, rooms={name: rooms[name] for name in names}), tasks).seconds["bake"]
 
-    alone = [seconds(name) for name in IDS]
-    assert len(set(alone)) == 3
-    assert seconds(*IDS, "room000001") == pytest.approx((2 * alone[0] + alone[1] + alone[2]) / 4)
+    alone = {name: seconds(name) for name in (*IDS, "room000001")}
+    assert len(set(alone.values())) == 4
+    assert seconds(*alone) == pytest.approx(sum(alone.values()) / 4)
+    assert seconds(*many) == pytest.approx((alone["room000000"] + alone["room000001"]) / 2)
 
 
 def test_cached_is_said_of_light_maps_in_the_cache_alone(recipe: Path, monkeypatch: pytest.MonkeyPatch) -> None:
