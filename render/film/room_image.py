@@ -18,11 +18,10 @@ from functools import cached_property
 from typing import Protocol
 
 import numpy as np
-from numpy.polynomial.legendre import leggauss
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from phibench.render.optics.beam_deposit import footprint
+from phibench.render.optics.beam_deposit import footprint, inside_reflectance, transmittance
 from phibench.render.optics.faces import FaceTable, IntArray
 from phibench.render.optics.ray_tracer import lens_rays, reflect
 from phibench.render.optics.reflection_point import bundle_spread, mirror_points
@@ -143,7 +142,7 @@ class LitRoom:
         onward = d + 2.0 * cos[:, None] * normal
         starts = origins_m[coated] + hits.distance_m[coated, None] * d + _LIFT_M * normal
         found = self.ground(self.geometry.first_hit(starts, onward), starts, onward)
-        result[coated] = reflectance(cos, table.coat[patch])[:, None] * found
+        result[coated] = (1.0 - transmittance(cos, table.coat[patch]))[:, None] * found
         return result
 
     def _ground(self, patch: IntArray, points: Array, d: Array) -> Array:
@@ -190,7 +189,7 @@ class LitRoom:
         coat, result = self._table.coat[patch], albedo.copy()
         on = np.flatnonzero(coat > 0.0)
         inside = self._inside[patch[on], None]
-        leaves = (1.0 - reflectance(cos[on], coat[on])) / coat[on] ** 2
+        leaves = transmittance(cos[on], coat[on]) / coat[on] ** 2
         result[on] = albedo[on] / (1.0 - albedo[on] * inside) * leaves[:, None]
         return result
 
@@ -250,25 +249,6 @@ def _image(texture: Texture) -> tuple[Array, float]:
         even, odd = np.array(texture.albedo_even), np.array(texture.albedo_odd)
         return np.array([[even, odd], [odd, even]]), 0.0
     return np.array([[texture.albedo]], float), 0.0
-
-
-def reflectance(cos: Array, index: Array) -> Array:
-    """Fresnel reflectance of a dielectric from outside, unpolarised light, shape (N,)."""
-    inner = np.sqrt(index**2 - 1.0 + cos**2)  # index times the cosine inside
-    s = (cos - inner) / (cos + inner)
-    p = (index**2 * cos - inner) / (index**2 * cos + inner)
-    return np.asarray(0.5 * (s**2 + p**2))
-
-
-def inside_reflectance(index: float) -> float:
-    """Reflectance of a dielectric's face for diffuse light from inside.
-
-    With r that from outside it is 1 - (1 - r) / index^2: what enters is what leaves (W. A. Shurcliff's reciprocity).
-    """
-    x, weight = leggauss(64)
-    cos = 0.5 * (x + 1.0)
-    outside = float(np.sum(weight * cos * reflectance(cos, np.full(64, index))))  # 2 cos, and half the interval
-    return 1.0 - (1.0 - outside) / index**2
 
 
 # -- camera ----------------------------------------------------------------------------------------------------------
