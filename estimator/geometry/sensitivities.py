@@ -8,7 +8,7 @@ the true rig: `true_rig.perturbed(...)`. The plane of focus, roughness and rim m
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
 
@@ -65,14 +65,31 @@ def sensitivity(
 
     Everything is NaN where the spot is not seen or the estimator has no answer.
     """
+    given = nominal_rig, nominal_stroke_m, true_rig, true_stroke_m, point_world_m
+    return sensitivities((estimator,), *given)[estimator]
+
+
+def sensitivities(
+    estimators: Iterable[str],
+    nominal_rig: Rig,
+    nominal_stroke_m: float,
+    true_rig: Rig,
+    true_stroke_m: float,
+    point_world_m: Array,
+) -> dict[str, Sensitivity]:
+    """The same of several estimators by name: how the pixels move is the same for all."""
     views = [true_rig.at(Stroke(true_stroke_m).offset_m(position)) for position in POSITIONS]
     pixels = [image_of(view, point_world_m).uv_px for view in views]
-    # chain rule: dD/d(pixels) of the nominal rig times d(pixels)/dp of the true one
-    by_pixel = PIXEL_GRADIENTS[estimator](nominal_rig, nominal_stroke_m, *pixels)
     moved = [pixel_gradient(view, uv, point_world_m) for view, uv in zip(views, pixels, strict=True)]
-    estimate = ESTIMATORS[estimator](nominal_rig, nominal_stroke_m, *pixels)
-    gradient = by_pixel[:2] @ moved[0] + by_pixel[2:] @ moved[1]
-    return Sensitivity(float(estimate.depth_m), gradient, truth_gradient(true_rig, point_world_m))
+    truth = truth_gradient(true_rig, point_world_m)
+    found = {}
+    for name in estimators:
+        # chain rule: dD/d(pixels) of the nominal rig times d(pixels)/dp of the true one
+        by_pixel = PIXEL_GRADIENTS[name](nominal_rig, nominal_stroke_m, *pixels)
+        gradient = by_pixel[:2] @ moved[0] + by_pixel[2:] @ moved[1]
+        estimate = ESTIMATORS[name](nominal_rig, nominal_stroke_m, *pixels)
+        found[name] = Sensitivity(float(estimate.depth_m), gradient, truth)
+    return found
 
 
 def truth_gradient(true_rig: Rig, point_world_m: Array) -> Array:

@@ -12,7 +12,7 @@ from phibench.datasets.read import Dataset, Sample, open_finished
 from phibench.datasets.store import schema
 from phibench.datasets.store.files import write_bytes
 from phibench.datasets.store.sensitivity_file import sensitivity_bytes, sensitivity_fault
-from phibench.estimator.geometry.sensitivities import PARAMETERS, sensitivity
+from phibench.estimator.geometry.sensitivities import PARAMETERS, sensitivities
 from phibench.estimator.geometry.triangulate import ESTIMATORS
 from phibench.scenes.rig import POSITIONS
 
@@ -37,8 +37,7 @@ def sensitivity_rows(samples: Iterable[Sample]) -> Iterator[Row]:
         d(true D)/d(parameter), for `TRUTH`; 0 for all others.
     """
     for sample in samples:
-        for estimator in ESTIMATORS:
-            yield _row(sample, estimator)
+        yield from _rows(sample)
 
 
 def write_sensitivities(dataset: Dataset, out: Path) -> Path:
@@ -67,22 +66,26 @@ def columns() -> tuple[str, ...]:
 _WORDS = ("sample_id", "estimator", "cause")
 
 
-def _row(sample: Sample, estimator: str) -> Row:
+def _rows(sample: Sample) -> Iterator[Row]:
+    """Rows of one sample, one for each estimator."""
     row = sample.row
     hidden = [f"{name}: {row.position(name).cause}" for name in POSITIONS if not row.position(name).visible]
-    words: Row = {"sample_id": row.sample_id, "estimator": estimator, "cause": ", ".join(hidden) or "none"}
+    words: Row = {"sample_id": row.sample_id, "cause": ", ".join(hidden) or "none"}
     if hidden:
-        return {**dict.fromkeys(columns()), **words, "depth_m": row.depth_m}
-    spot = np.array(row.spot_world_m)
-    change = sensitivity(estimator, sample.nominal_rig, row.nominal_stroke_m, sample.rig, row.stroke_m, spot)
-    truth = dict(zip(PARAMETERS, change.truth_gradient, strict=True))
-    return {
-        **words,
-        "depth_m": row.depth_m,
-        "estimate_m": _number(change.estimate_m),
-        **{f"estimate_m_per_{p}": _number(x) for p, x in zip(PARAMETERS, change.estimate_gradient, strict=True)},
-        **{f"truth_m_per_{p}": _number(truth[p]) for p in TRUTH},
-    }
+        empty = {**dict.fromkeys(columns()), **words, "depth_m": row.depth_m}
+        yield from ({**empty, "estimator": estimator} for estimator in ESTIMATORS)
+        return
+    rigs = sample.nominal_rig, row.nominal_stroke_m, sample.rig, row.stroke_m
+    for estimator, change in sensitivities(ESTIMATORS, *rigs, np.array(row.spot_world_m)).items():
+        truth = dict(zip(PARAMETERS, change.truth_gradient, strict=True))
+        yield {
+            **words,
+            "estimator": estimator,
+            "depth_m": row.depth_m,
+            "estimate_m": _number(change.estimate_m),
+            **{f"estimate_m_per_{p}": _number(x) for p, x in zip(PARAMETERS, change.estimate_gradient, strict=True)},
+            **{f"truth_m_per_{p}": _number(truth[p]) for p in TRUTH},
+        }
 
 
 def _number(value: Any) -> float | None:
