@@ -91,7 +91,7 @@ class FrameSettings:
     """
 
     seed: int = 0
-    spots: int = 2500
+    spots: int = 5000
     rounds: int = 3
     passes: int = 2
     batch: int = 32
