@@ -196,7 +196,7 @@ class DatasetPairs(DrawnPairs, ShortForm):
     def _otherwise(self) -> dict[str, Any]:
         """Frames and numbers of the sensor that are not the recipe's: scores of others are not comparable."""
         changed: dict[str, Any] = {}
-        if (counts := sorted({draw.frames for draw in self.pair_draws})) != [(1, 1)]:
+        if (counts := sorted({draw.frames for draw in self.pair_draws})) != [(1, 1)] or self._count_frames:
             changed["frames"] = [list(count) for count in counts]
         if self._sensor is not None:
             text = json.dumps([self._sensor.preset, dict(self._sensor.numbers)], sort_keys=True)
@@ -257,7 +257,7 @@ def dataset_pairs(
         chosen = _with_boxes(dataset, chosen, boxes_px, hints)
     elif not hints:
         chosen = tuple(replace(draw, boxes=None) for draw in chosen)
-    return DatasetPairs(dataset, chosen[:pairs], boxes_px, sensor)
+    return DatasetPairs(dataset, chosen[:pairs], boxes_px, sensor, count_frames=frames is not None)
 
 
 def _with_boxes(dataset: Dataset, chosen: tuple[PairDraw, ...], side_px: int, hints: bool) -> tuple[PairDraw, ...]:

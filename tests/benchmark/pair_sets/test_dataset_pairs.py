@@ -106,6 +106,18 @@ def test_several_frames_are_a_mean_with_their_number_and_have_their_own_bound(da
     assert np.allclose(bound, expected)
 
 
+def test_one_frame_on_and_off_has_the_bound_of_both(dataset: Dataset) -> None:
+    """Asked for, the bound takes the room from the laser-off frame alone; without it, as a level behind each filter."""
+    single, counted = (dataset_pairs(dataset, "bayer-raw", pairs=1, frames=n) for n in (None, FrameCounts(1, 1)))
+    for name, image in single.pair(0).images.items():
+        assert np.array_equal(image, counted.pair(0).images[name])
+    bounds = [pairs.truth(0).down.bound_px2 for pairs in (single, counted, counted.of_track("find"))]
+    assert all(bound is not None for bound in bounds)
+    level, room, again = (float(np.trace(bound)) for bound in bounds if bound is not None)
+    assert level < room == again < 2.0 * level  # at most, where the room makes the noise, its own as much again
+    assert (single.document().get("frames"), counted.document()["frames"]) == (None, [[1, 1]])
+
+
 def test_a_report_shows_yuyv_in_colour(dataset: Dataset) -> None:
     """Two planes, luma and chroma in turns, are no picture."""
     pairs = dataset_pairs(dataset, "yuyv", pairs=1)
