@@ -1,9 +1,11 @@
 """Networks on pairs of a test set whose rooms they have not seen: by light, against a fit, and what detectors find.
 
     .venv/bin/python -m docs.draw_learned pairs TEST SCORES NETWORKS
+    .venv/bin/python -m docs.draw_learned boxes TEST SCORES
     .venv/bin/python -m docs.draw_learned found SCORES
 
-SCORES is a folder with scores of `detect` and of others on TEST, such as mjpeg-detect.parquet, by `phibench score`.
+`boxes` reads the track `localise` of `phibench bench`, and compares with what on - off can tell of each spot. SCORES is
+a folder with scores of `detect` and of others on TEST, such as mjpeg-detect.parquet, by `phibench score`.
 NETWORKS is a folder of ONNX files of networks of crops. `pairs` asks them at the places that `detect` answered; bounds
 and the fit's errors are the scores'. `found` compares scores of `learned_detect` with those of `detect` and the fits.
 """
@@ -18,8 +20,9 @@ from typing import Any
 import numpy as np
 import polars as pl
 
+from phibench.benchmark.pair_sets.dataset_pairs import dataset_pairs
 from phibench.benchmark.scores.intervals import clopper_pearson
-from phibench.datasets.exposures.pair_draws import CachedSample, PairDraw, pair_draws
+from phibench.datasets.exposures.pair_draws import CachedSample, FrameCounts, PairDraw, pair_draws
 from phibench.datasets.frames.frame_source import frame_stream, noise_draw
 from phibench.datasets.frames.sensor_card import card_of
 from phibench.datasets.read import open_finished
@@ -29,6 +32,7 @@ from phibench.estimator.learned.networks import Network
 from phibench.render.sensor.light import Region
 from phibench.scenes.frames import Array
 from phibench.scenes.random_streams import generator
+from phibench.scenes.rig import POSITIONS
 from tools.crop_training import Answers
 
 RESAMPLES = 2000
@@ -80,6 +84,51 @@ def pairs(test: Path, scores: Path, networks: Path) -> None:
             for key, one in answers.items():
                 square, squared = (one.error_px[k] ** 2).sum(axis=1), one.squared_pull[k]
                 _print(name, key, square, others[k], squared, bound[k], samples[k])
+
+
+def boxes(test: Path, scores: Path) -> None:
+    """Print the same in boxes, of spots that all three find: a fit, `learned_crop` and `joint_fit`.
+
+    Beside them stands the efficiency of a perfect method that knows the room from its laser-off frame alone.
+    """
+    keys = ["number", "image"]
+    for preset, other in OTHERS.items():
+        tables = {
+            name: pl.read_parquet(scores / f"{preset}-{name}-localise.parquet").filter("detected")
+            for name in (other, "learned_crop", "joint_fit")
+        }
+        common = tables[other].filter((pl.col("bound_px2") < 1.0).fill_null(False)).select(keys)
+        common = common.join(_room_bounds(test, preset), on=keys)
+        for table in tables.values():
+            common = common.join(table.select(keys), on=keys)
+        for low, high in (LIGHT_E[0], LIGHT_E[4]):
+            told = f"{preset} {low:.0f} to {high:.0f} e-:"
+            chosen = {name: _of_light(table.join(common, on=keys), low, high) for name, table in tables.items()}
+            others = (chosen[other]["du_px"] ** 2 + chosen[other]["dv_px"] ** 2).to_numpy()
+            bound, room, samples = (chosen[other][key].to_numpy() for key in ("bound_px2", "room_px2", "sample_id"))
+            for name, rows in chosen.items():
+                square = (rows["du_px"] ** 2 + rows["dv_px"] ** 2).to_numpy()
+                pull = ((rows["pull_u"] ** 2 + rows["pull_v"] ** 2) / 2.0).to_numpy()
+                _print(told, name, square, others, pull, bound, samples)
+            perfect = interval(lambda k, b=bound, r=room: float(np.sqrt(b[k].mean() / r[k].mean())), samples, told)
+            print(told, "perfect by on - off: efficiency", [round(x, 3) for x in perfect])
+
+
+def _of_light(table: pl.DataFrame, low: float, high: float) -> pl.DataFrame:
+    """Rows of spots with so many electrons, in one order for all methods."""
+    return table.filter((pl.col("electrons") >= low) & (pl.col("electrons") < high)).sort("sample_id", "number", "image")
+
+
+def _room_bounds(test: Path, preset: str) -> pl.DataFrame:
+    """Bounds of spots whose room is known from one laser-off frame alone, px^2: number, image, room_px2."""
+    pairs = dataset_pairs(open_finished(test), preset, frames=FrameCounts(1, 1))
+    rows = []
+    for number in range(len(pairs)):
+        truth = pairs.truth(number)
+        for image in POSITIONS:
+            bound = getattr(truth, image).bound_px2
+            rows.append((number, image, None if bound is None else float(np.trace(bound))))
+    return pl.DataFrame(rows, schema=["number", "image", "room_px2"], orient="row")
 
 
 def _print(preset: str, name: str, square: Array, others: Array, squared: Array, bound: Array, samples: Array) -> None:
@@ -193,5 +242,7 @@ def _print_minus(preset: str, name: str, first: pl.DataFrame, second: pl.DataFra
 if __name__ == "__main__":
     if sys.argv[1] == "pairs":
         pairs(*map(Path, sys.argv[2:5]))
+    elif sys.argv[1] == "boxes":
+        boxes(*map(Path, sys.argv[2:4]))
     else:
         found(Path(sys.argv[2]))
