@@ -3,6 +3,7 @@
     .venv/bin/python -m docs.draw_learned pairs TEST SCORES NETWORKS
     .venv/bin/python -m docs.draw_learned boxes TEST SCORES
     .venv/bin/python -m docs.draw_learned found SCORES
+    .venv/bin/python -m docs.draw_learned shapes TEST
 
 `boxes` reads the track `localise` of `phibench bench`, and compares with what on - off can tell of each spot. SCORES is
 a folder with scores of `detect` and of others on TEST, such as mjpeg-detect.parquet, by `phibench score`.
@@ -116,7 +117,9 @@ def boxes(test: Path, scores: Path) -> None:
 
 def _of_light(table: pl.DataFrame, low: float, high: float) -> pl.DataFrame:
     """Rows of spots with so many electrons, in one order for all methods."""
-    return table.filter((pl.col("electrons") >= low) & (pl.col("electrons") < high)).sort("sample_id", "number", "image")
+    return table.filter((pl.col("electrons") >= low) & (pl.col("electrons") < high)).sort(
+        "sample_id", "number", "image"
+    )
 
 
 def _room_bounds(test: Path, preset: str) -> pl.DataFrame:
@@ -192,6 +195,26 @@ def _part(sample: CachedSample, pair_draw: PairDraw, position: str, uv_px: tuple
     return (*images, card_of(side.chain.sensor), response, np.array([u0, v0]))
 
 
+def shapes(test: Path) -> None:
+    """Print which part of spots' light lies off a Gaussian of the same mean and covariance: half, 95 %, the most."""
+    parts = []
+    for sample in open_finished(test):
+        for position in POSITIONS:
+            light = sample.spot(position).electrons_per_s[0]
+            if light.size and light.sum() > 0.0:
+                parts.append(_off_gaussian(light / light.sum()))
+    print(f"{len(parts)} spots:", np.round(np.quantile(parts, [0.5, 0.95, 1.0]), 5).tolist())
+
+
+def _off_gaussian(light: Array) -> float:
+    """Half the absolute difference of an image of sum 1, shape (h, w), and the Gaussian of its moments."""
+    place = np.indices(light.shape).reshape(2, -1)
+    offset = place - (place @ light.ravel())[:, None]
+    covariance = (offset * light.ravel()) @ offset.T
+    gaussian = np.exp(-0.5 * np.einsum("in,ij,jn->n", offset, np.linalg.inv(covariance), offset))
+    return float(0.5 * np.abs(light.ravel() - gaussian / gaussian.sum()).sum())
+
+
 def found(scores: Path) -> None:
     """Print hidden and visible spots that `detect` and `learned_detect` answer, and errors of the ones both find."""
     keys = ["number", "image"]
@@ -244,5 +267,7 @@ if __name__ == "__main__":
         pairs(*map(Path, sys.argv[2:5]))
     elif sys.argv[1] == "boxes":
         boxes(*map(Path, sys.argv[2:4]))
+    elif sys.argv[1] == "shapes":
+        shapes(Path(sys.argv[2]))
     else:
         found(Path(sys.argv[2]))

@@ -9,7 +9,7 @@ stream: first weights, crops, their order and flips, and which rooms are held ou
 Loss: -ln of a Gaussian, q / 2 - ln a - ln c with q = |L^T e|^2, L = ((a, 0), (b, c)) the Cholesky factor of the
 precision and e the error (D. A. Nix, A. S. Weigend, "Estimating the mean and variance of the target probability
 distribution", ICNN 1994). Errors beyond four claimed deviations count by their distance, not its square (P. J. Huber,
-"Robust estimation of a location parameter", 1964): torn spots are not to lead. Place: sum of w (cell + offset), w a
+"Robust estimation of a location parameter", 1964): outliers are not to lead. Place: sum of w (cell + offset), w a
 softmax over cells of 2 x 2 pixels, so that a shift of the image by a cell of the mosaic shifts the answer by as much.
 """
 
