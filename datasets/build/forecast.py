@@ -103,16 +103,16 @@ def forecast(plan: Plan, tasks: Collection[BuildTask]) -> Forecast:
     """Cost of these tasks of a plan."""
     counts = Counter(task.kind for task in tasks)
     pixels = plan.rig.camera.width_px * plan.rig.camera.height_px
+    texels, bake_s = _bake_means(plan) if counts["bake"] else (0.0, 0.0)
     size = {
-        "bake": _TEXEL_BYTES * _texels(plan),
+        "bake": _TEXEL_BYTES * texels,
         "view": _VIEW_BYTES + pixels * (_AMBIENT_BYTES_PX + _TRUTH_BYTES_PX + _PREVIEW_BYTES_PX),
         "spot": 2.0 * _SPOT_BYTES,
         "sample": 0.5 * pixels * _PREVIEW_BYTES_PX,
     }
     total = sum(count * size.get(kind, 0.0) for kind, count in counts.items())
-    bakes = "bake" in counts
-    seconds = _seconds(plan, pixels / 1e6, bakes)
-    return Forecast(dict(counts), int(_RESERVE * total), seconds, _light(plan) if bakes else "none")
+    seconds = _seconds(plan, pixels / 1e6, bake_s)
+    return Forecast(dict(counts), int(_RESERVE * total), seconds, _light(plan) if counts["bake"] else "none")
 
 
 def _light(plan: Plan) -> Light:
@@ -130,19 +130,23 @@ def _light(plan: Plan) -> Light:
     return "cached" if cached else "baked"
 
 
-def _seconds(plan: Plan, megapixels: float, bakes: bool) -> dict[str, float]:
+def _seconds(plan: Plan, megapixels: float, bake_s: float) -> dict[str, float]:
     samples = megapixels * 2 * plan.recipe.ambient.cells_per_pixel**2 * VIEW_S_PER_MEGASAMPLE
     return {
-        "bake": _bake_s(plan) if bakes else 0.0,
+        "bake": bake_s,
         "view": VIEW_S + megapixels * VIEW_S_PER_MEGAPIXEL + samples,
         "spot": SPOT_S,
         "sample": megapixels * SAMPLE_S_PER_MEGAPIXEL,
     }
 
 
-def _bake_s(plan: Plan) -> float:
-    """Seconds of a light map, the mean over the rooms of a plan; some of a kind stand for all of it."""
-    return sum(share * _room_s(plan, room) for share, room in _rooms_of_kinds(plan, _MEASURED_ROOMS))
+def _bake_means(plan: Plan) -> tuple[float, float]:
+    """Texels of a light map and seconds of its bake, means over the rooms of a plan; some of a kind stand for all."""
+    texels = seconds = 0.0
+    for share, room in _rooms_of_kinds(plan, _MEASURED_ROOMS):
+        texels += share * texel_count(room, plan.recipe.ambient.texel_m) if room.lit else 0.0
+        seconds += share * _room_s(plan, room)
+    return texels, seconds
 
 
 def _room_s(plan: Plan, room: Room) -> float:
@@ -176,13 +180,6 @@ def _rooms_of_kinds(plan: Plan, most: int) -> Iterator[tuple[float, Room]]:
         names = [name for name, source in plan.rooms.items() if source.kind == kind]
         chosen = names[:: math.ceil(len(names) / most)]
         yield from ((len(names) / len(chosen) / len(plan.rooms), plan.room(name)) for name in chosen)
-
-
-def _texels(plan: Plan) -> float:
-    """Texels of a light map, the mean over the rooms of a plan."""
-    size = plan.recipe.ambient.texel_m
-    rooms = _rooms_of_kinds(plan, _MEASURED_ROOMS)
-    return sum(share * texel_count(room, size) for share, room in rooms if room.lit)
 
 
 def megabytes(count: int) -> str:

@@ -287,7 +287,7 @@ def test_certificate_of_a_beam_that_an_edge_splits(monkeypatch: pytest.MonkeyPat
 
 
 def test_coats_keep_energy() -> None:
-    """A white ground returns all that enters; f(1.5) = 0.5963 (Egan and Hilgeman 1979), T(1.5) = 0.96 head on."""
+    """A white ground returns all that enters; f(1.5) = 0.596 (Egan and Hilgeman 1979), T(1.5) = 0.96 head on."""
     assert inside_reflectance(1.5) == pytest.approx(0.5963, abs=1e-4)
     assert transmittance(np.array([1.0, 0.0]), np.array([1.5, 1.5])) == pytest.approx([0.96, 0.0])
     white = wall(texture=Uniform((1.0, 1.0, 1.0)), coat=1.5)
