@@ -1,15 +1,15 @@
-"""Verification of a data set: file hashes, truth computed again, layers; and manifest, rigs, rooms against the recipe.
+"""Verification of a data set: file hashes, truth computed again, layers.
 
-`plan_faults` compares manifest, rigs and poses with the plan of the recipe. `verify` does this, checks all hashes, and
-compares spots, certificates, noise budgets, layers and light map with what the parameters give.
+`verify` checks all hashes and the manifest (`manifest_check`), and compares spots, certificates, noise budgets, layers
+and light maps with what the parameters give.
 """
 
 from __future__ import annotations
 
 import hashlib
-import json
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -22,11 +22,12 @@ from phibench.datasets.build.bake_task import read_light_map
 from phibench.datasets.build.dataset_build import sample_task_name
 from phibench.datasets.build.journal import Journal
 from phibench.datasets.build.sample_task import noise_row, spot_noise
-from phibench.datasets.build.spot_task import OUT_OF_TOLERANCE, SpotAnswer, answer_spot, certificate_fault
+from phibench.datasets.build.spot_task import SpotAnswer, answer_spot
 from phibench.datasets.common.errors import DatasetError
+from phibench.datasets.common.parallel import parallel_map
 from phibench.datasets.common.progress import Steps, progress_console
-from phibench.datasets.plan.plan import PairPlan, Plan, make_plan
-from phibench.datasets.plan.sampling import UNDRAWN
+from phibench.datasets.manifest_check import plan_faults
+from phibench.datasets.plan.plan import make_plan
 from phibench.datasets.read import Dataset, Sample, open_dataset
 from phibench.datasets.recipe.load import parse_recipe
 from phibench.datasets.store import schema
@@ -38,10 +39,10 @@ from phibench.datasets.store.checksums import (
     read_checksums,
     stray_files,
 )
-from phibench.datasets.store.json_forms import same_document, same_number, to_json
+from phibench.datasets.store.json_forms import same_number
 from phibench.datasets.store.layers import SPOT_STACKS, read_ambient_pair, read_exr, read_spot, read_truth
 from phibench.datasets.store.metadata import differences, parse_info
-from phibench.datasets.store.schema import LightRow, ManifestRow, PoseInfo, RoomInfo, SpotRow
+from phibench.datasets.store.schema import LightRow, PoseInfo, SpotRow
 from phibench.datasets.store.sensitivity_file import sensitivity_fault
 from phibench.render.optics.ray_tracer import trace_pixels
 from phibench.render.optics.reflection_point import mirror_points
@@ -56,6 +57,7 @@ from phibench.scenes.room import Room
 _FLOAT32 = 1e-6  # float32 rounds by 6e-8; other machines' libm adds a little
 _ANGLE_RAD = 1e-9  # closed form against ray tracer: 1.3e-7 px of the default rig
 _ANSWERS = 64  # of 0.1 MB each
+_PARTS = 64  # of a data set, for several workers: opening it takes a second
 _EDGE_PIXELS = 8  # pixels whose ray grazes an edge may see another object on another machine
 
 
@@ -84,7 +86,7 @@ class Report:
         return not self.faults
 
 
-def verify(folder: str | Path, truth_layers: bool = True, console: Console | None = None) -> Report:
+def verify(folder: str | Path, truth_layers: bool = True, console: Console | None = None, workers: int = 1) -> Report:
     """Check a data set.
 
     Parameters
@@ -94,6 +96,8 @@ def verify(folder: str | Path, truth_layers: bool = True, console: Console | Non
         Also compute the truth of every pixel again (about a second per view).
     console : Console, optional
         Where progress goes; by default the standard error.
+    workers : int
+        Rooms that are looked at at a time, each in a process of its own; 1 is this process.
 
     Raises
     ------
@@ -121,7 +125,7 @@ def verify(folder: str | Path, truth_layers: bool = True, console: Console | Non
     faults += plan_faults(dataset)
     if not bad & {schema.MANIFEST, schema.TABLE}:
         faults += differences(folder, dataset.rows)
-    faults += _content_faults(dataset, bad, truth_layers, console)
+    faults += _content_faults(dataset, bad, truth_layers, console, workers)
     return Report(_once(faults), files, len(dataset), notes)
 
 
@@ -204,23 +208,47 @@ def _journal_faults(folder: Path, journal: Journal) -> Iterator[str]:
 # Contents of spots and views.
 
 
-def _content_faults(dataset: Dataset, bad: set[str], truth_layers: bool, console: Console) -> list[str]:
+def _content_faults(dataset: Dataset, bad: set[str], truth_layers: bool, console: Console, workers: int) -> list[str]:
     """Faults of spots and views; files in `bad` are reported already and not opened."""
-    faults: list[str] = []
+    rooms = sorted({*dataset.rooms, *(row.room for row in dataset.rows), *(pose.room for pose in dataset.info.poses)})
+    with Steps(console, "verify", len(rooms)) as steps:
+        if workers == 1:
+            return list(_room_faults_of(dataset, rooms, bad, truth_layers, steps.advance))
+        parts = [(str(dataset.folder), rooms[k::_PARTS], bad, truth_layers) for k in range(min(_PARTS, len(rooms)))]
+        found = list[str]()
+        for part, faults in zip(parts, parallel_map(_part_faults, parts, workers), strict=True):
+            found += faults
+            for _ in part[1]:
+                steps.advance()
+        return found
+
+
+def _part_faults(part: tuple[str, list[str], set[str], bool]) -> list[str]:
+    """Faults in some rooms of a folder, in a process of their own."""
+    folder, rooms, bad, truth_layers = part
+    return list(_room_faults_of(open_dataset(folder), rooms, bad, truth_layers, lambda: None))
+
+
+def _room_faults_of(
+    dataset: Dataset, rooms: Sequence[str], bad: set[str], truth_layers: bool, advance: Callable[[], None]
+) -> Iterator[str]:
+    """Faults of what stands in some rooms, one room after the other: it takes longer to build than to look at."""
     answer = lru_cache(_ANSWERS)(answer_spot)  # neighbours share spots and poses
-    with Steps(console, "verify", len(dataset) + len(dataset.info.poses)) as steps:
-        for sample in sorted(dataset, key=lambda one: one.row.room):  # a room takes longer to build than to look at
+    samples, poses = defaultdict[str, list[Sample]](list), defaultdict[str, list[PoseInfo]](list)
+    for sample in dataset:
+        samples[sample.row.room].append(sample)
+    for pose in dataset.info.poses:
+        poses[pose.room].append(pose)
+    for room in rooms:
+        for sample in samples[room]:
             for position in POSITIONS:
-                faults += _guarded(_spot_faults(sample, position, answer, bad))
-            faults += _depth_faults(sample)
-            steps.advance()
-        for info in dataset.rooms.infos.values():
-            if info.lit and schema.light_map_file(info.room) not in bad:
-                faults += _guarded(_light_map_faults(dataset, info.room))
-        for pose in dataset.info.poses:
-            faults += _guarded(_view_faults(dataset, pose, bad, truth_layers))
-            steps.advance()
-    return faults
+                yield from _guarded(_spot_faults(sample, position, answer, bad))
+            yield from _depth_faults(sample)
+        if room in dataset.rooms and dataset.rooms.infos[room].lit and schema.light_map_file(room) not in bad:
+            yield from _guarded(_light_map_faults(dataset, room))
+        for pose in poses[room]:
+            yield from _guarded(_view_faults(dataset, pose, bad, truth_layers))
+        advance()
 
 
 def _spot_faults(
@@ -387,102 +415,3 @@ def _guarded(faults: Iterator[str]) -> Iterator[str]:
         yield from faults
     except DatasetError as error:
         yield str(error)
-
-
-# Manifest, rigs and poses against the plan.
-
-
-def plan_faults(dataset: Dataset) -> Iterator[str]:
-    """Faults of manifest, rigs and poses against the plan of the recipe."""
-    try:
-        whole = make_plan(dataset.recipe, held_room_files(dataset.folder), dataset.info.shard)
-    except DatasetError as error:
-        yield f"{schema.INFO}: its recipe cannot be followed: {error}"
-        return
-    yield from _left_out_faults(whole, dataset)
-    plan = whole.without(dataset.info.causes)
-    rows, pairs = {row.sample_id: row for row in dataset.rows}, {pair.sample_id: pair for pair in plan.pairs}
-    for name in sorted({*pairs, *plan.refused} - set(rows)):
-        yield f"{schema.MANIFEST}: sample {name} of the recipe is missing"
-    for name in sorted(set(rows) - set(pairs)):
-        yield f"{schema.MANIFEST}: sample {name} is not in the recipe"
-    if len(rows) != len(dataset.rows):
-        yield f"{schema.MANIFEST}: a sample is listed twice"
-    for name in (name for name in pairs if name in rows):
-        yield from _row_faults(plan, pairs[name], rows[name])
-    yield from _rig_faults(plan, dataset)
-    yield from _room_faults(plan, dataset)
-    held = [(pose.pose, pose.rig, pose.room) for pose in dataset.info.poses]
-    if held != [(pose.pose_id, pose.rig, pose.room) for pose in plan.poses]:
-        yield f"{schema.INFO}: the poses are not those of the recipe"
-
-
-def _left_out_faults(whole: Plan, dataset: Dataset) -> Iterator[str]:
-    """Faults of the list of samples that were left out: each must be of the recipe, and still be refused.
-
-    One that was refused for its noise, or whose room cannot be built, is not rendered again here.
-    """
-    causes, pairs = dataset.info.causes, {pair.sample_id: pair for pair in whole.pairs}
-    if len(causes) != len(dataset.info.left_out):
-        yield f"{schema.INFO}: left_out lists a sample twice"
-    for name, cause in causes.items():
-        if name not in pairs and name not in whole.refused:
-            yield f"{schema.INFO}: left_out lists {name}, which is not in the recipe"
-        elif name in pairs and cause.startswith(UNDRAWN):
-            yield f"{schema.INFO}: left_out lists {name}, which can be drawn"
-        elif name in pairs and cause.startswith(OUT_OF_TOLERANCE):
-            pair = pairs[name]
-            spot, room = whole.spots[pair.spot], whole.room(pair.room)
-            if not certificate_fault({p: answer_spot(whole.view(pair, p), spot, room) for p in POSITIONS}):
-                yield f"{schema.INFO}: left_out lists {name}, whose certificates pass when they are computed again"
-
-
-def _row_faults(plan: Plan, pair: PairPlan, row: ManifestRow) -> Iterator[str]:
-    spot = plan.spots[pair.spot]
-    expected = {
-        **{name: getattr(pair, name) for name in ("experiment", "target", "rig", "nominal_rig", "room", "tries")},
-        **{name: getattr(pair, name) for name in ("stroke_m", "nominal_stroke_m")},
-        "drawn": dict(pair.drawn),
-        "spot_world_m": spot.position_world_m,
-        "spot_normal_world": spot.normal_world,
-        "spot_beam_world": spot.beam_direction_world,
-        "spot_diameter_m": spot.diameter_m,
-    }
-    for name, value in expected.items():
-        if not same_document(getattr(row, name), value):
-            yield f"{row.sample_id}: {name} is {getattr(row, name)}, the recipe gives {value}"
-
-
-def _rig_faults(plan: Plan, dataset: Dataset) -> Iterator[str]:
-    held = dataset.rigs.documents
-    if set(held) != set(plan.rigs):
-        yield f"{schema.RIGS}: the rigs are not those of the recipe"
-    for name in (name for name in plan.rigs if name in held):
-        if not same_document(_with_form(held[name]), json.loads(json.dumps(to_json(plan.rigs[name])))):
-            yield f"{schema.RIGS}: {name} is not the rig that the recipe gives"
-
-
-def _room_faults(plan: Plan, dataset: Dataset) -> Iterator[str]:
-    if set(dataset.rooms) != set(plan.rooms):
-        yield f"{schema.ROOMS}: the rooms are not those of the recipe"
-    for info in dataset.rooms.infos.values():
-        if info.source and info.room in plan.rooms:
-            if not same_document(info.source, to_json(plan.rooms[info.room])):
-                yield f"{schema.ROOMS}: {info.room} is not the room that the recipe gives"
-            yield from _guarded(_room_line_faults(plan, dataset, info))
-
-
-def _room_line_faults(plan: Plan, dataset: Dataset, info: RoomInfo) -> Iterator[str]:
-    """Differences of a room's line from the room of its source."""
-    room = dataset.rooms[info.room]
-    for name, value in (("lit", room.lit), ("object_names", room.object_names(plan.rig.at(0.0)))):
-        if getattr(info, name) != value:
-            yield f"{schema.ROOMS}: {name} of {info.room} is not that of its source"
-
-
-def _with_form(rig: dict[str, Any]) -> dict[str, Any]:
-    """Document of a rig; one of schema version 4 knows no form, and its mirror has none. Nor has one of revolution."""
-    mirror = rig.get("mirror")
-    if not isinstance(mirror, dict) or "profile" in mirror:
-        return rig
-    return {**rig, "mirror": {"form": None, **mirror}}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -184,6 +185,7 @@ def verify(
     directory: Path,
     *,
     mitsuba: Whole | None = None,
+    workers: Workers = None,
     json: Annotated[bool, Parameter(negative="", help="The outcome as one JSON document.")] = False,
 ) -> int:
     """Check every file, hash, row and certificate of a data set; exit code 1 if there is a fault.
@@ -212,7 +214,7 @@ def verify(
         closing = f"{directory}: {len(wrong)} fault{'s' * (len(wrong) != 1)}"
         print(dumps({"faults": list(wrong), "valid": not wrong}) if json else "\n".join([*wrong, closing]))
         return 1 if wrong else 0
-    report = verify_dataset(directory)
+    report = verify_dataset(directory, workers=workers or os.cpu_count() or 1)
     if mitsuba is not None and report.ok:
         faults, notes = _by_mitsuba(directory, mitsuba, silent=json)
         report = replace(report, faults=faults, notes=(*report.notes, *notes))

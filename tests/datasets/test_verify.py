@@ -302,6 +302,20 @@ def test_a_depth_of_the_light_that_the_places_do_not_give_is_found(copy: Path) -
     assert fault.startswith("seen-near-h0.500: light_depth_m is")
 
 
+def test_several_processes_find_what_one_does(kinds_dataset: Path, tmp_path: Path) -> None:
+    """A fault in the last room; processes are started for it, which takes some seconds."""
+    copy = Path(shutil.copytree(kinds_dataset, tmp_path / "copy"))
+    rows = read_manifest(copy)
+    assert len({row.room for row in rows}) > 1
+    last = max(rows, key=lambda row: row.room)
+    changed = last.model_copy(update={"light_depth_m": (last.light_depth_m or 1.0) + 1e-6})
+    write_manifest(copy, [changed if row is last else row for row in rows])
+    sign(copy)
+    one, two = (verify(copy, False, Console(file=io.StringIO()), workers) for workers in (1, 2))
+    assert [fault for fault in one.faults if fault.startswith(f"{last.sample_id}: light_depth_m is")]
+    assert sorted(one.faults) == sorted(two.faults)
+
+
 def test_a_changed_rig_is_found(copy: Path) -> None:
     rig = json.loads((copy / schema.RIGS).read_text())
     rig["resolved"]["mirror"]["radius_m"] += 1e-6
