@@ -61,14 +61,12 @@ HELD_OUT = 20  # rooms
 RESCALED = 6000  # crops that a scale alone is taken from
 POOL_SEED = 5  # of the crops, which networks of all seeds share
 REQUESTS: Mapping[str, Sequence[Mapping[str, Any]]] = {
-    "bayer-raw": [{"read_noise_e": 3.0}, {"read_noise_e": 6.0}],
-    "srgb8": [{"read_noise_e": 3.0}, {"read_noise_e": 6.0}],
+    "bayer-raw": [{"read_noise_e": noise} for noise in (2.0, 3.5, 5.0, 7.0)],
+    "srgb8": [{"read_noise_e": noise} for noise in (2.0, 3.5, 5.0, 7.0)],
     # half of all crops: the hardest, and the most numbers to learn
     "mjpeg": [
-        {"jpeg_quality": 60, "read_noise_e": 3.0},
-        {"jpeg_quality": 75},
-        {"jpeg_quality": 85, "read_noise_e": 6.0},
-        {"jpeg_quality": 95},
+        {"jpeg_quality": quality, "read_noise_e": noise}
+        for quality, noise in ((40, 5.0), (50, 2.0), (60, 7.0), (70, 3.5), (77, 5.0), (84, 2.0), (91, 7.0), (97, 3.5))
     ],
 }
 Parameters = dict[str, Any]  # torch.Tensor by name
@@ -99,7 +97,7 @@ class TrainingSettings:
     seed: int = 0
     presets: tuple[str, ...] = tuple(REQUESTS)
     crops: int = 30_000
-    passes: int = 16
+    passes: int = 28
     views: int = 2
     batch: int = 64
     rate: float = 2e-3
@@ -152,7 +150,7 @@ class Items:
     Attributes
     ----------
     planes : shape (n, 4, 33, 33), float16
-    scalars : shape (n, 7)
+    scalars : shape (n, 9)
     uv_px : shape (n, 2)
     turned : shape (n,), bool
         Whether rows may become columns: not of JPEG with chroma of half the width.

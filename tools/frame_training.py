@@ -171,14 +171,14 @@ def spot_tiles(crops: SpotCrops) -> Tiles:
 
 
 def frame_maps(folder: Path, samples: Sequence[str], turn: int = 0) -> list[FrameMap]:
-    """Frames of samples: of each one in half of the requests, which of them takes turns."""
+    """Frames of samples: of each one in a quarter of the requests, which of them takes turns."""
     dataset = open_finished(folder)
     maps: list[FrameMap] = []
     draws = {one: {draw.sample_id: draw for draw in pair_draws(dataset, one, 1)} for one in REQUESTS}
     for number, name in enumerate(samples):
         cached = CachedSample.of(dataset[name])
         for preset, requests in REQUESTS.items():
-            for overrides in requests[(number + turn) % 2 :: 2]:
+            for overrides in requests[(number + turn) % 4 :: 4]:
                 draw = draws[preset][name]
                 draw = replace(draw, draw=turn, request=replace(draw.request, overrides=dict(overrides)))
                 maps += _maps_of(cached, draw, dataset)

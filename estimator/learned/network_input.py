@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.estimator.interface import Box, Image
+from phibench.estimator.spots.camera_codes import qtables_of, quantisation
 from phibench.estimator.spots.image_planes import colour_planes, demosaiced_planes, variance_e2
 from phibench.estimator.spots.raw_pixels import raw_electrons
 from phibench.scenes.frames import Array, BoolArray
@@ -28,7 +29,7 @@ from phibench.scenes.frames import Array, BoolArray
 SIDE_PX = 32
 WINDOW_PX = SIDE_PX + 1  # with red at all four corners: mirrored and turned, it still begins with red
 PLANES = 4  # R, G, B of the difference, and full pixels
-SCALARS = 7  # see `crop_input`
+SCALARS = 9  # see `crop_input`
 FRAME_PLANES = 3  # significance behind R and G, and full pixels
 ACCEPTED = ("bayer-raw", "srgb8", "mjpeg")
 
@@ -51,7 +52,7 @@ class CropInput:
     ----------
     planes : shape (4, 33, 33), float32
         Difference behind R, G, B over the spot's amplitude; 1 where a pixel is full.
-    scalars : shape (7,), float32
+    scalars : shape (9,), float32
     """
 
     planes: NDArray[np.float32]
@@ -133,8 +134,8 @@ def crop_input(on: Image, off: Image | None, card: SensorCard, response: Sequenc
     -------
     CropInput
         Scalars: ln of amplitude over the card's noise; ln of measured over the card's noise; amplitude over the
-        saturation; the room's level over the saturation; whether there are pixels with the laser off; whether the
-        pixels are raw; whether they are of MJPEG.
+        saturation; the room's level over the saturation; whether there are pixels with the laser off; ln of JPEG's
+        mean steps of luma and chroma over 10 codes, 0 without; whether the pixels are raw; whether they are of MJPEG.
     """
     planes, full = filter_planes(on, card)
     border = np.ones(full.shape, bool)
@@ -157,10 +158,19 @@ def crop_input(on: Image, off: Image | None, card: SensorCard, response: Sequenc
         amplitude / card.saturation_e,
         level / card.saturation_e,
         float(off is not None),
+        *_steps_ln(card),
         float(card.output == "raw"),
         float(card.output == "mjpeg"),
     )
     return CropInput(np.concatenate([relative, full[None]]).astype(np.float32), np.array(scalars, np.float32))
+
+
+def _steps_ln(card: SensorCard) -> tuple[float, float]:
+    """ln of JPEG's mean steps of luma and chroma over 10 codes; 0 without JPEG."""
+    if card.output != "mjpeg":
+        return 0.0, 0.0
+    luma, chroma = (float(np.log(table.mean() / 10.0)) for table in quantisation(qtables_of(card)))
+    return luma, chroma
 
 
 def _gains(response: Sequence[float]) -> Array:

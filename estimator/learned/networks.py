@@ -35,7 +35,7 @@ from phibench.estimator.learned.network_input import SIDE_PX, WINDOW_PX, CropInp
 from phibench.scenes.frames import Array, BoolArray
 from phibench.scenes.validation import printable_line
 
-VERSIONS = {CROP: "3", DETECT: "1"}
+VERSIONS = {CROP: "4", DETECT: "1"}
 """Versions of what a network gets, of its layers and of what it answers; a change of any raises it."""
 INSTALL = "pip install 'phibench[learned]'"
 INSTALL_TRAINING = "pip install 'phibench[learned-training]' (the CPU's wheel of PyTorch is enough: docs/learned.md)"
@@ -53,8 +53,8 @@ class NetworkError(DatasetError):
 
 
 SHIPPED = {
-    CROP: "06d4af03b8395c205c8735e04a92101b3129b2ef561a77448f75e75c2641c561",
-    DETECT: "c1c3fce2fa4a099856592af3999e1d4dda96e5927c91cc16fd186a7ec3667d08",
+    CROP: "efdb43f114c59b1b4328bc1a9aa9e4a19ec3324277554f61b3db8a22cd255129",
+    DETECT: "129ed24ca7641314eb8652bc81964e61873e5ef369ab8abb5add155e0441133a",
 }
 """SHA-256 that the files of this release state; part of the code, so that a method's hash changes with its weights."""
 

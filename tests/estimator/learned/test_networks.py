@@ -1,12 +1,15 @@
 """Networks: their input, their files and what is wrong with one, and training where PyTorch is installed."""
 
 import importlib.util
+import io
+import math
 import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import PIL.Image
 import pytest
 
 from phibench.benchmark.isolation.easy_pairs import EasyPairs
@@ -97,6 +100,22 @@ def test_gain_and_room_are_not_in_the_planes() -> None:
     assert np.abs(made[0].planes - made[1].planes).max() < 3.0 * 0.5 / 250.0
     assert np.abs(made[0].planes[0].max() - 1.0) < 0.1
     assert made[0].scalars[3] < made[1].scalars[3]  # the room's level is a number by itself
+
+
+def test_two_numbers_tell_the_steps_of_jpeg() -> None:
+    """Against the tables in a file of Pillow's; own tables count as a quality does, and other images have none."""
+    window = np.full((WINDOW_PX, WINDOW_PX, 3), 90, np.uint8)
+    for quality in (40, 76, 95):
+        file = io.BytesIO()
+        PIL.Image.fromarray(window).save(file, "JPEG", quality=quality)
+        tables = [PIL.Image.open(file).quantization[k] for k in (0, 1)]  # type: ignore[attr-defined]
+        expected = [math.log(sum(table) / 640.0) for table in tables]
+        card = sensor_card("mjpeg", jpeg_quality=quality)
+        np.testing.assert_allclose(crop_input(window, window, card, DEV).scalars[5:7], expected, rtol=1e-6)
+    own = replace(card, jpeg_quality=20, jpeg_qtables=((16,) * 64, (20,) * 64))
+    np.testing.assert_allclose(crop_input(window, window, own, DEV).scalars[5:7], np.log([1.6, 2.0]), rtol=1e-6)
+    plain = crop_input(window, window, sensor_card("srgb8"), DEV).scalars
+    assert plain[5:].tolist() == [0.0, 0.0, 0.0, 0.0]
 
 
 def test_filters_that_let_more_of_the_laser_through_give_the_same_planes() -> None:
