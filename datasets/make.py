@@ -48,6 +48,7 @@ from phibench.datasets.build.room_export import damaged_exports, export_lines, e
 from phibench.datasets.build.task_runner import unfinished_tasks
 from phibench.datasets.build.workers import Environment, NoRendererError, WorkerPool
 from phibench.datasets.common.errors import DatasetError, IncompleteError
+from phibench.datasets.common.parallel import worker_count
 from phibench.datasets.common.progress import progress_console
 from phibench.datasets.plan.draws import Causes, unexported_rooms
 from phibench.datasets.plan.pair_forecasts import pair_forecasts, pair_table, rim_lines
@@ -166,7 +167,7 @@ def dry_run(recipe: str | Path, out: str | Path, workers: int | None = None, **o
     DatasetError
         If recipe or folder will not do.
     """
-    out, count, wanted = Path(out), _count(workers), MakeOptions(**options)
+    out, count, wanted = Path(out), worker_count(workers), MakeOptions(**options)
     leave_out = wanted.leave_out_refused
     plan, _, note = _planned(recipe, out, wanted, lambda _, files: held_files(files, out))
     refuse_other(out, None if wanted.replace else plan.recipe.dataset.name)
@@ -216,13 +217,6 @@ def _hidden(causes: Mapping[str, Causes]) -> list[str]:
     return [f"{text} ({why}); --dry-run lists them all"]
 
 
-def _count(workers: int | None) -> int:
-    count = workers if workers is not None else os.cpu_count() or 1
-    if count < 1:
-        raise DatasetError(f"--workers: workers = {count}, at least 1 is needed")
-    return count
-
-
 def _planned(
     recipe: str | Path, out: Path, wanted: MakeOptions, exported: Callable[[Recipe, RoomFiles], RoomFiles]
 ) -> tuple[Plan, str, str]:
@@ -266,7 +260,7 @@ def _export(
         copy_room_files(own, out)
         held = RoomFiles(out / schema.ROOM_FILES, own.digests)
         if todo := unexported_rooms(recipe, held):
-            with WorkerPool(out, _count(workers), scheduler) as pool:
+            with WorkerPool(out, worker_count(workers), scheduler) as pool:
                 pool.environment()  # tells where nothing can be rendered, and connects to a scheduler
                 export_rooms(todo, recipe.ambient, pool, console, made)
     return held
@@ -288,7 +282,7 @@ def make_from_plan(
     """
     with (
         claimed_folder(out, None if wanted.replace else plan.recipe.dataset.name),
-        WorkerPool(out, _count(workers), scheduler) as pool,
+        WorkerPool(out, worker_count(workers), scheduler) as pool,
         Journal(out) as journal,
     ):
         if draws:

@@ -39,8 +39,9 @@ def tracks_section(documents: Sequence[ScoreDocument]) -> Section | None:
         "tuned on dev alone, by its author's word. Rig: what the method was given, or corrects itself.",
         "find: J is found spots / (visible spots + false answers). A guess pays only where it is right with a chance "
         "above J / (1 + J). depth: both spots must be found, so that a constant D counts nothing.",
-        "Ordered by the mean place over presets. Overlapping intervals settle no order: use phibench compare. A star: "
-        "too few samples for an interval. The rows of a perfect method are Gaussian errors at the bound.",
+        "Ordered by the mean place over presets. Overlapping intervals settle no order: phibench compare ONE.json "
+        "OTHER.json does, from 30 samples on. A star: too few samples for an interval. The rows of a perfect method "
+        "are Gaussian errors at the bound.",
     )
     cells = tuple((table.heads, *table.rows) for table in tables)
     return Section("Tracks", words, (), cells, tuple(table.title for table in tables))

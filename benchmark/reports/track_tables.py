@@ -81,7 +81,8 @@ def _by_preset(track: Track, documents: Sequence[ScoreDocument]) -> TextTable:
     for name, metric in numbers.perfect.items():
         made.append((name, "", "", *(_cell(metric, firsts[preset]) for preset in presets)))
     ordered = "Ordered by the mean place over presets. " if len(presets) > 1 else ""
-    note = f"{ordered}Overlapping intervals settle no order: use phibench compare."
+    compared = "phibench compare ONE.json OTHER.json does, from 30 samples on"
+    note = f"{ordered}Overlapping intervals settle no order: {compared}."
     return TextTable(numbers.title, ("method", *BY_WORD, *presets), tuple(made), "lll" + "r" * len(presets), note)
 
 

@@ -28,6 +28,20 @@ ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THRE
 """Environment variables, to be set before NumPy is loaded."""
 
 
+def worker_count(workers: int | None) -> int:
+    """Number of processes that is asked for; None is one for each core.
+
+    Raises
+    ------
+    DatasetError
+        If it is below 1.
+    """
+    count = workers if workers is not None else os.cpu_count() or 1
+    if count < 1:
+        raise DatasetError(f"--workers: workers = {count}, at least 1 is needed")
+    return count
+
+
 def parallel_map(
     function: Callable[[Item], Result], items: Iterable[Item], workers: int | None = None, *, in_order: bool = True
 ) -> Iterator[Result]:

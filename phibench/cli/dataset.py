@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -201,8 +200,10 @@ def verify(
     from json import dumps
 
     from phibench.benchmark.export.export_make import is_export, verify_export
+    from phibench.datasets.common.parallel import worker_count
     from phibench.datasets.verify import verify as verify_dataset
 
+    count = worker_count(workers)
     if is_export(directory):
         if mitsuba is not None:
             from phibench.datasets.common.errors import DatasetError
@@ -214,7 +215,7 @@ def verify(
         closing = f"{directory}: {len(wrong)} fault{'s' * (len(wrong) != 1)}"
         print(dumps({"faults": list(wrong), "valid": not wrong}) if json else "\n".join([*wrong, closing]))
         return 1 if wrong else 0
-    report = verify_dataset(directory, workers=workers or os.cpu_count() or 1)
+    report = verify_dataset(directory, workers=count)
     if mitsuba is not None and report.ok:
         faults, notes = _by_mitsuba(directory, mitsuba, silent=json)
         report = replace(report, faults=faults, notes=(*report.notes, *notes))
@@ -225,8 +226,8 @@ def verify(
         print(fault)
     for note in report.notes:
         print(f"note: {note}")
-    count = len(report.faults)
-    print(f"{directory}: {report.files} files, {report.samples} samples, {count} fault{'s' * (count != 1)}")
+    found = len(report.faults)
+    print(f"{directory}: {report.files} files, {report.samples} samples, {found} fault{'s' * (found != 1)}")
     return 0 if report.ok else 1
 
 

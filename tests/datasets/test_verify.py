@@ -32,6 +32,7 @@ from helpers.processes import within
 from PIL import Image
 from rich.console import Console
 
+from phibench.cli.main import main
 from phibench.datasets import show as show_module
 from phibench.datasets.build.dataset_build import visibility_line
 from phibench.datasets.common.errors import DatasetError
@@ -314,6 +315,12 @@ def test_several_processes_find_what_one_does(kinds_dataset: Path, tmp_path: Pat
     one, two = (verify(copy, False, Console(file=io.StringIO()), workers) for workers in (1, 2))
     assert [fault for fault in one.faults if fault.startswith(f"{last.sample_id}: light_depth_m is")]
     assert sorted(one.faults) == sorted(two.faults)
+
+
+@pytest.mark.parametrize("workers", ["0", "-3"])
+def test_fewer_than_one_process_is_refused(copy: Path, workers: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["dataset", "verify", str(copy), f"--workers={workers}"]) == 2
+    assert capsys.readouterr().err.strip().endswith(f"--workers: workers = {workers}, at least 1 is needed")
 
 
 def test_a_changed_rig_is_found(copy: Path) -> None:
