@@ -2,7 +2,7 @@
 
     .venv/bin/python docs/plan_release.py
 
-Tasks take the seconds that 350 pairs of bench-test took, and vary as theirs did. Machines are taken away at random
+Tasks take the seconds that 125 pairs of bench-test took, and vary as theirs did. Machines are taken away at random
 times and replaced. A machine that goes loses the task that each core is at, and the time until its successor works.
 """
 
@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 
 PAIRS, ROOMS = 100_000, 1_000
-# Mean and relative spread of CPU seconds of a task: 350 pairs of bench-test, `cpu_s` of its log.jsonl, at a load of 8.
-SECONDS = {"bake": (3.5, 0.69), "view": (2.9, 0.54), "spot": (0.51, 0.49), "sample": (0.30, 0.08)}
+# Mean and relative spread of CPU seconds of a task: 125 pairs of bench-test, `cpu_s` of its log.jsonl, nothing beside.
+SECONDS = {"bake": (3.8, 0.53), "view": (3.0, 0.46), "spot": (0.79, 0.36), "sample": (0.41, 0.66)}
 MB_A_PAIR = 22.2
 # Before the first task: shards of 10 and 20 of 100 000 samples in 1000 rooms took 5.9 and 9.8 s, as many rooms in each.
 PLAN_S, PLAN_S_A_ROOM, PLAN_S_A_PAIR = 2.0, 0.39, 0.01  # the first is for the numbers of all rooms and samples
