@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -211,14 +212,16 @@ def _journal_faults(folder: Path, journal: Journal) -> Iterator[str]:
 def _content_faults(dataset: Dataset, bad: set[str], truth_layers: bool, console: Console, workers: int) -> list[str]:
     """Faults of spots and views; files in `bad` are reported already and not opened."""
     rooms = sorted({*dataset.rooms, *(row.room for row in dataset.rows), *(pose.room for pose in dataset.info.poses)})
-    with Steps(console, "verify", len(rooms)) as steps:
-        if workers == 1:
-            return list(_room_faults_of(dataset, rooms, bad, truth_layers, steps.advance))
-        parts = [(str(dataset.folder), rooms[k::_PARTS], bad, truth_layers) for k in range(min(_PARTS, len(rooms)))]
+    steps_of = Counter([*(row.room for row in dataset.rows), *(pose.room for pose in dataset.info.poses)])
+    with Steps(console, "verify", steps_of.total()) as steps:
+        if workers == 1 or len(rooms) < 2:
+            return list(_faults_in_rooms(dataset, rooms, bad, truth_layers, steps.advance))
+        bounds = np.linspace(0, len(rooms), min(_PARTS, len(rooms)) + 1).astype(int).tolist()
+        parts = [(str(dataset.folder), rooms[a:b], bad, truth_layers) for a, b in pairwise(bounds)]
         found = list[str]()
         for part, faults in zip(parts, parallel_map(_part_faults, parts, workers), strict=True):
             found += faults
-            for _ in part[1]:
+            for _ in range(sum(steps_of[room] for room in part[1])):
                 steps.advance()
         return found
 
@@ -226,10 +229,10 @@ def _content_faults(dataset: Dataset, bad: set[str], truth_layers: bool, console
 def _part_faults(part: tuple[str, list[str], set[str], bool]) -> list[str]:
     """Faults in some rooms of a folder, in a process of their own."""
     folder, rooms, bad, truth_layers = part
-    return list(_room_faults_of(open_dataset(folder), rooms, bad, truth_layers, lambda: None))
+    return list(_faults_in_rooms(open_dataset(folder), rooms, bad, truth_layers, lambda: None))
 
 
-def _room_faults_of(
+def _faults_in_rooms(
     dataset: Dataset, rooms: Sequence[str], bad: set[str], truth_layers: bool, advance: Callable[[], None]
 ) -> Iterator[str]:
     """Faults of what stands in some rooms, one room after the other: it takes longer to build than to look at."""
@@ -244,11 +247,12 @@ def _room_faults_of(
             for position in POSITIONS:
                 yield from _guarded(_spot_faults(sample, position, answer, bad))
             yield from _depth_faults(sample)
+            advance()
         if room in dataset.rooms and dataset.rooms.infos[room].lit and schema.light_map_file(room) not in bad:
             yield from _guarded(_light_map_faults(dataset, room))
         for pose in poses[room]:
             yield from _guarded(_view_faults(dataset, pose, bad, truth_layers))
-        advance()
+            advance()
 
 
 def _spot_faults(

@@ -43,6 +43,7 @@ datasets/build
 datasets/make
 datasets/scene
 datasets/film
+datasets/manifest_check
 datasets/show datasets/sample_page datasets/verify datasets/merge_repair datasets/training
 estimator/interface
 estimator/pair_set estimator/drawn_pairs

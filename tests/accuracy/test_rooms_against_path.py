@@ -23,11 +23,8 @@ ROOMS = [
 ]
 SETTINGS = BakeSettings(texel_m=0.05, indirect_texel_m=0.05, lamp_rays=16, bounces=12, bounce_rays=16, final_rays=48)
 """A window shows 30 to 200 texels of 5 cm, whose noise of some 2 % averages to 0.2 to 0.4 % in one bake."""
-FINER_M = {"generated-4": 0.025, "generated-8": 0.0125}
-"""Texels of lamps' light where 5 cm do not hold a shadow: of a curtain's boxes of 9 cm, of a keyboard of 2 cm.
-
-At 5, 2.5 and 1.25 cm the curtain's window is off by -1.9, -0.5 and -0.3 %, the keyboard's by 1.3, 1.7 and 1.1 %.
-"""
+FINER_M = {"generated-4": 0.025}
+"""Texels of lamps' light where 5 cm are too coarse: a curtain's boxes of 9 cm, off by -1.9 % at 5 cm, -0.5 % at 2.5."""
 SAMPLES = 128  # a pixel and run of the tracer
 ALLOWED = 0.01
 SIGMAS = 3.0

@@ -28,7 +28,7 @@ from phibench.studies.paper.paper_tables import Score
 def run_with(monkeypatch, error):
     """Run `phibench dataset verify x` with a verification that raises."""
 
-    def fail(directory):
+    def fail(directory, workers):
         raise error
 
     monkeypatch.setattr("phibench.datasets.verify.verify", fail)
@@ -54,7 +54,7 @@ def test_mistakes_end_in_one_sentence(monkeypatch, capsys, error, sentence):
 
 @pytest.mark.parametrize(("faults", "code"), [((), 0), (("a.exr is damaged", "b.exr is missing"), 1)])
 def test_verify_prints_every_fault(monkeypatch, capsys, faults, code):
-    monkeypatch.setattr("phibench.datasets.verify.verify", lambda directory: Report(faults, 9, 3))
+    monkeypatch.setattr("phibench.datasets.verify.verify", lambda directory, workers: Report(faults, 9, 3))
     assert cli.main(["dataset", "verify", "x"]) == code
     assert capsys.readouterr().out.splitlines() == [*faults, f"x: 9 files, 3 samples, {len(faults)} faults"]
 
@@ -244,7 +244,7 @@ def test_every_command_is_told_of(monkeypatch, capsys):
     console = Console(file=(written := io.StringIO()))
     monkeypatch.setattr("phibench.datasets.common.progress.progress_console", lambda: console)
 
-    def slow(_folder: Path) -> Report:
+    def slow(_folder: Path, workers: int) -> Report:
         wait_for(written.getvalue)
         return Report((), 0, 0)
 
@@ -260,7 +260,7 @@ def test_verify_prints_one_document_and_nothing_else(
 ) -> None:
     for faults, code in (((), 0), (("views/x is missing",), 1)):
         report = Report(faults, files=7, samples=2, notes=("odd",))
-        monkeypatch.setattr("phibench.datasets.verify.verify", lambda folder, report=report: report)
+        monkeypatch.setattr("phibench.datasets.verify.verify", lambda folder, workers, report=report: report)
         assert cli.main(["dataset", "verify", "x", "--json"]) == code
         document = json.loads(capsys.readouterr().out)
         assert document == {"faults": list(faults), "files": 7, "samples": 2, "notes": ["odd"], "valid": code == 0}
